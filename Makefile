@@ -1,0 +1,45 @@
+# The commands that people and CI run; `make` alone lists them.
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+CODE := src tests
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test lint format clean
+.DELETE_ON_ERROR:
+
+help:           ## list the targets
+	@sed -nE 's/^([a-z]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 18
+
+install: $(STAMP)  ## make .venv with servoscope, editable, and what its tests need
+
+demo: $(STAMP)  ## simulate a rig, break it, diagnose it; the report goes to demo-output/
+	$(BIN)/servoscope demo -o demo-output
+
+test: lint      ## everything that must pass: format, lint, types, tests (REQUIRE_ALL=1: no test may skip)
+	$(BIN)/python -m pytest -n 2
+
+lint: $(STAMP)  ## format, lint and types, without changing a file
+	$(BIN)/python -m ruff format --check $(CODE)
+	$(BIN)/python -m ruff check $(CODE)
+	$(BIN)/python -m mypy --strict src
+
+format: $(STAMP)  ## put the code into shape
+	$(BIN)/python -m ruff check --fix $(CODE)
+	$(BIN)/python -m ruff format $(CODE)
+
+clean:          ## remove what the other targets made
+	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Done again only when one of the two files has changed; .venv itself is kept then, unless its Python is gone.
+$(STAMP): pyproject.toml requirements-dev.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "servoscope needs Python 3.11 or newer, and '$(PYTHON)' is $$($(PYTHON) --version 2>&1):" \
+	       "install one and name it, as in 'make PYTHON=python3.12'" >&2; exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV) || { \
+	  echo "no virtual environment could be made: on Debian and its kin, install python3-venv" >&2; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements-dev.lock -e '.[dev]'
+	@touch $@

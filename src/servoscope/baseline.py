@@ -1,0 +1,185 @@
+"""What healthy looks like: learned from recordings or computed from nominal parameters; one JSON file, versioned."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from servoscope.errors import BaselineError, LoopError
+from servoscope.loop import Loop
+from servoscope.output import atomic_write
+from servoscope.pipeline import Pipeline, Tuning
+from servoscope.plants import FloatArray, Plant
+from servoscope.signatures import Noise
+
+FORMAT = "servoscope-baseline"
+VERSION = 1
+
+Vector = tuple[float, ...]
+Matrix = tuple[Vector, ...]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Source(_Part):
+    """A recording that the baseline was learned from."""
+
+    name: str
+    samples: int
+    duration_s: float
+
+
+class Promise(_Part):
+    """The smallest change that the baseline promises to see, relative: 0.05 is 5 %; None: none at all."""
+
+    name: str
+    parameter: str
+    change: float | None
+
+
+class Baseline(_Part):
+    """What a healthy loop looks like to the monitor; everything that `diagnose` needs.
+
+    Parameters
+    ----------
+    loop
+        The loop, as in its file.
+    sources, hash
+        What it was learned from.
+    names
+        Of the n coefficients.
+    theta, covariance
+        Healthy coefficients (n,) and the covariance of a further healthy recording's mean around them (n, n): noise
+        of the baseline, scatter between recordings and model error.
+    scale, P_d, R, noise_a, noise_gamma
+        The recursion's tuning (see `servoscope.pipeline.Tuning`).
+    noise
+        n_u and n_y; None without a controller or physics.
+    ratios, model_theta
+        Healthy parameters relative to the loop file's nominal values, and the coefficients that they lead to under
+        the references of the baseline; empty without a controller or physics.
+    dof
+        Effective number of independent residuals.
+    limit
+        Threshold of T^2.
+    explained
+        Share of eta's variance that the model explains.
+    delay_s
+        Delay that the recordings show [s]; None where they do not tell.
+    promises
+        Smallest changes that are seen with 90 % probability within the baseline's own excitation.
+    notes
+        What `learn` found worth saying.
+    """
+
+    loop_settings: dict[str, Any] = Field(alias="loop")
+    sources: tuple[Source, ...]
+    hash: str
+    names: tuple[str, ...]
+    theta: Vector
+    covariance: Matrix
+    scale: Vector
+    P_d: Matrix
+    R: float
+    noise_a: Vector
+    noise_gamma: Vector
+    noise: Noise | None
+    ratios: dict[str, float]
+    model_theta: Vector
+    dof: float
+    limit: float
+    explained: float
+    delay_s: float | None
+    suggested_model_error: float
+    supported_false_alarms_per_year: float
+    promises: tuple[Promise, ...]
+    notes: tuple[str, ...]
+
+    @cached_property
+    def loop(self) -> Loop:
+        """The loop."""
+        return Loop.from_dict(self.loop_settings)
+
+    @property
+    def plant(self) -> Plant:
+        """The plant with its healthy parameters as learned."""
+        return self.loop.plant.with_ratios(self.ratios) if self.ratios else self.loop.plant
+
+    @property
+    def tuning(self) -> Tuning:
+        """What the recursion takes."""
+        arrays = (self.theta, self.scale, self.P_d)
+        theta, scale, P_d = (np.array(value) for value in arrays)
+        return Tuning(theta, scale, P_d, self.R, np.array(self.noise_a), np.array(self.noise_gamma))
+
+    def pipeline(self) -> Pipeline:
+        """Return the loop's chain of constant matrices."""
+        return Pipeline.of(self.loop)
+
+    def cov(self) -> FloatArray:
+        """Return `covariance` as an array (n, n)."""
+        return np.array(self.covariance)
+
+    def save(self, path: str | Path) -> None:
+        """Write the baseline as JSON; nothing half-written stays behind.
+
+        Raises
+        ------
+        OutputError
+            If the file cannot be written.
+        """
+        content = {"format": FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
+        atomic_write(Path(path), (json.dumps(content, indent=1) + "\n").encode())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a baseline.
+
+        Raises
+        ------
+        BaselineError
+            If the file is missing, is no baseline, or is one of another version.
+        """
+        path = Path(path)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise BaselineError(f"{path}: no such file; make a baseline with servoscope learn") from None
+        except OSError as error:
+            raise BaselineError(f"{path}: cannot be read ({error.strerror or error})") from None
+        except ValueError:
+            raise BaselineError(f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote") from None
+        if not isinstance(content, Mapping) or content.get("format") != FORMAT:
+            raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
+        if content.get("version") != VERSION:
+            raise BaselineError(
+                f"{path}: baseline of version {content.get('version')!r}, this program reads version {VERSION}: learn it again"
+            )
+        fields = {key: value for key, value in content.items() if key not in ("format", "version")}
+        try:
+            baseline = cls.model_validate(fields)
+            _ = baseline.loop
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise BaselineError(f"{path}: damaged baseline, {where}: {first['msg'].lower()}; learn it again") from None
+        except LoopError as error:
+            raise BaselineError(f"{path}: damaged baseline, {error}; learn it again") from None
+        return baseline
+
+
+def digest(loop: Loop, arrays: list[FloatArray]) -> str:
+    """Return a hash of a loop and of all samples that were learned from: 16 hexadecimal digits."""
+    h = hashlib.sha256(loop.hash().encode())
+    for array in arrays:
+        h.update(np.ascontiguousarray(array).tobytes())
+    return h.hexdigest()[:16]

@@ -1,0 +1,51 @@
+"""What can go wrong for a user, as one small tree of exceptions whose messages are one line each.
+
+    Exception
+      ServoscopeError            catch this one to catch all that servoscope raises on purpose
+        LoopError                a loop file or a setting is wrong
+        RecordingError           a recording cannot be used
+          NotEnoughError         it is usable as a file, but too short or too still to learn from
+        BaselineError            a baseline file is unusable, or of another version
+        SimulationError          a simulation that was asked for is impossible
+        OutputError              a result cannot be written
+
+Every message names the file, the row or the key, says what is wrong with it and what to do.
+"""
+
+__all__ = [
+    "BaselineError",
+    "LoopError",
+    "NotEnoughError",
+    "OutputError",
+    "RecordingError",
+    "ServoscopeError",
+    "SimulationError",
+]
+
+
+class ServoscopeError(Exception):
+    """The base of all errors that servoscope raises on purpose; its text is one line for the user."""
+
+
+class LoopError(ServoscopeError):
+    """A loop file, or a setting in it, is wrong."""
+
+
+class RecordingError(ServoscopeError):
+    """A recording cannot be used."""
+
+
+class NotEnoughError(RecordingError):
+    """A recording is too short, or excites too little, for what was asked."""
+
+
+class BaselineError(ServoscopeError):
+    """A baseline file is unusable, or was written by another version."""
+
+
+class SimulationError(ServoscopeError):
+    """A simulation that was asked for is impossible."""
+
+
+class OutputError(ServoscopeError):
+    """A result cannot be written."""

@@ -1,0 +1,276 @@
+"""One recording against one baseline: statistic, verdict, onset, and what a fault would have to be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope import ifrf
+from servoscope.baseline import Baseline
+from servoscope.detection import Onset, noncentrality, onset, required_noncentrality, statistic
+from servoscope.diagnosis import (
+    UNKNOWN,
+    Candidate,
+    Diagnosis,
+    FoundFault,
+    Parameter,
+    ResponsePoint,
+    Trace,
+    Verdict,
+    Warning,
+)
+from servoscope.errors import RecordingError
+from servoscope.inverse import nominal_theta
+from servoscope.isolation import Signature, curve, isolate, line
+from servoscope.learning import fault_directions
+from servoscope.pipeline import Estimates, Pipeline, Tuning
+from servoscope.plants import Fault, FloatArray
+from servoscope.recording import Recording
+from servoscope.signatures import Expectation, course
+
+SURE = 0.95  # probability from which a fault is named
+WEAKER = 3.0  # a recording that sees only changes this much larger than promised is called undetermined
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """Everything about one recording that its diagnosis is made of; build it with `of`."""
+
+    baseline: Baseline
+    recording: Recording
+    pipeline: Pipeline
+    tuning: Tuning
+    estimates: Estimates
+    expectation: Expectation | None
+    trace: Trace
+
+    @classmethod
+    def of(cls, baseline: Baseline, recording: Recording) -> Examination:
+        """Run the recursion over the recording and compare it with what a healthy loop would show.
+
+        Raises
+        ------
+        RecordingError
+            If the recording's sample rate is not the loop's.
+        """
+        loop = baseline.loop
+        if abs(recording.sample_rate / loop.sample_rate - 1.0) > 0.01:
+            raise RecordingError(
+                f"{recording.name}: sampled at {recording.sample_rate:g} Hz, the baseline's loop at "
+                f"{loop.sample_rate:g} Hz: learn a baseline at this rate"
+            )
+        pipeline, tuning = baseline.pipeline(), baseline.tuning
+        estimates = pipeline.estimate(tuning, recording)
+        expectation = None
+        expected = np.broadcast_to(tuning.theta, estimates.theta.shape)
+        if baseline.noise is not None:
+            expectation = Expectation(pipeline, tuning, baseline.noise, course(recording))
+            expected = expectation.healthy(baseline.plant, np.array(baseline.model_theta))
+        covariance = estimates.S + baseline.cov()
+        ready = estimates.updates > 0
+        T2 = np.where(ready, statistic(estimates.theta, expected, covariance), 0.0)
+        frequencies = loop.monitor.frequencies
+        trace = Trace(
+            t=recording.t[estimates.index],
+            names=pipeline.bank.names,
+            theta=estimates.theta,
+            covariance=covariance,
+            expected=expected,
+            statistic=T2,
+            threshold=baseline.limit,
+            ifrf=ifrf.response(pipeline.bank, frequencies, estimates.theta, covariance),
+            ifrf_expected=ifrf.response(
+                pipeline.bank, frequencies, expected, np.broadcast_to(baseline.cov(), covariance.shape)
+            ),
+            ready=ready,
+        )
+        return cls(baseline, recording, pipeline, tuning, estimates, expectation, trace)
+
+    def diagnosis(self, progress: Callable[[str], None] = lambda _: None) -> Diagnosis:
+        """Return the verdict; `progress` is told what is being done."""
+        trace, recording = self.trace, self.recording
+        warnings = [Warning.of(defect) for defect in recording.defects] + self._doubts()
+        alarms = np.flatnonzero(trace.ready & (trace.statistic > trace.threshold))
+        detected_at, since, probability = None, None, None
+        candidates: tuple[Candidate, ...] = ()
+        faults: tuple[FoundFault, ...] = ()
+        verdict: Verdict
+        if alarms.size:
+            verdict = "fault"
+            first = int(alarms[0])
+            # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
+            at = len(trace.t) - 1 if trace.statistic[-1] > trace.threshold else int(np.argmax(trace.statistic))
+            detected_at = float(trace.t[first])
+            progress("onset")
+            since = self._onset(first, at)
+            candidates = isolate(
+                self._signatures(at, since.sample),
+                trace.theta[at] - trace.expected[at],
+                self.estimates.S[at] * max(1.0, float(self.estimates.power[at])) + self.baseline.cov(),
+                lambda: progress("isolation"),
+            )
+            probability = candidates[0].probability
+            if probability >= SURE and candidates[0].name != UNKNOWN:
+                faults = candidates[0].faults
+        else:
+            blind = self._blind_to()
+            verdict = "undetermined" if blind else "healthy"
+            span = float(recording.t[0]), float(recording.t[-1])
+            warnings += [Warning(kind="power", from_s=span[0], to_s=span[1], count=1, message=text) for text in blind]
+        onset_s = (since.low_s, since.likely_s, since.high_s) if since is not None else None
+        return Diagnosis(
+            recording=recording.name,
+            samples=recording.samples,
+            duration_s=recording.duration_s,
+            verdict=verdict,
+            summary=_summary(self.baseline, verdict, faults, candidates, onset_s, warnings),
+            detected_at_s=detected_at,
+            onset_s=onset_s,
+            probability=probability,
+            faults=faults,
+            candidates=candidates,
+            parameters=self._parameters(),
+            ifrf=self._ifrf(),
+            warnings=tuple(sorted(warnings, key=lambda warning: warning.from_s)),
+        )
+
+    def _onset(self, first: int, at: int) -> Onset:
+        index = self.estimates.index
+        return onset(
+            self.pipeline,
+            self.tuning,
+            self.recording,
+            self.estimates,
+            self.trace.expected[at],
+            self.trace.theta[at],
+            int(index[first]),
+            int(index[at]),
+        )
+
+    def _signatures(self, at: int, since: int) -> list[Signature]:
+        """Return one signature per fault: simulated with the loop, from physics alone, or the coefficient itself."""
+        loop, plant, faults = self.baseline.loop, self.baseline.plant, self.baseline.loop.plant.faults
+        if self.expectation is not None:
+            model_theta = np.array(self.baseline.model_theta)
+            expectation = self.expectation.until(int(self.estimates.index[at]) + 1)
+            healthy = expectation.path([plant], [0], model_theta)[-1]
+
+            def simulated(fault: Fault) -> Callable[[float], FloatArray]:
+                def shift(ratio: float) -> FloatArray:
+                    ill = plant.with_ratios({fault.parameter: ratio})
+                    plants, onsets = ([plant, ill], [0, since]) if since > 0 else ([ill], [0])
+                    return expectation.path(plants, onsets, model_theta)[-1] - healthy
+
+                return shift
+
+            return [curve(fault, simulated(fault)) for fault in faults]
+        if plant.has_physics and loop.plant.kind != "polynomial":
+            base = nominal_theta(loop.model_copy(update={"plant": plant}))
+
+            def physical(fault: Fault) -> Callable[[float], FloatArray]:
+                def shift(ratio: float) -> FloatArray:
+                    ill = plant.with_ratios({fault.parameter: ratio})
+                    return nominal_theta(loop.model_copy(update={"plant": ill})) - base
+
+                return shift
+
+            return [curve(fault, physical(fault)) for fault in faults]
+        directions = fault_directions(loop, plant, self.tuning.theta)
+        return [line(fault, directions[fault.parameter]) for fault in faults if np.any(directions[fault.parameter])]
+
+    def _blind_to(self) -> list[str]:
+        """Return what this recording could not have shown although the baseline promises it."""
+        promised = {p.parameter: p for p in self.baseline.promises if p.change is not None}
+        directions = fault_directions(self.baseline.loop, self.baseline.plant, self.tuning.theta)
+        rows = np.array([directions[parameter] for parameter in promised])
+        best = np.zeros(len(rows))
+        if len(rows) and self.trace.ready.any():
+            ok = self.trace.ready
+            best = noncentrality(self.trace.covariance[ok], self.estimates.Psi[ok], rows).max(axis=0)
+        needed = required_noncentrality(self.pipeline.bank.n, self.baseline.limit)
+        told = []
+        for promise, information in zip(promised.values(), best, strict=True):
+            seen = np.sqrt(needed / information) if information > 0.0 else np.inf
+            if promise.change is not None and seen > WEAKER * promise.change:
+                size = "no change at all" if np.isinf(seen) else f"a change of {promise.parameter} only from {seen:.2g} times its value on"
+                told.append(
+                    f"too short or too little motion: it would show {size} ({promise.name}), the baseline promises "
+                    f"{promise.change:.2g}"
+                )
+        return told
+
+    def _doubts(self) -> list[Warning]:
+        """Return warnings about the estimate itself."""
+        doubts = []
+        e, t = self.estimates, self.recording.t
+        if len(e.updates) and e.skipped[-1] > 0.01 * (e.skipped[-1] + e.updates[-1]):
+            count = int(e.skipped[-1])
+            message = f"the instrument was too weak for {count} updates, which were skipped"
+            doubts.append(Warning(kind="instrument", from_s=float(t[0]), to_s=float(t[-1]), count=count, message=message))
+        if len(e.updates) and e.updates[-1] > 0:
+            last = int(e.index[int(np.searchsorted(e.updates, e.updates[-1]))])
+            if t[-1] - t[last] > self.baseline.loop.monitor.memory:
+                message = "at rest or in the dead zone to the end: nothing is known about this time"
+                doubts.append(
+                    Warning(kind="rest", from_s=float(t[last]), to_s=float(t[-1]), count=len(t) - last, message=message)
+                )
+        return doubts
+
+    def _parameters(self) -> dict[str, Parameter]:
+        if not len(self.trace.t):
+            return {}
+        theta, expected = self.trace.theta[-1], self.trace.expected[-1]
+        std = np.sqrt(np.diag(self.trace.covariance[-1]))
+        return {
+            name: Parameter(value=float(value), std=float(s), nominal=float(nominal))
+            for name, value, s, nominal in zip(self.trace.names, theta, std, expected, strict=True)
+        }
+
+    def _ifrf(self) -> tuple[ResponsePoint, ...]:
+        if not len(self.trace.t):
+            return ()
+        now, healthy = self.trace.ifrf, self.trace.ifrf_expected
+        std = np.sqrt(np.diagonal(now.covariance[-1], axis1=-2, axis2=-1))
+        return tuple(
+            ResponsePoint(
+                frequency_hz=float(f),
+                real=float(H.real),
+                imag=float(H.imag),
+                real_std=float(s[0]),
+                imag_std=float(s[1]),
+                nominal_real=float(H0.real),
+                nominal_imag=float(H0.imag),
+            )
+            for f, H, s, H0 in zip(now.frequencies, now.H[-1], std, healthy.H[-1], strict=True)
+        )
+
+
+def _summary(
+    baseline: Baseline,
+    verdict: Verdict,
+    faults: tuple[FoundFault, ...],
+    candidates: tuple[Candidate, ...],
+    onset_s: tuple[float, float, float] | None,
+    warnings: list[Warning],
+) -> str:
+    if verdict == "healthy":
+        return "Healthy: no change beyond what noise explains."
+    if verdict == "undetermined":
+        reason = next(warning.message for warning in warnings if warning.kind == "power")
+        return f"Undetermined: {reason}."
+    words = {fault.name: fault.words for fault in baseline.loop.plant.faults}
+    since = f"since {onset_s[1]:.1f} s" if onset_s is not None else ""
+    if faults:
+        (fault,) = faults
+        low, high = fault.interval
+        return (
+            f"Fault, {fault.name} ({words[fault.name]}): {fault.parameter} is {fault.ratio:.4g} times its healthy value "
+            f"({low:.4g} to {high:.4g}) {since}."
+        )
+    likely = [c for c in candidates if c.probability >= 0.05]
+    if likely[0].name == UNKNOWN and likely[0].probability >= 0.5:
+        return f"Fault, unknown: a change {since} that no single known fault explains."
+    listed = " or ".join(f"{c.name} ({c.probability:.0%})" for c in likely)
+    return f"Fault {since}, not to be told apart here: {listed}."

@@ -1,0 +1,129 @@
+"""What r excites: spectra and coherence of r, u and y, the usable band, the signal at the monitored frequencies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope.levels import Said
+from servoscope.plants import FloatArray
+from servoscope.recording import Recording
+
+COHERENT = 0.8
+LEAST_SEGMENTS = 4
+NOTHING = 1e-12  # share of the largest power below which r is said to have none
+
+
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Averaged periodograms (Welch 1967: Hann window, half overlapping) and what of u and y follows r.
+
+    Parameters
+    ----------
+    f
+        Frequencies [Hz], shape (F,).
+    R, U, Y
+        One-sided power densities [signal^2/Hz], shape (F,).
+    coherence_u, coherence_y
+        Squared coherence of r -> u and r -> y, freed of the bias of few segments, 0 to 1, shape (F,).
+    segments
+        Number of segments that were averaged.
+    """
+
+    f: FloatArray
+    R: FloatArray
+    U: FloatArray
+    Y: FloatArray
+    coherence_u: FloatArray
+    coherence_y: FloatArray
+    segments: int
+
+
+class Band(Said):
+    """Frequencies [Hz] at which both u and y follow r."""
+
+    low_hz: float
+    high_hz: float
+
+
+class Excited(Said):
+    """One monitored frequency.
+
+    `snr` is the power that follows r over the power that does not, the smaller of u and y; `relative_std` that of
+    the iFRF after the whole recording, `relative_std_memory` that after the estimator's memory, both None where the
+    regression failed.
+    """
+
+    frequency_hz: float
+    coherence_u: float
+    coherence_y: float
+    snr: float
+    relative_std: float | None
+    relative_std_memory: float | None
+
+
+def spectra(recording: Recording) -> Spectra | None:
+    """Estimate spectra within the stretches between gaps; None where too little is left of them."""
+    starts = np.flatnonzero(recording.restart)
+    stretches = list(zip(starts, np.append(starts[1:], recording.samples), strict=True))
+    length = _length(np.array([stop - start for start, stop in stretches]), recording.samples)
+    if length < 16:
+        return None
+    window = np.hanning(length + 1)[:-1]
+    scale = 2.0 / (recording.sample_rate * float(window @ window))
+    signals = np.stack([recording.r, recording.u, recording.y])
+    rows = []
+    for start, stop in stretches:
+        for begin in range(start, stop - length + 1, length // 2):
+            part = signals[:, begin : begin + length]
+            rows.append(np.fft.rfft((part - part.mean(axis=1, keepdims=True)) * window, axis=1))
+    if len(rows) < LEAST_SEGMENTS:
+        return None
+    X = np.stack(rows)[:, :, 1:]  # (segments, 3, F), without the mean
+    power = scale * np.mean(np.abs(X) ** 2, axis=0)
+    cross = scale * np.mean(np.conj(X[:, :1]) * X[:, 1:], axis=0)
+    floor = NOTHING * power.max(axis=1, keepdims=True) + np.finfo(np.float64).tiny
+    raw = np.abs(cross) ** 2 / np.maximum(power[:1] * power[1:], floor[:1] * floor[1:])
+    # Half-overlapping Hann segments hold about 0.9 independent ones each; noise alone shows 1/K.
+    K = max(0.9 * len(rows), 2.0)
+    coherence = np.clip((K * raw - 1.0) / (K - 1.0), 0.0, 1.0)
+    coherence[:, power[0] <= floor[0]] = 0.0
+    f = np.arange(1, length // 2 + 1) * recording.sample_rate / length
+    return Spectra(f, power[0], power[1], power[2], coherence[0], coherence[1], len(rows))
+
+
+def _length(sizes: np.ndarray[tuple[int], np.dtype[np.int64]], samples: int) -> int:
+    """Return the segments' length: about a dozen of them, and most rows in stretches that hold one."""
+    length = samples // 6
+    while length >= 16 and sizes[sizes >= length].sum() < 0.8 * samples:
+        length = int(0.8 * length)
+    return length
+
+
+def usable_band(s: Spectra) -> Band | None:
+    """Return the widest band, on a logarithmic scale, in which u and y follow r; None if there is none."""
+    both = np.minimum(s.coherence_u, s.coherence_y)
+    # A line here and there that fails does not end a band, nor does one that passes by chance make one.
+    padded = np.pad(both, 2, mode="edge")
+    smooth = np.median(np.stack([padded[i : i + both.size] for i in range(5)]), axis=0)
+    good = np.concatenate([[False], smooth >= COHERENT, [False]])
+    edges = np.flatnonzero(good[1:] != good[:-1]).reshape(-1, 2)
+    if not edges.size:
+        return None
+    resolution = float(s.f[0])
+    # The lowest line stands for all below it, down to the length of the recording.
+    widths = [(s.f[stop - 1] + 0.5 * resolution) / (s.f[start] - 0.5 * resolution) for start, stop in edges]
+    start, stop = edges[int(np.argmax(widths))]
+    return Band(low_hz=float(s.f[start]), high_hz=float(s.f[stop - 1]))
+
+
+def signal_at(s: Spectra, frequency: float) -> tuple[float, float, float]:
+    """Return the coherences r -> u and r -> y around a frequency [Hz], and the signal-to-noise ratio (power)."""
+    near = np.abs(s.f - frequency) <= max(0.05 * frequency, 1.01 * float(s.f[0]))
+    if not near.any():
+        return 0.0, 0.0, 0.0
+    weight = s.R[near] / max(float(s.R[near].sum()), np.finfo(np.float64).tiny)
+    of_u, of_y = float(weight @ s.coherence_u[near]), float(weight @ s.coherence_y[near])
+    least = min(of_u, of_y, 1.0 - 1e-9)
+    return of_u, of_y, least / (1.0 - least)

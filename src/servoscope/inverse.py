@@ -1,0 +1,243 @@
+"""The inverse regression as one filter bank: [r u y] -> (eta, phi, z), and E(f) from theta to the iFRF."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.errors import LoopError
+from servoscope.linear import Linear, sampled, settling, stack, state_variable_filter, taps
+from servoscope.loop import Loop
+from servoscope.plants import FloatArray
+
+ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class FilterBank:
+    """Constant matrices that turn samples into regressors.
+
+    Parameters
+    ----------
+    system
+        From ``w = [r, u, y, extra ...]`` to ``[eta, phi (n), z (n, only with an instrument)]``.
+    velocity
+        From y (or r) to the velocity whose sign forms the non-linear columns and gates the estimator.
+    velocity_of_reference
+        Whether `velocity` listens to r instead of y.
+    extras
+        Non-linear inputs after r, u, y, out of `servoscope.plants.EXTRAS`.
+    names
+        Names of the n coefficients.
+    powers
+        Powers of s (or of q for Tustin) of the first coefficients; the others do not enter the iFRF.
+    structure
+        ``svf``, ``tustin`` or ``tustin-held``.
+    gain
+        Factor on u before it enters eta.
+    wait
+        Samples that the estimator waits after the filters are re-armed.
+    sample_rate
+        In Hz.
+    """
+
+    system: Linear
+    velocity: Linear
+    velocity_of_reference: bool
+    extras: tuple[str, ...]
+    names: tuple[str, ...]
+    powers: tuple[int, ...]
+    structure: str
+    gain: float
+    wait: int
+    sample_rate: float
+
+    @property
+    def n(self) -> int:
+        """Number of coefficients."""
+        return len(self.names)
+
+    @property
+    def has_instrument(self) -> bool:
+        """Whether z stands beside phi."""
+        return len(self.system.C) == 1 + 2 * self.n
+
+    def E(self, frequencies: npt.ArrayLike) -> ComplexArray:
+        """Return the matrix of ``H_hat(f) = E(f) theta``.
+
+        For the state-variable filter the columns are (j 2 pi f)^i; for Tustin they are those of eq. (13) with
+        q = exp(-j 2 pi f / f_s) -- the paper prints the sign the other way round, but q is a delay.
+
+        Parameters
+        ----------
+        frequencies
+            In Hz, shape (F,).
+
+        Returns
+        -------
+        numpy.ndarray
+            Complex, shape (F, n); columns of friction and offset are zero.
+        """
+        f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+        E = np.zeros((len(f), self.n), dtype=np.complex128)
+        powers = np.asarray(self.powers)
+        if self.structure == "svf":
+            E[:, : len(powers)] = (2j * np.pi * f[:, None]) ** powers
+        else:
+            q = np.exp(-2j * np.pi * f / self.sample_rate)
+            E[:, : len(powers)] = q[:, None] ** powers / (1.0 + q[:, None]) ** max(self.powers)
+        return E / self.gain
+
+
+def tustin_coefficients(theta: FloatArray, sample_rate: float) -> FloatArray:
+    """Map theta of ``sum theta_i s^i`` to c of eq. (3), s = 2 f_s (1 - q)/(1 + q).
+
+    Parameters
+    ----------
+    theta
+        Coefficients of s^0 ... s^n, shape (n + 1,).
+    sample_rate
+        In Hz.
+
+    Returns
+    -------
+    numpy.ndarray
+        c_0 ... c_n, shape (n + 1,).
+    """
+    from numpy.polynomial import polynomial as P
+
+    n = len(theta) - 1
+    c = np.zeros(n + 1)
+    for i, theta_i in enumerate(theta):
+        c += theta_i * (2.0 * sample_rate) ** i * P.polymul(P.polypow([1.0, -1.0], i), P.polypow([1.0, 1.0], n - i))
+    return c
+
+
+def nominal_theta(loop: Loop) -> FloatArray:
+    """Return the coefficients that the plant's parameters give in the loop's own structure, shape (n,)."""
+    theta = loop.plant.theta()
+    return theta if loop.monitor.structure == "svf" else tustin_coefficients(theta, loop.sample_rate)
+
+
+def nominal_closed_loop(loop: Loop) -> Linear:
+    """Build r -> y of the nominal closed loop without noise: exact ZOH plant, PI controller, delay.
+
+    Raises
+    ------
+    LoopError
+        If the loop has no controller or the plant no nominal values, or if the nominal loop is unstable.
+    """
+    if loop.controller is None or not loop.plant.has_physics:
+        raise LoopError(f"{loop.name}: the nominal closed loop needs [controller] and the plant's nominal values")
+    dt = 1.0 / loop.sample_rate
+    plant = sampled(loop.plant.state_space(), loop.sample_rate, loop.hold, loop.delay)
+    k_p, k_i = loop.controller.k_p, loop.controller.k_i
+    n = len(plant.A)
+    # states [x, s], s the sum of past errors; with y = c x + d u and u = gain e + k_i s, both follow from
+    # one linear equation: e = (r - c x - d k_i s) / (1 + d gain)
+    gain, d = k_p + k_i * dt, float(plant.D[0, 0])
+    b, c = plant.B[:, 0], plant.C[0]
+    e = np.concatenate([-c, [-d * k_i, 1.0]]) / (1.0 + d * gain)  # on [x, s, r]
+    u = gain * e
+    u[n] += k_i
+    y = np.concatenate([c, [0.0, 0.0]]) + d * u
+    x_next = np.hstack([plant.A, np.zeros((n, 2))]) + np.outer(b, u)
+    s_next = dt * e
+    s_next[n] += 1.0
+    both = np.vstack([x_next, s_next])
+    if np.abs(np.linalg.eigvals(both[:, : n + 1])).max() >= 1.0:
+        raise LoopError(f"{loop.name}: the nominal closed loop is unstable, check [plant] and [controller]")
+    return Linear(both[:, : n + 1], both[:, n + 1 :], y[None, : n + 1], y[None, n + 1 :])
+
+
+def cutoff_of(loop: Loop) -> float:
+    """Return the cutoff of the state-variable filter [Hz]: the loop file's, or a tenth of the sample rate.
+
+    A tenth leaves ten samples per period at the cutoff, where the hold on y is still good; a loop file says
+    more when the loop's bandwidth asks for less.
+    """
+    return loop.monitor.cutoff if loop.monitor.cutoff is not None else loop.sample_rate / 10.0
+
+
+def _svf_paths(loop: Loop) -> tuple[Linear, Linear, list[Linear], int]:
+    """Return u -> eta, y -> phi, extras -> phi, and the samples to wait."""
+    plant, rate, cutoff = loop.plant, loop.sample_rate, cutoff_of(loop)
+    order = max(plant.powers) + 1
+    continuous = state_variable_filter(cutoff, order)
+    to_eta = sampled(continuous, rate, loop.hold, loop.delay).output(plant.input_gain * np.eye(1, order))
+    to_phi = sampled(continuous, rate, "foh").output(np.eye(order)[list(plant.powers)])
+    one = Linear(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)))
+    smooth = sampled(continuous, rate, "foh").output(np.eye(1, order))
+    wait = settling(cutoff, order, 1.0 / rate) + math.ceil(loop.delay * rate)
+    return to_eta, to_phi, [one if extra == "one" else smooth for extra in plant.extras], wait
+
+
+def _tustin_paths(loop: Loop) -> tuple[Linear, Linear, list[Linear], int]:
+    """Return the paths of eq. (4) as printed, or with (u(k) + u(k-1))/2 in place of u for a held input."""
+    plant = loop.plant
+    n = max(plant.powers)
+    if plant.extras or plant.powers != tuple(range(n + 1)):
+        raise LoopError(
+            f"{loop.name}: [monitor] structure = {loop.monitor.structure!r} needs a plant with all powers of s "
+            "and neither friction nor offset; use structure = 'svf'"
+        )
+    weights = plant.input_gain * np.array([math.comb(n, i) for i in range(n + 1)], dtype=np.float64)
+    if loop.monitor.structure == "tustin-held":
+        weights = np.convolve(weights, [0.5, 0.5])
+    late = round(loop.delay * loop.sample_rate)
+    to_eta = taps(np.concatenate([np.zeros(late), weights]))
+    return to_eta, taps(np.eye(n + 1)), [], n + 2 + late
+
+
+def build(loop: Loop, instrument: Linear | None = None) -> FilterBank:
+    """Turn a loop's settings into constant matrices.
+
+    Parameters
+    ----------
+    loop
+        The loop; its plant gives the columns, its monitor settings the structure and the cutoff.
+    instrument
+        From r to a noise-free output y_a. With it, z carries the same filters applied to y_a (THEORY section 5).
+
+    Raises
+    ------
+    LoopError
+        If the structure does not suit the plant.
+    """
+    plant = loop.plant
+    svf = loop.monitor.structure == "svf"
+    to_eta, to_phi, to_extras, wait = (_svf_paths if svf else _tustin_paths)(loop)
+    n_powers, n_extras = len(plant.powers), len(plant.extras)
+    n = n_powers + n_extras
+    bricks = [to_eta, to_phi, *to_extras]
+    feeds = [1, 2, *range(3, 3 + n_extras)]  # which of w = [r, u, y, extras] each brick listens to
+    if instrument is not None:
+        bricks.append(instrument.then(to_phi))
+        feeds.append(0)
+    whole = stack(bricks)
+    route = np.zeros((len(bricks), 3 + n_extras))
+    route[np.arange(len(bricks)), feeds] = 1.0
+    C, D = whole.C, whole.D @ route
+    if instrument is not None and n_extras:
+        # the instrument replaces only the columns of y; friction and offset instrument themselves
+        rows = np.r_[np.arange(1 + n), 1 + n + np.arange(n_powers), 1 + n_powers + np.arange(n_extras)]
+        C, D = C[rows], D[rows]
+    # second-order differentiator of its own: the sign of a strongly filtered velocity lags (THEORY section 8)
+    cutoff = getattr(plant, "sign_cutoff", None) or 50.0
+    differentiator = state_variable_filter(min(cutoff, 0.25 * loop.sample_rate), 2)
+    velocity = sampled(differentiator, loop.sample_rate, "foh").output(np.array([[0.0, 1.0]]))
+    return FilterBank(
+        system=Linear(whole.A, whole.B @ route, C, D),
+        velocity=velocity,
+        velocity_of_reference=getattr(plant, "sign_from", "output") == "reference",
+        extras=plant.extras,
+        names=plant.names if svf else tuple(f"c_{i}" for i in range(n)),
+        powers=plant.powers,
+        structure=loop.monitor.structure,
+        gain=plant.input_gain,
+        wait=wait,
+        sample_rate=loop.sample_rate,
+    )

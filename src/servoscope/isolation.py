@@ -1,0 +1,179 @@
+"""Which fault, how large, how sure: signatures against the deviation; ambiguity and "unknown" said aloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault
+from servoscope.errors import SimulationError
+from servoscope.plants import Fault, FloatArray
+
+GRID = 17  # points along a signature before the minimum is refined
+MISFIT = 1e-3  # probability with which the true fault may fit worse than the limit
+SYSTEMATIC = 2e-3  # share of a signature that nominal parameters and intersample models may be off by
+
+
+@dataclass(frozen=True)
+class Signature:
+    """The curve along which theta_hat moves as one fault grows.
+
+    Parameters
+    ----------
+    fault
+        Its names.
+    shift
+        Coordinate -> change of theta_hat, shape (n,).
+    ratio
+        Coordinate -> ratio of the parameter to its healthy value.
+    low, high
+        Range of the coordinate; the prior is uniform on it.
+    """
+
+    fault: Fault
+    shift: Callable[[float], FloatArray]
+    ratio: Callable[[float], float]
+    low: float
+    high: float
+
+
+def curve(fault: Fault, shift_of_ratio: Callable[[float], FloatArray]) -> Signature:
+    """Return the signature of a physical parameter: the coordinate is the logarithm of the ratio."""
+    low, high = np.log(fault.ratio_range)
+    return Signature(fault, lambda x: shift_of_ratio(float(np.exp(x))), lambda x: float(np.exp(x)), low, high)
+
+
+def line(fault: Fault, direction: FloatArray) -> Signature:
+    """Return the signature of a coefficient: theta moves along `direction`, its value of today, either way."""
+    reach = max(fault.ratio_range[1] - 1.0, 1.0)
+    return Signature(fault, lambda x: x * direction, lambda x: 1.0 + x, -reach, reach)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    signature: Signature
+    misfit: float  # smallest J
+    evidence: float  # log of the integral over the prior
+    best: float
+    low: float
+    high: float
+
+
+def isolate(
+    signatures: Sequence[Signature],
+    deviation: FloatArray,
+    covariance: FloatArray,
+    progress: Callable[[], None] = lambda: None,
+) -> tuple[Candidate, ...]:
+    """Compare a deviation with every signature.
+
+    Along each curve J(x) = (d - s(x))' Sigma(x)^-1 (d - s(x)); the probability of a fault is proportional to the
+    integral of exp(-(J + log det Sigma)/2) over its range. "unknown" stands for a change that would fit exactly as
+    badly as the limit that a true fault passes in one of a thousand cases.
+
+    Parameters
+    ----------
+    signatures
+        One per fault; a size at which the loop would be unstable counts as impossible.
+    deviation
+        theta_hat minus its healthy expectation, shape (n,).
+    covariance
+        Of the deviation, shape (n, n).
+    progress
+        Called once per signature.
+
+    Returns
+    -------
+    tuple of Candidate
+        Most probable first, ``unknown`` among them; probabilities sum to 1.
+    """
+    from scipy import stats
+
+    n = len(deviation)
+    limit = float(stats.chi2.isf(MISFIT, max(n - 1, 1)))
+    fitted = []
+    for signature in signatures:
+        found = _fit(signature, deviation, covariance)
+        progress()
+        if found is not None:
+            fitted.append(found)
+    if not fitted:
+        return (Candidate(name=UNKNOWN, probability=1.0),)
+    closest = min(fitted, key=lambda found: found.misfit)
+    unknown = closest.evidence + (closest.misfit - limit) / 2.0
+    evidence = np.array([found.evidence for found in fitted] + [unknown])
+    probability = np.exp(evidence - evidence.max())
+    probability /= probability.sum()
+    candidates = [
+        Candidate(
+            name=found.signature.fault.name,
+            probability=float(share),
+            faults=(
+                FoundFault(
+                    name=found.signature.fault.name,
+                    parameter=found.signature.fault.parameter,
+                    ratio=found.signature.ratio(found.best),
+                    interval=(found.signature.ratio(found.low), found.signature.ratio(found.high)),
+                ),
+            ),
+        )
+        for found, share in zip(fitted, probability[:-1], strict=True)
+    ]
+    candidates.append(Candidate(name=UNKNOWN, probability=float(probability[-1])))
+    return tuple(sorted(candidates, key=lambda candidate: -candidate.probability))
+
+
+def _fit(signature: Signature, deviation: FloatArray, covariance: FloatArray) -> _Fitted | None:
+    from scipy import optimize
+
+    size = np.sqrt(np.diag(covariance))
+    scaled = deviation / size
+    correlation = covariance / np.outer(size, size)
+
+    def cost(x: float) -> tuple[float, float]:
+        try:
+            s = signature.shift(x) / size
+        except SimulationError:  # unstable at this size: nobody could have recorded it
+            return np.inf, 0.0
+        Sigma = correlation + np.diag((SYSTEMATIC * s) ** 2 + 1e-12)
+        J = float((scaled - s) @ np.linalg.solve(Sigma, scaled - s))
+        return J, float(np.linalg.slogdet(Sigma)[1])
+
+    known: dict[float, tuple[float, float]] = {}
+
+    def J(x: float) -> float:
+        if x not in known:
+            known[x] = cost(x)
+        return known[x][0]
+
+    grid = np.linspace(signature.low, signature.high, GRID)
+    values = np.array([J(float(x)) for x in grid])
+    if not np.isfinite(values).any():
+        return None
+    i = int(np.argmin(values))
+    bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
+    width = bracket[1] - bracket[0]
+    best = float(optimize.minimize_scalar(J, bounds=bracket, method="bounded", options={"xatol": 1e-4 * width}).x)
+    if J(best) > values[i]:
+        best = float(grid[i])
+    # a parabola through the minimum says how wide to look; the integral itself uses the true curve
+    h = 1e-2 * width
+    left, right = max(best - h, signature.low), min(best + h, signature.high)
+    slope = max((J(left) - J(best)) / max(best - left, 1e-12) + (J(right) - J(best)) / max(right - best, 1e-12), 1e-12)
+    sigma = min(np.sqrt(2.0 * (right - left) / 2.0 / slope), signature.high - signature.low)
+    for x in best + sigma * np.linspace(-4.0, 4.0, 17):
+        J(float(np.clip(x, signature.low, signature.high)))
+    x = np.array(sorted(known))
+    J_x, logdet = np.array([known[float(value)] for value in x]).T
+    log_weight = -(J_x + logdet) / 2.0
+    top = log_weight.max()
+    # fine enough for a smooth posterior between the points that were simulated
+    fine = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in zip(x[:-1], x[1:], strict=True)]))
+    finite = np.maximum(log_weight, top - 1e4)
+    density = np.exp(np.interp(fine, x, finite) - top)
+    area = np.concatenate([[0.0], np.cumsum(np.diff(fine) * (density[1:] + density[:-1]) / 2.0)])
+    low, high = np.interp([0.025, 0.975], area / area[-1], fine)
+    evidence = float(top + np.log(area[-1] / (signature.high - signature.low)))
+    return _Fitted(signature, J(best), evidence, best, float(low), float(high))

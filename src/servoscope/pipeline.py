@@ -1,0 +1,223 @@
+"""One loop's chain of bank and recursion turned into constants: a recording -> regressors, estimates. No faults here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from servoscope import inverse
+from servoscope.inverse import FilterBank
+from servoscope.plants import EXTRAS, FloatArray
+from servoscope.recording import Recording
+
+if TYPE_CHECKING:
+    from servoscope.loop import Loop
+    from servoscope.recursion import BoolArray, Constants, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """What a baseline knows of one loop's recursion, in physical units.
+
+    Parameters
+    ----------
+    theta
+        Healthy coefficients, where the recursion starts, shape (n,).
+    scale
+        Typical size (rms) of each column of phi on healthy data, shape (n,).
+    P_d
+        Desired covariance of the AKF, shape (n, n).
+    R
+        Variance of the residual v.
+    noise_a, noise_gamma
+        Autoregression (p,) and autocovariance (p,) of v, gamma[0] its variance.
+    """
+
+    theta: FloatArray
+    scale: FloatArray
+    P_d: FloatArray
+    R: float
+    noise_a: FloatArray
+    noise_gamma: FloatArray
+
+    @property
+    def innovation(self) -> float:
+        """Variance of the white noise that drives the autoregression (Yule and Walker, with a floor)."""
+        gamma = self.noise_gamma
+        return max(float(gamma[0] - self.noise_a[:-1] @ gamma[1:]), 1e-9 * float(gamma[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """eta, phi and z of every sample.
+
+    Parameters
+    ----------
+    eta
+        Shape (N,).
+    phi, z
+        Shape (N, n); z is phi where there is no instrument.
+    ok
+        Whether the sample may update an estimator, shape (N,).
+    """
+
+    eta: FloatArray
+    phi: FloatArray
+    z: FloatArray
+    ok: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What the recursion says, one row per evaluation.
+
+    Parameters
+    ----------
+    index
+        Sample of the evaluation, shape (K,).
+    updates, skipped
+        Updates so far, and those that a guard refused, shape (K,).
+    power
+        Recent mean square of the residual relative to the baseline's, shape (K,).
+    theta
+        Estimate, shape (K, n).
+    S
+        Its covariance under the recording's own excitation, shape (K, n, n).
+    Psi
+        Share of the starting value that is left in it, shape (K, n, n).
+    """
+
+    index: IntArray
+    updates: FloatArray
+    skipped: FloatArray
+    power: FloatArray
+    theta: FloatArray
+    S: FloatArray
+    Psi: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Pipeline:
+    """A loop and its filter bank; build it with `of`."""
+
+    loop: Loop
+    bank: FilterBank
+
+    @classmethod
+    def of(cls, loop: Loop) -> Pipeline:
+        """Turn a loop's settings into constant matrices.
+
+        Raises
+        ------
+        LoopError
+            If the structure does not suit the plant, or the estimator needs an instrument and the loop has
+            neither a controller nor nominal values to make one of.
+        """
+        from servoscope import estimators
+
+        needs = estimators.load(loop.monitor.estimator).NEEDS_INSTRUMENT
+        return cls(loop, inverse.build(loop, inverse.nominal_closed_loop(loop) if needs else None))
+
+    @property
+    def every(self) -> int:
+        """Samples between evaluations."""
+        return max(1, round(self.loop.sample_rate / self.loop.monitor.evaluation_rate))
+
+    @property
+    def memory(self) -> float:
+        """Memory N of the estimator in samples."""
+        return self.loop.monitor.memory * self.loop.sample_rate
+
+    def constants(self, tuning: Tuning) -> Constants:
+        """Turn loop and tuning into what the compiled recursion takes; phi is divided by the tuning's scale."""
+        from servoscope.recursion import Constants
+
+        loop, bank, n = self.loop, self.bank, self.bank.n
+        rows = np.ones(len(bank.system.C))
+        rows[1 : 1 + n] = 1.0 / tuning.scale
+        if bank.has_instrument:
+            rows[1 + n :] = 1.0 / tuning.scale
+        pairs = np.outer(tuning.scale, tuning.scale)
+        infinite = (-np.inf, np.inf)
+        dead = loop.input_deadzone or (np.inf, -np.inf)
+        limits = (loop.input_limits or infinite) if loop.input_logged == "before_limiter" else infinite
+        arrays = {
+            "A": bank.system.A,
+            "B": bank.system.B,
+            "C": rows[:, None] * bank.system.C,
+            "D": rows[:, None] * bank.system.D,
+            "X0": bank.system.steady,
+            "vA": bank.velocity.A,
+            "vB": bank.velocity.B,
+            "vC": bank.velocity.C,
+            "vD": bank.velocity.D,
+            "vX0": bank.velocity.steady,
+            "limits": limits,
+            "deadzone": dead,
+            "theta": tuning.theta * tuning.scale,
+            "P_d": tuning.P_d * pairs,
+            "a": tuning.noise_a,
+            "gamma": tuning.noise_gamma,
+        }
+        return Constants(
+            **{name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()},
+            codes=np.array([EXTRAS.index(extra) for extra in bank.extras], dtype=np.int64),
+            v_of_r=bank.velocity_of_reference,
+            sign_speed=float(getattr(loop.plant, "sign_speed", 0.0)),
+            rest_speed=loop.monitor.rest_speed,
+            only_moving=loop.monitor.update_when == "moving",
+            wait=bank.wait,
+            every=self.every,
+            R=tuning.R,
+            memory=self.memory,
+        )
+
+    def blank(self) -> Tuning:
+        """Return a tuning that only serves to form regressors: scale 1, nothing known of noise."""
+        n = self.bank.n
+        return Tuning(np.zeros(n), np.ones(n), np.eye(n), 1.0, np.zeros(1), np.ones(1))
+
+    def regression(
+        self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray, tuning: Tuning | None = None
+    ) -> Regression:
+        """Form eta, phi and z of a block, each input of shape (N,); phi and z in physical units."""
+        from servoscope.recursion import Layout, regressors
+
+        c = self.constants(self.blank() if tuning is None else tuning)
+        state = Layout(c).start(c, 1)
+        out = np.empty((len(r), len(c.C)))
+        ok = np.empty(len(r), dtype=np.int64)
+        regressors(c, state[0], r, u, y, restart, out, ok)
+        n = self.bank.n
+        scale = np.ones(n) if tuning is None else tuning.scale
+        return Regression(out[:, 0], out[:, 1 : 1 + n] * scale, out[:, -n:] * scale, ok == 1)
+
+    def estimate(self, tuning: Tuning, recording: Recording) -> Estimates:
+        """Run the recursion over a recording, from the tuning's theta."""
+        from servoscope.recursion import Layout, block
+
+        c = self.constants(tuning)
+        layout = Layout(c)
+        state = layout.start(c, 1)
+        out = np.empty((1, recording.samples // self.every, layout.row))
+        signals = (recording.r, recording.u, recording.y, recording.restart)
+        block(self.loop.monitor.estimator)(c, state, *(signal[None, :] for signal in signals), out)
+        index = (np.arange(out.shape[1]) + 1) * self.every - 1
+        return self.unpack(tuning, out[0], index)
+
+    def unpack(self, tuning: Tuning, rows: FloatArray, index: IntArray) -> Estimates:
+        """Turn rows of the recursion, shape (K, row), into estimates in physical units."""
+        n, s = self.bank.n, tuning.scale
+        pairs = np.outer(s, s)
+        theta, S, Psi = np.split(rows[:, 3:], [n, n + n * n], axis=1)
+        return Estimates(
+            index=index,
+            updates=rows[:, 0],
+            skipped=rows[:, 1],
+            power=rows[:, 2] / tuning.noise_gamma[0],
+            theta=theta / s,
+            S=S.reshape(-1, n, n) / pairs,
+            Psi=Psi.reshape(-1, n, n) * (s[None, :] / s[:, None]),
+        )

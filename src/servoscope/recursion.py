@@ -1,0 +1,384 @@
+"""The compiled heart: constant arrays, state and a block of samples -> new state and evaluations.
+
+One sample, a log and a fleet run through the same `block`. The state of an asset is one row of floats; `Layout` says
+what stands where. Splitting a recording anywhere changes nothing, because everything that is carried from sample to
+sample stands in that row.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope import estimators
+from servoscope.compiled import kernel
+from servoscope.plants import FloatArray
+
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+# counters at the head of the state row
+ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, POWER = range(6)
+HEAD = 6
+
+
+class Constants(NamedTuple):
+    """Everything that a loop and a baseline say, as arrays (scaled: phi / scale, theta * scale).
+
+    ``A, B, C, D, X0`` are the filter bank and its steady state per unit input, ``vA ... vX0`` the velocity filter,
+    `codes` the non-linear inputs, `limits` and `deadzone` of u, `a` and `gamma` the noise's autoregression and
+    autocovariance (gamma[0] its variance).
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    X0: FloatArray
+    vA: FloatArray
+    vB: FloatArray
+    vC: FloatArray
+    vD: FloatArray
+    vX0: FloatArray
+    v_of_r: bool
+    codes: IntArray
+    limits: FloatArray
+    deadzone: FloatArray
+    sign_speed: float
+    rest_speed: float
+    only_moving: bool
+    wait: int
+    every: int
+    theta: FloatArray
+    P_d: FloatArray
+    R: float
+    a: FloatArray
+    gamma: FloatArray
+    memory: float
+
+
+class Layout:
+    """Where things stand in the state row of one asset, and in a row of evaluations.
+
+    Parameters
+    ----------
+    c
+        The constants, which fix the sizes.
+    """
+
+    def __init__(self, c: Constants) -> None:
+        nx, nv, n, p = len(c.A), len(c.vA), len(c.theta), len(c.a)
+        self.n = n
+        sizes = {
+            "head": HEAD,
+            "x": nx,
+            "xv": nv,
+            "theta": n,
+            "P": n * n,
+            "S": n * n,
+            "M": n * p,
+            "Psi": n * n,
+        }
+        ends = np.cumsum(list(sizes.values()))
+        self.slices = {
+            name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
+        self.size = int(ends[-1])
+        self.row = 3 + n + 2 * n * n  # counters, theta, S, Psi
+
+    def start(self, c: Constants, assets: int) -> FloatArray:
+        """Return the state before the first sample, shape (assets, size): theta at the baseline, P = P_d."""
+        state = np.zeros((assets, self.size))
+        state[:, self.slices["theta"]] = c.theta
+        state[:, self.slices["P"]] = c.P_d.ravel()
+        state[:, self.slices["Psi"]] = np.eye(self.n).ravel()
+        state[:, POWER] = c.gamma[0]
+        return state
+
+
+@kernel
+def sense(
+    c: Constants,
+    s: FloatArray,
+    w: FloatArray,
+    v_out: FloatArray,
+    r: float,
+    u: float,
+    y: float,
+    restart: bool,
+) -> int:
+    """Pass one sample through the filter bank; v_out becomes [eta, phi, z].
+
+    Returns 1 when the sample may update the estimator, 0 when the filters settle, the axis rests or u is dead, -1
+    when the sample is missing (NaN): then nothing but the demand to re-arm is remembered.
+    """
+    if not (np.isfinite(r) and np.isfinite(u) and np.isfinite(y)):
+        s[ARMED] = 0.0
+        return -1
+    nx = c.A.shape[0]
+    nv = c.vA.shape[0]
+    x = s[HEAD : HEAD + nx]
+    xv = s[HEAD + nx : HEAD + nx + nv]
+    arm = restart or s[ARMED] == 0.0
+    source = r if c.v_of_r else y
+    if arm:
+        for i in range(nv):
+            xv[i] = c.vX0[i, 0] * source
+    v = c.vD[0, 0] * source
+    for i in range(nv):
+        v += c.vC[0, i] * xv[i]
+    t0 = c.vA[0, 0] * xv[0] + c.vA[0, 1] * xv[1] + c.vB[0, 0] * source
+    xv[1] = c.vA[1, 0] * xv[0] + c.vA[1, 1] * xv[1] + c.vB[1, 0] * source
+    xv[0] = t0
+    w[0] = r
+    w[1] = min(max(u, c.limits[0]), c.limits[1])
+    w[2] = y
+    for i in range(len(c.codes)):
+        if c.codes[i] == 0:
+            w[3 + i] = 0.0 if abs(v) <= c.sign_speed else (1.0 if v > 0.0 else -1.0)
+        elif c.codes[i] == 1:
+            w[3 + i] = max(v, 0.0)
+        elif c.codes[i] == 2:
+            w[3 + i] = min(v, 0.0)
+        else:
+            w[3 + i] = 1.0
+    nw = len(w)
+    if arm:
+        s[ARMED] = 1.0
+        s[WAIT] = c.wait
+        for i in range(nx):
+            x[i] = 0.0
+            for j in range(nw):
+                x[i] += c.X0[i, j] * w[j]
+    for i in range(len(v_out)):
+        v_out[i] = 0.0
+        for j in range(nw):
+            v_out[i] += c.D[i, j] * w[j]
+        for j in range(nx):
+            v_out[i] += c.C[i, j] * x[j]
+    new = np.empty(nx)
+    for i in range(nx):
+        new[i] = 0.0
+        for j in range(nw):
+            new[i] += c.B[i, j] * w[j]
+        for j in range(nx):
+            new[i] += c.A[i, j] * x[j]
+    for i in range(nx):
+        x[i] = new[i]
+    if s[WAIT] > 0.0:
+        s[WAIT] -= 1.0
+        return 0
+    if c.only_moving and (abs(v) <= c.rest_speed or (c.deadzone[0] <= w[1] <= c.deadzone[1])):
+        return 0
+    return 1
+
+
+@kernel
+def spread(
+    a: FloatArray,
+    gamma: FloatArray,
+    K: FloatArray,
+    phi: FloatArray,
+    S: FloatArray,
+    M: FloatArray,
+    Psi: FloatArray,
+) -> None:
+    """Carry the covariance of theta_hat through one update of gain K, for coloured noise v.
+
+    With theta_err(k+1) = (I - K phi') theta_err(k) + K v(k) and v autoregressive (a, gamma), the joint covariance of
+    theta_err and the last p noises obeys a recursion of its own: S = Cov(theta_err), M = E[theta_err v_past']. It is
+    exact for given phi, whatever the excitation and the gating. Psi is the share of the starting value that is left.
+    """
+    n, p = M.shape
+    m = np.empty(n)  # E[theta_err(k) v(k)]
+    q = np.empty(n)  # S phi
+    h = np.empty(n)  # phi' Psi
+    phi_m = 0.0
+    phi_q = 0.0
+    for i in range(n):
+        m[i] = 0.0
+        for j in range(p):
+            m[i] += M[i, j] * a[j]
+        q[i] = 0.0
+        h[i] = 0.0
+        for j in range(n):
+            q[i] += S[i, j] * phi[j]
+            h[i] += phi[j] * Psi[j, i]
+    for i in range(n):
+        phi_m += phi[i] * m[i]
+        phi_q += phi[i] * q[i]
+    for i in range(n):
+        for j in range(i + 1):
+            am_i = m[i] - K[i] * phi_m
+            am_j = m[j] - K[j] * phi_m
+            S[i, j] += (
+                (phi_q + gamma[0]) * K[i] * K[j] - K[i] * q[j] - q[i] * K[j] + am_i * K[j] + K[i] * am_j
+            )
+            S[j, i] = S[i, j]
+        for j in range(n):
+            Psi[i, j] -= K[i] * h[j]
+    for lag in range(p - 1, 0, -1):
+        phi_M = 0.0
+        for i in range(n):
+            phi_M += phi[i] * M[i, lag - 1]
+        for i in range(n):
+            M[i, lag] = M[i, lag - 1] - K[i] * phi_M + K[i] * gamma[lag]
+    for i in range(n):
+        M[i, 0] = m[i] - K[i] * phi_m + K[i] * gamma[0]
+
+
+def _update(*_: Any) -> int:  # the template's placeholder: `block` is built with an estimator in its place
+    return 0
+
+
+def _block(
+    c: Constants,
+    state: FloatArray,
+    r: FloatArray,
+    u: FloatArray,
+    y: FloatArray,
+    restart: BoolArray,
+    out: FloatArray,
+) -> int:
+    nx = c.A.shape[0]
+    nv = c.vA.shape[0]
+    n = len(c.theta)
+    p = len(c.a)
+    assets, samples = r.shape
+    w = np.empty(c.B.shape[1])
+    v_out = np.empty(c.C.shape[0])
+    K = np.empty(n)
+    row = 0
+    for asset in range(assets):
+        s = state[asset]
+        o = HEAD + nx + nv
+        theta = s[o : o + n]
+        P = s[o + n : o + n + n * n].reshape((n, n))
+        o += n + n * n
+        S = s[o : o + n * n].reshape((n, n))
+        M = s[o + n * n : o + n * n + n * p].reshape((n, p))
+        Psi = s[o + n * n + n * p : o + 2 * n * n + n * p].reshape((n, n))
+        phi = v_out[1 : 1 + n]
+        z = v_out[len(v_out) - n :]
+        row = 0
+        for k in range(samples):
+            ok = sense(c, s, w, v_out, r[asset, k], u[asset, k], y[asset, k], restart[asset, k])
+            if ok == 1:
+                e = v_out[0]
+                for i in range(n):
+                    e -= phi[i] * theta[i]
+                if _update(theta, P, c.P_d, c.R, v_out[0], phi, z, K) == 0:
+                    s[UPDATES] += 1.0
+                    s[POWER] += (e * e - s[POWER]) / c.memory
+                else:
+                    s[SKIPPED] += 1.0
+                spread(c.a, c.gamma, K, phi, S, M, Psi)
+            elif s[WAIT] > 0.0 or ok == -1:
+                for i in range(n):  # after a gap the noise is new
+                    for j in range(p):
+                        M[i, j] = 0.0
+            s[SAMPLE] += 1.0
+            if s[SAMPLE] % c.every == 0.0:
+                q = out[asset, row]
+                q[0] = s[UPDATES]
+                q[1] = s[SKIPPED]
+                q[2] = s[POWER]
+                for i in range(n):
+                    q[3 + i] = theta[i]
+                    for j in range(n):
+                        q[3 + n + i * n + j] = S[i, j]
+                        q[3 + n + n * n + i * n + j] = Psi[i, j]
+                row += 1
+    return row
+
+
+@kernel
+def regressors(
+    c: Constants,
+    state: FloatArray,
+    r: FloatArray,
+    u: FloatArray,
+    y: FloatArray,
+    restart: BoolArray,
+    out: FloatArray,
+    ok: IntArray,
+) -> None:
+    """Write [eta, phi, z] of every sample of one asset to `out` (N, 1 + n [+ n]) and what `sense` says to `ok` (N,)."""
+    w = np.empty(c.B.shape[1])
+    for k in range(len(r)):
+        ok[k] = sense(c, state, w, out[k], r[k], u[k], y[k], restart[k])
+
+
+@functools.cache
+def block(estimator: str) -> Callable[..., int]:
+    """Compile the block function around one estimator.
+
+    The signature is ``block(c, state, r, u, y, restart, out) -> rows``; r, u, y, restart have shape
+    (assets, samples), `state` is changed in place, and `out` (assets, rows, `Layout.row`) receives an evaluation
+    every ``c.every`` samples. Numba's cache sees only the file of the function itself, so the sources of all
+    kernels are part of its name: a change in any of them compiles anew.
+    """
+    module = estimators.load(estimator)
+    sources = [Path(__file__), Path(str(module.__file__))]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+    function = FunctionType(
+        _block.__code__, {**globals(), "_update": module.update}, f"block_{module.NAME.replace('-', '_')}"
+    )
+    function.__qualname__ = f"{function.__name__}_{digest}"
+    function.__module__ = __name__
+    return kernel(function)
+
+
+@kernel
+def mean_path(
+    eta: FloatArray,
+    phi: FloatArray,
+    z: FloatArray,
+    ok: BoolArray,
+    which: IntArray,
+    c: FloatArray,
+    S: FloatArray,
+    P_d: FloatArray,
+    R: float,
+    start: FloatArray,
+    every: int,
+) -> FloatArray:
+    """Follow the mean of theta_hat at P = P_d for noise-free regressors plus the noise's moments, shape (K, n).
+
+    ``theta += (P_d z (eta - phi' theta) + P_d (c - S theta)) / (R + phi' P_d z + tr(P_d S))``; c (p, n) and S
+    (p, n, n) are the noise's E[phi eta] and E[phi phi'] with the plant ``which[k]`` (N,).
+    """
+    N, n = phi.shape
+    theta = start.copy()
+    path = np.empty((N // every, n))
+    gain = np.empty(n)
+    pull = np.empty(n)
+    for k in range(N):
+        if ok[k]:
+            p = which[k]
+            e = eta[k]
+            denominator = R
+            for i in range(n):
+                e -= phi[k, i] * theta[i]
+                gain[i] = 0.0
+                pull[i] = c[p, i]
+                for j in range(n):
+                    gain[i] += P_d[i, j] * z[k, j]
+                    pull[i] -= S[p, i, j] * theta[j]
+                    denominator += P_d[i, j] * S[p, j, i]
+                denominator += phi[k, i] * gain[i]
+            for i in range(n):
+                step = gain[i] * e
+                for j in range(n):
+                    step += P_d[i, j] * pull[j]
+                theta[i] += step / denominator
+        if (k + 1) % every == 0:
+            path[(k + 1) // every - 1] = theta
+    return path

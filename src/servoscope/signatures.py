@@ -1,0 +1,168 @@
+"""What a monitor is expected to say: the mean path of theta_hat for a given plant under a given reference.
+
+Neither noise nor intersample behaviour is assumed away: the loop is simulated with the recording's own reference, its
+regressors enter the same recursion, and the noise's mean effect on it (errors in variables) is added through its
+moments. So the biases of the regression are in the expectation, and cancel from residuals and from fault sizes
+(indirect inference; Gourieroux, Monfort and Renault, 1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.pipeline import Pipeline, Tuning
+from servoscope.plants import FloatArray, Plant
+from servoscope.recording import Recording
+from servoscope.simulation import response, simulate
+
+LONGEST_FILL = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
+NOISE_SAMPLES = 8000  # length of the noise-only simulation; the same seed for all plants keeps curves smooth
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White noise of the loop: standard deviations of n_u (enters with u) and n_y (part of the measured y)."""
+
+    u_std: float
+    y_std: float
+
+
+class Moments(NamedTuple):
+    """The noise's share of the moments: ``c = E[phi_n eta_n]`` (n,) and ``S = E[phi_n phi_n']`` (n, n)."""
+
+    c: FloatArray
+    S: FloatArray
+
+
+class Course(NamedTuple):
+    """A reference on a gapless clock, and which of its samples were recorded."""
+
+    r: FloatArray
+    kept: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    restart: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+
+
+def course(recording: Recording) -> Course:
+    """Put r on a gapless clock; short gaps are bridged by straight lines, for simulation only."""
+    steps = np.round(np.diff(recording.t) * recording.sample_rate).astype(np.int64)
+    steps = np.clip(steps, 1, round(LONGEST_FILL * recording.sample_rate))
+    kept = np.concatenate([[0], np.cumsum(steps)])
+    r = np.interp(np.arange(kept[-1] + 1), kept, recording.r)
+    return Course(np.asarray(r, dtype=np.float64), kept, recording.restart)
+
+
+def noise_moments(pipeline: Pipeline, plant: Plant, noise: Noise) -> Moments:
+    """Simulate the loop at rest with noise alone and return its moments; zero with an instrument (E[z v] = 0)."""
+    n = pipeline.bank.n
+    if pipeline.bank.has_instrument or not (noise.u_std or noise.y_std):
+        return Moments(np.zeros(n), np.zeros((n, n)))
+    loop = pipeline.loop.model_copy(update={"plant": plant})
+    quiet, _ = simulate(
+        loop, np.zeros(NOISE_SAMPLES), noise_u_std=noise.u_std, noise_y_std=noise.y_std, seed=7
+    )
+    g = pipeline.regression(quiet.r, quiet.u, quiet.y, quiet.restart)
+    eta, phi = g.eta[g.ok], g.phi[g.ok]
+    return Moments(phi.T @ eta / len(eta), phi.T @ phi / len(eta))
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """Expected estimates for one loop's recursion under one reference.
+
+    Parameters
+    ----------
+    pipeline, tuning
+        The recursion.
+    noise
+        Of the loop.
+    course
+        The reference.
+    """
+
+    pipeline: Pipeline
+    tuning: Tuning
+    noise: Noise
+    course: Course
+
+    @cached_property
+    def _moments(self) -> dict[Plant, Moments]:
+        return {}
+
+    def moments(self, plant: Plant) -> Moments:
+        """Return the noise's moments with a plant; remembered."""
+        if plant not in self._moments:
+            self._moments[plant] = noise_moments(self.pipeline, plant, self.noise)
+        return self._moments[plant]
+
+    def path(self, plants: Sequence[Plant], onsets: Sequence[int], start: FloatArray) -> FloatArray:
+        """Return the mean of theta_hat at every evaluation, shape (K, n).
+
+        Parameters
+        ----------
+        plants
+            Plants that follow each other.
+        onsets
+            Sample of the recording from which each holds; the first is 0.
+        start
+            theta_hat before the first sample, shape (n,).
+
+        Raises
+        ------
+        SimulationError
+            If the loop is unstable with one of the plants.
+        """
+        from servoscope.recursion import mean_path
+
+        r, kept, restart = self.course
+        u, y = response(self.pipeline.loop, r, plants=plants, switch=[int(kept[k]) for k in onsets])
+        g = self.pipeline.regression(r[kept], u[kept], y[kept], restart)
+        moments = [self.moments(plant) for plant in plants]
+        which = np.searchsorted(np.asarray(onsets), np.arange(len(kept)), side="right") - 1
+        return mean_path(
+            g.eta,
+            g.phi,
+            g.z,
+            g.ok,
+            which,
+            np.array([m.c for m in moments]),
+            np.array([m.S for m in moments]),
+            self.tuning.P_d,
+            self.tuning.R,
+            np.asarray(start, dtype=np.float64),
+            self.pipeline.every,
+        )
+
+    def until(self, samples: int) -> Expectation:
+        """Return the expectation for the recording's first samples only."""
+        r, kept, restart = self.course
+        shorter = Course(r[: int(kept[samples - 1]) + 1], kept[:samples], restart[:samples])
+        return replace(self, course=shorter)
+
+    def healthy(self, plant: Plant, model_theta: FloatArray) -> FloatArray:
+        """Return what a healthy loop would show at every evaluation, shape (K, n).
+
+        `model_theta` is what `plant` gives under the baseline's own references; what it leaves unexplained of the
+        baseline's theta is kept as a constant difference.
+        """
+        return self.path([plant], [0], model_theta) + (self.tuning.theta - model_theta)
+
+    def batch(self, plant: Plant) -> FloatArray:
+        """Return what least squares over the whole reference converges to, shape (n,)."""
+        r, kept, restart = self.course
+        u, y = response(self.pipeline.loop, r, plants=[plant])
+        g = self.pipeline.regression(r[kept], u[kept], y[kept], restart)
+        phi, z, eta = g.phi[g.ok], g.z[g.ok], g.eta[g.ok]
+        c, S = self.moments(plant)
+        return solve_scaled(z.T @ phi + len(eta) * S, z.T @ eta + len(eta) * c)
+
+
+def solve_scaled(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Solve A x = b for a matrix whose rows and columns have very different units."""
+    s = 1.0 / np.sqrt(np.abs(np.diag(A)))
+    scaled = np.linalg.lstsq(A * np.outer(s, s), (b.T * s).T, rcond=None)[0]
+    return np.asarray((scaled.T * s).T, dtype=np.float64)

@@ -1,0 +1,209 @@
+"""The closed loop itself: PI controller and exact plant, noisy with its truth or noise-free and fast."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.errors import SimulationError
+from servoscope.plants import FloatArray, Plant
+from servoscope.simulation.discretise import discretise, split_delay
+from servoscope.simulation.faults import FaultEvent, resolve, schedule
+from servoscope.simulation.stability import check_stable, gains
+
+if TYPE_CHECKING:
+    from servoscope.loop import Loop
+    from servoscope.recording import Recording
+    from servoscope.simulation.kernels import Settings
+
+NOISE_U_STD = 1e-4
+NOISE_Y_STD = float(np.sqrt(1e-7))
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What no recording contains.
+
+    Parameters
+    ----------
+    t
+        Times of the samples [s], shape (N,).
+    y_true
+        Output without measurement noise, shape (N,).
+    u_true
+        What acts on the plant: u after limits and dead zone, plus its noise, before the delay, shape (N,).
+    ratios
+        Parameters that change, each with its ratio to the nominal value from each sample to the next, shape
+        (N,).
+    theta
+        Coefficients of the plant from each sample to the next, shape (N, n).
+    faults
+        The events, in order of time, with the names of their parameters.
+    plant
+        The nominal plant.
+    """
+
+    t: FloatArray
+    y_true: FloatArray
+    u_true: FloatArray
+    ratios: dict[str, FloatArray]
+    theta: FloatArray
+    faults: tuple[FaultEvent, ...]
+    plant: Plant
+
+
+def simulate(
+    loop: Loop,
+    r: npt.ArrayLike,
+    *,
+    faults: Sequence[FaultEvent] = (),
+    noise_u_std: float = NOISE_U_STD,
+    noise_y_std: float = NOISE_Y_STD,
+    seed: int = 0,
+) -> tuple[Recording, Truth]:
+    """Simulate a loop with its plant, faults and noise.
+
+    The controller computes u(k) = k_p e(k) + k_i T sum e from e = r - y as measured, without anti-windup.
+    Limits and the dead zone of the loop apply: inside the dead zone nothing passes, outside u acts as it
+    is.
+
+    Parameters
+    ----------
+    loop
+        Loop with a controller and a plant whose nominal values are known.
+    r
+        Reference, shape (N,), for example of `reference`.
+    faults
+        Events, one or several; times count from the first sample.
+    noise_u_std, noise_y_std
+        Standard deviations of white noise that enters the plant with u, and that is part of the measured y.
+    seed
+        Seed of the noise.
+
+    Returns
+    -------
+    Recording, Truth
+        r, u and y as a machine would log them (u before or after its limiter, as the loop says), and the
+        truth.
+
+    Raises
+    ------
+    SimulationError
+        If the loop has no controller or is unstable with one of the plants, or r or a fault does not fit.
+    LoopError
+        If the plant has no nominal values.
+    """
+    from servoscope.recording import Recording
+
+    r = _checked(r)
+    if not (noise_u_std >= 0.0 and noise_y_std >= 0.0):
+        raise SimulationError("standard deviations of the noise must not be negative")
+    events = resolve(loop.plant, faults)
+    plan = schedule(loop.plant, events, r.size, loop.sample_rate)
+    rng = np.random.default_rng(seed)
+    n_u = noise_u_std * rng.standard_normal(r.size)
+    n_y = noise_y_std * rng.standard_normal(r.size)
+    words = [
+        ", ".join(f"{name} x {values[i]:g}" for name, values in plan.ratios.items()) or "its nominal plant"
+        for i in range(len(plan.plants))
+    ]
+    u, acting, y = _run(loop, plan.plants, words, plan.which, r, n_u, n_y)
+    t = np.arange(r.size) / loop.sample_rate
+    first = np.zeros(r.size, dtype=bool)
+    first[0] = True
+    recording = Recording(
+        name=f"{loop.name} simulated",
+        t=t,
+        r=r,
+        u=u,
+        y=y + n_y,
+        sample_rate=loop.sample_rate,
+        restart=first,
+        run=np.zeros(r.size, dtype=np.int32),
+        defects=(),
+    )
+    ratios = {name: values[plan.which] for name, values in plan.ratios.items()}
+    theta = np.array([plant.theta() for plant in plan.plants])[plan.which]
+    return recording, Truth(t, y, acting, ratios, theta, events, loop.plant)
+
+
+def response(
+    loop: Loop, r: npt.ArrayLike, *, plants: Sequence[Plant] | None = None, switch: Sequence[int] = (0,)
+) -> tuple[FloatArray, FloatArray]:
+    """Return u as logged and y, each (N,), of the loop without noise, from rest.
+
+    Parameters
+    ----------
+    loop
+        Loop with a controller.
+    r
+        Reference, shape (N,).
+    plants
+        Plants that follow each other, that of the loop if None; position, speed and pressure go on across a
+        switch.
+    switch
+        Sample from which each of them holds; the first is 0, and they increase.
+
+    Raises
+    ------
+    SimulationError
+        If the loop has no controller or is unstable with one of the plants, or the arguments do not fit
+        together.
+    """
+    r = _checked(r)
+    plants = (loop.plant,) if plants is None else tuple(plants)
+    edges = np.asarray(switch, dtype=np.int64)
+    if edges.shape != (len(plants),) or edges.size == 0 or edges[0] != 0 or np.any(np.diff(edges) <= 0):
+        raise SimulationError("switch needs one sample per plant, increasing, the first of them 0")
+    which = np.searchsorted(edges, np.arange(r.size), side="right") - 1
+    words = [f"plant {i + 1} of {len(plants)}" for i in range(len(plants))]
+    u, _, y = _run(loop, plants, words, which, r, np.zeros(r.size), np.zeros(r.size))
+    return u, y
+
+
+def _checked(r: npt.ArrayLike) -> FloatArray:
+    reference = np.ascontiguousarray(r, dtype=np.float64)
+    if reference.ndim != 1 or reference.size == 0 or not np.all(np.isfinite(reference)):
+        raise SimulationError("the reference must be one row of finite numbers")
+    return reference
+
+
+def _run(
+    loop: Loop,
+    plants: Sequence[Plant],
+    words: Sequence[str],
+    which: npt.NDArray[np.int64],
+    r: FloatArray,
+    n_u: FloatArray,
+    n_y: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return u as logged, what acts on the plant, and y without noise; words say which plant is unstable."""
+    settings = _settings(loop)
+    from servoscope.simulation import axis, kernels
+
+    discrete = [
+        discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants
+    ]
+    for each, what in zip(discrete, words, strict=True):
+        check_stable(loop, each, what)
+    if loop.plant.extras:
+        motion = axis.motion(plants, loop)
+        u, limited, acting, y = kernels.run_axis(motion, which, settings, r, n_u, n_y)
+    else:
+        A, b_next, b_now, b_late, c = (np.stack([each[i] for each in discrete]) for i in range(5))
+        u, limited, acting, y = kernels.run_linear(A, b_next, b_now, b_late, c, which, settings, r, n_u, n_y)
+    return (limited if loop.input_logged == "after_limiter" else u), acting, y
+
+
+def _settings(loop: Loop) -> Settings:
+    from servoscope.simulation.kernels import Settings
+
+    k_p, integrating = gains(loop)
+    low, high = loop.input_limits or (-np.inf, np.inf)
+    shut_low, shut_high = loop.input_deadzone or (np.inf, -np.inf)
+    m, rest = split_delay(loop.delay, loop.sample_rate)
+    return Settings(k_p, integrating, low, high, shut_low, shut_high, m, rest)

@@ -1,0 +1,102 @@
+"""What all tests share: the recordings beside the project, the reference rig, and how strictly tests run.
+
+REQUIRE_ALL=1 turns every skipped test into a failed one, so that a run meant to be complete is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import pytest
+
+PROJECT = Path(__file__).resolve().parent.parent
+
+hypothesis.settings.register_profile("servoscope", derandomize=True, deadline=None, max_examples=50)
+hypothesis.settings.load_profile("servoscope")
+
+
+def _share_compiled_code() -> None:
+    """Give numba one cache per state of the compiled sources, for all workers and subprocesses.
+
+    Numba's own check looks at the file of a function alone: after an edit to a function that it calls in
+    another file, the old machine code would run.
+    """
+    digest = hashlib.sha256()
+    for path in sorted((PROJECT / "src").rglob("*.py")):
+        text = path.read_bytes()
+        if b"numba" in text:
+            digest.update(text)
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(PROJECT / ".cache" / "numba" / digest.hexdigest()[:16]))
+
+
+_share_compiled_code()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Under REQUIRE_ALL=1, report a skipped test as failed, with the reason of the skip."""
+    report = yield
+    if report.skipped and not hasattr(report, "wasxfail") and os.environ.get("REQUIRE_ALL") == "1":
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        report.outcome = "failed"
+        report.longrepr = f"{item.nodeid}: nothing may be skipped under REQUIRE_ALL=1, but: {reason}"
+    return report
+
+
+@pytest.fixture(scope="session")
+def project() -> Path:
+    """The folder with pyproject.toml."""
+    return PROJECT
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder ``../shared/data``: simulated and measured recordings that are not part of the project."""
+    folder = PROJECT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("the recordings in ../shared/data are not on this machine")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def eha_cases(shared_data: Path) -> Path:
+    """The folder of 60 s recordings of the rig, by an independent simulator; faults start at 30 s."""
+    return shared_data / "eha_cases"
+
+
+@pytest.fixture(scope="session")
+def eha_truth(eha_cases: Path) -> dict[str, dict[str, Any]]:
+    """What was injected into each of them: file name -> {"reference", "fault_at_s", "ratios", ...}."""
+    return {case["file"]: case for case in json.loads((eha_cases / "truth.json").read_text())}
+
+
+@pytest.fixture
+def rig() -> dict[str, Any]:
+    """A fresh loop file, as a mapping, of the rig behind `eha_cases`; a test may change it."""
+    return {
+        "name": "reference rig",
+        "sample_rate": 100.0,
+        "plant": {
+            "kind": "eha",
+            "m_p": 4.0,
+            "b_p": 200.0,
+            "k_p": 4.0 * (2.0 * math.pi * 13.0) ** 2,  # without oil, the mass would swing at 13 Hz
+            "A_p": 4e-4,
+            "V_o": 1e-4,
+            "beta": 1e9,
+            "C_ie": 6e-12,
+            "p_s": 14e6,
+            "rho": 850.0,
+            "C_d": 0.6,
+            "W": 0.02,
+            "K_m": 1e-3,
+        },
+        "controller": {"kind": "pi", "k_p": 20.0, "k_i": 5.0},
+    }
