@@ -14,18 +14,24 @@ SECONDS_PER_YEAR = 365.25 * 86400.0
 POWER = 0.9  # probability with which a promised change is seen
 
 
-def threshold(n: int, evaluation_rate: float, false_alarms_per_year: float, dof: float) -> float:
+def threshold(
+    n: int, evaluation_rate: float, memory: float, false_alarms_per_year: float, dof: float
+) -> float:
     """Return the limit of T^2 that a healthy loop crosses as often as the budget allows.
 
-    Every evaluation counts as a look of its own, which is on the safe side: looks within a memory are correlated. The
-    noise's variance is itself estimated, so T^2 follows Hotelling's distribution rather than a chi-square.
+    theta_hat forgets within `memory`, so looks close together are one look; how close depends on the level: an
+    Ornstein-Uhlenbeck process stays above a high level only for a time of the order of memory / level (Aldous, 1989,
+    section D). Simulated healthy loops show level / (2 memory) looks per second. The noise's variance is itself
+    estimated, so T^2 follows Hotelling's distribution rather than a chi-square.
 
     Parameters
     ----------
     n
         Number of coefficients.
     evaluation_rate
-        Looks per second [Hz].
+        Evaluations per second [Hz].
+    memory
+        Of the estimator [s].
     false_alarms_per_year
         Budget.
     dof
@@ -33,9 +39,13 @@ def threshold(n: int, evaluation_rate: float, false_alarms_per_year: float, dof:
     """
     from scipy import stats
 
-    tail = min(false_alarms_per_year / (SECONDS_PER_YEAR * evaluation_rate), 0.5)
     dof = max(dof, n + 2.0)
-    return float(n * dof / (dof - n + 1.0) * stats.f.isf(tail, n, dof - n + 1.0))
+    limit = 10.0
+    for _ in range(20):
+        looks = SECONDS_PER_YEAR * min(evaluation_rate, max(limit / (2.0 * memory), 1.0 / memory))
+        tail = min(false_alarms_per_year / looks, 0.5)
+        limit = float(n * dof / (dof - n + 1.0) * stats.f.isf(tail, n, dof - n + 1.0))
+    return limit
 
 
 def required_noncentrality(n: int, limit: float) -> float:
@@ -130,7 +140,7 @@ def onset(
     g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
     used = np.flatnonzero(g.ok[: last + 1])
     gain = np.zeros(last + 1)
-    white = [_whitened(g.eta - g.phi @ theta, tuning.noise_a)[used] for theta in (healthy, faulty)]
+    white = [_whitened((g.eta - g.phi @ theta)[used], tuning.noise_a) for theta in (healthy, faulty)]
     innovation = tuning.innovation * max(1.0, float(estimates.power[-1]))
     gain[used] = (white[0] ** 2 - white[1] ** 2) / (2.0 * innovation)
     log_likelihood = np.cumsum(gain[::-1])[::-1][: until + 1]  # of a change at each sample, up to a constant

@@ -166,19 +166,29 @@ class Examination:
                 return shift
 
             return [curve(fault, simulated(fault)) for fault in faults]
+        learned = self._learned_since(since, at)
         if plant.has_physics and loop.plant.kind != "polynomial":
             base = nominal_theta(loop.model_copy(update={"plant": plant}))
 
             def physical(fault: Fault) -> Callable[[float], FloatArray]:
                 def shift(ratio: float) -> FloatArray:
                     ill = plant.with_ratios({fault.parameter: ratio})
-                    return nominal_theta(loop.model_copy(update={"plant": ill})) - base
+                    return learned @ (nominal_theta(loop.model_copy(update={"plant": ill})) - base)
 
                 return shift
 
             return [curve(fault, physical(fault)) for fault in faults]
         directions = fault_directions(loop, plant, self.tuning.theta)
-        return [line(fault, directions[fault.parameter]) for fault in faults if np.any(directions[fault.parameter])]
+        moving = [fault for fault in faults if np.any(directions[fault.parameter])]
+        return [line(fault, learned @ directions[fault.parameter]) for fault in moving]
+
+    def _learned_since(self, since: int, at: int) -> FloatArray:
+        """Return I - Psi from the onset to an evaluation: the share of a change that theta_hat has taken up."""
+        recording, n = self.recording, self.pipeline.bank.n
+        last = int(self.estimates.index[at])
+        later = recording.part(float(recording.t[since]), float(recording.t[last]) + 0.5 / recording.sample_rate)
+        Psi = self.pipeline.estimate(self.tuning, later).Psi
+        return np.eye(n) - Psi[-1] if len(Psi) else np.eye(n)
 
     def _blind_to(self) -> list[str]:
         """Return what this recording could not have shown although the baseline promises it."""

@@ -118,6 +118,25 @@ def usable_band(s: Spectra) -> Band | None:
     return Band(low_hz=float(s.f[start]), high_hz=float(s.f[stop - 1]))
 
 
+def information_edge(s: Spectra, noise: float, sample_rate: float) -> float:
+    """Return up to which frequency [Hz] y stands out of its own white noise by a factor of ten in power.
+
+    Parameters
+    ----------
+    s
+        Spectra.
+    noise
+        Standard deviation of the white part of y.
+    sample_rate
+        In Hz.
+    """
+    clear = s.Y > 10.0 * 2.0 * noise**2 / sample_rate
+    # Lines that fail one by one, between those of a multisine, do not end it.
+    share = np.cumsum(clear) / np.arange(1, clear.size + 1)
+    good = np.flatnonzero(clear & (share >= 0.5))
+    return float(s.f[good[-1]]) if good.size else float(s.f[0])
+
+
 def signal_at(s: Spectra, frequency: float) -> tuple[float, float, float]:
     """Return the coherences r -> u and r -> y around a frequency [Hz], and the signal-to-noise ratio (power)."""
     near = np.abs(s.f - frequency) <= max(0.05 * frequency, 1.01 * float(s.f[0]))

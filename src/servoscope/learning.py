@@ -117,7 +117,11 @@ def _assemble(
     tuning = replace(found.tuning, theta=theta)
     plant = loop.plant.with_ratios(ratios) if ratios else loop.plant
     limit = threshold(
-        pipeline.bank.n, loop.monitor.evaluation_rate, loop.monitor.false_alarms_per_year, found.dof
+        pipeline.bank.n,
+        loop.monitor.evaluation_rate,
+        loop.monitor.memory,
+        loop.monitor.false_alarms_per_year,
+        found.dof,
     )
     progress("promises")
     estimates = [pipeline.estimate(tuning, rec) for rec in recordings]
@@ -177,13 +181,18 @@ def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
 
 
 def _scatter(found: Fit) -> FloatArray:
-    """Return the covariance between recordings beyond their noise; it is diagonal, few recordings give no more."""
+    """Return the covariance between recordings beyond their noise; it is diagonal, few recordings give no more.
+
+    A further recording scatters like Student's t around the mean of m, with the variance (m - 1)/(m - 3); fewer than
+    four recordings get the factor of four.
+    """
     m, n = found.each.shape
     if m < 2:
         return np.zeros((n, n))
     own = np.mean([np.diag(c) for c in found.each_covariance], axis=0)
     beyond = np.maximum(found.each.var(axis=0, ddof=1) - own, 0.0)
-    return np.diag(beyond * (1.0 + 1.0 / m))
+    students = (m - 1.0) / (m - 3.0) if m > 3 else 3.0
+    return np.diag(beyond * students * (1.0 + 1.0 / m))
 
 
 def _noise(pipeline: Pipeline, found: Fit, regressions: Sequence[Regression]) -> Noise:
@@ -277,13 +286,13 @@ def _supported_budget(n: int, loop: Loop, dof: float, excess: float) -> float:
     the threshold by less than half, and not at all where healthy data contradict the noise model.
     """
     if excess > WORTH_A_LOOK:
-        return float("inf") if dof <= 0 else SECONDS_PER_YEAR / max(dof / loop.sample_rate, 1.0)
-    rate = loop.monitor.evaluation_rate
+        return SECONDS_PER_YEAR / loop.monitor.memory
+    looks = loop.monitor.evaluation_rate, loop.monitor.memory
     for exponent in np.arange(-3.0, 9.0, 0.5):
-        budget = 10.0**exponent
-        if threshold(n, rate, budget, dof) <= 1.5 * threshold(n, rate, budget, 1e9):
+        budget = float(10.0**exponent)
+        if threshold(n, *looks, budget, dof) <= 1.5 * threshold(n, *looks, budget, 1e9):
             return budget
-    return SECONDS_PER_YEAR * rate
+    return SECONDS_PER_YEAR * looks[0]
 
 
 def _promises(
@@ -333,14 +342,15 @@ def _delay(loop: Loop, recordings: Sequence[Recording], found: Fit) -> tuple[flo
     here = values[int(np.argmin(np.abs(late - loop.delay)))]
     i = int(np.argmin(values))
     best = float(late[i])
-    if 0 < i < len(late) - 1:
+    inside = 0 < i < len(late) - 1  # at an end the residual only falls: a misfit of another kind
+    if inside:
         left, mid, right = values[i - 1 : i + 2]
         step_left, step_right = late[i] - late[i - 1], late[i + 1] - late[i]
         slope = (right - mid) / step_right - (mid - left) / step_left
         if slope > 0.0:
-            best -= float(((right - mid) / step_right * step_left + (mid - left) / step_left * step_right) / (2 * slope) / 1.0)
+            best -= float(((right - mid) / step_right * step_left + (mid - left) / step_left * step_right) / (2 * slope))
     gain = found.dof * (here - values[i]) / 2.0  # log likelihood ratio of the best delay
-    if gain < 5.0 and values.max() - values.min() < 10.0 / found.dof:
+    if (i and not inside) or (gain < 5.0 and values.max() - values.min() < 10.0 / found.dof):
         return None, ["the recordings do not tell the delay between u and y"]
     if gain > 10.0 and abs(best - loop.delay) > DELAY_TOLERANCE * dt and here - values[i] > DELAY_SIGNIFICANT:
         raise RecordingError(

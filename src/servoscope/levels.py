@@ -22,7 +22,7 @@ PLATEAU = 5  # samples in a row at the very extreme before u is said to be at a 
 RESTING = 0.02  # share of the fast speeds (99th percentile) below which the output rests
 SHORTEST_REST = 0.25  # s: turning round is not rest
 BINS = 40  # of |u|, to look for a dead zone
-SELDOM, MOSTLY = 0.1, 0.6  # shares of moving samples inside a dead zone and just outside it
+SELDOM, MOSTLY = 0.1, 0.5  # shares of moving samples inside a dead zone and just outside it
 
 
 class Said(BaseModel):
@@ -256,7 +256,8 @@ def _edge(u: FloatArray, moving: BoolArray, expected: float) -> float | None:
     while reach < BINS and counts[reach] >= 10 and share[reach] <= SELDOM:
         reach += 1
     edge = reach * top / BINS
-    outside = slice(reach + 1, reach + 4)
-    if reach < 2 or edge < 3.0 * expected or moved[outside].sum() < MOSTLY * max(counts[outside].sum(), 1):
+    # Between the two lies what starts to move: friction at rest is not sharp.
+    outside = share[reach : reach + 10][counts[reach : reach + 10] > 0]
+    if reach < 2 or edge < 3.0 * expected or not outside.size or outside.mean() < MOSTLY:
         return None
     return edge

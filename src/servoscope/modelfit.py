@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from servoscope import inverse
+from servoscope.defects import spans
 from servoscope.inverse import FilterBank
 from servoscope.levels import BoolArray, Said
 from servoscope.linear import sampled
@@ -19,15 +19,17 @@ from servoscope.plants.polynomial import Friction, Polynomial
 from servoscope.recording import Recording
 
 WORTH = 0.02  # share of the unexplained variance that one more power of s must take away
+WORTH_FRICTION = 0.2  # and that Coulomb friction must: its sign is never quite right
 FAST_SIGN = 50.0  # Hz, of the differentiator behind sign(y')
 IndexArray = npt.NDArray[np.intp]
 
 
 class OrderTried(Said):
-    """A generic inverse, its friction, and the share of filtered u that it explains (None: not enough samples)."""
+    """A generic inverse with offset: order, friction, stiffness, and the share of the filtered u that it explains."""
 
     order: int
     friction: Friction
+    stiffness: bool
     explained: float
 
 
@@ -111,11 +113,19 @@ def regressors(recording: Recording, loop: Loop, delay: float | None = None) -> 
     delay
         In place of the loop's [s].
     """
+    from servoscope.recursion import USED, Layout
+    from servoscope.recursion import regressors as form
+
     monitor = loop.monitor.model_copy(update={"structure": "svf", "update_when": "always"})
     loop = loop.model_copy(update={"monitor": monitor, "delay": loop.delay if delay is None else delay})
     bank = inverse.build(loop)
-    g = Pipeline(loop, bank).regression(recording.r, recording.u, recording.y, recording.restart)
-    return Regressors(loop, bank, g.eta, g.phi, g.ok)
+    pipeline = Pipeline(loop, bank)
+    constants = pipeline.constants(pipeline.blank())._replace(stride=1)  # here, every sample counts
+    rows = np.empty((recording.samples, len(constants.C)))
+    said = np.empty(recording.samples, dtype=np.int64)
+    state = Layout(constants).start(constants, 1)[0]
+    form(constants, state, recording.r, recording.u, recording.y, recording.restart, rows, said)
+    return Regressors(loop, bank, rows[:, 0], rows[:, 1 : 1 + bank.n], said == USED)
 
 
 def fit(names: tuple[str, ...], eta: FloatArray, phi: FloatArray, used: BoolArray, block: int) -> Fitted | None:
@@ -164,102 +174,142 @@ def fit(names: tuple[str, ...], eta: FloatArray, phi: FloatArray, used: BoolArra
     )
 
 
-def columns_of(g: Regressors, order: int, friction: Friction) -> IndexArray:
+def columns_of(g: Regressors, order: int, friction: Friction, stiffness: bool = True) -> IndexArray:
     """Return which columns of the most general inverse belong to a smaller one."""
     n_powers = len(g.bank.powers)
     extras = [i + n_powers for i, extra in enumerate(g.bank.extras) if friction == "coulomb" or extra != "sign_v"]
-    return np.array([*range(order + 1), *extras], dtype=np.intp)
+    return np.array([*range(0 if stiffness else 1, order + 1), *extras], dtype=np.intp)
 
 
-def try_orders(g: Regressors, used: BoolArray, block: int) -> tuple[list[OrderTried], OrderTried | None]:
-    """Fit the generic inverses of order 1 to 3, then the best of them with Coulomb friction.
+def try_orders(g: Regressors, used: BoolArray, block: int) -> tuple[tuple[OrderTried, ...], OrderTried | None]:
+    """Fit the generic inverses of order 1 to 3, then the best of them without stiffness and with Coulomb friction.
 
-    The best is the lowest whose successor takes away less than 2 % of the unexplained variance.
+    The best is the lowest whose successor takes away less than 2 % of the unexplained variance; stiffness stays
+    if it takes away as much, friction if it takes away 20 %.
+
+    Returns
+    -------
+    tuple of OrderTried, OrderTried or None
+        All of them, and the best; None if there are too few rows.
     """
-    tried: list[OrderTried] = []
 
-    def attempt(order: int, friction: Friction) -> None:
-        which = columns_of(g, order, friction)
+    def attempt(order: int, friction: Friction, stiffness: bool) -> OrderTried | None:
+        which = columns_of(g, order, friction, stiffness)
         fitted = fit(tuple(g.bank.names[i] for i in which), g.eta, g.columns(which), used, block)
-        if fitted is not None:
-            tried.append(OrderTried(order=order, friction=friction, explained=fitted.explained))
+        if fitted is None:
+            return None
+        return OrderTried(order=order, friction=friction, stiffness=stiffness, explained=fitted.explained)
 
-    for order in (1, 2, 3):
-        attempt(order, "none")
+    tried = [found for order in (1, 2, 3) if (found := attempt(order, "none", True)) is not None]
     if not tried:
-        return tried, None
+        return (), None
     best = tried[0]
     for candidate in tried[1:]:
         if 1.0 - candidate.explained < (1.0 - WORTH) * (1.0 - best.explained):
             best = candidate
-    attempt(best.order, "coulomb")
-    return tried, best
+    rough = attempt(best.order, "coulomb", True)
+    if rough is not None:
+        tried.append(rough)
+        if 1.0 - rough.explained < (1.0 - WORTH_FRICTION) * (1.0 - best.explained):
+            best = rough
+    loose = attempt(best.order, best.friction, False)
+    if loose is not None:
+        tried.append(loose)
+        if 1.0 - best.explained > (1.0 - WORTH) * (1.0 - loose.explained):
+            best = loose
+    return tuple(tried), best
 
 
-def free_run(recording: Recording, g: Regressors, fitted: Fitted, powers: tuple[int, ...]) -> FreeRun:
-    """Simulate the estimated model with u alone and compare with y.
+def free_run(recording: Recording, g: Regressors, which: IndexArray, fitted: Fitted) -> FreeRun:
+    """Simulate the estimated model with u alone and compare with y, both behind the state-variable filter.
+
+    Friction is driven by the measured speed. A plant without stiffness only accumulates its errors in y, so its
+    speed is compared. Initial states and a constant input are fitted stretch by stretch.
 
     Parameters
     ----------
     recording
         N samples.
     g
-        Gives the columns beyond the powers of s, which are taken as measured.
+        Its regressors.
+    which
+        Columns of phi that the fit used.
     fitted
-        Its first ``len(powers)`` coefficients are those of the powers.
-    powers
-        Powers of s.
+        The fit.
     """
-    from scipy.signal import lfilter, ss2tf
-
-    order = max(powers)
-    c = np.zeros(order + 1)
-    c[list(powers)] = fitted.theta[: len(powers)]
+    names = [g.bank.names[i] for i in which]
+    columns = dict(zip(names, g.columns(which).T, strict=True))
+    theta = dict(zip(names, fitted.theta, strict=True))
+    powers = [g.bank.powers[i] for i in which if i < len(g.bank.powers)]
+    c = np.zeros(max(powers) + 1)
+    for name, power in zip(names, powers, strict=False):
+        c[power] = theta.pop(name)
+    y = columns[names[powers.index(0)]] if 0 in powers else None
+    speed = columns[names[powers.index(1)]] if 1 in powers else None
+    directions = ("viscous_friction_forward", "viscous_friction_backward")
+    if directions[0] in theta:
+        c[1] = 0.5 * (theta[directions[0]] + theta[directions[1]])
+        speed = columns[directions[0]] + columns[directions[1]]
+        for name in directions:
+            theta[name] -= c[1]
+    drive = g.eta - sum(theta[name] * columns[name] for name in theta)
+    what, output = ("y", y) if y is not None else ("the speed", speed)
+    if output is None:
+        return FreeRun(explained=None, words="not possible: the model has neither y nor its speed")
+    if y is None:
+        c = c[1:]
     if c[-1] == 0.0:
-        return FreeRun(explained=None, words=f"not possible: nothing excites the power {order} of s")
+        return FreeRun(explained=None, words="not possible: nothing excites the highest power of s")
     # A pole that takes longer than ten recordings is an integrator for all that this one can tell.
     slow = 0.1 / recording.duration_s
     poles = np.roots(c[::-1])
-    if poles.real.max() > slow:
-        time = 1.0 / poles.real.max()
-        return FreeRun(explained=None, words=f"not possible: the estimated model is unstable (grows in {time:.2g} s)")
+    if poles.size and poles.real.max() > slow:
+        grows = 1.0 / float(poles.real.max())
+        words = f"not possible: the estimated model is unstable (grows by a factor e in {grows:.2g} s)"
+        return FreeRun(explained=None, words=words)
     if (np.abs(poles) < slow).sum() > 1:
         return FreeRun(explained=None, words="not possible: the estimated model integrates twice, it would drift")
-    A = np.eye(order, k=1)
-    A[-1] = -c[:-1] / c[-1]
-    B = np.zeros((order, 1))
-    B[-1, 0] = 1.0 / c[-1]
-    plant = sampled((A, B, np.eye(1, order)), recording.sample_rate, g.loop.hold, g.loop.delay)
-    numerator, denominator = ss2tf(plant.A, plant.B, plant.C, plant.D)
-    # What initial states and a constant input add dies out with these; they are fitted stretch by stretch.
-    start = np.zeros((order, order))
-    start[:, :] = np.eye(order)
-    drive = g.bank.gain * recording.u - _extras(g, fitted, len(powers))
-    starts = np.flatnonzero(recording.restart)
+    share = _simulated(g, c, drive, output)
+    if share is None:
+        return FreeRun(explained=None, words="not possible: no stretch without gaps is long enough")
+    return FreeRun(explained=share, words=f"driven by u alone, the model explains {percent(share)} of {what}")
+
+
+def _simulated(g: Regressors, c: FloatArray, drive: FloatArray, output: FloatArray) -> float | None:
+    """Return the share of the output that ``1/sum c_i s^i`` makes of `drive`; None without a long stretch."""
+    from scipy.signal import lfilter, ss2tf
+
+    order = len(c) - 1
+    numerator, denominator = np.array([1.0 / c[0] if order == 0 else 0.0]), np.ones(1)
+    if order:
+        A = np.eye(order, k=1)
+        A[-1] = -c[:-1] / c[-1]
+        B = np.zeros((order, 1))
+        B[-1, 0] = 1.0 / c[-1]
+        plant = sampled((A, B, np.eye(1, order)), g.bank.sample_rate, "foh")
+        numerators, denominator = ss2tf(plant.A, plant.B, plant.C, plant.D)
+        numerator = numerators[0]
     left = whole = 0.0
-    for begin, end in zip(starts, np.append(starts[1:], recording.samples), strict=True):
-        if end - begin < 20 * (order + 1):
+    for begin, end in spans(g.ok):
+        if end - begin < 20 * (order + 2):
             continue
-        y = recording.y[begin:end]
-        y_u = lfilter(numerator[0], denominator, drive[begin:end])
+        y = output[begin:end]
         impulse = np.zeros(end - begin)
         impulse[0] = 1.0
         free = [lfilter(np.eye(order)[i], denominator, impulse) for i in range(order)]
-        step = lfilter(numerator[0], denominator, np.ones(end - begin))
-        nuisance = np.column_stack([*free, step])
+        nuisance = np.column_stack([*free, lfilter(numerator, denominator, np.ones(end - begin))])
         nuisance /= np.maximum(np.sqrt((nuisance**2).mean(axis=0)), np.finfo(np.float64).tiny)
-        miss = y - y_u
+        miss = y - lfilter(numerator, denominator, drive[begin:end])
+        if not np.isfinite(miss).all():
+            return None
         miss = miss - nuisance @ np.linalg.lstsq(nuisance, miss, rcond=1e-10)[0]
         left += float(miss @ miss)
         whole += float(((y - y.mean()) ** 2).sum())
-    if not whole > 0.0 or not math.isfinite(left):
-        return FreeRun(explained=None, words="not possible: no stretch without gaps is long enough")
-    share = 1.0 - left / whole
-    return FreeRun(explained=share, words=f"driven by u alone, the model explains {100 * max(share, 0.0):.3g} % of y")
+    return 1.0 - left / whole if whole > 0.0 else None
 
 
-def _extras(g: Regressors, fitted: Fitted, n_powers: int) -> FloatArray:
-    """Return what friction and offset take from u, shape (N,), from their columns as filtered for the regression."""
-    return np.asarray(g.phi[:, -len(fitted.theta[n_powers:]) :] @ fitted.theta[n_powers:]) * (
-        1.0 if len(fitted.theta) > n_powers else 0.0
-    )
+def percent(share: float) -> str:
+    """Say a share in words: 99.3 %, and 99.97 % rather than 100 %."""
+    left = 1.0 - share
+    digits = 1 if left > 0.01 or left <= 0.0 else min(int(np.ceil(-np.log10(left))) - 1, 6)
+    return f"{100.0 * max(share, 0.0):.{digits}f} %"

@@ -126,9 +126,19 @@ class Pipeline:
         return max(1, round(self.loop.sample_rate / self.loop.monitor.evaluation_rate))
 
     @property
+    def stride(self) -> int:
+        """Samples between updates: 1 up to 20 times the cutoff; beyond, neighbours in a filtered signal repeat each other.
+
+        Their noise would be so nearly a polynomial in time that no autoregression of it can be solved for.
+        """
+        if self.bank.structure != "svf":
+            return 1
+        return max(1, int(self.loop.sample_rate / (10.0 * inverse.cutoff_of(self.loop))))
+
+    @property
     def memory(self) -> float:
-        """Memory N of the estimator in samples."""
-        return self.loop.monitor.memory * self.loop.sample_rate
+        """Memory N of the estimator in updates."""
+        return self.loop.monitor.memory * self.loop.sample_rate / self.stride
 
     def constants(self, tuning: Tuning) -> Constants:
         """Turn loop and tuning into what the compiled recursion takes; phi is divided by the tuning's scale."""
@@ -169,6 +179,7 @@ class Pipeline:
             rest_speed=loop.monitor.rest_speed,
             only_moving=loop.monitor.update_when == "moving",
             wait=bank.wait,
+            stride=self.stride,
             every=self.every,
             R=tuning.R,
             memory=self.memory,

@@ -27,6 +27,8 @@ BoolArray = npt.NDArray[np.bool_]
 # counters at the head of the state row
 ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, POWER = range(6)
 HEAD = 6
+# what `sense` says of a sample
+MISSING, HELD, USED, BETWEEN = -1, 0, 1, 2
 
 
 class Constants(NamedTuple):
@@ -34,7 +36,7 @@ class Constants(NamedTuple):
 
     ``A, B, C, D, X0`` are the filter bank and its steady state per unit input, ``vA ... vX0`` the velocity filter,
     `codes` the non-linear inputs, `limits` and `deadzone` of u, `a` and `gamma` the noise's autoregression and
-    autocovariance (gamma[0] its variance).
+    autocovariance (gamma[0] its variance), in updates: of every `stride`-th sample.
     """
 
     A: FloatArray
@@ -55,6 +57,7 @@ class Constants(NamedTuple):
     rest_speed: float
     only_moving: bool
     wait: int
+    stride: int
     every: int
     theta: FloatArray
     P_d: FloatArray
@@ -116,12 +119,13 @@ def sense(
 ) -> int:
     """Pass one sample through the filter bank; v_out becomes [eta, phi, z].
 
-    Returns 1 when the sample may update the estimator, 0 when the filters settle, the axis rests or u is dead, -1
-    when the sample is missing (NaN): then nothing but the demand to re-arm is remembered.
+    Returns `USED` when the sample may update the estimator, `HELD` when the filters settle, the axis rests or u is
+    dead, `BETWEEN` when the stride leaves it out, and `MISSING` for a NaN: then only the demand to re-arm stays.
     """
+    s[SAMPLE] += 1.0
     if not (np.isfinite(r) and np.isfinite(u) and np.isfinite(y)):
         s[ARMED] = 0.0
-        return -1
+        return MISSING
     nx = c.A.shape[0]
     nv = c.vA.shape[0]
     x = s[HEAD : HEAD + nx]
@@ -172,12 +176,16 @@ def sense(
             new[i] += c.A[i, j] * x[j]
     for i in range(nx):
         x[i] = new[i]
+    if c.only_moving and (abs(v) <= c.rest_speed or (c.deadzone[0] <= w[1] <= c.deadzone[1])):
+        # what enters the filters now has nothing to do with the motion: wait until they have forgotten it
+        s[WAIT] = c.wait
+        return HELD
     if s[WAIT] > 0.0:
         s[WAIT] -= 1.0
-        return 0
-    if c.only_moving and (abs(v) <= c.rest_speed or (c.deadzone[0] <= w[1] <= c.deadzone[1])):
-        return 0
-    return 1
+        return HELD
+    if c.stride > 1 and s[SAMPLE] % c.stride != 0.0:
+        return BETWEEN
+    return USED
 
 
 @kernel
@@ -270,7 +278,7 @@ def _block(
         row = 0
         for k in range(samples):
             ok = sense(c, s, w, v_out, r[asset, k], u[asset, k], y[asset, k], restart[asset, k])
-            if ok == 1:
+            if ok == USED:
                 e = v_out[0]
                 for i in range(n):
                     e -= phi[i] * theta[i]
@@ -280,11 +288,10 @@ def _block(
                 else:
                     s[SKIPPED] += 1.0
                 spread(c.a, c.gamma, K, phi, S, M, Psi)
-            elif s[WAIT] > 0.0 or ok == -1:
-                for i in range(n):  # after a gap the noise is new
+            elif ok != BETWEEN:
+                for i in range(n):  # after a gap or a rest the noise is new
                     for j in range(p):
                         M[i, j] = 0.0
-            s[SAMPLE] += 1.0
             if s[SAMPLE] % c.every == 0.0:
                 q = out[asset, row]
                 q[0] = s[UPDATES]

@@ -1,0 +1,194 @@
+"""What pictures are drawn with: colours, envelopes of long signals, ranges without outliers, SVG for a page, files."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from servoscope.errors import OutputError
+from servoscope.output import atomic_write
+from servoscope.plants import FloatArray
+
+__all__ = ["COLOURS", "STYLE", "BoolArray", "envelope", "robust_range", "save", "spans_on", "svg"]
+
+BoolArray = npt.NDArray[np.bool_]
+
+# Blue is measured, grey is expected, orange is alarm: told apart by all common kinds of colour vision, and in grey.
+COLOURS = {
+    "paper": "#ffffff",
+    "ink": "#1c2530",
+    "muted": "#687482",
+    "rule": "#d9dfe5",
+    "measured": "#1f5fa8",
+    "healthy": "#7d8894",
+    "alarm": "#c6501c",
+    "reference": "#b9c3cd",
+}
+STYLE: dict[str, Any] = {
+    "axes.edgecolor": COLOURS["muted"],
+    "axes.facecolor": "none",
+    "axes.formatter.useoffset": False,
+    "axes.labelcolor": COLOURS["ink"],
+    "axes.labelsize": 8.5,
+    "axes.linewidth": 0.7,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": COLOURS["ink"],
+    "axes.titlesize": 9.5,
+    "figure.facecolor": "none",
+    "figure.constrained_layout.h_pad": 0.06,
+    "font.size": 8.5,
+    "legend.borderaxespad": 0.0,
+    "legend.columnspacing": 1.6,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    "legend.labelcolor": COLOURS["ink"],
+    "lines.linewidth": 1.2,
+    "savefig.facecolor": "none",
+    "svg.hashsalt": "servoscope",  # the same diagnosis gives the same bytes
+    "text.color": COLOURS["ink"],
+    "xtick.color": COLOURS["muted"],
+    "xtick.labelcolor": COLOURS["ink"],
+    "ytick.color": COLOURS["muted"],
+    "ytick.labelcolor": COLOURS["ink"],
+}
+COLUMNS = 1200  # of an envelope
+FORMATS = ("svg", "png", "pdf")
+
+
+def envelope(
+    t: FloatArray, x: FloatArray, restart: BoolArray | None = None, columns: int = COLUMNS
+) -> tuple[FloatArray, FloatArray]:
+    """Return a line that looks like x(t) with at most about three points per column.
+
+    Short signals are returned as they are, long ones as the smallest and largest value in each column of time. NaN
+    breaks the line where it restarts.
+
+    Parameters
+    ----------
+    t, x
+        Shape (N,); t must not fall.
+    restart
+        True where a sample does not follow its predecessor, shape (N,).
+    columns
+        Columns of time.
+    """
+    breaks = np.zeros(len(t), dtype=bool) if restart is None else restart.copy()
+    breaks[:1] = False
+    if len(t) <= 4 * columns:
+        at = np.flatnonzero(breaks)
+        return np.insert(t, at, t[at]), np.insert(x, at, np.nan)
+    width = (t[-1] - t[0]) / columns or 1.0
+    column = np.minimum(((t - t[0]) / width).astype(np.int64), columns - 1)
+    start = np.flatnonzero(np.diff(column, prepend=-1))
+    low = np.minimum.reduceat(np.where(np.isfinite(x), x, np.inf), start)
+    high = np.maximum.reduceat(np.where(np.isfinite(x), x, -np.inf), start)
+    empty = ~np.isfinite(low)
+    low[empty] = high[empty] = np.nan
+    # the way that the signal takes through the column: from its first value's side to the other
+    rising = x[start] - low <= high - x[start]
+    pairs = np.stack([np.where(rising, low, high), np.where(rising, high, low)], axis=1).ravel()
+    times = np.repeat(t[start], 2)
+    at = 2 * np.flatnonzero(breaks[start])
+    return np.insert(times, at, times[at]), np.insert(pairs, at, np.nan)
+
+
+def spans_on(t: FloatArray, low: FloatArray, high: FloatArray, most: int = COLUMNS) -> list[tuple[float, float]]:
+    """Return the spans low to high, shape (M,); where there are many, those that a picture would show as one joined.
+
+    Parameters
+    ----------
+    t
+        The time axis, shape (N,).
+    low, high
+        Rising, shape (M,).
+    most
+        Parts of the time axis that can be told apart.
+    """
+    if not len(low):
+        return []
+    fine = (t[-1] - t[0]) / most if len(low) > 50 else 0.0
+    apart = low[1:] - np.maximum.accumulate(high)[:-1] > fine
+    first = np.concatenate([[True], apart])
+    last = np.concatenate([apart, [True]])
+    return list(zip(low[first].tolist(), high[last].tolist(), strict=True))
+
+
+def robust_range(values: FloatArray, always: FloatArray | None = None) -> tuple[float, float]:
+    """Return limits of an axis that hold all but the wildest 2 % of the values, and all of `always`.
+
+    Parameters
+    ----------
+    values, always
+        Any shape; what is not finite is left out.
+    """
+    finite = values[np.isfinite(values)]
+    kept = list(np.percentile(finite, [1.0, 99.0])) if finite.size else []
+    if always is not None:
+        kept += list(always[np.isfinite(always)])
+    if not kept:
+        return 0.0, 1.0
+    low, high = float(min(kept)), float(max(kept))
+    pad = 0.08 * (high - low) or 0.05 * abs(high) or 1.0
+    return low - pad, high + pad
+
+
+def svg(figure: Figure, name: str) -> str:
+    """Return a figure as an ``<svg>`` element for a page that may hold several.
+
+    Text stays text in the page's own font, colours become the page's (``var(--ink)``, ...), ids begin with `name`, and
+    nothing refers to anything outside.
+    """
+    text = _rendered(figure, "svg", fonttype="none").decode()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'\s(?:xmlns(?::\w+)?|version)="[^"]*"', "", text, count=3)
+    text = re.sub(r'(<svg[^>]*?)\s(?:width="[^"]*"\s*)', r"\1 ", text, count=1)
+    text = re.sub(r'(<svg[^>]*?)\s(?:height="[^"]*"\s*)', r"\1 ", text, count=1)
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r'href="#', f'href="#{name}-', text)
+    text = re.sub(r"url\(#", f"url(#{name}-", text)
+    text = re.sub(r";? ?font-family: [^;\"]*", "", text)
+    text = re.sub(r"font: (?:(bold|\d+) )?([\d.]+px)[^;\"]*", _font, text)
+    for word, colour in COLOURS.items():
+        text = text.replace(colour, f"var(--{word})")
+    return text.replace("<svg", '<svg role="img"', 1)
+
+
+def _font(found: re.Match[str]) -> str:
+    weight = f"; font-weight: {found[1]}" if found[1] else ""
+    return f"font-size: {found[2]}{weight}"
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write a figure as SVG, PNG or PDF, told by the file's name; nothing half-written stays behind.
+
+    Raises
+    ------
+    OutputError
+        If the name has another ending, or the file cannot be written.
+    """
+    kind = Path(path).suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise OutputError(f"{path}: a figure is written as .svg, .png or .pdf, give the name one of these endings")
+    atomic_write(path, _rendered(figure, kind, fonttype="path"))
+
+
+def _rendered(figure: Figure, kind: str, *, fonttype: str) -> bytes:
+    buffer = io.BytesIO()
+    metadata = {"svg": {"Date": None}, "png": {}, "pdf": {"CreationDate": None}}[kind]
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(STYLE)
+        matplotlib.rcParams["svg.fonttype"] = fonttype
+        face = "none" if fonttype == "none" else "white"
+        figure.savefig(buffer, format=kind, facecolor=face, dpi=150, metadata=metadata)
+    return buffer.getvalue()

@@ -1,0 +1,83 @@
+"""The main job on an embedded example, as the commands that do it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from servoscope.errors import OutputError
+from servoscope.output import atomic_write
+
+__all__ = ["Step", "prepare", "steps"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command of the demonstration.
+
+    Parameters
+    ----------
+    words
+        What it is for.
+    arguments
+        The command's words after ``servoscope``.
+    into
+        File that takes its standard output; None: the terminal.
+    """
+
+    words: str
+    arguments: tuple[str, ...]
+    into: Path | None = None
+
+
+def prepare(folder: Path) -> None:
+    """Make the folder and put the loop file of the reference rig into it.
+
+    Raises
+    ------
+    OutputError
+        If that is not possible.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made a folder ({error.strerror or error})") from None
+    rig = files("servoscope").joinpath("examples", "reference-rig.toml").read_bytes()
+    atomic_write(folder / "loop.toml", rig)
+
+
+def steps(folder: Path) -> tuple[Step, ...]:
+    """Return the commands, in order: simulate healthy and faulty, learn, diagnose."""
+
+    def at(name: str) -> str:
+        return str(folder / name)
+
+    return (
+        Step(
+            "A healthy rig, recorded for 60 s: an electrohydraulic actuator in a closed loop.",
+            ("simulate", at("loop.toml"), "-o", at("healthy.csv"), "--seed", "1"),
+        ),
+        Step(
+            "The same rig on another day: at 30 s its internal leakage grows by 20 %.",
+            ("simulate", at("loop.toml"), "-o", at("suspect.csv"), "--fault", "C_ie=1.2@30", "--seed", "2"),
+        ),
+        Step(
+            "Learn what healthy looks like.",
+            ("learn", at("loop.toml"), at("healthy.csv"), "-o", at("baseline.json")),
+        ),
+        Step(
+            "Diagnose the other day, from r, u and y alone.",
+            (
+                "diagnose",
+                at("baseline.json"),
+                at("suspect.csv"),
+                "--report",
+                at("report.html"),
+                "--trace",
+                at("trace.parquet"),
+                "--json",
+            ),
+            folder / "diagnosis.json",
+        ),
+    )

@@ -1,0 +1,295 @@
+"""The pictures of a diagnosis: signals, statistic, coefficients, iFRF in the complex plane; imported late."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import ParamSpec
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from servoscope.canvas import COLOURS, STYLE, BoolArray, envelope, robust_range, spans_on
+from servoscope.diagnosis import Diagnosis, Trace
+from servoscope.plants import FloatArray
+from servoscope.recording import Recording
+from servoscope.wording import axis_scale, plain_symbol, times
+
+__all__ = ["coefficients", "ifrf", "signals", "statistic"]
+
+WIDTH = 9.0  # inches; the page scales pictures to its own width
+MOST_POINTS = 1500  # of a path in the complex plane
+PAPER, INK, MUTED, RULE = COLOURS["paper"], COLOURS["ink"], COLOURS["muted"], COLOURS["rule"]
+MEASURED, HEALTHY, ALARM = COLOURS["measured"], COLOURS["healthy"], COLOURS["alarm"]
+REFERENCE = COLOURS["reference"]
+
+P = ParamSpec("P")
+
+
+def _styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Draw with our style alone, whatever the user's matplotlibrc says."""
+
+    @wraps(draw)
+    def styled(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with matplotlib.rc_context():
+            matplotlib.rcdefaults()
+            matplotlib.rcParams.update(STYLE)
+            return draw(*args, **kwargs)
+
+    return styled
+
+
+@_styled
+def signals(
+    recording: Recording, diagnosis: Diagnosis | None = None, *, units: tuple[str, str] = ("", "")
+) -> Figure:
+    """Draw reference and output, their difference, and the input over time; gaps are shaded.
+
+    Parameters
+    ----------
+    recording
+        Signals of any length; long ones are drawn as their envelope.
+    diagnosis
+        Marks onset and detection.
+    units
+        Of the output (and reference) and of the input; empty where unknown.
+    """
+    figure = Figure(figsize=(WIDTH, 5.0), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True, height_ratios=[3, 2, 3])
+    unit, factor = times(recording.duration_s)
+    t = recording.t / factor
+    error = recording.r - recording.y
+    rows: tuple[tuple[str, str, tuple[tuple[FloatArray, str, str], ...]], ...] = (
+        ("r, y", units[0], ((recording.r, REFERENCE, "reference r"), (recording.y, MEASURED, "output y"))),
+        ("r − y", units[0], ((error, INK, "tracking error r − y"),)),
+        ("u", units[1], ((recording.u, MEASURED, "input u"),)),
+    )
+    for ax, (label, of, lines) in zip(axes, rows, strict=True):
+        prefix, scale = axis_scale([x for x, _, _ in lines], of)
+        for x, colour, _ in lines:
+            # the reference shines out from under the output that follows it
+            width = 2.6 if x is recording.r else 0.85
+            ax.plot(*envelope(t, x * scale, recording.restart), color=colour, linewidth=width)
+        ax.set_ylabel(f"{label} [{prefix}]" if prefix else label)
+        _gaps(ax, t, recording.restart, 1.5 / recording.sample_rate / factor)
+        _marks(ax, diagnosis, factor)
+    lines_ = [Line2D([], [], color=c, linewidth=w, label=label) for (_, c, label), w in zip(rows[0][2], (2.6, 1.2), strict=True)]
+    _legend_above(axes[0], diagnosis, lines_)
+    axes[0].margins(x=0.0)
+    axes[-1].set_xlabel(f"time [{unit}]")
+    return figure
+
+
+@_styled
+def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
+    """Draw T^2 over time on a logarithmic axis, with its threshold, the onset and the detection."""
+    figure = Figure(figsize=(WIDTH, 2.7), layout="constrained")
+    ax = figure.subplots()
+    usable = trace.ready & np.isfinite(trace.statistic) & (trace.statistic > 0.0)
+    unit, factor = times(float(np.ptp(trace.t)) if len(trace.t) else 0.0)
+    ax.set_xlabel(f"time [{unit}]")
+    ax.set_ylabel("statistic T²")
+    if not usable.any():
+        return _nothing(figure, ax)
+    t = trace.t / factor
+    value = np.where(usable, trace.statistic, np.nan)
+    lowest = min(float(np.nanpercentile(value, 1.0)), trace.threshold) / 2.0
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.plot(*envelope(t, value), color=MEASURED, marker="o" if usable.sum() < 20 else "", markersize=3)
+    ax.axhline(trace.threshold, color=ALARM, linewidth=1.0, linestyle=(0, (5, 2.5)))
+    over = np.where(usable, np.maximum(trace.statistic, trace.threshold), np.nan)
+    ax.fill_between(*envelope(t, over), trace.threshold, color=ALARM, alpha=0.16, linewidth=0)
+    ax.set_ylim(lowest, 3.0 * max(float(np.nanmax(value)), trace.threshold))
+    ax.margins(x=0.0)
+    if usable.sum() == 1:
+        ax.set_xlim(t[usable][0] - 1.0, t[usable][0] + 1.0)
+    _marks(ax, diagnosis, factor)
+    lines = [
+        Line2D([], [], color=MEASURED, label="statistic T²"),
+        Line2D([], [], color=ALARM, linestyle=(0, (5, 2.5)), label=f"threshold {trace.threshold:.3g}"),
+    ]
+    _legend_above(ax, diagnosis, lines)
+    return figure
+
+
+@_styled
+def coefficients(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
+    """Draw each coefficient's deviation from its healthy expectation over time, with bands of two sigma.
+
+    In percent of the expectation, or in units of the coefficient where the expectation is no larger than the
+    estimate's standard deviation.
+    """
+    n = len(trace.names)
+    columns = 1 if n == 1 else 2
+    rows = -(-n // columns)
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.65 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    unit, factor = times(float(np.ptp(trace.t)) if len(trace.t) else 0.0)
+    for i, ax in enumerate(axes.flat):
+        if i < n:
+            _coefficient(ax, trace, i, factor)
+            _marks(ax, diagnosis, factor)
+            ax.xaxis.set_tick_params(labelbottom=i + columns >= n)
+            if i + columns >= n:
+                ax.set_xlabel(f"time [{unit}]")
+        else:
+            ax.set_axis_off()
+    handles = [
+        Line2D([], [], color=MEASURED, label="estimate"),
+        Patch(facecolor=MEASURED, alpha=0.2, label="± 2 standard deviations"),
+        Line2D([], [], color=HEALTHY, linestyle=(0, (4, 2)), label="healthy expectation"),
+        *_mark_handles(diagnosis),
+    ]
+    figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))
+    return figure
+
+
+def _coefficient(ax: Axes, trace: Trace, i: int, factor: float) -> None:
+    healthy = trace.expected[:, i]
+    std = np.sqrt(np.maximum(trace.covariance[:, i, i], 0.0))
+    deviation = trace.theta[:, i] - healthy
+    usable = trace.ready & np.isfinite(deviation)
+    ax.set_title(plain_symbol(trace.names[i]), loc="left", fontweight="bold")
+    ax.axhline(0.0, color=HEALTHY, linewidth=1.1, linestyle=(0, (4, 2)), zorder=3)
+    ax.margins(x=0.0)
+    if not usable.any():
+        _empty(ax, "no estimate")
+        return
+    size = np.abs(healthy)
+    if np.nanmedian(size[usable]) > np.nanmedian(np.nan_to_num(std[usable])):
+        size = np.where(size > 0.0, size, np.nan)
+        deviation, std = 100.0 * deviation / size, 100.0 * std / size
+        ax.set_ylabel("deviation [%]")
+    else:
+        ax.set_ylabel("deviation")
+    middle = np.where(usable, deviation, np.nan)
+    band = 2.0 * np.nan_to_num(std)
+    t = trace.t / factor
+    x, low = envelope(t, middle - band)
+    _, high = envelope(t, middle + band)
+    ax.fill_between(x, low, high, color=MEASURED, alpha=0.2, linewidth=0)
+    ax.plot(*envelope(t, middle), color=MEASURED, marker="o" if usable.sum() < 20 else "", markersize=3)
+    ax.set_ylim(robust_range(np.concatenate([(middle - band)[usable], (middle + band)[usable], [0.0]])))
+
+
+@_styled
+def ifrf(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
+    """Draw the iFRF in the complex plane, one panel per frequency: path over time, last estimate, healthy.
+
+    Ellipses hold 95 %. The axes of a panel are scaled each on its own, for the iFRF moves far less one way than the
+    other as a rule.
+    """
+    F = len(trace.ifrf.frequencies)
+    columns = max(1, min(F, 4 if F in (4, 7, 8) else 3))
+    rows = max(1, -(-F // columns))
+    figure = Figure(figsize=(WIDTH, 0.5 + 8.4 / columns * (0.95 if columns > 1 else 0.45) * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    usable = trace.ready & np.isfinite(trace.theta).all(axis=1)
+    onset = diagnosis.onset_s[1] if diagnosis is not None and diagnosis.onset_s is not None else np.inf
+    for i, ax in enumerate(axes.flat):
+        if i < F:
+            ax.set_title(f"{trace.ifrf.frequencies[i]:g} Hz", loc="left", fontweight="bold")
+            _plane(ax, trace, i, usable, onset)
+            ax.set_xlabel("real part")
+            if i % columns == 0:
+                ax.set_ylabel("imaginary part")
+        else:
+            ax.set_axis_off()
+    handles = [
+        _marker("D", PAPER, INK, "healthy expectation"),
+        _marker("o", ALARM if np.isfinite(onset) else MEASURED, PAPER, "last estimate; ellipses hold 95 %"),
+        Line2D([], [], color=MEASURED, alpha=0.5, label="path before onset" if np.isfinite(onset) else "path"),
+    ]
+    if np.isfinite(onset):
+        handles.append(Line2D([], [], color=ALARM, alpha=0.5, label="path after onset"))
+    figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))
+    return figure
+
+
+def _plane(ax: Axes, trace: Trace, i: int, usable: BoolArray, onset: float) -> None:
+    rows = np.flatnonzero(usable)
+    if not len(rows):
+        _empty(ax, "no estimate")
+        return
+    last = int(rows[-1])
+    path = trace.ifrf.H[:, i]
+    thin = rows[:: max(1, len(rows) // MOST_POINTS)]
+    for part, colour in ((thin[trace.t[thin] <= onset], MEASURED), (thin[trace.t[thin] > onset], ALARM)):
+        ax.plot(path[part].real, path[part].imag, color=colour, linewidth=0.7, alpha=0.45)
+    shown = [np.stack([path[rows].real, path[rows].imag], axis=-1)]
+    faulty = np.isfinite(onset)
+    for response, colour, alpha, marker in (
+        (trace.ifrf_expected, HEALTHY, 0.28, "D"),
+        (trace.ifrf, ALARM if faulty else MEASURED, 0.24, "o"),
+    ):
+        H, covariance = response.H[last, i], response.covariance[last, i]
+        if not np.isfinite(H):
+            continue
+        if np.isfinite(covariance).all():
+            outline = type(response)(response.frequencies[i : i + 1], H[None], covariance[None]).ellipse(96)[0]
+            ax.fill(*outline.T, facecolor=colour, alpha=alpha, linewidth=0)
+            ax.plot(*outline.T, color=colour, linewidth=1.1)
+            shown.append(outline)
+        style = {"facecolor": PAPER if marker == "D" else colour, "edgecolor": INK if marker == "D" else PAPER}
+        ax.scatter(H.real, H.imag, 32.0, marker=marker, linewidth=1.1, zorder=4, **style)
+        shown.append(np.array([[H.real, H.imag]]))
+    certain = np.vstack(shown[1:]) if len(shown) > 1 else shown[0]
+    ax.set_xlim(robust_range(shown[0][:, 0], certain[:, 0]))
+    ax.set_ylim(robust_range(shown[0][:, 1], certain[:, 1]))
+    ax.locator_params(nbins=4)
+    ax.grid(visible=True, color=RULE, linewidth=0.6)
+
+
+def _marker(shape: str, face: str, edge: str, label: str) -> Line2D:
+    return Line2D([], [], marker=shape, linestyle="", markerfacecolor=face, markeredgecolor=edge, label=label)
+
+
+def _gaps(ax: Axes, t: FloatArray, restart: BoolArray, longest: float) -> None:
+    step = np.diff(t)
+    after = np.flatnonzero(restart[1:] & (step > longest))
+    for low, high in spans_on(t, t[after], t[after + 1]):
+        ax.axvspan(low, high, facecolor=HEALTHY, edgecolor=HEALTHY, linewidth=0.6, alpha=0.3, zorder=0)
+    joints = t[1:][restart[1:] & (step <= longest)]
+    for joint, _ in spans_on(t, joints, joints):
+        ax.axvline(joint, color=MUTED, linewidth=0.6, linestyle=(0, (1, 3)), zorder=1)
+
+
+def _marks(ax: Axes, diagnosis: Diagnosis | None, factor: float) -> None:
+    if diagnosis is None:
+        return
+    if diagnosis.onset_s is not None:
+        low, likely, high = (value / factor for value in diagnosis.onset_s)
+        ax.axvspan(low, high, facecolor=ALARM, edgecolor=ALARM, linewidth=0.5, alpha=0.22, zorder=0)
+        ax.axvline(likely, color=ALARM, linewidth=1.0, alpha=0.8, zorder=1)
+    if diagnosis.detected_at_s is not None:
+        ax.axvline(diagnosis.detected_at_s / factor, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), zorder=2)
+
+
+def _mark_handles(diagnosis: Diagnosis | None) -> list[Line2D | Patch]:
+    handles: list[Line2D | Patch] = []
+    if diagnosis is not None and diagnosis.onset_s is not None:
+        handles.append(Patch(facecolor=ALARM, edgecolor=ALARM, alpha=0.4, label="onset, 95 % interval"))
+    if diagnosis is not None and diagnosis.detected_at_s is not None:
+        handles.append(Line2D([], [], color=INK, linestyle=(0, (2, 2)), label="detected"))
+    return handles
+
+
+def _legend_above(ax: Axes, diagnosis: Diagnosis | None, lines: Sequence[Line2D]) -> None:
+    handles = [*lines, *_mark_handles(diagnosis)]
+    ax.figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))  # type: ignore[union-attr]
+
+
+def _empty(ax: Axes, words: str) -> None:
+    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=MUTED)
+    ax.set_yticks([])
+
+
+def _nothing(figure: Figure, ax: Axes) -> Figure:
+    _empty(ax, "no evaluation: the recording is too short for the estimator")
+    return figure

@@ -1,0 +1,165 @@
+"""What a fit leaves over: white beyond the filters' memory or structured, repeating with the reference or noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from servoscope.levels import BoolArray, Said
+from servoscope.plants import FloatArray
+from servoscope.recording import Recording
+
+LAGS = 20
+SIGNIFICANT = 0.01  # probability below which a residual is called structured
+REPEATS = 0.002  # relative structure function of r at its period
+DIFFERS = 0.2  # and what it must have exceeded before
+
+
+class Residual(Said):
+    """The residual of the regression.
+
+    Parameters
+    ----------
+    relative
+        Its standard deviation over that of the filtered u.
+    p_value, white
+        Ljung-Box-like test over 20 lags beyond the filters' memory; white if above 0.01. None: too short.
+    correlation_s
+        Time over which residuals hang together [s].
+    period_s
+        Period of the reference [s]; None if it does not repeat.
+    repeating, repeating_std
+        Share of the residual's variance that repeats with that period: what the model lacks, rather than noise.
+        Both None without a period.
+    model_error
+        Share of u (rms) that the model leaves unexplained apart from noise, as far as this recording shows.
+    """
+
+    relative: float
+    p_value: float | None
+    white: bool | None
+    correlation_s: float
+    period_s: float | None
+    repeating: float | None
+    repeating_std: float | None
+    model_error: float
+
+
+def on_grid(recording: Recording, x: FloatArray, mask: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """Put x, shape (N,), on the uniform grid of sample times; rows that are missing or masked are 0 and False."""
+    slots = np.round((recording.t - recording.t[0]) * recording.sample_rate).astype(np.int64)
+    values = np.zeros(int(slots[-1]) + 1)
+    there = np.zeros(values.size, dtype=bool)
+    values[slots[mask]] = x[mask]
+    there[slots[mask]] = True
+    return values, there
+
+
+def correlations(x: FloatArray, there: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the autocovariance of x at all lags and the number of pairs behind each, both shape (N,)."""
+    length = 1 << (2 * x.size - 1).bit_length()
+    spectrum, presence = np.fft.rfft(np.where(there, x, 0.0), length), np.fft.rfft(there.astype(np.float64), length)
+    sums = np.fft.irfft(np.abs(spectrum) ** 2, length)[: x.size]
+    pairs = np.round(np.fft.irfft(np.abs(presence) ** 2, length)[: x.size])
+    return sums / np.maximum(pairs, 1.0), pairs
+
+
+def period_of(recording: Recording) -> int | None:
+    """Return the period of r in samples; None if it does not repeat, twice at least.
+
+    The smallest lag at which the structure function E[(r(k+p) - r(k))^2] / (2 var r) comes back to 0.
+    """
+    every = np.ones(recording.samples, dtype=bool)
+    r, there = on_grid(recording, recording.r - recording.r.mean(), every)
+    spread = float(np.var(recording.r))
+    if not spread > 0.0:
+        return None
+    length = 1 << (2 * r.size - 1).bit_length()
+    masks = np.fft.rfft(there.astype(np.float64), length)
+    squares = np.fft.irfft(np.fft.rfft(r**2, length) * np.conj(masks), length)[: r.size]
+    before = np.fft.irfft(np.conj(np.fft.rfft(r**2, length)) * masks, length)[: r.size]
+    products, pairs = correlations(r, there)
+    pairs = np.maximum(pairs, 1.0)
+    half = r.size // 2 + 1
+    S = ((squares + before) / pairs / 2.0 - products)[:half] / spread
+    left = np.flatnonzero(S > DIFFERS)
+    if not left.size:
+        return None
+    back = np.flatnonzero(S[left[0] :] < REPEATS)
+    if not back.size:
+        return None
+    first = int(left[0] + back[0])
+    out = np.flatnonzero(S[first:] >= REPEATS)
+    last = first + int(out[0]) if out.size else S.size
+    return first + int(np.argmin(S[first:last]))
+
+
+def effective(rho: FloatArray, rows: int, memory: int) -> float:
+    """Return the number of independent values among `rows` with autocorrelation `rho` (Bartlett)."""
+    return rows / max(1.0 + 2.0 * float((rho[1 : memory + 1] ** 2).sum()), 1.0)
+
+
+def describe(
+    recording: Recording, v: FloatArray, eta: FloatArray, used: BoolArray, memory: int
+) -> tuple[Residual, float, FloatArray]:
+    """Judge a residual.
+
+    Parameters
+    ----------
+    recording
+        N samples.
+    v, eta
+        Residual and filtered input, shape (N,).
+    used
+        Rows that count, shape (N,).
+    memory
+        Samples over which the filters alone make residuals hang together.
+
+    Returns
+    -------
+    Residual, float, numpy.ndarray
+        The judgement, the number of independent residuals, and the autocorrelation from lag 0 on.
+    """
+    x, there = on_grid(recording, v, used)
+    covariance, pairs = correlations(x, there)
+    variance = max(float(covariance[0]), np.finfo(np.float64).tiny)
+    rho = covariance / variance
+    rows = int(used.sum())
+    inflation = 1.0 + 2.0 * float((rho[1:memory] ** 2).sum())
+    p_value = None
+    lags = memory * np.arange(1, LAGS + 1)
+    lags = lags[lags < rho.size // 2]
+    lags = lags[pairs[lags] > 0.2 * rows]
+    if lags.size >= 3:
+        from scipy.stats import chi2
+
+        Q = float((pairs[lags] * rho[lags] ** 2).sum()) / inflation
+        p_value = float(chi2.sf(Q, lags.size))
+    period = period_of(recording)
+    repeating = std = None
+    if period is not None and period >= memory:
+        multiples = np.arange(period, rho.size - period // 2, period)
+        multiples = multiples[pairs[multiples] > 0.2 * rows] if multiples.size else multiples
+        if multiples.size:
+            weight = pairs[multiples]
+            repeating = float((weight * rho[multiples]).sum() / weight.sum())
+            std = math.sqrt(inflation / float(weight.sum()))
+    relative = math.sqrt(variance / max(float(eta[used].var()), np.finfo(np.float64).tiny))
+    far = float(np.median(np.abs(rho[memory : 3 * memory]))) if rho.size > 3 * memory else 0.0
+    structured = (max(repeating - 2.0 * (std or 0.0), 0.0) if repeating is not None else far)
+    if p_value is not None and p_value > SIGNIFICANT and repeating is None:
+        structured = 0.0
+    reach = min(rho.size, 50 * memory)
+    below = np.flatnonzero(np.abs(rho[:reach]) < 0.1)
+    residual = Residual(
+        relative=relative,
+        p_value=p_value,
+        white=None if p_value is None else p_value > SIGNIFICANT,
+        correlation_s=float(below[0] if below.size else reach) / recording.sample_rate,
+        period_s=None if period is None else period / recording.sample_rate,
+        repeating=repeating,
+        repeating_std=std,
+        model_error=relative * math.sqrt(min(structured, 1.0)),
+    )
+    return residual, effective(rho, rows, reach), rho[:reach]

@@ -1,0 +1,243 @@
+"""How results look in a terminal: baselines, diagnoses, inspections, tables, progress."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from servoscope.baseline import Baseline
+    from servoscope.diagnosis import Diagnosis, Warning
+    from servoscope.readers import ChannelInfo
+
+COLOURS = {"healthy": "green", "fault": "red", "undetermined": "yellow"}
+MOST_WARNINGS = 12
+LEAST_SHOWN = 0.0005  # probability below which a candidate is not worth its line
+
+
+def console(*, stderr: bool = False) -> Console:
+    """Return a console on stdout or stderr: without colour when that is no terminal or NO_COLOR is set."""
+    return Console(stderr=stderr, highlight=False, markup=False, emoji=False)
+
+
+def percent(share: float) -> str:
+    """Return a share with so many digits that 99.97 % does not become 100 %."""
+    if not math.isfinite(share):
+        return "-"
+    if 0.0005 > share > 0.0:
+        return "< 0.1 %"
+    if 0.9995 < share < 1.0:
+        return f"{100.0 * share:.2f} %" if share <= 0.99995 else "> 99.99 %"
+    return f"{100.0 * share:.3g} %"
+
+
+def span(seconds: float) -> str:
+    """Return a duration in the unit that suits it."""
+    if seconds < 600.0:
+        return f"{seconds:.4g} s"
+    return f"{seconds / 60.0:.3g} min" if seconds < 7200.0 else f"{seconds / 3600.0:.3g} h"
+
+
+def table(out: Console, header: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> None:
+    """Print a table whose first `words` columns are text and whose others are numbers."""
+    grid = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_edge=False)
+    for i, name in enumerate(header):
+        grid.add_column(name, justify="left" if i < words else "right", overflow="fold")
+    for row in rows:
+        grid.add_row(*(Text(cell) for cell in row))
+    out.print(Padding(grid, (0, 0, 0, 2)))
+
+
+def facts(out: Console, pairs: Sequence[tuple[str, str]]) -> None:
+    """Print names and values in two columns; long values wrap inside theirs."""
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(style="dim", no_wrap=True)
+    grid.add_column(overflow="fold")
+    for name, value in pairs:
+        grid.add_row(name, Text(value))
+    out.print(Padding(grid, (0, 0, 0, 2)))
+
+
+def notes(out: Console, texts: Sequence[str], colour: str = "yellow") -> None:
+    """Print sentences as a list, wrapped under their own beginning."""
+    for text in texts:
+        grid = Table.grid(padding=(0, 1, 0, 0))
+        grid.add_column()
+        grid.add_column(overflow="fold")
+        grid.add_row(Text("!", style=colour), Text(text))
+        out.print(Padding(grid, (0, 0, 0, 2)))
+
+
+def baseline(out: Console, b: Baseline) -> None:
+    """Print what was learned."""
+    out.print(Text.assemble((b.loop.name, "bold"), f": baseline from {_sources(b)}"))
+    std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
+    rows = [
+        (name, f"{value:.5g}", f"{s:.2g}", percent(abs(s / value)) if value else "-")
+        for name, value, s in zip(b.names, b.theta, std, strict=True)
+    ]
+    table(out, ("coefficient", "value", "std. dev.", "relative"), rows)
+    out.print()
+    if b.ratios:
+        table(out, ("parameter", "healthy / nominal"), [(name, f"{ratio:.4g}") for name, ratio in b.ratios.items()])
+        out.print()
+    seen = [(p.name, p.parameter, percent(p.change) if p.change is not None else "never") for p in b.promises]
+    if seen:
+        table(out, ("fault", "parameter", "seen from a change of"), seen, words=2)
+        out.print()
+    monitor = b.loop.monitor
+    told = [
+        ("explained", f"{percent(b.explained)} of u's variance (R = {b.R:.3g})"),
+        ("delay", f"{1e3 * b.delay_s:.3g} ms" if b.delay_s is not None else "the recordings do not tell"),
+        ("threshold", f"T² = {b.limit:.4g} for {monitor.false_alarms_per_year:g} false alarms per year"),
+        ("supported", f"the data speak for {b.supported_false_alarms_per_year:.3g} false alarms per year or more"),
+        ("model_error", f"{monitor.model_error:g} set, {b.suggested_model_error:.2g} suggested"),
+    ]
+    if b.noise is not None:
+        told.insert(1, ("noise", f"u {b.noise.u_std:.3g}, y {b.noise.y_std:.3g} (standard deviations)"))
+    facts(out, told)
+    notes(out, b.notes)
+
+
+def baseline_facts(b: Baseline) -> dict[str, object]:
+    """Return what `baseline` prints, ready for JSON."""
+    said = b.model_dump(mode="json", by_alias=True)
+    std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
+    return {
+        "loop": b.loop.name,
+        "sources": said["sources"],
+        "parameters": {
+            name: {"value": value, "std": s} for name, value, s in zip(b.names, b.theta, std, strict=True)
+        },
+        "healthy_ratios": said["ratios"],
+        "noise": said["noise"],
+        "delay_s": b.delay_s,
+        "explained": b.explained,
+        "R": b.R,
+        "threshold": b.limit,
+        "false_alarms_per_year": b.loop.monitor.false_alarms_per_year,
+        "supported_false_alarms_per_year": b.supported_false_alarms_per_year,
+        "model_error": b.loop.monitor.model_error,
+        "suggested_model_error": b.suggested_model_error,
+        "promises": said["promises"],
+        "notes": said["notes"],
+    }
+
+
+def diagnosis(out: Console, d: Diagnosis) -> None:
+    """Print a verdict, what stands behind it, and the warnings."""
+    out.print(Text.assemble((d.recording, "bold"), f": {span(d.duration_s)}, {d.samples} samples"))
+    out.print(Padding(Text(d.summary, style=f"bold {COLOURS[d.verdict]}"), (0, 0, 0, 2)))
+    told = []
+    if d.detected_at_s is not None:
+        told.append(("detected", f"{d.detected_at_s:.4g} s"))
+    if d.onset_s is not None:
+        low, likely, high = d.onset_s
+        told.append(("onset", f"{likely:.4g} s ({low:.4g} to {high:.4g} s, 95 %)"))
+    if told:
+        facts(out, told)
+    shown = [c for c in d.candidates if c.probability >= LEAST_SHOWN or c.name == d.candidates[0].name]
+    rows = []
+    for c in shown:
+        fault = c.faults[0] if c.faults else None
+        size = (fault.parameter, f"{fault.ratio:.4g}", f"{fault.interval[0]:.4g} to {fault.interval[1]:.4g}") if fault else ("", "", "")
+        rows.append((c.name, percent(c.probability), *size))
+    if rows:
+        table(out, ("candidate", "probability", "parameter", "ratio", "95 % interval"), rows)
+    _warnings(out, d.warnings)
+
+
+def channels(out: Console, name: str, found: Sequence[ChannelInfo]) -> None:
+    """Print the columns of a file."""
+    out.print(Text.assemble((name, "bold"), f": {len(found)} columns"))
+    rows = [(c.name, c.dtype, f"{c.min:.6g}", f"{c.max:.6g}") for c in found]
+    rows = [tuple(cell if cell != "nan" else "-" for cell in row) for row in rows]
+    table(out, ("column", "type", "smallest", "largest"), rows, words=2)
+
+
+def _sources(b: Baseline) -> str:
+    length = span(sum(source.duration_s for source in b.sources))
+    if len(b.sources) > 3:
+        return f"{len(b.sources)} recordings, {length}"
+    return f"{', '.join(source.name for source in b.sources)}, {length}"
+
+
+def _warnings(out: Console, warnings: Sequence[Warning]) -> None:
+    texts = []
+    for w in warnings:
+        if w.kind == "power":
+            texts.append(w.message)
+            continue
+        when = f"at {w.from_s:.6g} s" if w.from_s == w.to_s else f"{w.from_s:.6g} to {w.to_s:.6g} s"
+        texts.append(f"{when}: {w.message}")
+    more = len(texts) - MOST_WARNINGS
+    if more > 1:
+        texts[MOST_WARNINGS:] = [f"and {more} more, all of them with --json"]
+    notes(out, texts)
+
+
+class Steps:
+    """A progress bar over some parts, each in so many steps; made by `progress`."""
+
+    def __init__(self, bar: Progress, task: TaskID, each: int) -> None:
+        self._bar, self._task, self._each = bar, task, each
+        self._part, self._done, self._what, self._step = -1, 0, "", ""
+
+    def begin(self, what: str) -> None:
+        """Go on to the next part."""
+        self._part, self._done, self._what, self._step = self._part + 1, 0, what, ""
+        self._show()
+
+    def tell(self, step: str) -> None:
+        """Go on to the next step of the part."""
+        self._done, self._step = min(self._done + 1, self._each), step
+        self._show()
+
+    def compiling(self) -> None:
+        """Say why this takes longer than it will the next time."""
+        self._show(" (compiling, once)")
+
+    def _show(self, more: str = "") -> None:
+        text = ": ".join(filter(None, (self._what, self._step))) + more
+        self._bar.update(self._task, completed=self._part * self._each + self._done, description=text)
+
+
+@contextmanager
+def progress(parts: int, each: int) -> Iterator[Steps]:
+    """Show a progress bar on stderr, if that is a terminal, and take it away again at the end."""
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    err = console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        steps = Steps(bar, bar.add_task("", total=parts * each), each)
+        if not err.is_terminal:
+            yield steps
+            return
+        with on_compiling(steps.compiling):
+            yield steps
+
+
+@contextmanager
+def on_compiling(tell: Callable[[], None]) -> Iterator[None]:
+    """Call `tell` whenever machine code is made that was not in the cache yet."""
+    from numba.core.event import Event, Listener, install_listener
+
+    class Told(Listener):
+        def on_start(self, event: Event) -> None:
+            tell()
+
+        def on_end(self, event: Event) -> None:
+            """Nothing to say."""
+
+    with install_listener("numba:compile", Told()):
+        yield

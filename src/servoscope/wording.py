@@ -1,0 +1,188 @@
+"""Numbers, names and verdicts as people read them: significant digits, units, symbols; plain text and HTML."""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from servoscope.plants import FloatArray
+
+__all__ = [
+    "axis_scale",
+    "clock_time",
+    "moments",
+    "number",
+    "plain_symbol",
+    "probability",
+    "quantity",
+    "ratios",
+    "signed_percent",
+    "size_of",
+    "symbol",
+    "times",
+    "with_std",
+]
+
+GREEK = {"theta": "θ", "beta": "β", "rho": "ρ"}
+SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "µ"), (1e9, "n"))
+DASH = "–"
+
+
+def symbol(name: str) -> str:
+    """Return a parameter's or coefficient's name as HTML: C_ie with a subscript, viscous_friction in words."""
+    found = re.fullmatch(r"([A-Za-z]{1,5})(?:_(\w{1,3}))?", name)
+    if found is None:
+        return html.escape(name.replace("_", " "))
+    stem, index = found.groups()
+    letters = GREEK.get(stem, stem if index or len(stem) == 1 else None)
+    if letters is None:
+        return html.escape(name)
+    return f"<i>{html.escape(letters)}</i>" + (f"<sub>{html.escape(index)}</sub>" if index else "")
+
+
+def plain_symbol(name: str) -> str:
+    """Return the same as plain text for a picture; dollar signs are kept from being read as mathematics."""
+    found = re.fullmatch(r"(theta|beta|rho)(?:_(\d+))?", name)
+    if found is not None:
+        return GREEK[found[1]] + (found[2] or "").translate(SUBSCRIPTS)
+    short = re.fullmatch(r"[A-Za-z]{1,2}_\w{1,3}", name)
+    return (name if short else name.replace("_", " ")).replace("$", r"\$")
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Return a number with so many significant digits as HTML; very small and large ones as powers of ten."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    if value == 0.0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if -4 <= exponent < 6:
+        return _signed(f"{value:.{max(digits - 1 - exponent, 0)}f}")
+    return _signed(f"{value / 10.0**exponent:.{digits - 1}f}") + _power(exponent)
+
+
+def quantity(value: float) -> str:
+    """Return a setting as it was written, with a true minus sign and powers of ten, as HTML."""
+    text = f"{value:.10g}" if abs(value) < 1e6 else re.sub(r"\.?0*e", "e", f"{value:.9e}")
+    mantissa, _, exponent = text.partition("e")
+    return _signed(mantissa) + (_power(int(exponent)) if exponent else "")
+
+
+def with_std(value: float, std: float, *others: float) -> tuple[str, ...]:
+    """Return value, standard deviation and further values of the same kind, to the digits that the std supports.
+
+    Returns
+    -------
+    tuple of str
+        As HTML, in the order of the arguments.
+    """
+    values = (value, std, *others)
+    if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
+        return tuple(number(each) for each in values)
+    top = max((abs(each) for each in values if math.isfinite(each)), default=0.0)
+    exponent = math.floor(math.log10(top)) if top > 0.0 else 0
+    exponent = 0 if -3 <= exponent < 6 else exponent
+    decimals = _decimals(std / 10.0**exponent, most=7)
+    power = _power(exponent) if exponent else ""
+    return tuple(
+        _signed(f"{each / 10.0**exponent:.{decimals}f}") + power if math.isfinite(each) else DASH for each in values
+    )
+
+
+def probability(value: float | None) -> str:
+    """Return a probability in percent, never rounded to certainty."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    if value > 0.999:
+        return "> 99.9 %"
+    if value < 0.001:
+        return "< 0.1 %"
+    return f"{100.0 * value:.1f} %"
+
+
+def signed_percent(change: float) -> str:
+    """Return a relative change in percent with its sign; large ones as a factor."""
+    if not math.isfinite(change):
+        return DASH
+    if abs(change) >= 2.0:
+        return f"× {number(1.0 + change, 3)}"
+    text = f"{100.0 * change:+.2f}" if abs(change) < 0.1 else f"{100.0 * change:+.1f}"
+    return _signed(text) + " %"
+
+
+def size_of(ratio: float, low: float, high: float) -> tuple[str, str, str]:
+    """Return a fault's size and its interval as a person would say them: +20 %, or a factor where it is large.
+
+    To the digits that the interval supports.
+    """
+    values = (ratio, low, high)
+    if all(0.2 <= value < 3.0 for value in values):
+        decimals = _decimals(50.0 * (high - low))
+        changes = (_signed(f"{100.0 * (value - 1.0):+.{decimals}f}") + " %" for value in values)
+        return tuple(changes)  # type: ignore[return-value]
+    ratio_, low_, high_ = ratios(*values)
+    return f"× {ratio_}", f"× {low_}", f"× {high_}"
+
+
+def ratios(ratio: float, low: float, high: float) -> tuple[str, str, str]:
+    """Return a ratio and its interval to the digits that the interval supports."""
+    if not math.isfinite(high - low):
+        return number(ratio), number(low), number(high)
+    # four digits are enough for anybody
+    size = max(abs(ratio), abs(low), abs(high), 1e-12)
+    decimals = min(_decimals((high - low) / 2.0), max(3 - math.floor(math.log10(size)), 0))
+    return tuple(_signed(f"{value:.{decimals}f}") for value in (ratio, low, high))  # type: ignore[return-value]
+
+
+def _decimals(uncertainty: float, most: int = 6) -> int:
+    """Return how many decimals show the first digit of an uncertainty, or two where they are below 35."""
+    if not uncertainty > 0.0:
+        return 3
+    return min(max(-math.floor(math.log10(uncertainty / 3.5)), 0), most)
+
+
+def moments(low: float, high: float) -> tuple[str, str]:
+    """Return the two ends of an interval of time [s], without their unit, to the digits that tell them apart."""
+    decimals = min(max(_decimals(high - low), 1), 3)
+    return _signed(f"{low:.{decimals}f}"), _signed(f"{high:.{decimals}f}")
+
+
+def clock_time(seconds: float) -> str:
+    """Return a time on the recording's clock, with hours and minutes added where it is long."""
+    text = _signed(f"{seconds:.1f}") + " s"
+    if abs(seconds) < 600.0 or not math.isfinite(seconds):
+        return text
+    minutes, rest = divmod(round(abs(seconds)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{text} ({f'{hours} h ' if hours else ''}{minutes} min {rest} s)"
+
+
+def times(duration_s: float) -> tuple[str, float]:
+    """Return the unit of a time axis and how many seconds it has."""
+    if duration_s > 4.0 * 3600.0:
+        return "h", 3600.0
+    return ("min", 60.0) if duration_s > 1200.0 else ("s", 1.0)
+
+
+def axis_scale(values: Sequence[FloatArray], unit: str) -> tuple[str, float]:
+    """Return a unit with a prefix that suits the values, and the factor that goes with it."""
+    if not unit:
+        return "", 1.0
+    top = max((float(np.nanmax(np.abs(x))) for x in values if np.isfinite(x).any()), default=0.0)
+    for factor, prefix in PREFIXES:
+        if top * factor >= 0.5:
+            return prefix + unit, factor
+    return unit, 1.0
+
+
+def _signed(text: str) -> str:
+    return text.replace("-", "−")
+
+
+def _power(exponent: int) -> str:
+    return f" × 10<sup>{_signed(str(exponent))}</sup>"

@@ -1,0 +1,187 @@
+"""Slow, obvious oracles for the compiled chain: textbook matrices, dense sub-steps and loops; nothing is shared with it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import signal
+
+Array = npt.NDArray[np.float64]
+Update = Callable[..., tuple[Array, Array, Array]]
+
+
+def between_samples(w: Array, rate: float, hold: str, steps: int, delay: float = 0.0) -> tuple[Array, Array]:
+    """Return a fine clock and w on it: held or in straight lines, late by `delay` [s], w[0] before the start."""
+    t = np.arange((len(w) - 1) * steps + 1) / (rate * steps)
+    at = np.round((t - delay) * rate * steps).astype(int)
+    if hold == "zoh":
+        return t, w[np.clip(at // steps, 0, None)]
+    return t, np.interp(at / steps, np.arange(len(w)), w)
+
+
+def continuous(
+    numerator: npt.ArrayLike, denominator: npt.ArrayLike, w: Array, rate: float, hold: str, delay: float = 0.0, steps: int = 1
+) -> Array:
+    """Pass samples through a continuous transfer function (highest power first), from its steady state at w[0]."""
+    t, fine = between_samples(w - w[0], rate, hold, steps, delay)
+    num, den = np.atleast_1d(numerator), np.atleast_1d(denominator)
+    out = signal.lsim((num, den), fine, t, interp=hold == "foh")[1]
+    return np.asarray(np.atleast_1d(out)[::steps] + w[0] * num[-1] / den[-1])
+
+
+def svf(
+    w: Array, power: int, cutoff: float, order: int, rate: float, hold: str, delay: float = 0.0, steps: int = 1
+) -> Array:
+    """Return ``s^power w`` behind ``(1 + s/lambda)^-order`` at the sample times."""
+    lam = 2.0 * math.pi * cutoff
+    denominator = np.poly(np.full(order, -lam))
+    numerator = lam**order * np.concatenate([[1.0], np.zeros(power)])
+    return continuous(numerator, denominator, w, rate, hold, delay, steps)
+
+
+def tustin(u: Array, y: Array, held: bool = False) -> tuple[Array, Array]:
+    """Return eta and phi of eq. (4) for order 3, with u or (u(k) + u(k-1))/2; signals rest before the start."""
+
+    def past(x: Array, lag: int) -> Array:
+        return np.concatenate([np.full(lag, x[0]), x[: len(x) - lag]])
+
+    a = (u + past(u, 1)) / 2.0 if held else u
+    eta = a + 3.0 * past(a, 1) + 3.0 * past(a, 2) + past(a, 3)
+    return eta, np.column_stack([past(y, lag) for lag in range(4)])
+
+
+def akf(theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array) -> tuple[Array, Array, Array]:
+    """Take one step of eqs. (7) to (9) and (11); `z` is not used."""
+    K = P @ phi / (R + phi @ P @ phi)
+    new = P - P @ np.outer(phi, phi) @ P / (R + phi @ P @ phi) + P_d @ np.outer(phi, phi) @ P_d / (R + phi @ P_d @ phi)
+    return theta + K * (eta - phi @ theta), new, K
+
+
+def iv_akf(theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array) -> tuple[Array, Array, Array]:
+    """Take one step of the instrumental-variable AKF, skipped where the instrument points away."""
+    if phi @ P @ z < 0.0 or phi @ P_d @ z < 0.0:
+        return theta, P, np.zeros_like(theta)
+    K = P @ z / (R + phi @ P @ z)
+    new = P - np.outer(K, phi @ P) + np.outer(P_d @ z, phi @ P_d) / (R + phi @ P_d @ z)
+    return theta + K * (eta - phi @ theta), new, K
+
+
+UPDATES: dict[str, Update] = {"akf": akf, "iv-akf": iv_akf}
+
+
+class Spread:
+    """Joint covariance of the estimate's error and the last p noises, one explicit augmented matrix."""
+
+    def __init__(self, n: int, a: Array, gamma: Array) -> None:
+        p = len(a)
+        self.n, self.a, self.gamma = n, a, gamma
+        self.joint = np.zeros((n + p, n + p))
+        self.Psi = np.eye(n)
+        self.forget()
+
+    def forget(self) -> None:
+        """Start with fresh noise, independent of the estimate."""
+        n, p = self.n, len(self.a)
+        self.joint[:n, n:] = 0.0
+        self.joint[n:, :n] = 0.0
+        self.joint[n:, n:] = self.gamma[np.abs(np.subtract.outer(np.arange(p), np.arange(p)))]
+
+    def update(self, K: Array, phi: Array) -> None:
+        """Advance by v(k) = a' v_past + w(k) and error(k+1) = (I - K phi') error + K v(k)."""
+        n, p = self.n, len(self.a)
+        keep = np.eye(n) - np.outer(K, phi)
+        F = np.zeros((n + p, n + p))
+        F[:n, :n], F[:n, n:] = keep, np.outer(K, self.a)
+        F[n, n:] = self.a
+        F[n + 1 :, n : n + p - 1] = np.eye(p - 1)
+        G = np.concatenate([K, [1.0], np.zeros(p - 1)])
+        innovation = self.gamma[0] - self.a @ self.joint[n:, n:] @ self.a
+        self.joint = F @ self.joint @ F.T + innovation * np.outer(G, G)
+        self.Psi = keep @ self.Psi
+
+
+@dataclass
+class Chain:
+    """What `chain` returns, one row per sample: theta, S and Psi (scaled), updates so far, mean square residual."""
+
+    theta: Array
+    S: Array
+    Psi: Array
+    updates: Array
+    power: Array
+
+
+def stretches(r: Array, u: Array, y: Array, restart: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return [begin, end) of the stretches of whole samples that follow each other."""
+    whole = np.isfinite(r + u + y)
+    edges = [k for k in range(len(r)) if whole[k] and (k == 0 or restart[k] or not whole[k - 1])]
+    ends = []
+    for begin in edges:
+        end = begin + 1
+        while end < len(r) and whole[end] and not restart[end]:
+            end += 1
+        ends.append((begin, end))
+    return ends
+
+
+def chain(
+    update: Update,
+    eta: Array,
+    phi: Array,
+    z: Array,
+    used: list[bool],
+    between: list[bool],
+    theta: Array,
+    P: Array,
+    P_d: Array,
+    R: float,
+    a: Array,
+    gamma: Array,
+    memory: float,
+) -> Chain:
+    """Follow estimator, covariance and residual power over given regressors; the noise is new where nothing is used."""
+    N, n = phi.shape
+    spread = Spread(n, a, gamma)
+    updates, power = 0, gamma[0]
+    rows: list[tuple[Array, Array, Array, int, float]] = []
+    for k in range(N):
+        if used[k]:
+            e = eta[k] - phi[k] @ theta
+            theta, P, K = update(theta, P, P_d, R, eta[k], phi[k], z[k])
+            if np.any(K):
+                updates += 1
+                power += (e**2 - power) / memory
+            spread.update(K, phi[k])
+        elif not between[k]:
+            spread.forget()
+        rows.append((theta, spread.joint[:n, :n].copy(), spread.Psi.copy(), updates, power))
+    columns = [np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)]
+    return Chain(*columns)
+
+
+def t_squared(theta: Array, expected: Array, covariance: Array) -> Array:
+    """Return (theta - mu)' Cov^-1 (theta - mu) row by row."""
+    return np.array([(t - m) @ np.linalg.inv(C) @ (t - m) for t, m, C in zip(theta, expected, covariance, strict=True)])
+
+
+def change_point(before: Array, after: Array, a: Array, variance: float) -> Array:
+    """Return the log-likelihood of a change at every sample from two residuals, N(0, variance) once whitened."""
+    N = len(before)
+
+    def white(v: Array, k: int) -> float:
+        return float(v[k] - sum(a[j - 1] * v[k - j] for j in range(1, min(len(a), k) + 1)))
+
+    costs = [[white(v, k) ** 2 / (2.0 * variance) for k in range(N)] for v in (before, after)]
+    return np.array([-sum(costs[0][:k]) - sum(costs[1][k:]) for k in range(N)])
+
+
+def inside(points: Array, polygon: Array) -> npt.NDArray[np.bool_]:
+    """Return which points (N, 2) lie within a convex closed polygon (M, 2)."""
+    edge = np.diff(polygon, axis=0)
+    to_point = points[:, None, :] - polygon[None, :-1, :]
+    side = edge[None, :, 0] * to_point[:, :, 1] - edge[None, :, 1] * to_point[:, :, 0]
+    return np.asarray(np.all(side >= 0.0, axis=1) | np.all(side <= 0.0, axis=1))

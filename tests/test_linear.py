@@ -1,0 +1,89 @@
+"""Discrete bricks against continuous systems simulated in small steps, and the algebra that joins them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import naive
+import numpy as np
+import pytest
+
+from servoscope.linear import Linear, sampled, settling, stack, state_variable_filter, taps
+
+RATE = 100.0
+HOLDS: tuple[Literal["zoh", "foh"], ...] = ("zoh", "foh")
+
+
+def noise(samples: int, seed: int = 0) -> naive.Array:
+    return np.random.default_rng(seed).standard_normal(samples) + 1.0
+
+
+class TestSampled:
+    @pytest.mark.parametrize("hold", HOLDS)
+    @pytest.mark.parametrize("delay", [0.0, 0.0037, 0.01, 0.0249])
+    def test_is_exact_for_held_and_ramped_inputs_that_arrive_late(
+        self, hold: Literal["zoh", "foh"], delay: float
+    ) -> None:
+        w = noise(120)
+        ours = sampled(state_variable_filter(10.0, 4), RATE, hold, delay).simulate(w[:, None])
+        for power in range(4):
+            theirs = naive.svf(w, power, 10.0, 4, RATE, hold, delay, steps=100)
+            assert np.abs(ours[:, power] - theirs).max() < 1e-9 * np.abs(theirs).max(), power
+
+    @pytest.mark.parametrize("hold", HOLDS)
+    def test_starts_at_rest_at_the_first_input(self, hold: Literal["zoh", "foh"]) -> None:
+        system = sampled(state_variable_filter(10.0, 4), RATE, hold, 0.0137)
+        out = system.simulate(np.full((50, 1), 3.0))
+        assert out == pytest.approx(np.tile([3.0, 0.0, 0.0, 0.0], (50, 1)), abs=1e-4)  # s^3 F is of size 1e5
+
+
+class TestAlgebra:
+    def systems(self) -> tuple[Linear, Linear]:
+        first = sampled(state_variable_filter(5.0, 2), RATE, "zoh").output(np.array([[1.0, 0.02]]))
+        return first, sampled(state_variable_filter(20.0, 3), RATE, "foh").output(np.eye(1, 3))
+
+    def test_series_is_one_after_the_other(self) -> None:
+        first, second = self.systems()
+        w = noise(80)[:, None]
+        w -= w[0]  # from rest: a series connection and its parts then start alike
+        assert first.then(second).simulate(w) == pytest.approx(second.simulate(first.simulate(w)), abs=1e-12)
+
+    def test_stack_shares_nothing(self) -> None:
+        first, second = self.systems()
+        w = np.column_stack([noise(80, 1), noise(80, 2)])
+        both = stack([first, second]).simulate(w)
+        assert both == pytest.approx(np.hstack([first.simulate(w[:, :1]), second.simulate(w[:, 1:])]), abs=1e-12)
+
+    def test_steady_state_stands_still(self) -> None:
+        first, second = self.systems()
+        both = stack([first, second, taps(np.ones(4))])
+        x = both.steady @ np.array([1.0, -2.0, 0.5])
+        assert both.A @ x + both.B @ np.array([1.0, -2.0, 0.5]) == pytest.approx(x, rel=1e-10, abs=1e-12)
+
+    def test_taps_are_a_convolution(self) -> None:
+        w, weights = noise(40), np.array([[1.0, 3.0, 3.0, 1.0], [0.0, 0.0, 2.0, 0.0]])
+        out = taps(weights).simulate(w[:, None])
+        padded = np.concatenate([np.full(3, w[0]), w])
+        for row, column in zip(weights, out.T, strict=True):
+            assert column == pytest.approx(np.convolve(padded, row)[3 : 3 + len(w)], abs=1e-12)
+
+    def test_a_single_tap_is_a_gain_without_state(self) -> None:
+        w = noise(5)[:, None]
+        assert taps(np.array([2.5])).simulate(w) == pytest.approx(2.5 * w)
+
+
+class TestStateVariableFilter:
+    @pytest.mark.parametrize("order", [2, 4, 5])
+    def test_frequency_response(self, order: int) -> None:
+        A, B, C = state_variable_filter(10.0, order)
+        for f in (0.5, 10.0, 30.0):
+            s = 2j * np.pi * f
+            H = C @ np.linalg.solve(s * np.eye(order) - A, B)
+            assert H[:, 0] == pytest.approx(s ** np.arange(order) / (1.0 + s / (20.0 * np.pi)) ** order, rel=1e-12)
+
+    @pytest.mark.parametrize(("cutoff", "order"), [(10.0, 4), (2.0, 3), (20.0, 5)])
+    def test_settling_is_the_first_sample_after_which_a_step_is_over(self, cutoff: float, order: int) -> None:
+        w = np.concatenate([[0.0], np.ones(400)])
+        left = np.abs(naive.svf(w, 0, cutoff, order, RATE, "zoh") - 1.0)[1:]  # left[i]: i samples after the step
+        count = settling(cutoff, order, 1.0 / RATE)
+        assert left[count] <= 1e-3 < left[count - 1]
