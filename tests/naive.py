@@ -85,10 +85,14 @@ class Spread:
 
     def forget(self) -> None:
         """Start with fresh noise, independent of the estimate."""
-        n, p = self.n, len(self.a)
+        n = self.n
         self.joint[:n, n:] = 0.0
         self.joint[n:, :n] = 0.0
-        self.joint[n:, n:] = self.gamma[np.abs(np.subtract.outer(np.arange(p), np.arange(p)))]
+        self._stationary()
+
+    def _stationary(self) -> None:
+        p = len(self.a)
+        self.joint[self.n :, self.n :] = self.gamma[np.abs(np.subtract.outer(np.arange(p), np.arange(p)))]
 
     def update(self, K: Array, phi: Array) -> None:
         """Advance by v(k) = a' v_past + w(k) and error(k+1) = (I - K phi') error + K v(k)."""
@@ -101,6 +105,7 @@ class Spread:
         G = np.concatenate([K, [1.0], np.zeros(p - 1)])
         innovation = self.gamma[0] - self.a @ self.joint[n:, n:] @ self.a
         self.joint = F @ self.joint @ F.T + innovation * np.outer(G, G)
+        self._stationary()  # as it is already, but for rounding, which would grow
         self.Psi = keep @ self.Psi
 
 
@@ -126,6 +131,17 @@ def stretches(r: Array, u: Array, y: Array, restart: npt.NDArray[np.bool_]) -> l
             end += 1
         ends.append((begin, end))
     return ends
+
+
+def usable(
+    r: Array, u: Array, y: Array, restart: npt.NDArray[np.bool_], wait: int, resting: npt.NDArray[np.bool_] | None = None
+) -> npt.NDArray[np.bool_]:
+    """Return which samples come `wait` after the start of their stretch and after the last sample at rest in it."""
+    ok = np.zeros(len(r), dtype=bool)
+    for begin, end in stretches(r, u, y, restart):
+        for k in range(begin + wait, end):
+            ok[k] = resting is None or not resting[max(k - wait, begin) : k + 1].any()
+    return ok
 
 
 def chain(

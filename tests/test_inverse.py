@@ -88,19 +88,20 @@ class TestRegressors:
         assert close(g.phi[20:, -1], naive.svf(sign, 0, 10.0, 3, 100.0, "foh")[20:], 1e-2)
 
     def test_gates(self, rig: dict[str, Any]) -> None:
-        """Nothing is used while the filters settle, at rest and inside the dead zone; u is limited where it was not."""
-        r, u, y = signals()
+        """Nothing is used near rest and the dead zone or while the filters settle; u is limited where it was not."""
+        speed = np.repeat([0.0, 1.0, 0.0, -1.0], [60, 120, 40, 180])
+        y = 2.0 + np.cumsum(speed) / 100.0
+        u = 5.0 * np.cos(np.arange(400) / 60.0)
         loop = Loop.from_dict(
             rig
             | {"input_deadzone": [-1.0, 1.0], "input_limits": [-4.0, 4.0], "input_logged": "before_limiter"}
-            | {"monitor": {"update_when": "moving", "rest_speed": 20.0}}
+            | {"monitor": {"update_when": "moving", "rest_speed": 0.5}}
         )
-        g = regression(loop, r, u, y)
-        v = naive.svf(y, 1, 25.0, 2, 100.0, "foh")
+        g = regression(loop, y, u, y)
         limited = np.clip(u, -4.0, 4.0)
-        expected = (np.abs(v) > 20.0) & (np.abs(limited) > 1.0)
-        expected[: Pipeline.of(loop).bank.wait] = False
-        assert 30 < expected.sum() < 270
+        resting = (np.abs(naive.svf(y, 1, 25.0, 2, 100.0, "foh")) <= 0.5) | (np.abs(limited) <= 1.0)
+        expected = naive.usable(y, u, y, np.zeros(400, dtype=bool), Pipeline.of(loop).bank.wait, resting)
+        assert 50 < expected.sum() < 250
         assert np.array_equal(g.ok, expected)
         assert close(g.eta, naive.svf(limited, 0, 10.0, 4, 100.0, "zoh"))
 

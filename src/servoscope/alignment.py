@@ -123,7 +123,7 @@ def _described(d: FloatArray, J: FloatArray, configured: float, independent: flo
     # Likelihood ratio: N log(J / J_min) = chi^2 at the ends of the interval.
     level = least * math.exp(CHI2_95 / max(independent, 1.0))
     samples = float(d[best] + offset)
-    below = np.flatnonzero(J <= level)
+    below = np.flatnonzero(level >= J)
     half = math.sqrt(2.0 * (level - least) / max(curvature, PARABOLA * least))
     low = min(samples - half, float(d[below[0]])) if below.size else samples - half
     high = max(samples + half, float(d[below[-1]])) if below.size else samples + half

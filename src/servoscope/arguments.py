@@ -4,18 +4,32 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from servoscope.errors import OutputError, ServoscopeError
+from servoscope.errors import OutputError, RecordingError, ServoscopeError
 
 if TYPE_CHECKING:
-    from servoscope.loop import Columns
+    from servoscope.baseline import Baseline
+    from servoscope.loop import Columns, Loop
+    from servoscope.readers import ChannelInfo
+    from servoscope.recording import Recording
     from servoscope.simulation import FaultEvent
 
-__all__ = ["Outputs", "check_output", "columns_from", "conditions", "fault_events", "stem_of"]
+__all__ = [
+    "Outputs",
+    "Source",
+    "check_output",
+    "columns_from",
+    "conditions",
+    "fault_events",
+    "no_mapping",
+    "provenance",
+    "stem_of",
+]
 
 
 def conditions(texts: Sequence[str]) -> dict[str, str]:
@@ -57,6 +71,53 @@ def columns_from(text: str | None, base: Columns | None = None) -> Columns | Non
         return parse_columns(text, base)
     except ServoscopeError as error:
         raise typer.BadParameter(f"--{error}; as in --columns 't=Time, r=Ref, u=2 * Current, y=Pos'") from None
+
+
+@dataclass(frozen=True)
+class Source:
+    """How the recordings of one command are read: the loop, ``--columns``, ``--where`` and ``--by``."""
+
+    loop: Loop | None
+    columns: Columns | None
+    where: dict[str, str]
+    by: str | None
+
+    @classmethod
+    def of(cls, loop: Loop | None, columns: str | None, where: Sequence[str] | None, by: str | None) -> Source:
+        """Read the options.
+
+        Raises
+        ------
+        typer.BadParameter
+            If one of them cannot be read.
+        """
+        mapping = columns_from(columns, loop.columns if loop is not None else None)
+        return cls(loop, mapping, conditions(where or ()), by)
+
+    def read(self, path: Path) -> list[Recording]:
+        """Return the recordings in a file: one, or one per value of the column in ``--by``.
+
+        Raises
+        ------
+        RecordingError, LoopError
+            If the file cannot be used.
+        """
+        from servoscope import readers
+
+        return readers.read_parts(path, self.loop, columns=self.columns, where=self.where, by=self.by)
+
+    def many(self, paths: Sequence[Path]) -> bool:
+        """Return whether several recordings are to be expected."""
+        return len(paths) > 1 or self.by is not None
+
+    def unmapped(self, path: Path) -> list[ChannelInfo]:
+        """Return the columns of a file whose mapping nobody gave and that has not all of t, r, u and y; else none."""
+        from servoscope import readers
+
+        if self.loop is not None or self.columns is not None:
+            return []
+        found = readers.channels(path)
+        return found if {"t", "r", "u", "y"} - {channel.name for channel in found} else []
 
 
 def fault_events(texts: Sequence[str]) -> list[FaultEvent]:
@@ -146,6 +207,11 @@ class Outputs:
         self._in_folder = wanted.is_dir() or not wanted.suffix
         self._used: set[str] = set()
 
+    @classmethod
+    def of(cls, wanted: Path | None, suffix: str, many: bool, inputs: Sequence[Path]) -> Outputs | None:
+        """Return where results go; None if none are wanted."""
+        return None if wanted is None else cls(wanted, suffix, many, inputs)
+
     def path(self, stem: str) -> Path:
         """Return the file for the next recording; makes the folder if there is to be one.
 
@@ -173,3 +239,27 @@ class Outputs:
         if any(_same(found, each) for each in self.inputs):
             raise OutputError(f"{found}: is one of the inputs and would be overwritten, name another folder or file")
         return found
+
+
+def no_mapping(path: Path) -> RecordingError:
+    """Return the error that asks for a mapping."""
+    example = "--columns 't=..., r=..., u=..., y=...'"
+    return RecordingError(f"{path.name}: has no columns t, r, u and y: say which they are with {example}, or give --loop")
+
+
+def provenance(baseline: Baseline, file: Path, recording: Path) -> dict[str, str]:
+    """Return where a diagnosis comes from, line by line, for its report."""
+    from datetime import UTC, datetime
+
+    from servoscope import __version__
+
+    sources = [source.name for source in baseline.sources]
+    more = f" and {len(sources) - 5} more" if len(sources) > 6 else ""
+    return {
+        "recording": str(recording),
+        "baseline": f"{file} ({baseline.hash})",
+        "learned from": ", ".join(sources if not more else sources[:5]) + more,
+        "threshold": f"{baseline.limit:.4g}",
+        "made with": f"servoscope {__version__}",
+        "made at": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    }

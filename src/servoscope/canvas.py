@@ -1,9 +1,11 @@
-"""What pictures are drawn with: colours, envelopes of long signals, ranges without outliers, SVG for a page, files."""
+"""What pictures are drawn with: colours, envelopes of long signals, ranges of axes, SVG for a page, files."""
 
 from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,11 @@ from servoscope.errors import OutputError
 from servoscope.output import atomic_write
 from servoscope.plants import FloatArray
 
-__all__ = ["COLOURS", "STYLE", "BoolArray", "envelope", "robust_range", "save", "spans_on", "svg"]
+__all__ = ["COLOURS", "STYLE", "BoolArray", "envelope", "robust_range", "save", "spans_on", "styled", "svg"]
 
 BoolArray = npt.NDArray[np.bool_]
 
-# Blue is measured, grey is expected, orange is alarm: told apart by all common kinds of colour vision, and in grey.
+# Blue is measured, grey is expected, orange is alarm: told apart by every common kind of colour vision.
 COLOURS = {
     "paper": "#ffffff",
     "ink": "#1c2530",
@@ -64,13 +66,29 @@ COLUMNS = 1200  # of an envelope
 FORMATS = ("svg", "png", "pdf")
 
 
+@contextmanager
+def styled(fonttype: str = "path") -> Iterator[None]:
+    """Let our style alone count within, whatever the user's matplotlibrc says, and give theirs back afterwards.
+
+    Parameters
+    ----------
+    fonttype
+        Whether SVG holds text as shapes ("path") or as text ("none").
+    """
+    parameters: Any = matplotlib.rcParams  # which keys its type knows depends on the release
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        parameters.update(STYLE | {"svg.fonttype": fonttype})
+        yield
+
+
 def envelope(
     t: FloatArray, x: FloatArray, restart: BoolArray | None = None, columns: int = COLUMNS
 ) -> tuple[FloatArray, FloatArray]:
     """Return a line that looks like x(t) with at most about three points per column.
 
-    Short signals are returned as they are, long ones as the smallest and largest value in each column of time. NaN
-    breaks the line where it restarts.
+    Short signals are returned as they are, long ones as the smallest and largest value in each column of time.
+    NaN breaks the line where it restarts.
 
     Parameters
     ----------
@@ -101,8 +119,10 @@ def envelope(
     return np.insert(times, at, times[at]), np.insert(pairs, at, np.nan)
 
 
-def spans_on(t: FloatArray, low: FloatArray, high: FloatArray, most: int = COLUMNS) -> list[tuple[float, float]]:
-    """Return the spans low to high, shape (M,); where there are many, those that a picture would show as one joined.
+def spans_on(
+    t: FloatArray, low: FloatArray, high: FloatArray, most: int = COLUMNS
+) -> list[tuple[float, float]]:
+    """Return the spans low to high; where there are many, those that a picture would show as one are joined.
 
     Parameters
     ----------
@@ -144,8 +164,8 @@ def robust_range(values: FloatArray, always: FloatArray | None = None) -> tuple[
 def svg(figure: Figure, name: str) -> str:
     """Return a figure as an ``<svg>`` element for a page that may hold several.
 
-    Text stays text in the page's own font, colours become the page's (``var(--ink)``, ...), ids begin with `name`, and
-    nothing refers to anything outside.
+    Text stays text in the page's own font, colours become the page's (``var(--ink)``, ...), ids begin with
+    `name`, and nothing refers to anything outside.
     """
     text = _rendered(figure, "svg", fonttype="none").decode()
     text = text[text.index("<svg") :]
@@ -178,17 +198,14 @@ def save(figure: Figure, path: str | Path) -> None:
     """
     kind = Path(path).suffix.lower().removeprefix(".")
     if kind not in FORMATS:
-        raise OutputError(f"{path}: a figure is written as .svg, .png or .pdf, give the name one of these endings")
+        raise OutputError(f"{path}: a figure is written as .svg, .png or .pdf, let its name end so")
     atomic_write(path, _rendered(figure, kind, fonttype="path"))
 
 
 def _rendered(figure: Figure, kind: str, *, fonttype: str) -> bytes:
     buffer = io.BytesIO()
     metadata = {"svg": {"Date": None}, "png": {}, "pdf": {"CreationDate": None}}[kind]
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(STYLE)
-        matplotlib.rcParams["svg.fonttype"] = fonttype
+    with styled(fonttype):
         face = "none" if fonttype == "none" else "white"
         figure.savefig(buffer, format=kind, facecolor=face, dpi=150, metadata=metadata)
     return buffer.getvalue()

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import io
+import shlex
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+import typer
+from rich.text import Text
+
 from servoscope.errors import OutputError
 from servoscope.output import atomic_write
+from servoscope.progress import on_compiling
 
-__all__ = ["Step", "prepare", "steps"]
+__all__ = ["Step", "prepare", "show", "steps"]
 
 
 @dataclass(frozen=True)
@@ -81,3 +89,52 @@ def steps(folder: Path) -> tuple[Step, ...]:
             folder / "diagnosis.json",
         ),
     )
+
+
+def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
+    """Run the demonstration and print each command, what it says and what to open.
+
+    Parameters
+    ----------
+    folder
+        Where the files go.
+    run
+        Runs a command; returns its exit code, or None for 0.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written.
+    """
+    from servoscope import terminal
+    from servoscope.diagnosis import Diagnosis
+
+    prepare(folder)
+    out = terminal.console()
+    told: list[bool] = []
+
+    def compiling() -> None:
+        if not told:
+            out.print(Text("  compiling, once: the next time this starts at once", style="dim"))
+        told.append(True)
+
+    with on_compiling(compiling):
+        for step in steps(folder):
+            into = f" > {shlex.quote(str(step.into))}" if step.into is not None else ""
+            out.print(Text(step.words, style="bold"))
+            out.print(Text(f"$ servoscope {shlex.join(step.arguments)}{into}", style="cyan"), soft_wrap=True)
+            if step.into is None:
+                _checked(run(step.arguments))
+            else:
+                said = io.StringIO()
+                with redirect_stdout(said):
+                    _checked(run(step.arguments))
+                atomic_write(step.into, said.getvalue().encode())
+                terminal.diagnosis(out, Diagnosis.model_validate_json(said.getvalue()))
+            out.print()
+    out.print(Text(f"Open {folder / 'report.html'} in a browser; {folder / 'loop.toml'} describes the rig."), soft_wrap=True)
+
+
+def _checked(code: object) -> None:
+    if code:  # the command has said why
+        raise typer.Exit(int(str(code)))

@@ -48,7 +48,7 @@ class Band(Said):
 
 
 class Excited(Said):
-    """One monitored frequency.
+    """One monitored frequency, with the coherences of r -> u and r -> y around it.
 
     `snr` is the power that follows r over the power that does not, the smaller of u and y; `relative_std` that of
     the iFRF after the whole recording, `relative_std_memory` that after the estimator's memory, both None where the
@@ -63,11 +63,24 @@ class Excited(Said):
     relative_std_memory: float | None
 
 
-def spectra(recording: Recording) -> Spectra | None:
-    """Estimate spectra within the stretches between gaps; None where too little is left of them."""
+def spectra(recording: Recording, period: int | None = None) -> Spectra | None:
+    """Estimate spectra within the stretches between gaps; None where too little is left of them.
+
+    Parameters
+    ----------
+    recording
+        The recording.
+    period
+        Of the reference, in samples: segments of that length keep the power of its lines from leaking between
+        them, where it would look like noise.
+    """
     starts = np.flatnonzero(recording.restart)
     stretches = list(zip(starts, np.append(starts[1:], recording.samples), strict=True))
-    length = _length(np.array([stop - start for start, stop in stretches]), recording.samples)
+    sizes = np.array([stop - start for start, stop in stretches])
+    length = _length(sizes, recording.samples)
+    whole = (period or 0) * max(1, length // (period or 1))
+    if whole >= 16 and sum(max(0, 2 * (size // whole) - 1) for size in sizes) >= LEAST_SEGMENTS:
+        length = whole
     if length < 16:
         return None
     window = np.hanning(length + 1)[:-1]
@@ -130,7 +143,7 @@ def information_edge(s: Spectra, noise: float, sample_rate: float) -> float:
     sample_rate
         In Hz.
     """
-    clear = s.Y > 10.0 * 2.0 * noise**2 / sample_rate
+    clear = 10.0 * 2.0 * noise**2 / sample_rate < s.Y
     # Lines that fail one by one, between those of a multisine, do not end it.
     share = np.cumsum(clear) / np.arange(1, clear.size + 1)
     good = np.flatnonzero(clear & (share >= 0.5))

@@ -6,21 +6,19 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import ParamSpec
 
-import matplotlib
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from servoscope.canvas import COLOURS, STYLE, BoolArray, envelope, robust_range, spans_on
+from servoscope.canvas import COLOURS, BoolArray, envelope, robust_range, save, spans_on
 from servoscope.diagnosis import Diagnosis, Trace
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 from servoscope.wording import axis_scale, plain_symbol, times
 
-__all__ = ["coefficients", "ifrf", "signals", "statistic"]
+__all__ = ["coefficients", "ifrf", "save", "signals", "statistic"]
 
 WIDTH = 9.0  # inches; the page scales pictures to its own width
 MOST_POINTS = 1500  # of a path in the complex plane
@@ -36,9 +34,7 @@ def _styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
     @wraps(draw)
     def styled(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with matplotlib.rc_context():
-            matplotlib.rcdefaults()
-            matplotlib.rcParams.update(STYLE)
+        with styled():
             return draw(*args, **kwargs)
 
     return styled
@@ -63,11 +59,11 @@ def signals(
     axes = figure.subplots(3, 1, sharex=True, height_ratios=[3, 2, 3])
     unit, factor = times(recording.duration_s)
     t = recording.t / factor
-    error = recording.r - recording.y
-    rows: tuple[tuple[str, str, tuple[tuple[FloatArray, str, str], ...]], ...] = (
-        ("r, y", units[0], ((recording.r, REFERENCE, "reference r"), (recording.y, MEASURED, "output y"))),
-        ("r − y", units[0], ((error, INK, "tracking error r − y"),)),
-        ("u", units[1], ((recording.u, MEASURED, "input u"),)),
+    both = ((recording.r, REFERENCE, "reference r"), (recording.y, MEASURED, "output y"))
+    rows = (
+        ("r, y", units[0], both),
+        ("r − y", units[0], ((recording.r - recording.y, INK, ""),)),
+        ("u", units[1], ((recording.u, MEASURED, ""),)),
     )
     for ax, (label, of, lines) in zip(axes, rows, strict=True):
         prefix, scale = axis_scale([x for x, _, _ in lines], of)
@@ -78,8 +74,11 @@ def signals(
         ax.set_ylabel(f"{label} [{prefix}]" if prefix else label)
         _gaps(ax, t, recording.restart, 1.5 / recording.sample_rate / factor)
         _marks(ax, diagnosis, factor)
-    lines_ = [Line2D([], [], color=c, linewidth=w, label=label) for (_, c, label), w in zip(rows[0][2], (2.6, 1.2), strict=True)]
-    _legend_above(axes[0], diagnosis, lines_)
+    two = [
+        Line2D([], [], color=c, linewidth=w, label=words)
+        for (_, c, words), w in zip(both, (2.6, 1.2), strict=True)
+    ]
+    _legend_above(figure, diagnosis, two)
     axes[0].margins(x=0.0)
     axes[-1].set_xlabel(f"time [{unit}]")
     return figure
@@ -114,7 +113,7 @@ def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
         Line2D([], [], color=MEASURED, label="statistic T²"),
         Line2D([], [], color=ALARM, linestyle=(0, (5, 2.5)), label=f"threshold {trace.threshold:.3g}"),
     ]
-    _legend_above(ax, diagnosis, lines)
+    _legend_above(figure, diagnosis, lines)
     return figure
 
 
@@ -182,16 +181,18 @@ def _coefficient(ax: Axes, trace: Trace, i: int, factor: float) -> None:
 def ifrf(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     """Draw the iFRF in the complex plane, one panel per frequency: path over time, last estimate, healthy.
 
-    Ellipses hold 95 %. The axes of a panel are scaled each on its own, for the iFRF moves far less one way than the
-    other as a rule.
+    Ellipses hold 95 %. The axes of a panel are scaled each on its own: as a rule the iFRF moves far less one way
+    than the other.
     """
     F = len(trace.ifrf.frequencies)
     columns = max(1, min(F, 4 if F in (4, 7, 8) else 3))
     rows = max(1, -(-F // columns))
-    figure = Figure(figsize=(WIDTH, 0.5 + 8.4 / columns * (0.95 if columns > 1 else 0.45) * rows), layout="constrained")
+    height = 8.0 / columns if columns > 1 else 4.0
+    figure = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     usable = trace.ready & np.isfinite(trace.theta).all(axis=1)
     onset = diagnosis.onset_s[1] if diagnosis is not None and diagnosis.onset_s is not None else np.inf
+    faulty = bool(np.isfinite(onset))
     for i, ax in enumerate(axes.flat):
         if i < F:
             ax.set_title(f"{trace.ifrf.frequencies[i]:g} Hz", loc="left", fontweight="bold")
@@ -203,10 +204,12 @@ def ifrf(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
             ax.set_axis_off()
     handles = [
         _marker("D", PAPER, INK, "healthy expectation"),
-        _marker("o", ALARM if np.isfinite(onset) else MEASURED, PAPER, "last estimate; ellipses hold 95 %"),
-        Line2D([], [], color=MEASURED, alpha=0.5, label="path before onset" if np.isfinite(onset) else "path"),
+        _marker("o", ALARM if faulty else MEASURED, PAPER, "last estimate; ellipses hold 95 %"),
+        Line2D(
+            [], [], color=MEASURED, alpha=0.5, label="path before onset" if np.isfinite(onset) else "path"
+        ),
     ]
-    if np.isfinite(onset):
+    if faulty:
         handles.append(Line2D([], [], color=ALARM, alpha=0.5, label="path after onset"))
     figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))
     return figure
@@ -232,12 +235,14 @@ def _plane(ax: Axes, trace: Trace, i: int, usable: BoolArray, onset: float) -> N
         if not np.isfinite(H):
             continue
         if np.isfinite(covariance).all():
-            outline = type(response)(response.frequencies[i : i + 1], H[None], covariance[None]).ellipse(96)[0]
+            outline = type(response)(response.frequencies[i : i + 1], H[None], covariance[None]).ellipse(96)[
+                0
+            ]
             ax.fill(*outline.T, facecolor=colour, alpha=alpha, linewidth=0)
             ax.plot(*outline.T, color=colour, linewidth=1.1)
             shown.append(outline)
-        style = {"facecolor": PAPER if marker == "D" else colour, "edgecolor": INK if marker == "D" else PAPER}
-        ax.scatter(H.real, H.imag, 32.0, marker=marker, linewidth=1.1, zorder=4, **style)
+        face, edge = (PAPER, INK) if marker == "D" else (colour, PAPER)
+        ax.plot(H.real, H.imag, marker, markersize=5.5, mfc=face, mec=edge, zorder=4)
         shown.append(np.array([[H.real, H.imag]]))
     certain = np.vstack(shown[1:]) if len(shown) > 1 else shown[0]
     ax.set_xlim(robust_range(shown[0][:, 0], certain[:, 0]))
@@ -268,7 +273,9 @@ def _marks(ax: Axes, diagnosis: Diagnosis | None, factor: float) -> None:
         ax.axvspan(low, high, facecolor=ALARM, edgecolor=ALARM, linewidth=0.5, alpha=0.22, zorder=0)
         ax.axvline(likely, color=ALARM, linewidth=1.0, alpha=0.8, zorder=1)
     if diagnosis.detected_at_s is not None:
-        ax.axvline(diagnosis.detected_at_s / factor, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), zorder=2)
+        ax.axvline(
+            diagnosis.detected_at_s / factor, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), zorder=2
+        )
 
 
 def _mark_handles(diagnosis: Diagnosis | None) -> list[Line2D | Patch]:
@@ -280,9 +287,9 @@ def _mark_handles(diagnosis: Diagnosis | None) -> list[Line2D | Patch]:
     return handles
 
 
-def _legend_above(ax: Axes, diagnosis: Diagnosis | None, lines: Sequence[Line2D]) -> None:
+def _legend_above(figure: Figure, diagnosis: Diagnosis | None, lines: Sequence[Line2D | Patch]) -> None:
     handles = [*lines, *_mark_handles(diagnosis)]
-    ax.figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))  # type: ignore[union-attr]
+    figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))
 
 
 def _empty(ax: Axes, words: str) -> None:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from servoscope.errors import LoopError
 from servoscope.linear import Linear, sampled, settling, stack, state_variable_filter, taps
 from servoscope.loop import Loop
-from servoscope.plants import FloatArray
+from servoscope.plants import FloatArray, Plant
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -122,35 +122,48 @@ def nominal_theta(loop: Loop) -> FloatArray:
     return theta if loop.monitor.structure == "svf" else tustin_coefficients(theta, loop.sample_rate)
 
 
-def nominal_closed_loop(loop: Loop) -> Linear:
-    """Build r -> y of the nominal closed loop without noise: exact ZOH plant, PI controller, delay.
+def closed_loop(loop: Loop, plant: Plant) -> Linear:
+    """Build the sampled closed loop [r, n_u, n_y] -> [u, y as measured]: exact plant, PI controller, delay.
 
     Raises
     ------
     LoopError
-        If the loop has no controller or the plant no nominal values, or if the nominal loop is unstable.
+        If the loop has no controller or the plant no nominal values, or if the loop is unstable with this plant.
     """
-    if loop.controller is None or not loop.plant.has_physics:
+    if loop.controller is None or not plant.has_physics:
         raise LoopError(f"{loop.name}: the nominal closed loop needs [controller] and the plant's nominal values")
     dt = 1.0 / loop.sample_rate
-    plant = sampled(loop.plant.state_space(), loop.sample_rate, loop.hold, loop.delay)
+    G = sampled(plant.state_space(), loop.sample_rate, loop.hold, loop.delay)
     k_p, k_i = loop.controller.k_p, loop.controller.k_i
-    n = len(plant.A)
-    # states [x, s], s the sum of past errors; with y = c x + d u and u = gain e + k_i s, both follow from
-    # one linear equation: e = (r - c x - d k_i s) / (1 + d gain)
-    gain, d = k_p + k_i * dt, float(plant.D[0, 0])
-    b, c = plant.B[:, 0], plant.C[0]
-    e = np.concatenate([-c, [-d * k_i, 1.0]]) / (1.0 + d * gain)  # on [x, s, r]
-    u = gain * e
-    u[n] += k_i
-    y = np.concatenate([c, [0.0, 0.0]]) + d * u
-    x_next = np.hstack([plant.A, np.zeros((n, 2))]) + np.outer(b, u)
-    s_next = dt * e
-    s_next[n] += 1.0
-    both = np.vstack([x_next, s_next])
+    n = len(G.A)
+    # states [x, s], s the sum of past errors; rows below act on [x, s, r, n_u, n_y]. With y = c x + d (u + n_u) + n_y
+    # and u = gain e + k_i s, the error follows from one linear equation.
+    gain, d = k_p + k_i * dt, float(G.D[0, 0])
+    identity = np.eye(n + 4)
+    s, r, n_u, n_y = identity[n:]
+    output = np.zeros(n + 4)
+    output[:n] = G.C[0]
+    e = (r - output - d * n_u - n_y - d * k_i * s) / (1.0 + d * gain)
+    u = gain * e + k_i * s
+    y = output + d * (u + n_u) + n_y
+    x_next = np.hstack([G.A, np.zeros((n, 4))]) + np.outer(G.B[:, 0], u + n_u)
+    both = np.vstack([x_next, s + dt * e])
     if np.abs(np.linalg.eigvals(both[:, : n + 1])).max() >= 1.0:
-        raise LoopError(f"{loop.name}: the nominal closed loop is unstable, check [plant] and [controller]")
-    return Linear(both[:, : n + 1], both[:, n + 1 :], y[None, : n + 1], y[None, n + 1 :])
+        raise LoopError(f"{loop.name}: the closed loop is unstable, check [plant] and [controller]")
+    outputs = np.vstack([u, y])
+    return Linear(both[:, : n + 1], both[:, n + 1 :], outputs[:, : n + 1], outputs[:, n + 1 :])
+
+
+def instrument_of(loop: Loop) -> Linear:
+    """Return r -> y of the nominal closed loop without noise, the instrument of THEORY section 5.
+
+    Raises
+    ------
+    LoopError
+        As `closed_loop`.
+    """
+    whole = closed_loop(loop, loop.plant)
+    return Linear(whole.A, whole.B[:, :1], whole.C[1:], whole.D[1:, :1])
 
 
 def cutoff_of(loop: Loop) -> float:

@@ -13,6 +13,7 @@ from servoscope.plants import Fault, FloatArray
 
 GRID = 17  # points along a signature before the minimum is refined
 MISFIT = 1e-3  # probability with which the true fault may fit worse than the limit
+HOPELESS = 200.0  # excess misfit from which a signature is not refined
 SYSTEMATIC = 2e-3  # share of a signature that nominal parameters and intersample models may be off by
 
 
@@ -93,12 +94,14 @@ def isolate(
 
     n = len(deviation)
     limit = float(stats.chi2.isf(MISFIT, max(n - 1, 1)))
+    searches = [_Search(signature, deviation, covariance) for signature in signatures]
+    coarse = [search.coarse() for search in searches]
     fitted = []
-    for signature in signatures:
-        found = _fit(signature, deviation, covariance)
+    for search, misfit in zip(searches, coarse, strict=True):
         progress()
-        if found is not None:
-            fitted.append(found)
+        if np.isfinite(misfit):
+            # what misses by far even on the grid needs no fine integral: its probability is zero either way
+            fitted.append(search.fit(fine=misfit < min(coarse) + HOPELESS))
     if not fitted:
         return (Candidate(name=UNKNOWN, probability=1.0),)
     closest = min(fitted, key=lambda found: found.misfit)
@@ -125,55 +128,65 @@ def isolate(
     return tuple(sorted(candidates, key=lambda candidate: -candidate.probability))
 
 
-def _fit(signature: Signature, deviation: FloatArray, covariance: FloatArray) -> _Fitted | None:
-    from scipy import optimize
+class _Search:
+    """J along one signature, each point computed once."""
 
-    size = np.sqrt(np.diag(covariance))
-    scaled = deviation / size
-    correlation = covariance / np.outer(size, size)
+    def __init__(self, signature: Signature, deviation: FloatArray, covariance: FloatArray) -> None:
+        self.signature = signature
+        self.size = np.sqrt(np.diag(covariance))
+        self.scaled = deviation / self.size
+        self.correlation = covariance / np.outer(self.size, self.size)
+        self.known: dict[float, tuple[float, float]] = {}
 
-    def cost(x: float) -> tuple[float, float]:
+    def J(self, x: float) -> float:
+        """Return the misfit at a coordinate; infinite where the loop would be unstable."""
+        if x not in self.known:
+            self.known[x] = self._compute(x)
+        return self.known[x][0]
+
+    def _compute(self, x: float) -> tuple[float, float]:
         try:
-            s = signature.shift(x) / size
-        except SimulationError:  # unstable at this size: nobody could have recorded it
+            s = self.signature.shift(x) / self.size
+        except SimulationError:  # nobody could have recorded it
             return np.inf, 0.0
-        Sigma = correlation + np.diag((SYSTEMATIC * s) ** 2 + 1e-12)
-        J = float((scaled - s) @ np.linalg.solve(Sigma, scaled - s))
+        Sigma = self.correlation + np.diag((SYSTEMATIC * s) ** 2 + 1e-12)
+        J = float((self.scaled - s) @ np.linalg.solve(Sigma, self.scaled - s))
         return J, float(np.linalg.slogdet(Sigma)[1])
 
-    known: dict[float, tuple[float, float]] = {}
+    def coarse(self) -> float:
+        """Return the smallest misfit on the grid."""
+        grid = np.linspace(self.signature.low, self.signature.high, GRID)
+        return min(self.J(float(x)) for x in grid)
 
-    def J(x: float) -> float:
-        if x not in known:
-            known[x] = cost(x)
-        return known[x][0]
+    def fit(self, fine: bool) -> _Fitted:
+        """Refine the minimum and integrate over the prior."""
+        from scipy import optimize
 
-    grid = np.linspace(signature.low, signature.high, GRID)
-    values = np.array([J(float(x)) for x in grid])
-    if not np.isfinite(values).any():
-        return None
-    i = int(np.argmin(values))
-    bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
-    width = bracket[1] - bracket[0]
-    best = float(optimize.minimize_scalar(J, bounds=bracket, method="bounded", options={"xatol": 1e-4 * width}).x)
-    if J(best) > values[i]:
-        best = float(grid[i])
-    # a parabola through the minimum says how wide to look; the integral itself uses the true curve
-    h = 1e-2 * width
-    left, right = max(best - h, signature.low), min(best + h, signature.high)
-    slope = max((J(left) - J(best)) / max(best - left, 1e-12) + (J(right) - J(best)) / max(right - best, 1e-12), 1e-12)
-    sigma = min(np.sqrt(2.0 * (right - left) / 2.0 / slope), signature.high - signature.low)
-    for x in best + sigma * np.linspace(-4.0, 4.0, 17):
-        J(float(np.clip(x, signature.low, signature.high)))
-    x = np.array(sorted(known))
-    J_x, logdet = np.array([known[float(value)] for value in x]).T
-    log_weight = -(J_x + logdet) / 2.0
-    top = log_weight.max()
-    # fine enough for a smooth posterior between the points that were simulated
-    fine = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in zip(x[:-1], x[1:], strict=True)]))
-    finite = np.maximum(log_weight, top - 1e4)
-    density = np.exp(np.interp(fine, x, finite) - top)
-    area = np.concatenate([[0.0], np.cumsum(np.diff(fine) * (density[1:] + density[:-1]) / 2.0)])
-    low, high = np.interp([0.025, 0.975], area / area[-1], fine)
-    evidence = float(top + np.log(area[-1] / (signature.high - signature.low)))
-    return _Fitted(signature, J(best), evidence, best, float(low), float(high))
+        signature = self.signature
+        grid = np.array(sorted(self.known))
+        i = int(np.argmin([self.J(float(x)) for x in grid]))
+        bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
+        width = bracket[1] - bracket[0]
+        steps = {"xatol": 1e-4 * width, "maxiter": 40 if fine else 8}
+        optimize.minimize_scalar(self.J, bounds=bracket, method="bounded", options=steps)
+        best = min(self.known, key=lambda x: self.known[x][0])
+        if fine:
+            # a parabola through the minimum says how wide to look; the integral itself uses the true curve
+            h = 1e-2 * width
+            left, right = max(best - h, signature.low), min(best + h, signature.high)
+            rise = [(self.J(x) - self.J(best)) / max(abs(x - best), 1e-12) for x in (left, right)]
+            curvature = max(sum(rise) / (right - left), 1e-12)
+            reach = min(4.0 / np.sqrt(curvature), signature.high - signature.low)
+            for x in best + reach * np.linspace(-1.0, 1.0, 17):
+                self.J(float(np.clip(x, signature.low, signature.high)))
+        x = np.array(sorted(self.known))
+        J, logdet = np.array([self.known[float(value)] for value in x]).T
+        log_weight = -(J + logdet) / 2.0
+        top = float(log_weight.max())
+        # fine enough for a smooth posterior between the points that were simulated
+        dense = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in zip(x[:-1], x[1:], strict=True)]))
+        density = np.exp(np.interp(dense, x, np.maximum(log_weight, top - 1e4)) - top)
+        area = np.concatenate([[0.0], np.cumsum(np.diff(dense) * (density[1:] + density[:-1]) / 2.0)])
+        low, high = np.interp([0.025, 0.975], area / area[-1], dense)
+        evidence = top + float(np.log(area[-1] / (signature.high - signature.low)))
+        return _Fitted(signature, self.known[best][0], evidence, best, float(low), float(high))

@@ -11,11 +11,12 @@ from servoscope.baseline import Baseline, Promise, Source, digest
 from servoscope.detection import SECONDS_PER_YEAR, noncentrality, required_noncentrality, statistic, threshold
 from servoscope.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.inverse import nominal_theta
+from servoscope.linear import Linear, autocovariances
 from servoscope.loop import Loop
 from servoscope.pipeline import Estimates, Pipeline, Regression
 from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
-from servoscope.signatures import Expectation, Noise, course
+from servoscope.signatures import Expectation, Noise, course, noise_system
 from servoscope.simulation import reference, simulate
 from servoscope.tuning import Fit, autocovariance, fit, least_squares
 
@@ -200,16 +201,18 @@ def _noise(pipeline: Pipeline, found: Fit, regressions: Sequence[Regression]) ->
     from scipy.optimize import nnls
 
     lags = 20
-    theta = nominal_theta(pipeline.loop)
-    columns = []
-    for u_std, y_std in ((1.0, 0.0), (0.0, 1.0)):
-        quiet, _ = simulate(pipeline.loop, np.zeros(20_000), noise_u_std=u_std, noise_y_std=y_std, seed=11)
-        g = pipeline.regression(quiet.r, quiet.u, quiet.y, quiet.restart)
-        columns.append(autocovariance([(g.eta - g.phi @ theta)[g.ok]], lags))
+    n = pipeline.bank.n
+    residual = np.concatenate([[1.0], -nominal_theta(pipeline.loop)])  # v = eta - phi' theta
+    system = noise_system(pipeline, pipeline.loop.plant)
+    v = Linear(system.A, system.B, residual @ system.C[None, : 1 + n], residual @ system.D[None, : 1 + n])
+    columns = [
+        autocovariances(Linear(v.A, v.B[:, [i]], v.C, v.D[:, [i]]), lags, pipeline.stride)[:, 0, 0] for i in (0, 1)
+    ]
     measured = autocovariance([(g.eta - g.phi @ found.tuning.theta)[g.ok] for g in regressions], lags)
     size = np.array([column[0] for column in columns])
     shares, _ = nnls(np.column_stack(columns) / size, measured)
-    return Noise(*np.sqrt(shares / size).tolist())
+    u_std, y_std = np.sqrt(shares / size).tolist()
+    return Noise(u_std=u_std, y_std=y_std)
 
 
 def _healthy_parameters(

@@ -59,7 +59,10 @@ def on_grid(recording: Recording, x: FloatArray, mask: BoolArray) -> tuple[Float
 def correlations(x: FloatArray, there: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Return the autocovariance of x at all lags and the number of pairs behind each, both shape (N,)."""
     length = 1 << (2 * x.size - 1).bit_length()
-    spectrum, presence = np.fft.rfft(np.where(there, x, 0.0), length), np.fft.rfft(there.astype(np.float64), length)
+    spectrum, presence = (
+        np.fft.rfft(np.where(there, x, 0.0), length),
+        np.fft.rfft(there.astype(np.float64), length),
+    )
     sums = np.fft.irfft(np.abs(spectrum) ** 2, length)[: x.size]
     pairs = np.round(np.fft.irfft(np.abs(presence) ** 2, length)[: x.size])
     return sums / np.maximum(pairs, 1.0), pairs
@@ -101,7 +104,7 @@ def effective(rho: FloatArray, rows: int, memory: int) -> float:
 
 
 def describe(
-    recording: Recording, v: FloatArray, eta: FloatArray, used: BoolArray, memory: int
+    recording: Recording, v: FloatArray, eta: FloatArray, used: BoolArray, memory: int, period: int | None
 ) -> tuple[Residual, float, FloatArray]:
     """Judge a residual.
 
@@ -115,6 +118,8 @@ def describe(
         Rows that count, shape (N,).
     memory
         Samples over which the filters alone make residuals hang together.
+    period
+        Of the reference, in samples, from `period_of`.
 
     Returns
     -------
@@ -136,7 +141,6 @@ def describe(
 
         Q = float((pairs[lags] * rho[lags] ** 2).sum()) / inflation
         p_value = float(chi2.sf(Q, lags.size))
-    period = period_of(recording)
     repeating = std = None
     if period is not None and period >= memory:
         multiples = np.arange(period, rho.size - period // 2, period)
@@ -147,7 +151,7 @@ def describe(
             std = math.sqrt(inflation / float(weight.sum()))
     relative = math.sqrt(variance / max(float(eta[used].var()), np.finfo(np.float64).tiny))
     far = float(np.median(np.abs(rho[memory : 3 * memory]))) if rho.size > 3 * memory else 0.0
-    structured = (max(repeating - 2.0 * (std or 0.0), 0.0) if repeating is not None else far)
+    structured = max(repeating - 2.0 * (std or 0.0), 0.0) if repeating is not None else far
     if p_value is not None and p_value > SIGNIFICANT and repeating is None:
         structured = 0.0
     reach = min(rho.size, 50 * memory)

@@ -261,3 +261,28 @@ def _edge(u: FloatArray, moving: BoolArray, expected: float) -> float | None:
     if reach < 2 or edge < 3.0 * expected or not outside.size or outside.mean() < MOSTLY:
         return None
     return edge
+
+
+def swapped(recording: Recording) -> str | None:
+    """Say in words why u and y seem to be swapped; None if they do not."""
+    r, u, y = recording.r, recording.u, recording.y
+    scale = float(np.std(r))
+    if not scale > 0.0:
+        return None
+    of_u, of_y = float(np.std(u - r)), float(np.std(y - r))
+    if of_u < 0.5 * scale and of_u < 0.5 * of_y:
+        return "u follows the reference in its own units and y does not"
+    if np.std(u) == 0.0 or np.std(y) == 0.0:
+        return None
+    follows_u, follows_y = (abs(float(np.corrcoef(r, x)[0, 1])) for x in (u, y))
+    rough_u, rough_y = (float(np.std(np.diff(x)) / np.std(x)) for x in (u, y))
+    if follows_u > 0.98 and follows_y < 0.9 and rough_u < 0.5 * rough_y:
+        return f"u goes with the reference (correlation {follows_u:.3f}, y {follows_y:.3f}) and is the smoother of the two"
+    return None
+
+
+def percent(share: float) -> str:
+    """Say a share in words: 99.3 %, and 99.97 % rather than 100 %."""
+    left = 1.0 - share
+    digits = 1 if left > 0.01 or left <= 0.0 else min(int(np.ceil(-np.log10(left))) - 1, 6)
+    return f"{100.0 * max(share, 0.0):.{digits}f} %"

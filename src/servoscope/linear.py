@@ -66,6 +66,42 @@ class Linear:
         return v
 
 
+def autocovariances(system: Linear, lags: int, stride: int = 1) -> FloatArray:
+    """Return the output autocovariances E[v(k + lag stride) v(k)'] under unit white noise at every input.
+
+    Parameters
+    ----------
+    system
+        A stable system.
+    lags
+        Number of lags beyond 0.
+    stride
+        Samples per lag.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape (lags + 1, p, p).
+    """
+    from scipy.linalg import matrix_balance, solve_discrete_lyapunov
+
+    A, B, C, D = system.A, system.B, system.C, system.D
+    if not len(A):
+        return np.concatenate([(D @ D.T)[None], np.zeros((lags, len(D), len(D)))])
+    # states of very different units would spoil the solution
+    A, T = matrix_balance(A, permute=False)
+    B, C = np.linalg.solve(T, B), C @ T
+    X = solve_discrete_lyapunov(A, B @ B.T)
+    with_output = A @ X @ C.T + B @ D.T  # E[x(k + 1) v(k)']
+    covariances = [C @ X @ C.T + D @ D.T]
+    power = np.linalg.matrix_power(A, stride - 1)
+    step = np.linalg.matrix_power(A, stride)
+    for _ in range(lags):
+        covariances.append(C @ power @ with_output)
+        power = power @ step
+    return np.array(covariances)
+
+
 def stack(systems: Sequence[Linear]) -> Linear:
     """Put systems side by side: inputs and outputs one after the other, nothing shared."""
 

@@ -34,12 +34,16 @@ def atomic_write(path: str | Path, content: bytes) -> None:
         if target.is_dir():
             raise OutputError(f"{path}: is a directory, give the name of a file")
         if not target.parent.is_dir():
-            raise OutputError(f"{path}: cannot be written, there is no folder {Path(path).parent}; make it first")
+            raise OutputError(f"{path}: cannot be written, there is no folder {Path(path).parent}")
         if target.exists() and not target.is_file():
             target.write_bytes(content)  # a device or a pipe, which must not be renamed away
             return
         _replace(target, content)
-    except (OSError, RuntimeError, ValueError) as error:  # the last two: a loop of links, a zero byte in the name
+    except (
+        OSError,
+        RuntimeError,
+        ValueError,
+    ) as error:  # the last two: a loop of links, a zero byte in the name
         reason = getattr(error, "strerror", None) or error
         raise OutputError(f"{path!s}: cannot be written ({reason})".replace("\0", "?")) from None
 

@@ -118,7 +118,7 @@ class Pipeline:
         from servoscope import estimators
 
         needs = estimators.load(loop.monitor.estimator).NEEDS_INSTRUMENT
-        return cls(loop, inverse.build(loop, inverse.nominal_closed_loop(loop) if needs else None))
+        return cls(loop, inverse.build(loop, inverse.instrument_of(loop) if needs else None))
 
     @property
     def every(self) -> int:

@@ -15,13 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servoscope.errors import LoopError, SimulationError
+from servoscope.inverse import closed_loop
+from servoscope.linear import Linear, autocovariances
 from servoscope.pipeline import Pipeline, Tuning
 from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
-from servoscope.simulation import response, simulate
+from servoscope.simulation import response
 
 LONGEST_FILL = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
-NOISE_SAMPLES = 8000  # length of the noise-only simulation; the same seed for all plants keeps curves smooth
 
 
 @dataclass(frozen=True)
@@ -56,18 +58,32 @@ def course(recording: Recording) -> Course:
     return Course(np.asarray(r, dtype=np.float64), kept, recording.restart)
 
 
+def noise_system(pipeline: Pipeline, plant: Plant) -> Linear:
+    """Return [n_u, n_y] -> [eta, phi, z] through the closed loop with a plant.
+
+    Raises
+    ------
+    SimulationError
+        If the loop is unstable with the plant.
+    """
+    try:
+        loop = closed_loop(pipeline.loop, plant)
+    except LoopError as error:
+        raise SimulationError(str(error)) from None
+    bank = pipeline.bank.system
+    noisy = Linear(loop.A, loop.B[:, 1:], loop.C, loop.D[:, 1:])
+    return noisy.then(Linear(bank.A, bank.B[:, 1:3], bank.C, bank.D[:, 1:3]))
+
+
 def noise_moments(pipeline: Pipeline, plant: Plant, noise: Noise) -> Moments:
-    """Simulate the loop at rest with noise alone and return its moments; zero with an instrument (E[z v] = 0)."""
+    """Return the moments of the noise in the regressors; zero with an instrument, for E[z v] = 0 is its point."""
     n = pipeline.bank.n
     if pipeline.bank.has_instrument or not (noise.u_std or noise.y_std):
         return Moments(np.zeros(n), np.zeros((n, n)))
-    loop = pipeline.loop.model_copy(update={"plant": plant})
-    quiet, _ = simulate(
-        loop, np.zeros(NOISE_SAMPLES), noise_u_std=noise.u_std, noise_y_std=noise.y_std, seed=7
-    )
-    g = pipeline.regression(quiet.r, quiet.u, quiet.y, quiet.restart)
-    eta, phi = g.eta[g.ok], g.phi[g.ok]
-    return Moments(phi.T @ eta / len(eta), phi.T @ phi / len(eta))
+    system = noise_system(pipeline, plant)
+    std = np.array([noise.u_std, noise.y_std])
+    (covariance,) = autocovariances(Linear(system.A, system.B * std, system.C, system.D * std), 0)
+    return Moments(covariance[1 : 1 + n, 0].copy(), covariance[1 : 1 + n, 1 : 1 + n].copy())
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
-"""How results look in a terminal: baselines, diagnoses, inspections, tables, progress."""
+"""How results look in a terminal: simulations, inspections, baselines, diagnoses."""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -13,13 +14,27 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from pydantic import BaseModel
 
     from servoscope.baseline import Baseline
     from servoscope.diagnosis import Diagnosis, Warning
+    from servoscope.inspection import Inspection
+    from servoscope.loop import Columns
     from servoscope.readers import ChannelInfo
+    from servoscope.recording import Recording
+    from servoscope.simulation import Truth
 
-COLOURS = {"healthy": "green", "fault": "red", "undetermined": "yellow"}
+COLOURS = {
+    "healthy": "green",
+    "usable": "green",
+    "fault": "red",
+    "not usable": "red",
+    "stop": "red",
+    "undetermined": "yellow",
+    "usable with care": "yellow",
+    "care": "yellow",
+    "note": "blue",
+}
 MOST_WARNINGS = 12
 LEAST_SHOWN = 0.0005  # probability below which a candidate is not worth its line
 
@@ -156,6 +171,20 @@ def diagnosis(out: Console, d: Diagnosis) -> None:
     _warnings(out, d.warnings)
 
 
+def plain(said: BaseModel) -> object:
+    """Return a result ready for JSON; what is no number becomes null."""
+    return json.loads(said.model_dump_json())
+
+
+def channel_facts(name: str, found: Sequence[ChannelInfo]) -> dict[str, object]:
+    """Return the columns of a file, ready for JSON."""
+    told = [
+        {"name": c.name, "type": c.dtype, **{key: x if math.isfinite(x) else None for key, x in (("min", c.min), ("max", c.max))}}
+        for c in found
+    ]
+    return {"recording": name, "channels": told}
+
+
 def channels(out: Console, name: str, found: Sequence[ChannelInfo]) -> None:
     """Print the columns of a file."""
     out.print(Text.assemble((name, "bold"), f": {len(found)} columns"))
@@ -185,59 +214,76 @@ def _warnings(out: Console, warnings: Sequence[Warning]) -> None:
     notes(out, texts)
 
 
-class Steps:
-    """A progress bar over some parts, each in so many steps; made by `progress`."""
-
-    def __init__(self, bar: Progress, task: TaskID, each: int) -> None:
-        self._bar, self._task, self._each = bar, task, each
-        self._part, self._done, self._what, self._step = -1, 0, "", ""
-
-    def begin(self, what: str) -> None:
-        """Go on to the next part."""
-        self._part, self._done, self._what, self._step = self._part + 1, 0, what, ""
-        self._show()
-
-    def tell(self, step: str) -> None:
-        """Go on to the next step of the part."""
-        self._done, self._step = min(self._done + 1, self._each), step
-        self._show()
-
-    def compiling(self) -> None:
-        """Say why this takes longer than it will the next time."""
-        self._show(" (compiling, once)")
-
-    def _show(self, more: str = "") -> None:
-        text = ": ".join(filter(None, (self._what, self._step))) + more
-        self._bar.update(self._task, completed=self._part * self._each + self._done, description=text)
+def simulated_facts(recording: Recording, truth: Truth, columns: Columns) -> dict[str, object]:
+    """Return what was simulated, ready for JSON."""
+    named = {fault.parameter: fault.name for fault in truth.plant.faults}
+    return {
+        "samples": recording.samples,
+        "duration_s": recording.duration_s,
+        "sample_rate_hz": recording.sample_rate,
+        "columns": {"t": columns.time or "t", "r": columns.reference, "u": columns.input, "y": columns.output},
+        "faults": [{"name": named.get(event.parameter, event.parameter), **asdict(event)} for event in truth.faults],
+    }
 
 
-@contextmanager
-def progress(parts: int, each: int) -> Iterator[Steps]:
-    """Show a progress bar on stderr, if that is a terminal, and take it away again at the end."""
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    err = console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        steps = Steps(bar, bar.add_task("", total=parts * each), each)
-        if not err.is_terminal:
-            yield steps
-            return
-        with on_compiling(steps.compiling):
-            yield steps
+def renamed(out: Console, columns: Columns) -> None:
+    """Print the mapping that a simulated recording needs, where the loop's columns are no plain names."""
+    pairs = (columns.time or "t", columns.reference, columns.input, columns.output)
+    mapping = ", ".join(f"{letter}={name}" for letter, name in zip("truy", pairs, strict=True))
+    notes(out, [f"the loop's columns are no plain names: read it with --columns '{mapping}'"])
 
 
-@contextmanager
-def on_compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Call `tell` whenever machine code is made that was not in the cache yet."""
-    from numba.core.event import Event, Listener, install_listener
+def simulated(out: Console, path: str, reference: str, recording: Recording, truth: Truth) -> None:
+    """Print what was simulated, with its truth."""
+    out.print(Text.assemble((recording.name, "bold"), f": {span(recording.duration_s)}, {recording.samples} samples"))
+    named = {fault.parameter: fault.name for fault in truth.plant.faults}
+    told = [("reference", reference)]
+    for event in truth.faults:
+        how = f" over {span(event.ramp_s)}" if event.ramp_s else ""
+        what = f"{event.parameter} becomes {event.ratio:g} times its value at {event.at_s:g} s{how}"
+        told.append(("truth", f"{named[event.parameter]}: {what}" if event.parameter in named else what))
+    if not truth.faults:
+        told.append(("truth", "healthy"))
+    facts(out, told)
+    written(out, path)
 
-    class Told(Listener):
-        def on_start(self, event: Event) -> None:
-            tell()
 
-        def on_end(self, event: Event) -> None:
-            """Nothing to say."""
+def inspection(out: Console, i: Inspection) -> None:
+    """Print whether a recording is usable, why, what it holds, and what to do."""
+    s = i.sampling
+    size = f"{span(s.duration_s)}, {s.samples} samples at {s.sample_rate_hz:.6g} Hz"
+    out.print(Text.assemble((i.recording, "bold"), f": {size}"))
+    summary = i.summary.removeprefix(f"{i.recording}: ")
+    out.print(Padding(Text(summary[:1].upper() + summary[1:], style=f"bold {COLOURS[i.verdict]}"), (0, 0, 0, 2)))
+    told = []
+    if s.runs > 1 or s.stretches > 1:
+        told.append(("stretches", f"{s.stretches} in {s.runs} runs, the longest {span(s.longest_stretch_s)}"))
+    if i.fit is not None:
+        told.append(("model", f"{i.fit.model} explains {percent(i.fit.explained)} of the filtered u"))
+    if i.free_run is not None:
+        told.append(("free run", i.free_run.words))
+    if i.suggested_cutoff_hz is not None:
+        told.append(("cutoff", f"{i.suggested_cutoff_hz:g} Hz suggested"))
+    facts(out, told)
+    if i.frequencies:
+        rows = [
+            (
+                f"{f.frequency_hz:g} Hz",
+                f"{f.coherence_u:.3f}",
+                f"{f.coherence_y:.3f}",
+                f"{f.snr:.3g}",
+                percent(f.relative_std) if f.relative_std is not None else "-",
+            )
+            for f in i.frequencies
+        ]
+        table(out, ("frequency", "coherence r, u", "coherence r, y", "signal / noise", "iFRF std."), rows)
+    for finding in i.findings:
+        notes(out, [finding.message], COLOURS[finding.severity])
+    if i.recommendations:
+        out.print("  What to do:")
+        notes(out, i.recommendations, "blue")
 
-    with install_listener("numba:compile", Told()):
-        yield
+
+def written(out: Console, path: object) -> None:
+    """Print that a file was written, on one line that can be copied."""
+    out.print(Text(f"  wrote {path}"), soft_wrap=True)

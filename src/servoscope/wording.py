@@ -1,20 +1,21 @@
-"""Numbers, names and verdicts as people read them: significant digits, units, symbols; plain text and HTML."""
+"""Numbers, names and times as people read them: digits, units, symbols; as plain text and as HTML."""
 
 from __future__ import annotations
 
 import html
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from servoscope.diagnosis import UNKNOWN
 from servoscope.plants import FloatArray
 
 __all__ = [
     "axis_scale",
     "clock_time",
-    "moments",
+    "meaning",
     "number",
     "plain_symbol",
     "probability",
@@ -23,7 +24,9 @@ __all__ = [
     "signed_percent",
     "size_of",
     "symbol",
+    "time_decimals",
     "times",
+    "units",
     "with_std",
 ]
 
@@ -31,6 +34,7 @@ GREEK = {"theta": "θ", "beta": "β", "rho": "ρ"}
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "µ"), (1e9, "n"))
 DASH = "–"
+UNITS = {"eha": ("m", "A")}  # of y and u, where the kind of plant fixes them
 
 
 def symbol(name: str) -> str:
@@ -90,7 +94,8 @@ def with_std(value: float, std: float, *others: float) -> tuple[str, ...]:
     decimals = _decimals(std / 10.0**exponent, most=7)
     power = _power(exponent) if exponent else ""
     return tuple(
-        _signed(f"{each / 10.0**exponent:.{decimals}f}") + power if math.isfinite(each) else DASH for each in values
+        _signed(f"{each / 10.0**exponent:.{decimals}f}") + power if math.isfinite(each) else DASH
+        for each in values
     )
 
 
@@ -146,20 +151,34 @@ def _decimals(uncertainty: float, most: int = 6) -> int:
     return min(max(-math.floor(math.log10(uncertainty / 3.5)), 0), most)
 
 
-def moments(low: float, high: float) -> tuple[str, str]:
-    """Return the two ends of an interval of time [s], without their unit, to the digits that tell them apart."""
-    decimals = min(max(_decimals(high - low), 1), 3)
-    return _signed(f"{low:.{decimals}f}"), _signed(f"{high:.{decimals}f}")
+def time_decimals(width: float) -> int:
+    """Return with how many decimals times [s] are told that are known to within `width` [s]."""
+    return min(max(_decimals(width), 1), 4)
 
 
-def clock_time(seconds: float) -> str:
+def clock_time(seconds: float, decimals: int = 1) -> str:
     """Return a time on the recording's clock, with hours and minutes added where it is long."""
-    text = _signed(f"{seconds:.1f}") + " s"
-    if abs(seconds) < 600.0 or not math.isfinite(seconds):
+    text = _signed(f"{seconds:.{decimals}f}") + " s"
+    if not 600.0 <= seconds < math.inf:
         return text
-    minutes, rest = divmod(round(abs(seconds)), 60)
+    minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{text} ({f'{hours} h ' if hours else ''}{minutes} min {rest} s)"
+
+
+def meaning(name: str, words: Mapping[str, str]) -> str:
+    """Return what a candidate means, in plain words.
+
+    Parameters
+    ----------
+    name
+        Of the candidate, several faults joined by "+".
+    words
+        Name of a fault -> its words; what they say in brackets is left out.
+    """
+    if name == UNKNOWN:
+        return "none of the known faults"
+    return " and ".join(words.get(part, part).partition(" (")[0] for part in name.split("+"))
 
 
 def times(duration_s: float) -> tuple[str, float]:
@@ -167,6 +186,11 @@ def times(duration_s: float) -> tuple[str, float]:
     if duration_s > 4.0 * 3600.0:
         return "h", 3600.0
     return ("min", 60.0) if duration_s > 1200.0 else ("s", 1.0)
+
+
+def units(kind: str) -> tuple[str, str]:
+    """Return the units of y and u for a kind of plant; empty where they depend on the machine."""
+    return UNITS.get(kind, ("", ""))
 
 
 def axis_scale(values: Sequence[FloatArray], unit: str) -> tuple[str, float]:

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope.errors import OutputError
 from servoscope.loop import Columns
 from servoscope.output import atomic_write
 from servoscope.recording import Recording
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-__all__ = ["SUFFIXES", "table_bytes", "write"]
+__all__ = ["SUFFIXES", "write", "write_table"]
 
 SUFFIXES = (".csv", ".parquet", ".pq")
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -45,8 +44,6 @@ def write(path: str | Path, recording: Recording, columns: Columns | None = None
     OutputError
         If the suffix is another, or the file cannot be written.
     """
-    import pyarrow as pa
-
     used = _plain_names(columns or Columns())
     assigned = {
         used.time or "t": np.round(recording.t / UNITS[used.time_unit], 9),
@@ -55,19 +52,22 @@ def write(path: str | Path, recording: Recording, columns: Columns | None = None
         used.output: recording.y,
         **{name: recording.run for name in used.segment},
     }
-    atomic_write(path, table_bytes(pa.table(assigned), Path(path)))
+    write_table(path, assigned)
     return used
 
 
-def table_bytes(table: pa.Table, path: Path) -> bytes:
-    """Return a table as the kind of file that the path's suffix names.
+def write_table(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Write columns of equal length; nothing half-written stays behind.
 
     Raises
     ------
     OutputError
-        If the suffix is none of `SUFFIXES`.
+        If the suffix is none of `SUFFIXES`, or the file cannot be written.
     """
-    suffix = path.suffix.lower()
+    import pyarrow as pa
+
+    table = pa.table(dict(columns))
+    suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise OutputError(f"{path}: cannot write this kind of file, end the name in {' or '.join(SUFFIXES)}")
     sink = io.BytesIO()
@@ -81,7 +81,7 @@ def table_bytes(table: pa.Table, path: Path) -> bytes:
         import pyarrow.parquet as pq
 
         pq.write_table(table, sink)
-    return sink.getvalue()
+    atomic_write(path, sink.getvalue())
 
 
 def _plain_names(columns: Columns) -> Columns:

@@ -1,0 +1,274 @@
+"""The command ``servoscope``, thin: parses, calls, prints."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from servoscope import arguments
+from servoscope.arguments import Outputs, Source
+from servoscope.shell import FAULT, Commands, Failures, print_json
+
+if TYPE_CHECKING:
+    from servoscope.recording import Recording
+
+REPORTS, TRACES, RECORDINGS = (".html", ".htm"), (".parquet", ".pq"), (".csv", ".parquet", ".pq")
+CONTEXT = {"help_option_names": ["-h", "--help"]}
+
+app = typer.Typer(
+    cls=Commands, add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, context_settings=CONTEXT
+)
+
+LoopFile = Annotated[Path, typer.Argument(metavar="LOOP", help="Loop file (TOML).")]
+ColumnsText = Annotated[
+    str | None, typer.Option("--columns", metavar="MAP", help="Where signals stand: 't=Time, r=Ref, u=2*Amps, y=Pos'.")
+]
+Where = Annotated[
+    list[str] | None, typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges.")
+]
+By = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
+Report = Annotated[
+    Path | None, typer.Option(metavar="FILE.html", help="Write a page with plots; for several, one per recording.")
+]
+Trace = Annotated[
+    Path | None, typer.Option(metavar="FILE.parquet", help="Write the course over time; for several, one each.")
+]
+
+
+def main() -> None:
+    """Run the command line of this process."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # a terminal without a sign for squared is no reason to stop
+    app(prog_name="servoscope")
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from servoscope import __version__
+
+        typer.echo(f"servoscope {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def servoscope(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Listen to a servo loop and say whether its actuator is healthy; if not, what changed, by how much, since when."""
+
+
+@app.command()
+def simulate(
+    loop: LoopFile,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="REC", help="Recording to write, CSV or Parquet.")],
+    reference: Annotated[
+        str, typer.Option(metavar="KIND|FILE", help="profile, multisine, trapezoid, steps, chirp, or a file with t, r.")
+    ] = "profile",
+    amplitude: Annotated[float, typer.Option(metavar="X", help="Factor on the reference.")] = 1.0,
+    duration: Annotated[float, typer.Option(metavar="S", help="Length in s.")] = 60.0,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=RATIO@S", help="C_ie=1.2@30 steps at 30 s, C_ie=1.2@30~600 ramps; repeatable."),
+    ] = None,
+    noise_u: Annotated[float, typer.Option(metavar="X", min=0.0, help="Standard deviation of noise on u.")] = 1e-4,
+    noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Standard deviation of noise on y.")] = 3.162e-4,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the noise.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a loop, with faults if wanted, and write what a machine would log."""
+    arguments.check_output(output, "-o", RECORDINGS, [loop, Path(reference)])
+    events = arguments.fault_events(fault or [])
+
+    from servoscope import simulation, terminal, writers
+    from servoscope.loop import Loop
+    from servoscope.progress import progress
+
+    settings = Loop.load(loop)
+    with progress(1, 1) as steps:
+        steps.begin("simulating")
+        r = simulation.reference(reference, duration, settings.sample_rate, amplitude=amplitude)
+        recording, truth = simulation.simulate(
+            settings, r, faults=events, noise_u_std=noise_u, noise_y_std=noise_y, seed=seed
+        )
+        steps.tell("writing")
+        used = writers.write(output, recording, settings.columns)
+    if as_json:
+        how = {"reference": reference, "amplitude": amplitude, "noise_u_std": noise_u, "noise_y_std": noise_y}
+        said = {"recording": str(output), **terminal.simulated_facts(recording, truth, used), **how, "seed": seed}
+        print_json(said, lines=False)
+    else:
+        terminal.simulated(terminal.console(), str(output), reference, recording, truth)
+        if used != settings.columns:
+            terminal.renamed(terminal.console(), used)
+
+
+@app.command()
+def inspect(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Recordings.")],
+    loop: Annotated[Path | None, typer.Option(metavar="LOOP", help="Loop file: columns, sample rate, plant.")] = None,
+    columns: ColumnsText = None,
+    where: Where = None,
+    by: By = None,
+    as_json: AsJson = False,
+    report: Report = None,
+) -> None:
+    """Say whether a log is usable, and if not, why; where its signals are unknown, say which columns it has."""
+    arguments.check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
+
+    from servoscope import inspection, terminal
+    from servoscope.loop import Loop
+    from servoscope.progress import progress
+
+    settings = Loop.load(loop) if loop is not None else None
+    source = Source.of(settings, columns, where, by)
+    many = source.many(logs)
+    pages = Outputs.of(report, ".html", many, logs)
+    out, failures = terminal.console(), Failures()
+    with progress(len(logs), 2) as steps:
+        for path in logs:
+            steps.begin(path.name)
+            with failures.noted():
+                if unmapped := source.unmapped(path):
+                    with steps.paused():
+                        if as_json:
+                            print_json(terminal.channel_facts(path.name, unmapped), lines=many)
+                        else:
+                            terminal.channels(out, path.name, unmapped)
+                    raise arguments.no_mapping(path)
+                for recording in source.read(path):
+                    steps.tell("inspecting")
+                    said = inspection.inspect(recording, settings)
+                    with steps.paused():
+                        if as_json:
+                            print_json(said.model_dump(mode="json"), lines=many)
+                        else:
+                            terminal.inspection(out, said)
+                    if pages is not None:
+                        with failures.noted():
+                            target = pages.path(arguments.stem_of(path, recording.name))
+                            inspection.write(target, said, recording)
+                            terminal.written(terminal.console(stderr=as_json), target)
+    failures.leave()
+
+
+@app.command()
+def learn(
+    loop: LoopFile,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="BASELINE", help="Baseline to write (JSON).")],
+    healthy: Annotated[
+        list[Path] | None, typer.Argument(metavar="HEALTHY...", help="Healthy recordings.", show_default=False)
+    ] = None,
+    nominal: Annotated[bool, typer.Option("--nominal", help="From the plant's nominal parameters instead.")] = False,
+    columns: ColumnsText = None,
+    where: Where = None,
+    by: By = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn from healthy recordings what healthy looks like."""
+    paths = healthy or []
+    if nominal == bool(paths):
+        raise typer.BadParameter("give healthy recordings or --nominal, and not both")
+    arguments.check_output(output, "-o", (), [loop, *paths])
+
+    from servoscope import learning, terminal
+    from servoscope.loop import Loop
+    from servoscope.progress import progress
+
+    settings = Loop.load(loop)
+    source = Source.of(settings, columns, where, by)
+    if source.columns is not None:  # into the baseline with it: whoever diagnoses need not say it again
+        settings = settings.model_copy(update={"columns": source.columns})
+    failures = Failures()
+    recordings: list[Recording] = []
+    with progress(len(paths) + 1, 4) as steps:
+        for path in paths:
+            steps.begin(path.name)
+            with failures.noted():
+                recordings += source.read(path)
+        if failures.count and not recordings:
+            failures.leave()
+        steps.begin("learning")
+        found = learning.nominal(settings, steps.tell) if nominal else learning.learn(settings, recordings, steps.tell)
+        found.save(output)
+    if as_json:
+        print_json({"baseline": str(output), **terminal.baseline_facts(found)}, lines=False)
+    else:
+        terminal.baseline(terminal.console(), found)
+        terminal.written(terminal.console(), output)
+    failures.leave()
+
+
+@app.command()
+def diagnose(
+    baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="What learn wrote.")],
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Recordings to judge.")],
+    columns: ColumnsText = None,
+    where: Where = None,
+    by: By = None,
+    as_json: AsJson = False,
+    report: Report = None,
+    trace: Trace = None,
+    fail_on_fault: Annotated[bool, typer.Option("--fail-on-fault", help="Exit with 3 if there is a fault.")] = False,
+) -> None:
+    """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure that is."""
+    inputs = [baseline, *recordings]
+    arguments.check_output(report, "--report", REPORTS, inputs, folder=True)
+    arguments.check_output(trace, "--trace", TRACES, inputs, folder=True)
+
+    from servoscope import monitor, terminal, writers
+    from servoscope.baseline import Baseline
+    from servoscope.progress import progress
+
+    healthy = Baseline.load(baseline)
+    source = Source.of(healthy.loop, columns, where, by)
+    many = source.many(recordings)
+    pages, traces = Outputs.of(report, ".html", many, inputs), Outputs.of(trace, ".parquet", many, inputs)
+    out, failures, faulty = terminal.console(), Failures(), False
+    with progress(len(recordings), 3 + len(healthy.loop.plant.faults)) as steps:
+        for path in recordings:
+            steps.begin(path.name)
+            with failures.noted():
+                for recording in source.read(path):
+                    with failures.noted():
+                        steps.tell("recursion")
+                        said, course = monitor.examine(healthy, recording, steps.tell)
+                        faulty |= said.verdict == "fault"
+                        with steps.paused():
+                            if as_json:
+                                print_json(terminal.plain(said), lines=many)
+                            else:
+                                terminal.diagnosis(out, said)
+                        stem = arguments.stem_of(path, recording.name)
+                        if traces is not None:
+                            target = traces.path(stem)
+                            writers.write_table(target, course.table())
+                            terminal.written(terminal.console(stderr=as_json), target)
+                        if pages is not None:
+                            from servoscope import report as reports
+
+                            target = pages.path(stem)
+                            origin = arguments.provenance(healthy, baseline, path)
+                            reports.write(target, said, course, recording, healthy.loop, origin)
+                            terminal.written(terminal.console(stderr=as_json), target)
+    if fail_on_fault and faulty:
+        raise typer.Exit(FAULT)
+    failures.leave()
+
+
+@app.command()
+def demo(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for what it writes.")
+    ] = Path("demo-output"),
+) -> None:
+    """Simulate a rig, break it, learn and diagnose: the main job in four commands, a few seconds after the first time."""
+    from servoscope import demo as demonstration
+
+    demonstration.show(output, lambda words: app(list(words), standalone_mode=False))

@@ -1,0 +1,82 @@
+"""All that is measured on a recording before anything is concluded from it: one frozen model, ready for JSON."""
+
+from __future__ import annotations
+
+from servoscope.alignment import Delay
+from servoscope.excitation import Band, Excited
+from servoscope.freerun import FreeRun
+from servoscope.leftover import Residual
+from servoscope.levels import DeadZone, DefectCount, Quantisation, Rest, Said, Sampling, Saturation
+from servoscope.modelfit import OrderTried
+
+
+class Coefficient(Said):
+    """A coefficient over the whole recording, with its standard deviation."""
+
+    value: float
+    std: float
+
+
+class Fit(Said):
+    """The inverse model fitted to the whole recording.
+
+    Parameters
+    ----------
+    model
+        In words.
+    coefficients
+        By name.
+    used_share
+        Share of the samples used: filters settled, output not at rest.
+    explained, explained_ungated
+        Share of the variance of the filtered u that is explained one step ahead, without and with rest.
+    condition, weakest
+        Condition number of the scaled R_phi, and its weakest direction in words.
+    wrong_sign
+        Name of the coefficient that carries most of u, where it is negative: u or y has the wrong sign.
+    """
+
+    model: str
+    coefficients: dict[str, Coefficient]
+    used_share: float
+    explained: float
+    explained_ungated: float
+    condition: float
+    weakest: str
+    wrong_sign: str | None
+
+
+class Measured(Said):
+    """All that is measured on a recording; parts that could not be measured are None or empty.
+
+    `cutoff_hz` is the state-variable filter's in the fit, `suggested_cutoff_hz` the one that the recording asks for;
+    `orders` are the generic inverses tried, the best of them in `best_order`.
+    """
+
+    recording: str
+    loop: str | None
+    sampling: Sampling
+    defects: tuple[DefectCount, ...]
+    quantisation: tuple[Quantisation, ...]
+    saturation: Saturation | None = None
+    swapped: str | None = None
+    dead_zone: DeadZone | None = None
+    rest: Rest | None = None
+    band: Band | None = None
+    frequencies: tuple[Excited, ...] = ()
+    cutoff_hz: float | None = None
+    suggested_cutoff_hz: float | None = None
+    orders: tuple[OrderTried, ...] = ()
+    best_order: OrderTried | None = None
+    fit: Fit | None = None
+    delay: Delay | None = None
+    free_run: FreeRun | None = None
+    residual: Residual | None = None
+
+
+def described(order: OrderTried) -> str:
+    """Say what a generic inverse consists of."""
+    parts = (
+        ["stiffness"] * order.stiffness + ["Coulomb friction"] * (order.friction == "coulomb") + ["offset"]
+    )
+    return f"an inverse of order {order.order} with {', '.join(parts)}"

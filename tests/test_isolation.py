@@ -1,0 +1,148 @@
+"""Naming a fault from a deviation: probabilities, sizes with intervals, ambiguity and "unknown"."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import naive
+import numpy as np
+import pytest
+from scipy import integrate
+
+from servoscope.diagnosis import UNKNOWN, Candidate
+from servoscope.errors import SimulationError
+from servoscope.isolation import SYSTEMATIC, Signature, curve, isolate, line
+from servoscope.plants import Fault
+
+SCALE = np.array([1.0, 1e-2, 1e-5, 1e-7])  # coefficients have very different sizes
+CORRELATION = np.array([[1.0, 0.3, 0.0, 0.1], [0.3, 1.0, -0.2, 0.0], [0.0, -0.2, 1.0, 0.5], [0.1, 0.0, 0.5, 1.0]])
+SIGMA = 1e-4 * CORRELATION * np.outer(SCALE, SCALE)
+PUMP, LEAK, RUB = (
+    np.array([3.0, 2.0, 1.0, 1.0]), np.array([0.0, 2.0, -1.0, 1.0]), np.array([1.0, -1.0, 2.0, 1.0]),
+)  # fmt: skip
+
+
+def bent(direction: naive.Array) -> Callable[[float], naive.Array]:
+    """Return a curve that leaves the healthy point along a direction and bends away from it."""
+    return lambda ratio: SCALE * (direction * np.log(ratio) + 0.3 * np.roll(direction, 1) * np.log(ratio) ** 2)
+
+
+def fault(name: str, low: float = 0.2, high: float = 5.0) -> Fault:
+    return Fault(name, name[:1], (low, high), f"words for {name}")
+
+
+def three() -> list[Signature]:
+    return [curve(fault(name), bent(d)) for name, d in (("pump", PUMP), ("leak", LEAK), ("rub", RUB))]
+
+
+def draw(mean: naive.Array, seed: int) -> naive.Array:
+    return np.random.default_rng(seed).multivariate_normal(mean / SCALE, SIGMA / np.outer(SCALE, SCALE)) * SCALE
+
+
+def check_form(candidates: tuple[Candidate, ...], count: int) -> None:
+    shares = [candidate.probability for candidate in candidates]
+    assert sum(shares) == pytest.approx(1.0, abs=1e-12)
+    assert shares == sorted(shares, reverse=True)
+    assert len(candidates) == count and [c.name for c in candidates].count(UNKNOWN) == 1
+    assert all(c.faults == () for c in candidates if c.name == UNKNOWN)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.9, 1.2, 4.9])
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_names_and_sizes_a_fault(which: int, ratio: float) -> None:
+    signature = three()[which]
+    calls: list[int] = []
+    candidates = isolate(three(), draw(signature.shift(np.log(ratio)), 1), SIGMA, lambda: calls.append(1))
+    check_form(candidates, 4)
+    best = candidates[0]
+    assert best.name == signature.fault.name and best.probability > 0.95
+    (found,) = best.faults
+    assert found.parameter == signature.fault.parameter
+    assert found.ratio == pytest.approx(ratio, rel=0.03)
+    assert found.interval[0] <= found.ratio <= found.interval[1]
+    assert len(calls) == 3
+
+
+def test_intervals_hold_the_truth_19_times_of_20() -> None:
+    hits = 0
+    for seed in range(200):
+        ratio = 1.1 + 0.004 * seed
+        candidates = isolate(three()[1:2], draw(bent(LEAK)(ratio), seed), SIGMA)
+        low, high = next(c for c in candidates if c.name == "leak").faults[0].interval
+        hits += low <= ratio <= high
+    assert 181 <= hits <= 198, hits
+
+
+def test_probabilities_are_the_integrals_over_the_prior() -> None:
+    """Against adaptive quadrature, where two faults fit about equally well."""
+    first, second = bent(PUMP), bent(PUMP + [0.0, 0.0, 0.0, 0.15])
+    signatures = [curve(fault("first"), first), curve(fault("second", 0.5, 2.0), second)]
+    d = draw(0.5 * (first(1.1) + second(1.1)), 3)
+    size = np.sqrt(np.diag(SIGMA))
+
+    def weight(x: float, shift: Callable[[float], naive.Array]) -> float:
+        s = shift(float(np.exp(x)))
+        S = (SIGMA + np.diag((SYSTEMATIC * s) ** 2)) / np.outer(size, size)
+        miss = (d - s) / size
+        return float(np.exp(-0.5 * miss @ np.linalg.inv(S) @ miss) / np.sqrt(np.linalg.det(S)))
+
+    evidence = []
+    for shift, signature in ((first, signatures[0]), (second, signatures[1])):
+        near = np.log(1.1)
+        area = integrate.quad(weight, near - 0.1, near + 0.1, args=(shift,), points=[near], limit=200)[0]
+        evidence.append(area / (signature.high - signature.low))
+    share = {c.name: c.probability for c in isolate(signatures, d, SIGMA)}
+    known = share["first"] + share["second"]
+    assert 0.02 < share["first"] / known < 0.98
+    assert share["first"] / known == pytest.approx(evidence[0] / sum(evidence), abs=0.01)
+
+
+def test_two_curves_that_coincide_are_ambiguous() -> None:
+    twins = [curve(fault("one"), bent(RUB)), curve(fault("other"), bent(RUB)), three()[0]]
+    candidates = isolate(twins, draw(bent(RUB)(1.5), 2), SIGMA)
+    check_form(candidates, 4)
+    assert {candidates[0].name, candidates[1].name} == {"one", "other"}
+    assert candidates[0].probability == pytest.approx(candidates[1].probability, rel=1e-9)
+    assert 0.4 < candidates[0].probability < 0.5
+
+
+def test_unknown_when_no_curve_fits() -> None:
+    aside = np.cross(PUMP[:3], LEAK[:3])
+    candidates = isolate(three(), SCALE * np.append(aside, -3.0), SIGMA)
+    check_form(candidates, 4)
+    assert candidates[0].name == UNKNOWN and candidates[0].probability > 0.999
+
+
+def test_unknown_seldom_wins_over_the_true_fault() -> None:
+    wins = sum(isolate(three(), draw(bent(PUMP)(1.3), seed), SIGMA)[0].name == UNKNOWN for seed in range(200))
+    assert wins <= 2
+
+
+def test_no_signatures_at_all_is_unknown() -> None:
+    assert isolate([], 0.1 * SCALE, SIGMA) == (Candidate(name=UNKNOWN, probability=1.0),)
+
+
+def test_sizes_at_which_the_loop_is_unstable_are_impossible() -> None:
+    def shift(ratio: float) -> naive.Array:
+        if ratio > 2.0:
+            raise SimulationError("unstable")
+        return bent(PUMP)(ratio)
+
+    half = [curve(fault("pump"), shift)]
+    candidates = isolate(half, draw(bent(PUMP)(1.9), 1), SIGMA)
+    assert candidates[0].name == "pump"
+    assert candidates[0].faults[0].ratio == pytest.approx(1.9, rel=0.03)
+    assert candidates[0].faults[0].interval[1] <= 2.0 + 1e-9
+    never = [curve(fault("pump"), lambda _: shift(3.0)), *three()[1:]]
+    assert {c.name for c in isolate(never, draw(bent(LEAK)(1.5), 1), SIGMA)} == {"leak", "rub", UNKNOWN}
+
+
+@pytest.mark.parametrize("change", [-0.5, 0.25, 3.0])
+def test_lines_measure_a_coefficient_in_its_own_size(change: float) -> None:
+    theta = SCALE * [2.0, 3.0, 4.0, 5.0]
+    lines = [line(fault(name, 0.1, 10.0), np.where(np.arange(4) == i, theta, 0.0)) for i, name in enumerate("abcd")]
+    candidates = isolate(lines, draw(change * np.where(np.arange(4) == 2, theta, 0.0), 5), SIGMA)
+    assert candidates[0].name == "c" and candidates[0].probability > 0.95
+    (found,) = candidates[0].faults
+    assert found.ratio == pytest.approx(1.0 + change, abs=0.02)
+    assert found.interval[0] < 1.0 + change < found.interval[1]

@@ -1,0 +1,429 @@
+"""The report: what it says, that it needs nothing from outside, odd data, hostile names, and writing it whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from servoscope import canvas, figures, report, wording
+from servoscope.diagnosis import Candidate, Diagnosis, FoundFault, Parameter, ResponsePoint, Trace, Warning
+from servoscope.errors import OutputError
+from servoscope.ifrf import Response
+from servoscope.loop import Loop
+from servoscope.output import atomic_write
+from servoscope.recording import Recording
+
+PROVENANCE = {"baseline": "healthy.json", "hash": "0123456789abcdef", "threshold": "46.2"}
+VOID = {"meta", "br", "path", "use", "circle", "link", "img"}
+
+
+class Reader(HTMLParser):
+    """Text, tags with attributes, and whether what is opened is closed."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.feed(page)
+        self.close()
+        self.text = " ".join(self.text.split())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in VOID:
+            return
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.text += data if self.open and self.open[-1] in ("sub", "sup", "i") else f" {data}"
+
+
+def make_recording(N: int = 6000, seed: int = 0, name: str = "suspect.csv") -> Recording:
+    rng = np.random.default_rng(seed)
+    t = np.arange(N) / 100.0
+    restart = np.zeros(N, dtype=bool)
+    restart[0] = True
+    if N > 100:
+        t[N // 2 :] += 0.37
+        restart[N // 2] = True
+        restart[3 * N // 4] = True
+    r = 0.03 * np.sin(t)
+    u, noise = rng.normal(0.0, 0.1, N), rng.normal(0.0, 1e-3, N)
+    return Recording(name, t, r, u, r + noise, 100.0, restart, np.zeros(N, dtype=np.int32))
+
+
+def make_trace(
+    K: int = 600, n: int = 4, F: int = 3, seed: int = 1, names: tuple[str, ...] | None = None
+) -> Trace:
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(1, K + 1)
+    shifted = (t > 30.0)[:, None]
+    expected = np.tile(10.0 ** -np.arange(n), (K, 1))
+    theta = expected * (1.0 + 0.01 * rng.normal(size=(K, n)) + 0.2 * shifted)
+    covariance = np.einsum("kn,nm->knm", (0.01 * expected) ** 2, np.eye(n))
+    E = np.exp(1j * rng.uniform(0.0, 6.0, (F, n)))
+
+    def of(theta: Any) -> Response:
+        spread = np.tile(1e-4 * np.array([[2.0, 0.5], [0.5, 1.0]]), (K, F, 1, 1))
+        return Response(np.arange(1.0, F + 1.0), theta @ E.T, spread)
+
+    return Trace(
+        t=t,
+        names=names or tuple(f"theta_{i}" for i in range(n)),
+        theta=theta,
+        covariance=covariance,
+        expected=expected,
+        statistic=rng.chisquare(n, K) + 400.0 * shifted[:, 0],
+        threshold=46.2,
+        ifrf=of(theta),
+        ifrf_expected=of(expected),
+        ready=t > 0.55 if K > 10 else np.ones(K, dtype=bool),
+    )
+
+
+def make_diagnosis(verdict: str = "fault", **changes: Any) -> Diagnosis:
+    leakage = FoundFault(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.19, 1.21))
+    values: dict[str, Any] = {
+        "recording": "suspect.csv",
+        "samples": 6000,
+        "duration_s": 60.37,
+        "verdict": verdict,
+        "summary": "What the summary says.",
+        "parameters": {"theta_0": Parameter(value=0.3129, std=0.0023, nominal=0.2590)},
+        "ifrf": (
+            ResponsePoint(
+                frequency_hz=1.0,
+                real=0.31,
+                imag=1.6625,
+                real_std=0.0022,
+                imag_std=0.002,
+                nominal_real=0.2564,
+                nominal_imag=1.6587,
+            ),
+        ),
+        "warnings": (
+            Warning(kind="gap", from_s=20.0, to_s=20.37, count=37, message="gap of 37 rows, not bridged"),
+        ),
+    }
+    if verdict == "fault":
+        values |= {
+            "detected_at_s": 31.4,
+            "onset_s": (29.8, 30.0, 30.2),
+            "probability": 0.998,
+            "faults": (leakage,),
+            "candidates": (
+                Candidate(name="leakage", probability=0.998, faults=(leakage,)),
+                Candidate(name="unknown", probability=0.002),
+            ),
+        }
+    return Diagnosis(**(values | changes))
+
+
+@pytest.fixture
+def loop(rig: dict[str, Any]) -> Loop:
+    return Loop.from_dict(rig)
+
+
+def read(
+    diagnosis: Diagnosis, loop: Loop, trace: Trace | None = None, recording: Recording | None = None
+) -> Reader:
+    return Reader(
+        report.page(diagnosis, trace or make_trace(), recording or make_recording(), loop, PROVENANCE)
+    )
+
+
+def test_a_fault_is_told_with_when_how_large_and_how_sure(loop: Loop) -> None:
+    page = read(make_diagnosis(), loop)
+    for words in (
+        "Internal leakage",
+        "What the summary says.",
+        "30.0 s",
+        "95 %: 29.8 to 30.2 s",
+        "detected at 31.4 s",
+        "+20.0 %",
+        "95 %: +19.0 % to +21.0 %",
+        "99.8 %",
+        "Cie × 1.200",
+        "1.190 to 1.210",
+        "none of the known faults",
+    ):
+        assert words in page.text, words
+    assert not page.wrong and not page.open
+
+
+def test_the_page_is_one_well_formed_document_with_four_pictures(loop: Loop) -> None:
+    page = read(make_diagnosis(), loop)
+    pictures = [attrs for tag, attrs in page.tags if tag == "svg" and attrs.get("role") == "img"]
+    ids = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
+    assert len(pictures) == 4
+    assert all("width" not in attrs and "height" not in attrs for attrs in pictures)
+    assert len(ids) == len(set(ids)), "an id stands twice"
+    used = {str(attrs["xlink:href"]).removeprefix("#") for tag, attrs in page.tags if tag == "use"}
+    assert used and used <= set(ids), "a picture refers to a shape that is not there"
+
+
+def test_nothing_comes_from_outside(loop: Loop) -> None:
+    content = report.page(make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
+    assert not re.search(r"(?i)https?:|//\w|@import|url\((?!#)|javascript:", content)
+    page = Reader(content)
+    assert not {tag for tag, _ in page.tags} & {"script", "link", "iframe", "img", "object", "embed", "base"}
+    for _, attrs in page.tags:
+        for name in ("src", "href", "xlink:href"):
+            assert (attrs.get(name) or "#").startswith("#")
+        assert not [name for name in attrs if name.startswith("on")]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [("healthy", "No change from the healthy baseline"), ("undetermined", "This recording cannot tell")],
+)
+def test_quiet_verdicts(loop: Loop, verdict: str, words: str) -> None:
+    page = read(make_diagnosis(verdict), loop)
+    assert words in page.text and "Largest statistic" in page.text
+    assert "Since when" not in page.text and "Candidates" not in page.text
+
+
+def test_an_open_question_is_told_as_one(loop: Loop) -> None:
+    both = (Candidate(name="friction", probability=0.6), Candidate(name="contamination", probability=0.38))
+    page = read(make_diagnosis(faults=(), candidates=both, probability=0.6), loop)
+    assert "The actuator has changed: friction or oil contamination" in page.text and "60.0 %" in page.text
+    unknown = (Candidate(name="unknown", probability=0.99), *both)
+    page = read(make_diagnosis(faults=(), candidates=unknown, probability=0.99), loop)
+    assert "in a way that no known fault explains" in page.text
+
+
+def test_numbers_warnings_settings_and_provenance_are_there(loop: Loop) -> None:
+    page = read(make_diagnosis(), loop)
+    for words in ("0.3129", "0.2590", "+20.8 %", "1.6625 ± 0.0020", "A/m"):
+        assert words in page.text, words
+    for words in ("gap of 37 rows, not bridged", "20.00 to 20.37", " 37 "):
+        assert words in page.text, words
+    for key, value in PROVENANCE.items():
+        assert f"{key} {value}" in page.text
+    for words in (
+        "[plant]",
+        "C_ie 6 × 10−12",
+        "[monitor]",
+        "false_alarms_per_year 1",
+        "frequencies 1, 10, 20",
+    ):
+        assert words in page.text, words
+
+
+def test_hostile_names_stay_text(loop: Loop) -> None:
+    evil = "<script>alert('x')</script>\"&$x$"
+    fault = FoundFault(name=evil, parameter=evil, ratio=-1.5, interval=(-2.0, float("nan")))
+    diagnosis = make_diagnosis(
+        recording=evil + "\udc80",
+        summary=evil,
+        faults=(fault,),
+        candidates=(Candidate(name=evil, probability=1.0, faults=(fault,)),),
+        parameters={evil: Parameter(value=float("nan"), std=0.0, nominal=0.0)},
+        warnings=(Warning(kind=evil, from_s=0.0, to_s=0.0, count=1, message=evil),),
+    )
+    loop = loop.model_copy(update={"name": evil})
+    trace = make_trace(names=(evil, "a$b", "c_d", "$"))
+    content = report.page(diagnosis, trace, make_recording(name=evil), loop, {evil: evil})
+    page = Reader(content)
+    assert not [tag for tag, _ in page.tags if tag == "script"] and "<script" not in content.lower()
+    assert page.text.count("alert('x')") >= 8 and not page.wrong
+    assert all(not name.startswith("on") for _, attrs in page.tags for name in attrs)
+
+
+@pytest.mark.parametrize("verdict", ["fault", "healthy", "undetermined"])
+@pytest.mark.parametrize("K", [0, 1, 2])
+def test_short_traces_are_drawn(loop: Loop, K: int, verdict: str) -> None:
+    page = read(make_diagnosis(verdict, ifrf=(), parameters={}), loop, make_trace(K), make_recording(20))
+    assert not page.wrong
+    assert ("the recording is too short for the estimator" in page.text) == (K == 0)
+
+
+@pytest.mark.parametrize("F", [1, 2, 5, 8])
+@pytest.mark.parametrize("n", [1, 3, 8])
+def test_any_number_of_coefficients_and_frequencies_is_drawn(n: int, F: int) -> None:
+    trace, diagnosis = make_trace(n=n, F=F), make_diagnosis()
+    panels = len([ax for ax in figures.ifrf(trace, diagnosis).axes if ax.axison])
+    rows = len([ax for ax in figures.coefficients(trace, diagnosis).axes if ax.axison])
+    assert (panels, rows) == (F, n)
+    assert "8 Hz" in canvas.svg(figures.ifrf(trace), "x") or F < 8
+
+
+@pytest.mark.parametrize("unready", ["ready", "theta", "expected", "covariance", "some"])
+def test_what_is_not_a_number_does_not_stop_a_picture(unready: str) -> None:
+    trace = make_trace()
+    if unready == "ready":
+        trace = dataclasses.replace(trace, ready=np.zeros(600, dtype=bool))
+    elif unready == "some":
+        theta, value = trace.theta.copy(), trace.statistic.copy()
+        theta[100:200], value[100:200], value[0] = np.nan, np.nan, 0.0
+        trace = dataclasses.replace(trace, theta=theta, statistic=value)
+    else:
+        nan = np.full_like(getattr(trace, unready), np.nan)
+        H = np.full_like(trace.ifrf.H, np.nan)
+        broken = dataclasses.replace(trace.ifrf, H=H, covariance=np.full_like(trace.ifrf.covariance, np.nan))
+        trace = dataclasses.replace(trace, **{unready: nan}, ifrf=broken, ifrf_expected=broken)
+    for draw in (figures.statistic, figures.coefficients, figures.ifrf):
+        assert "<svg" in canvas.svg(draw(trace, make_diagnosis()), "x")
+
+
+def test_a_coefficient_that_should_be_zero_is_drawn_in_its_own_units() -> None:
+    trace = make_trace()
+    expected = trace.expected.copy()
+    expected[:, 1] = 0.0
+    axes = figures.coefficients(dataclasses.replace(trace, expected=expected)).axes
+    assert [ax.get_ylabel() for ax in axes] == [
+        "deviation [%]",
+        "deviation",
+        "deviation [%]",
+        "deviation [%]",
+    ]
+
+
+def test_long_recordings_are_drawn_fast_and_small(loop: Loop, tmp_path: Path) -> None:
+    recording, trace, diagnosis = make_recording(1_000_000), make_trace(100_000), make_diagnosis()
+    report.write(tmp_path / "warm.html", diagnosis, make_trace(10), make_recording(50), loop, {})
+    begin = time.perf_counter()
+    report.write(tmp_path / "long.html", diagnosis, trace, recording, loop, PROVENANCE)
+    assert time.perf_counter() - begin < 8.0  # about one and a half alone on a machine
+    assert (tmp_path / "long.html").stat().st_size < 3_000_000
+
+
+def test_the_envelope_keeps_every_peak_and_every_gap() -> None:
+    rng = np.random.default_rng(3)
+    t, x = np.arange(100_000) / 100.0, rng.normal(size=100_000)
+    x[54_321] = 99.0
+    restart = np.zeros(len(t), dtype=bool)
+    restart[[0, 30_000]] = True
+    t[30_000:] += 50.0
+    x[70_000:72_000] = np.nan
+    at, value = canvas.envelope(t, x, restart)
+    assert len(at) == len(value) <= 3 * 1200 + 1
+    assert np.nanmax(value) == 99.0 and np.nanmin(value) == np.nanmin(x)
+    assert (
+        np.isnan(value[(at >= 350.0) & (at < 350.5)]).any()
+        and np.isnan(value[(at > 752.0) & (at < 768.0)]).all()
+    )
+    assert (np.diff(at) >= 0.0).all()
+    short = canvas.envelope(t[:5], x[:5], np.array([True, False, True, False, False]))[1]
+    np.testing.assert_array_equal(short, [x[0], x[1], np.nan, x[2], x[3], x[4]])
+
+
+def test_many_gaps_are_joined_where_they_cannot_be_told_apart() -> None:
+    t = np.linspace(0.0, 1000.0, 100_001)
+    low = np.arange(0.0, 900.0, 0.1)
+    assert len(canvas.spans_on(t, low, low + 0.05)) == 1
+    assert len(canvas.spans_on(t, low[:40], low[:40] + 0.05)) == 40
+    assert canvas.spans_on(t, low[:0], low[:0]) == []
+
+
+def test_the_same_diagnosis_gives_the_same_page(loop: Loop) -> None:
+    pages = {
+        report.page(make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE) for _ in range(2)
+    }
+    assert len(pages) == 1
+
+
+def test_pictures_do_not_change_the_users_matplotlib() -> None:
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    canvas.svg(figures.statistic(make_trace()), "x")
+    assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize("ending", ["svg", "png", "pdf"])
+def test_a_picture_is_saved(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"x.{ending}"
+    canvas.save(figures.signals(make_recording(), make_diagnosis(), units=("m", "A")), path)
+    assert path.read_bytes()[:5] in (b"<?xml", b"\x89PNG\r", b"%PDF-")
+    with pytest.raises(OutputError, match=r"x\.bmp: a figure is written as"):
+        canvas.save(figures.statistic(make_trace()), tmp_path / "x.bmp")
+
+
+def test_writing_is_all_or_nothing(loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "r.html"
+    path.write_text("before")
+    path.chmod(0o640)
+
+    def full_disk(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full_disk)
+        with pytest.raises(OutputError) as caught:
+            report.write(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
+    assert str(caught.value) == f"{path}: cannot be written (No space left on device)"
+    assert path.read_text() == "before" and [each.name for each in tmp_path.iterdir()] == ["r.html"]
+    report.write(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
+    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert path.stat().st_mode & 0o777 == 0o640 and len(list(tmp_path.iterdir())) == 1
+
+
+def test_where_nothing_can_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    for path, reason in (
+        (tmp_path / "none" / "r.html", "there is no folder"),
+        (tmp_path / "file" / "r.html", "there is no folder"),
+        (tmp_path, "is a directory"),
+        (tmp_path / ("x" * 300), "name too long"),
+        (f"{tmp_path}/a\0b", "cannot be written"),
+    ):
+        with pytest.raises(OutputError, match=f"(?i){reason}") as caught:
+            atomic_write(path, b"x")
+        assert "\n" not in str(caught.value) and "\0" not in str(caught.value)
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+def test_writing_follows_links_and_leaves_devices_alone(tmp_path: Path) -> None:
+    (tmp_path / "real").write_bytes(b"old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    atomic_write(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
+    atomic_write(os.devnull, b"gone")
+    assert not Path(os.devnull).is_file()
+
+
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        (wording.number(0.0), "0"),
+        (wording.number(float("nan")), "–"),
+        (wording.number(-12.3456), "−12.35"),
+        (wording.number(1.234e-9, 3), "1.23 × 10<sup>−9</sup>"),
+        (wording.with_std(0.25993, 0.00021, 0.26), ("0.25993", "0.00021", "0.26000")),
+        (wording.with_std(5.5e-5, 1.2e-6), ("5.50 × 10<sup>−5</sup>", "0.12 × 10<sup>−5</sup>")),
+        (wording.quantity(1e9), "1 × 10<sup>9</sup>"),
+        (wording.quantity(0.025), "0.025"),
+        (wording.probability(1.0), "> 99.9 %"),
+        (wording.probability(0.0), "< 0.1 %"),
+        (wording.size_of(20.0, 19.0, 21.0), ("× 20.0", "× 19.0", "× 21.0")),
+        (wording.size_of(0.9, 0.89, 0.91), ("−10.0 %", "−11.0 %", "−9.0 %")),
+        (wording.ratios(0.3, 0.3, 0.3), ("0.300", "0.300", "0.300")),
+        (wording.clock_time(3723.0), "3723.0 s (1 h 2 min 3 s)"),
+        (wording.symbol("C_ie"), "<i>C</i><sub>ie</sub>"),
+        (wording.symbol("theta_0"), "<i>θ</i><sub>0</sub>"),
+        (wording.symbol("viscous_friction"), "viscous friction"),
+        (wording.plain_symbol("theta_0"), "θ₀"),
+    ],
+)
+def test_numbers_and_names_read_well(told: object, expected: object) -> None:
+    assert told == expected
