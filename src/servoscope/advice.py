@@ -22,19 +22,17 @@ def _recommended(m: Measured, loop: Loop | None) -> Iterator[str]:
         b = m.best_order
         settings = [f"order = {b.order}", f'friction = "{b.friction}"', "offset = true"]
         settings += ["stiffness = true"] * b.stiffness
-        yield f'[plant] kind = "polynomial", {", ".join(settings)} explains most of what a generic inverse can'
+        yield f'[plant] kind = "polynomial", {", ".join(settings)} explains most with least'
     if m.suggested_cutoff_hz is not None and m.cutoff_hz is not None:
         if loop is None:
-            yield f"[monitor] cutoff = {m.suggested_cutoff_hz:.2g}: up to there y follows the reference and is more than noise"
+            words = "up to there y follows the reference and is more than noise"
+            yield f"[monitor] cutoff = {m.suggested_cutoff_hz:.2g}: {words}"
         elif m.cutoff_hz > 1.8 * m.suggested_cutoff_hz:
-            words = f"above {m.suggested_cutoff_hz:.2g} Hz y is little but noise, or does not follow the reference"
+            words = f"above {m.suggested_cutoff_hz:.2g} Hz y is little but noise, or leaves the reference"
             yield f"[monitor] cutoff = {m.suggested_cutoff_hz:.2g} instead of {m.cutoff_hz:.3g}: {words}"
     d = m.delay
     if d is not None and d.seconds is not None and d.gain > DELAY_GAIN:
-        if (
-            d.seconds > 0.0
-            and abs(d.seconds * m.sampling.sample_rate_hz - d.configured_samples) > DELAY_TOLERANCE
-        ):
+        if d.seconds > 0.0 and abs(d.seconds * m.sampling.sample_rate_hz - d.configured_samples) > DELAY_TOLERANCE:
             yield f"delay = {d.seconds:.4g}"
         elif d.samples is not None and d.samples < -DELAY_TOLERANCE:
             yield "log u in the sample in which it is put out: it comes late beside y"
@@ -45,12 +43,14 @@ def _recommended(m: Measured, loop: Loop | None) -> Iterator[str]:
         and not gated
         and (m.dead_zone is not None or (excess > 1.3 and m.fit.explained_ungated < 0.99))
     ):
-        yield f'[monitor] update_when = "moving", rest_speed = {m.rest.speed:.2g}: at rest u says nothing about the plant'
+        words = "at rest u says nothing about the plant"
+        yield f'[monitor] update_when = "moving", rest_speed = {m.rest.speed:.2g}: {words}'
     if m.dead_zone is not None and (loop is None or loop.input_deadzone is None):
-        yield f"input_deadzone = [{m.dead_zone.low:.4g}, {m.dead_zone.high:.4g}], if it is one rather than friction at rest"
+        words = "if it is one rather than friction at rest"
+        yield f"input_deadzone = [{m.dead_zone.low:.4g}, {m.dead_zone.high:.4g}], {words}"
     if m.saturation is not None and m.saturation.source == "seen":
         ends = " and ".join(f"{end:g}" for end in (m.saturation.low, m.saturation.high) if end is not None)
-        yield f"input_limits, if u is limited at {ends}, and input_logged: whether it is logged before or after that"
+        yield f"input_limits, if u is limited at {ends}, and input_logged: before or after that"
     if m.residual is not None and m.residual.model_error > MODEL_ERROR:
         words = "the scatter between several healthy recordings says more"
         yield f"[monitor] model_error = {min(m.residual.model_error, 0.1):.1g}, or a better model; {words}"
@@ -58,7 +58,8 @@ def _recommended(m: Measured, loop: Loop | None) -> Iterator[str]:
     wide = [at for at in m.frequencies if at.relative_std_memory is not None and at.snr >= SNR]
     worst = max((at.relative_std_memory or 0.0 for at in wide), default=0.0)
     if worst > PRECISE:
-        yield f"[monitor] memory = {memory * min((worst / PRECISE) ** 2, 20.0):.2g} for 5 % at every frequency that is excited"
+        longer = memory * min((worst / PRECISE) ** 2, 20.0)
+        yield f"[monitor] memory = {longer:.2g} for 5 % at every frequency that is excited"
     weak = [f"{at.frequency_hz:g}" for at in m.frequencies if at.snr < SNR]
     if weak and loop is not None:
         yield f"[monitor] frequencies without {', '.join(weak)} Hz, or record a faster motion"

@@ -24,10 +24,10 @@ PRIOR = 1.0  # standard deviation of a coefficient around its nominal value, rel
 class Delay(Said):
     """Delay from u as logged to u acting.
 
-    `samples` and `seconds` are None where the residual variance is flat or falls towards the end of the range, the
-    95 % interval `low_samples` ... `high_samples` in the latter case only. `gain` is the share of the residual variance that the delay
-    takes away against the loop's own (`configured_samples`). The interval counts noise, not an inverse that is too
-    simple: what of the plant the model lacks looks like delay as well.
+    `samples` and `seconds` are None where the residual variance is flat or falls towards the end of the
+    range, the 95 % interval `low_samples` ... `high_samples` in the latter case only. `gain` is the share of the
+    residual variance that the delay takes away against the loop's own (`configured_samples`). The interval
+    counts noise, not an inverse that is too simple: what the model lacks of the plant looks like delay.
     """
 
     samples: float | None
@@ -40,14 +40,12 @@ class Delay(Said):
     words: str
 
 
-def estimate(
-    recording: Recording, g: Regressors, which: IndexArray, fitted: Fitted, independent: float
-) -> Delay:
+def estimate(recording: Recording, g: Regressors, which: IndexArray, fitted: Fitted, independent: float) -> Delay:
     """Search the delay, in quarters of a sample and between them by a parabola.
 
-    Delay looks like more of the higher powers of s, and the other way round: with three of them free, all but the
-    third power of the delay is absorbed. Where the plant has nominal values they therefore hold the coefficients,
-    each within a standard deviation of 100 %.
+    Delay looks like more of the higher powers of s, and the other way round: with three of them free, all but
+    the third power of the delay is absorbed. Where the plant has nominal values they therefore hold the
+    coefficients, each within a standard deviation of 100 %.
 
     Parameters
     ----------
@@ -93,7 +91,7 @@ def estimate(
 def _held(
     g: Regressors, which: IndexArray, rows: IndexArray, fitted: Fitted, independent: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return an orthonormal basis of the columns, with rows below that hold them, and what those rows aim at."""
+    """Return an orthonormal basis of the columns over rows that hold them, and what those rows aim at."""
     phi = g.columns(which)[rows]
     size = np.sqrt((phi**2).mean(axis=0))
     plant = g.loop.plant

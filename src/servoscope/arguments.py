@@ -23,6 +23,7 @@ __all__ = [
     "Outputs",
     "Source",
     "check_output",
+    "check_reference",
     "columns_from",
     "conditions",
     "fault_events",
@@ -33,7 +34,7 @@ __all__ = [
 
 
 def conditions(texts: Sequence[str]) -> dict[str, str]:
-    """Read ``--where``: ``["load=20,run=1-5"]`` is {"load": "20", "run": "1-5"}; ``run=1,3,7`` is one condition.
+    """Read ``--where``: ``["load=20,run=1-5"]`` is {"load": "20", "run": "1-5"}; ``run=1,3`` is one.
 
     Raises
     ------
@@ -111,7 +112,7 @@ class Source:
         return len(paths) > 1 or self.by is not None
 
     def unmapped(self, path: Path) -> list[ChannelInfo]:
-        """Return the columns of a file whose mapping nobody gave and that has not all of t, r, u and y; else none."""
+        """Return a file's columns if it lacks one of t, r, u, y and nobody gave a mapping; else none."""
         from servoscope import readers
 
         if self.loop is not None or self.columns is not None:
@@ -134,6 +135,20 @@ def fault_events(texts: Sequence[str]) -> list[FaultEvent]:
         return [FaultEvent.parse(text) for text in texts]
     except ServoscopeError as error:
         raise typer.BadParameter(f"--{error}") from None
+
+
+def check_reference(text: str) -> None:
+    """Refuse a ``--reference`` that is neither a known kind nor looks like a file.
+
+    Raises
+    ------
+    typer.BadParameter
+        If so.
+    """
+    from servoscope.simulation.references import KINDS
+
+    if text not in KINDS and not Path(text).suffix and not Path(text).exists():
+        raise typer.BadParameter(f"--reference {text}: choose from {', '.join(KINDS)}, or name a file")
 
 
 def check_output(
@@ -164,7 +179,7 @@ def check_output(
     if path is None:
         return
     if any(_same(path, each) for each in inputs):
-        raise typer.BadParameter(f"{option} {path}: is one of the inputs and would be overwritten, give another name")
+        raise typer.BadParameter(f"{option} {path}: is an input and would be overwritten, give another name")
     if folder and (path.is_dir() or not path.suffix):
         return
     if suffixes and path.suffix.lower() not in suffixes:
@@ -181,7 +196,7 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def stem_of(path: Path, recording: str) -> str:
-    """Return what a recording's own files are called: ``x`` of x.csv, ``x-run-6`` of its part x.csv[run=6]."""
+    """Return what a recording's files are called: ``x`` for x.csv, ``x-run-6`` for its part x.csv[run=6]."""
     part = re.sub(r"[^\w.+]+", "-", recording.removeprefix(path.name)).strip("-")
     return f"{path.stem}-{part}" if part else path.stem
 
@@ -192,8 +207,9 @@ class Outputs:
     Parameters
     ----------
     wanted
-        What the user asked for: a file, which is kept for a single recording and gets each one's name before its
-        suffix for several (``report-x.html``); a folder, or a name without suffix, which gets one file per recording.
+        What the user asked for: a file, which is kept for a single recording and gets each one's name before
+        its suffix for several (``report-x.html``); a folder, or a name without suffix, which gets one file
+        per recording.
     suffix
         Of the files in a folder, for example ``.html``.
     many
@@ -237,14 +253,14 @@ class Outputs:
         else:
             found = self.wanted.with_name(free + self.wanted.suffix)
         if any(_same(found, each) for each in self.inputs):
-            raise OutputError(f"{found}: is one of the inputs and would be overwritten, name another folder or file")
+            raise OutputError(f"{found}: is an input and would be overwritten, name another folder")
         return found
 
 
 def no_mapping(path: Path) -> RecordingError:
     """Return the error that asks for a mapping."""
     example = "--columns 't=..., r=..., u=..., y=...'"
-    return RecordingError(f"{path.name}: has no columns t, r, u and y: say which they are with {example}, or give --loop")
+    return RecordingError(f"{path.name}: lacks a column t, r, u or y: say which they are, {example}, or give --loop")
 
 
 def provenance(baseline: Baseline, file: Path, recording: Path) -> dict[str, str]:

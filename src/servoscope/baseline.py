@@ -157,12 +157,14 @@ class Baseline(_Part):
         except OSError as error:
             raise BaselineError(f"{path}: cannot be read ({error.strerror or error})") from None
         except ValueError:
-            raise BaselineError(f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote") from None
+            raise BaselineError(
+                f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
+            ) from None
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
         if content.get("version") != VERSION:
             raise BaselineError(
-                f"{path}: baseline of version {content.get('version')!r}, this program reads version {VERSION}: learn it again"
+                f"{path}: baseline of version {content.get('version')!r}, this program reads {VERSION}: learn it again"
             )
         fields = {key: value for key, value in content.items() if key not in ("format", "version")}
         try:

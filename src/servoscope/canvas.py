@@ -68,7 +68,7 @@ FORMATS = ("svg", "png", "pdf")
 
 @contextmanager
 def styled(fonttype: str = "path") -> Iterator[None]:
-    """Let our style alone count within, whatever the user's matplotlibrc says, and give theirs back afterwards.
+    """Let our style alone count within, whatever the user's matplotlibrc says; theirs is back afterwards.
 
     Parameters
     ----------
@@ -87,8 +87,8 @@ def envelope(
 ) -> tuple[FloatArray, FloatArray]:
     """Return a line that looks like x(t) with at most about three points per column.
 
-    Short signals are returned as they are, long ones as the smallest and largest value in each column of time.
-    NaN breaks the line where it restarts.
+    Short signals are returned as they are, long ones as the smallest and largest value in each column of
+    time. NaN breaks the line where it restarts.
 
     Parameters
     ----------
@@ -119,9 +119,7 @@ def envelope(
     return np.insert(times, at, times[at]), np.insert(pairs, at, np.nan)
 
 
-def spans_on(
-    t: FloatArray, low: FloatArray, high: FloatArray, most: int = COLUMNS
-) -> list[tuple[float, float]]:
+def spans_on(t: FloatArray, low: FloatArray, high: FloatArray, most: int = COLUMNS) -> list[tuple[float, float]]:
     """Return the spans low to high; where there are many, those that a picture would show as one are joined.
 
     Parameters

@@ -19,23 +19,31 @@ REPORTS, TRACES, RECORDINGS = (".html", ".htm"), (".parquet", ".pq"), (".csv", "
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 app = typer.Typer(
-    cls=Commands, add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, context_settings=CONTEXT
+    cls=Commands,
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings=CONTEXT,
 )
 
 LoopFile = Annotated[Path, typer.Argument(metavar="LOOP", help="Loop file (TOML).")]
 ColumnsText = Annotated[
-    str | None, typer.Option("--columns", metavar="MAP", help="Where signals stand: 't=Time, r=Ref, u=2*Amps, y=Pos'.")
+    str | None,
+    typer.Option("--columns", metavar="MAP", help="Where signals stand: 't=Time, r=Ref, u=2*Amps, y=Pos'."),
 ]
 Where = Annotated[
-    list[str] | None, typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges.")
+    list[str] | None,
+    typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges."),
 ]
 By = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
 Report = Annotated[
-    Path | None, typer.Option(metavar="FILE.html", help="Write a page with plots; for several, one per recording.")
+    Path | None,
+    typer.Option(metavar="FILE.html", help="Write a page with plots; for several, one per recording."),
 ]
 Trace = Annotated[
-    Path | None, typer.Option(metavar="FILE.parquet", help="Write the course over time; for several, one each.")
+    Path | None,
+    typer.Option(metavar="FILE.parquet", help="Write the course over time; for several, one each."),
 ]
 
 
@@ -61,7 +69,7 @@ def servoscope(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Listen to a servo loop and say whether its actuator is healthy; if not, what changed, by how much, since when."""
+    """Say from r, u and y of a servo loop whether its actuator is healthy; if not, what changed, and when."""
 
 
 @app.command()
@@ -69,24 +77,25 @@ def simulate(
     loop: LoopFile,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="REC", help="Recording to write, CSV or Parquet.")],
     reference: Annotated[
-        str, typer.Option(metavar="KIND|FILE", help="profile, multisine, trapezoid, steps, chirp, or a file with t, r.")
+        str, typer.Option(metavar="KIND|FILE", help="profile, multisine, trapezoid, steps, chirp, or a file.")
     ] = "profile",
     amplitude: Annotated[float, typer.Option(metavar="X", help="Factor on the reference.")] = 1.0,
     duration: Annotated[float, typer.Option(metavar="S", help="Length in s.")] = 60.0,
     fault: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=RATIO@S", help="C_ie=1.2@30 steps at 30 s, C_ie=1.2@30~600 ramps; repeatable."),
+        typer.Option(metavar="NAME=RATIO@S", help="C_ie=1.2@30: step; C_ie=1.2@30~600: ramp; repeatable."),
     ] = None,
-    noise_u: Annotated[float, typer.Option(metavar="X", min=0.0, help="Standard deviation of noise on u.")] = 1e-4,
-    noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Standard deviation of noise on y.")] = 3.162e-4,
+    noise_u: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on u, std. dev.")] = 1e-4,
+    noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on y, std. dev.")] = 3.162e-4,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the noise.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a loop, with faults if wanted, and write what a machine would log."""
     arguments.check_output(output, "-o", RECORDINGS, [loop, Path(reference)])
+    arguments.check_reference(reference)
     events = arguments.fault_events(fault or [])
 
-    from servoscope import simulation, terminal, writers
+    from servoscope import simulation, summaries, terminal, writers
     from servoscope.loop import Loop
     from servoscope.progress import progress
 
@@ -100,9 +109,10 @@ def simulate(
         steps.tell("writing")
         used = writers.write(output, recording, settings.columns)
     if as_json:
-        how = {"reference": reference, "amplitude": amplitude, "noise_u_std": noise_u, "noise_y_std": noise_y}
-        said = {"recording": str(output), **terminal.simulated_facts(recording, truth, used), **how, "seed": seed}
-        print_json(said, lines=False)
+        how = {"reference": reference, "amplitude": amplitude, "seed": seed}
+        noise = {"noise_u_std": noise_u, "noise_y_std": noise_y}
+        facts = summaries.simulated(recording, truth, used)
+        print_json({"recording": str(output), **facts, **how, **noise}, lines=False)
     else:
         terminal.simulated(terminal.console(), str(output), reference, recording, truth)
         if used != settings.columns:
@@ -111,7 +121,7 @@ def simulate(
 
 @app.command()
 def inspect(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Recordings.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Recordings.")],
     loop: Annotated[Path | None, typer.Option(metavar="LOOP", help="Loop file: columns, sample rate, plant.")] = None,
     columns: ColumnsText = None,
     where: Where = None,
@@ -119,10 +129,10 @@ def inspect(
     as_json: AsJson = False,
     report: Report = None,
 ) -> None:
-    """Say whether a log is usable, and if not, why; where its signals are unknown, say which columns it has."""
+    """Say whether a log is usable, and if not, why; without a mapping, say which columns it has."""
     arguments.check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
 
-    from servoscope import inspection, terminal
+    from servoscope import inspection, inspection_figures, summaries, terminal
     from servoscope.loop import Loop
     from servoscope.progress import progress
 
@@ -138,7 +148,7 @@ def inspect(
                 if unmapped := source.unmapped(path):
                     with steps.paused():
                         if as_json:
-                            print_json(terminal.channel_facts(path.name, unmapped), lines=many)
+                            print_json(summaries.channels(path.name, unmapped), lines=many)
                         else:
                             terminal.channels(out, path.name, unmapped)
                     raise arguments.no_mapping(path)
@@ -153,7 +163,7 @@ def inspect(
                     if pages is not None:
                         with failures.noted():
                             target = pages.path(arguments.stem_of(path, recording.name))
-                            inspection.write(target, said, recording)
+                            inspection_figures.write(target, said, recording)
                             terminal.written(terminal.console(stderr=as_json), target)
     failures.leave()
 
@@ -163,7 +173,7 @@ def learn(
     loop: LoopFile,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="BASELINE", help="Baseline to write (JSON).")],
     healthy: Annotated[
-        list[Path] | None, typer.Argument(metavar="HEALTHY...", help="Healthy recordings.", show_default=False)
+        list[Path] | None, typer.Argument(metavar="HEALTHY", help="Healthy recordings.", show_default=False)
     ] = None,
     nominal: Annotated[bool, typer.Option("--nominal", help="From the plant's nominal parameters instead.")] = False,
     columns: ColumnsText = None,
@@ -177,7 +187,7 @@ def learn(
         raise typer.BadParameter("give healthy recordings or --nominal, and not both")
     arguments.check_output(output, "-o", (), [loop, *paths])
 
-    from servoscope import learning, terminal
+    from servoscope import learning, summaries, terminal
     from servoscope.loop import Loop
     from servoscope.progress import progress
 
@@ -195,10 +205,11 @@ def learn(
         if failures.count and not recordings:
             failures.leave()
         steps.begin("learning")
-        found = learning.nominal(settings, steps.tell) if nominal else learning.learn(settings, recordings, steps.tell)
+        tell = steps.tell
+        found = learning.nominal(settings, tell) if nominal else learning.learn(settings, recordings, tell)
         found.save(output)
     if as_json:
-        print_json({"baseline": str(output), **terminal.baseline_facts(found)}, lines=False)
+        print_json({"baseline": str(output), **summaries.baseline(found)}, lines=False)
     else:
         terminal.baseline(terminal.console(), found)
         terminal.written(terminal.console(), output)
@@ -208,7 +219,7 @@ def learn(
 @app.command()
 def diagnose(
     baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="What learn wrote.")],
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Recordings to judge.")],
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING", help="Recordings to judge.")],
     columns: ColumnsText = None,
     where: Where = None,
     by: By = None,
@@ -217,12 +228,12 @@ def diagnose(
     trace: Trace = None,
     fail_on_fault: Annotated[bool, typer.Option("--fail-on-fault", help="Exit with 3 if there is a fault.")] = False,
 ) -> None:
-    """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure that is."""
+    """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure."""
     inputs = [baseline, *recordings]
     arguments.check_output(report, "--report", REPORTS, inputs, folder=True)
     arguments.check_output(trace, "--trace", TRACES, inputs, folder=True)
 
-    from servoscope import monitor, terminal, writers
+    from servoscope import monitor, summaries, terminal, writers
     from servoscope.baseline import Baseline
     from servoscope.progress import progress
 
@@ -242,7 +253,7 @@ def diagnose(
                         faulty |= said.verdict == "fault"
                         with steps.paused():
                             if as_json:
-                                print_json(terminal.plain(said), lines=many)
+                                print_json(summaries.plain(said), lines=many)
                             else:
                                 terminal.diagnosis(out, said)
                         stem = arguments.stem_of(path, recording.name)
@@ -264,11 +275,11 @@ def diagnose(
 
 @app.command()
 def demo(
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for what it writes.")
-    ] = Path("demo-output"),
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for what it writes.")] = Path(
+        "demo-output"
+    ),
 ) -> None:
-    """Simulate a rig, break it, learn and diagnose: the main job in four commands, a few seconds after the first time."""
+    """Simulate a rig, break it, learn and diagnose: the main job in four commands."""
     from servoscope import demo as demonstration
 
     demonstration.show(output, lambda words: app(list(words), standalone_mode=False))

@@ -132,7 +132,10 @@ def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
                 atomic_write(step.into, said.getvalue().encode())
                 terminal.diagnosis(out, Diagnosis.model_validate_json(said.getvalue()))
             out.print()
-    out.print(Text(f"Open {folder / 'report.html'} in a browser; {folder / 'loop.toml'} describes the rig."), soft_wrap=True)
+    out.print(
+        Text(f"Open {folder / 'report.html'} in a browser; {folder / 'loop.toml'} describes the rig."),
+        soft_wrap=True,
+    )
 
 
 def _checked(code: object) -> None:

@@ -14,9 +14,7 @@ SECONDS_PER_YEAR = 365.25 * 86400.0
 POWER = 0.9  # probability with which a promised change is seen
 
 
-def threshold(
-    n: int, evaluation_rate: float, memory: float, false_alarms_per_year: float, dof: float
-) -> float:
+def threshold(n: int, evaluation_rate: float, memory: float, false_alarms_per_year: float, dof: float) -> float:
     """Return the limit of T^2 that a healthy loop crosses as often as the budget allows.
 
     theta_hat forgets within `memory`, so looks close together are one look; how close depends on the level: an

@@ -9,6 +9,7 @@ import numpy as np
 
 from servoscope import ifrf
 from servoscope.baseline import Baseline
+from servoscope.candidates import candidates_of
 from servoscope.detection import Onset, noncentrality, onset, required_noncentrality, statistic
 from servoscope.diagnosis import (
     UNKNOWN,
@@ -22,11 +23,9 @@ from servoscope.diagnosis import (
     Warning,
 )
 from servoscope.errors import RecordingError
-from servoscope.inverse import nominal_theta
-from servoscope.isolation import Signature, curve, isolate, line
-from servoscope.learning import fault_directions
+from servoscope.identification import fault_directions
+from servoscope.isolation import isolate
 from servoscope.pipeline import Estimates, Pipeline, Tuning
-from servoscope.plants import Fault, FloatArray
 from servoscope.recording import Recording
 from servoscope.signatures import Expectation, course
 
@@ -106,7 +105,7 @@ class Examination:
             progress("onset")
             since = self._onset(first, at)
             candidates = isolate(
-                self._signatures(at, since.sample),
+                candidates_of(self.baseline, recording, self.expectation, since.sample, int(self.estimates.index[at])),
                 trace.theta[at] - trace.expected[at],
                 self.estimates.S[at] * max(1.0, float(self.estimates.power[at])) + self.baseline.cov(),
                 lambda: progress("isolation"),
@@ -149,47 +148,6 @@ class Examination:
             int(index[at]),
         )
 
-    def _signatures(self, at: int, since: int) -> list[Signature]:
-        """Return one signature per fault: simulated with the loop, from physics alone, or the coefficient itself."""
-        loop, plant, faults = self.baseline.loop, self.baseline.plant, self.baseline.loop.plant.faults
-        if self.expectation is not None:
-            model_theta = np.array(self.baseline.model_theta)
-            expectation = self.expectation.until(int(self.estimates.index[at]) + 1)
-            healthy = expectation.path([plant], [0], model_theta)[-1]
-
-            def simulated(fault: Fault) -> Callable[[float], FloatArray]:
-                def shift(ratio: float) -> FloatArray:
-                    ill = plant.with_ratios({fault.parameter: ratio})
-                    plants, onsets = ([plant, ill], [0, since]) if since > 0 else ([ill], [0])
-                    return expectation.path(plants, onsets, model_theta)[-1] - healthy
-
-                return shift
-
-            return [curve(fault, simulated(fault)) for fault in faults]
-        learned = self._learned_since(since, at)
-        if plant.has_physics and loop.plant.kind != "polynomial":
-            base = nominal_theta(loop.model_copy(update={"plant": plant}))
-
-            def physical(fault: Fault) -> Callable[[float], FloatArray]:
-                def shift(ratio: float) -> FloatArray:
-                    ill = plant.with_ratios({fault.parameter: ratio})
-                    return learned @ (nominal_theta(loop.model_copy(update={"plant": ill})) - base)
-
-                return shift
-
-            return [curve(fault, physical(fault)) for fault in faults]
-        directions = fault_directions(loop, plant, self.tuning.theta)
-        moving = [fault for fault in faults if np.any(directions[fault.parameter])]
-        return [line(fault, learned @ directions[fault.parameter]) for fault in moving]
-
-    def _learned_since(self, since: int, at: int) -> FloatArray:
-        """Return I - Psi from the onset to an evaluation: the share of a change that theta_hat has taken up."""
-        recording, n = self.recording, self.pipeline.bank.n
-        last = int(self.estimates.index[at])
-        later = recording.part(float(recording.t[since]), float(recording.t[last]) + 0.5 / recording.sample_rate)
-        Psi = self.pipeline.estimate(self.tuning, later).Psi
-        return np.eye(n) - Psi[-1] if len(Psi) else np.eye(n)
-
     def _blind_to(self) -> list[str]:
         """Return what this recording could not have shown although the baseline promises it."""
         promised = {p.parameter: p for p in self.baseline.promises if p.change is not None}
@@ -204,10 +162,10 @@ class Examination:
         for promise, information in zip(promised.values(), best, strict=True):
             seen = np.sqrt(needed / information) if information > 0.0 else np.inf
             if promise.change is not None and seen > WEAKER * promise.change:
-                size = "no change at all" if np.isinf(seen) else f"a change of {promise.parameter} only from {seen:.2g} times its value on"
+                size = "not at all" if np.isinf(seen) else f"only from {seen:.0%} on"
                 told.append(
-                    f"too short or too little motion: it would show {size} ({promise.name}), the baseline promises "
-                    f"{promise.change:.2g}"
+                    f"too short or too little motion: a change of {promise.parameter} ({promise.name}) would show "
+                    f"{size}, the baseline promises {promise.change:.0%}"
                 )
         return told
 
@@ -218,7 +176,8 @@ class Examination:
         if len(e.updates) and e.skipped[-1] > 0.01 * (e.skipped[-1] + e.updates[-1]):
             count = int(e.skipped[-1])
             message = f"the instrument was too weak for {count} updates, which were skipped"
-            doubts.append(Warning(kind="instrument", from_s=float(t[0]), to_s=float(t[-1]), count=count, message=message))
+            span = float(t[0]), float(t[-1])
+            doubts.append(Warning(kind="instrument", from_s=span[0], to_s=span[1], count=count, message=message))
         if len(e.updates) and e.updates[-1] > 0:
             last = int(e.index[int(np.searchsorted(e.updates, e.updates[-1]))])
             if t[-1] - t[last] > self.baseline.loop.monitor.memory:
@@ -276,8 +235,8 @@ def _summary(
         (fault,) = faults
         low, high = fault.interval
         return (
-            f"Fault, {fault.name} ({words[fault.name]}): {fault.parameter} is {fault.ratio:.4g} times its healthy value "
-            f"({low:.4g} to {high:.4g}) {since}."
+            f"Fault, {fault.name} ({words[fault.name]}): {fault.parameter} is {fault.ratio:.4g} times its healthy "
+            f"value ({low:.4g} to {high:.4g}) {since}."
         )
     likely = [c for c in candidates if c.probability >= 0.05]
     if likely[0].name == UNKNOWN and likely[0].probability >= 0.5:

@@ -1,4 +1,4 @@
-"""What r excites: spectra and coherence of r, u and y, the usable band, the signal at the monitored frequencies."""
+"""What r excites: spectra and coherence of r, u and y, the usable band, signal to noise at a frequency."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class Band(Said):
 class Excited(Said):
     """One monitored frequency, with the coherences of r -> u and r -> y around it.
 
-    `snr` is the power that follows r over the power that does not, the smaller of u and y; `relative_std` that of
-    the iFRF after the whole recording, `relative_std_memory` that after the estimator's memory, both None where the
-    regression failed.
+    `snr` is the power that follows r over the power that does not, the smaller of u and y; `relative_std`
+    that of the iFRF after the whole recording, `relative_std_memory` that after the estimator's memory, both None
+    where the regression failed.
     """
 
     frequency_hz: float
@@ -151,7 +151,7 @@ def information_edge(s: Spectra, noise: float, sample_rate: float) -> float:
 
 
 def signal_at(s: Spectra, frequency: float) -> tuple[float, float, float]:
-    """Return the coherences r -> u and r -> y around a frequency [Hz], and the signal-to-noise ratio (power)."""
+    """Return the coherences r -> u and r -> y around a frequency [Hz], and signal over noise (power)."""
     near = np.abs(s.f - frequency) <= max(0.05 * frequency, 1.01 * float(s.f[0]))
     if not near.any():
         return 0.0, 0.0, 0.0

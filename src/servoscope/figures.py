@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import wraps
-from typing import ParamSpec
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from servoscope.canvas import COLOURS, BoolArray, envelope, robust_range, save, spans_on
+from servoscope.canvas import COLOURS, BoolArray, envelope, robust_range, save, spans_on, styled
 from servoscope.diagnosis import Diagnosis, Trace
+from servoscope.ifrf import Response
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 from servoscope.wording import axis_scale, plain_symbol, times
@@ -26,24 +25,9 @@ PAPER, INK, MUTED, RULE = COLOURS["paper"], COLOURS["ink"], COLOURS["muted"], CO
 MEASURED, HEALTHY, ALARM = COLOURS["measured"], COLOURS["healthy"], COLOURS["alarm"]
 REFERENCE = COLOURS["reference"]
 
-P = ParamSpec("P")
 
-
-def _styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Draw with our style alone, whatever the user's matplotlibrc says."""
-
-    @wraps(draw)
-    def styled(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with styled():
-            return draw(*args, **kwargs)
-
-    return styled
-
-
-@_styled
-def signals(
-    recording: Recording, diagnosis: Diagnosis | None = None, *, units: tuple[str, str] = ("", "")
-) -> Figure:
+@styled()
+def signals(recording: Recording, diagnosis: Diagnosis | None = None, *, units: tuple[str, str] = ("", "")) -> Figure:
     """Draw reference and output, their difference, and the input over time; gaps are shaded.
 
     Parameters
@@ -74,17 +58,14 @@ def signals(
         ax.set_ylabel(f"{label} [{prefix}]" if prefix else label)
         _gaps(ax, t, recording.restart, 1.5 / recording.sample_rate / factor)
         _marks(ax, diagnosis, factor)
-    two = [
-        Line2D([], [], color=c, linewidth=w, label=words)
-        for (_, c, words), w in zip(both, (2.6, 1.2), strict=True)
-    ]
+    two = [Line2D([], [], color=c, linewidth=w, label=words) for (_, c, words), w in zip(both, (2.6, 1.2), strict=True)]
     _legend_above(figure, diagnosis, two)
     axes[0].margins(x=0.0)
     axes[-1].set_xlabel(f"time [{unit}]")
     return figure
 
 
-@_styled
+@styled()
 def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     """Draw T^2 over time on a logarithmic axis, with its threshold, the onset and the detection."""
     figure = Figure(figsize=(WIDTH, 2.7), layout="constrained")
@@ -117,7 +98,7 @@ def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     return figure
 
 
-@_styled
+@styled()
 def coefficients(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     """Draw each coefficient's deviation from its healthy expectation over time, with bands of two sigma.
 
@@ -177,12 +158,12 @@ def _coefficient(ax: Axes, trace: Trace, i: int, factor: float) -> None:
     ax.set_ylim(robust_range(np.concatenate([(middle - band)[usable], (middle + band)[usable], [0.0]])))
 
 
-@_styled
+@styled()
 def ifrf(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     """Draw the iFRF in the complex plane, one panel per frequency: path over time, last estimate, healthy.
 
-    Ellipses hold 95 %. The axes of a panel are scaled each on its own: as a rule the iFRF moves far less one way
-    than the other.
+    Ellipses hold 95 %. The axes of a panel are scaled each on its own: as a rule the iFRF moves far less
+    one way than the other.
     """
     F = len(trace.ifrf.frequencies)
     columns = max(1, min(F, 4 if F in (4, 7, 8) else 3))
@@ -205,9 +186,7 @@ def ifrf(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     handles = [
         _marker("D", PAPER, INK, "healthy expectation"),
         _marker("o", ALARM if faulty else MEASURED, PAPER, "last estimate; ellipses hold 95 %"),
-        Line2D(
-            [], [], color=MEASURED, alpha=0.5, label="path before onset" if np.isfinite(onset) else "path"
-        ),
+        Line2D([], [], color=MEASURED, alpha=0.5, label="path before onset" if faulty else "path"),
     ]
     if faulty:
         handles.append(Line2D([], [], color=ALARM, alpha=0.5, label="path after onset"))
@@ -235,9 +214,8 @@ def _plane(ax: Axes, trace: Trace, i: int, usable: BoolArray, onset: float) -> N
         if not np.isfinite(H):
             continue
         if np.isfinite(covariance).all():
-            outline = type(response)(response.frequencies[i : i + 1], H[None], covariance[None]).ellipse(96)[
-                0
-            ]
+            one = Response(response.frequencies[i : i + 1], H[None], covariance[None])
+            outline = one.ellipse(96)[0]
             ax.fill(*outline.T, facecolor=colour, alpha=alpha, linewidth=0)
             ax.plot(*outline.T, color=colour, linewidth=1.1)
             shown.append(outline)
@@ -273,9 +251,7 @@ def _marks(ax: Axes, diagnosis: Diagnosis | None, factor: float) -> None:
         ax.axvspan(low, high, facecolor=ALARM, edgecolor=ALARM, linewidth=0.5, alpha=0.22, zorder=0)
         ax.axvline(likely, color=ALARM, linewidth=1.0, alpha=0.8, zorder=1)
     if diagnosis.detected_at_s is not None:
-        ax.axvline(
-            diagnosis.detected_at_s / factor, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), zorder=2
-        )
+        ax.axvline(diagnosis.detected_at_s / factor, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), zorder=2)
 
 
 def _mark_handles(diagnosis: Diagnosis | None) -> list[Line2D | Patch]:
@@ -294,9 +270,10 @@ def _legend_above(figure: Figure, diagnosis: Diagnosis | None, lines: Sequence[L
 
 def _empty(ax: Axes, words: str) -> None:
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=MUTED)
+    ax.set_xticks([])
     ax.set_yticks([])
 
 
 def _nothing(figure: Figure, ax: Axes) -> Figure:
-    _empty(ax, "no evaluation: the recording is too short for the estimator")
+    _empty(ax, "no evaluation: the estimator never had enough data")
     return figure

@@ -22,8 +22,8 @@ class FreeRun(Said):
 def free_run(recording: Recording, g: Regressors, which: IndexArray, fitted: Fitted) -> FreeRun:
     """Simulate the estimated model with u alone and compare with y, both behind the state-variable filter.
 
-    Friction is driven by the measured speed. A plant without stiffness only accumulates its errors in y, so its
-    speed is compared. Initial states and a constant input are fitted stretch by stretch.
+    Friction is driven by the measured speed. A plant without stiffness only accumulates its errors in y, so
+    its speed is compared. Initial states and a constant input are fitted stretch by stretch.
 
     Parameters
     ----------
@@ -67,9 +67,7 @@ def free_run(recording: Recording, g: Regressors, which: IndexArray, fitted: Fit
         words = f"not possible: the estimated model is unstable (grows by a factor e in {grows:.2g} s)"
         return FreeRun(explained=None, words=words)
     if (np.abs(poles) < slow).sum() > 1:
-        return FreeRun(
-            explained=None, words="not possible: the estimated model integrates twice, it would drift"
-        )
+        return FreeRun(explained=None, words="not possible: the estimated model integrates twice, it would drift")
     share = _simulated(g, c, drive, output)
     if share is None:
         return FreeRun(explained=None, words="not possible: no stretch without gaps is long enough")

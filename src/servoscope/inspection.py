@@ -1,4 +1,4 @@
-"""Is this log usable for servoscope, and if not, why: everything that is measured on a recording, and the verdict."""
+"""Is this log usable for servoscope, and if not, why: all that is measured, and the verdict."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MEMORY = 5.0  # s, without a loop
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """What figures need and no summary holds: spectra, residual (N,) with its mask, autocorrelation from lag 0 on."""
+    """What figures need and no summary holds: spectra, residual v (N,) where used, autocorrelation rho."""
 
     spectra: Spectra | None
     v: FloatArray
@@ -70,8 +70,8 @@ def inspect(recording: Recording, loop: Loop | None = None) -> Inspection:
     recording
         The recording.
     loop
-        The loop it was taken from. Without it a generic inverse (a polynomial in s of order 1 to 3 with offset,
-        stiffness and Coulomb friction as far as they explain anything) takes its place.
+        The loop it was taken from. Without it a generic inverse (a polynomial in s of order 1 to 3 with
+        offset, and with stiffness and Coulomb friction as far as they explain anything) takes its place.
 
     Returns
     -------
@@ -95,9 +95,7 @@ def inspect(recording: Recording, loop: Loop | None = None) -> Inspection:
     return _concluded(measured, loop, constant, traces)
 
 
-def _concluded(
-    m: Measured, loop: Loop | None, constant: tuple[str, ...], traces: Traces | None
-) -> Inspection:
+def _concluded(m: Measured, loop: Loop | None, constant: tuple[str, ...], traces: Traces | None) -> Inspection:
     findings = judge(m, loop, constant)
     verdict = verdict_of(findings)
     severity = {"not usable": "stop", "usable with care": "care", "usable": "none"}[verdict]
@@ -172,7 +170,7 @@ def _modelled(recording: Recording, loop: Loop | None, m: Measured) -> tuple[Mea
 
 
 def _suggested_cutoff(spectra: Spectra | None, coherent: float | None, noise: float, rate: float) -> float:
-    """Return a tenth of the sample rate, or up to where y is more than noise, or follows r, if that is less."""
+    """Return a tenth of the sample rate, or up to where y is more than noise and follows r, if less."""
     if spectra is None:
         return rate / 10.0
     edge = min(rate / 10.0, excitation.information_edge(spectra, noise, rate), coherent or math.inf)

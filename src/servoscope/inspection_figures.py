@@ -25,10 +25,12 @@ DOTS = 110  # per inch
 COLOURS = {"r": "#6b7280", "u": "#b45309", "y": "#1d4ed8"}
 SIGNS = {"usable": "#15803d", "usable with care": "#b45309", "not usable": "#b91c1c"}
 STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #111827; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
+       color: #111827; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
 .verdict { color: white; border-radius: .4rem; padding: .6rem 1rem; font-weight: 600; }
-table { border-collapse: collapse; } td, th { text-align: left; padding: .2rem 1rem .2rem 0; vertical-align: top; }
+table { border-collapse: collapse; }
+td, th { text-align: left; padding: .2rem 1rem .2rem 0; vertical-align: top; }
 td.stop { color: #b91c1c; } td.care { color: #b45309; } td.note { color: #6b7280; }
 img { max-width: 100%; } .small { color: #6b7280; font-size: .9rem; }
 """
@@ -40,7 +42,7 @@ def figures_of(inspection: Inspection, recording: Recording) -> list[tuple[str, 
     Parameters
     ----------
     inspection
-        As `servoscope.inspection.inspect` returned it; what was read back from JSON has only the signals to show.
+        As `servoscope.inspection.inspect` returned it; read back from JSON it has only the signals to show.
     recording
         The recording that was inspected.
 
@@ -69,9 +71,7 @@ def _figure(rows: int, *, share_time: bool) -> tuple[Figure, list[Axes]]:
     return figure, axes
 
 
-def _broken(
-    recording: Recording, x: np.ndarray[tuple[int], np.dtype[np.float64]]
-) -> tuple[np.ndarray, np.ndarray]:
+def _broken(recording: Recording, x: np.ndarray[tuple[int], np.dtype[np.float64]]) -> tuple[np.ndarray, np.ndarray]:
     """Return t and x with a NaN before each restart, so that lines end at gaps."""
     at = np.flatnonzero(recording.restart[1:]) + 1
     return np.insert(recording.t, at, np.nan), np.insert(x, at, np.nan)
@@ -144,7 +144,8 @@ def _rows(inspection: Inspection) -> list[tuple[str, str]]:
         ("sampling", f"{s.samples} samples at {s.sample_rate_hz:g} Hz, {s.duration_s:.4g} s, {s.runs} runs"),
         (
             "gaps",
-            f"{s.stretches - s.runs}; longest stretch without {s.longest_stretch_s:.4g} s, {s.missing_percent:.2g} % missing",
+            f"{s.stretches - s.runs}; longest stretch without {s.longest_stretch_s:.4g} s,"
+            f" {s.missing_percent:.2g} % missing",
         ),
     ]
     for q in inspection.quantisation:
@@ -166,25 +167,21 @@ def _rows(inspection: Inspection) -> list[tuple[str, str]]:
 def page(inspection: Inspection, recording: Recording) -> str:
     """Return the page as HTML that needs nothing else: no script, no network."""
     findings = "".join(
-        f'<tr><td class="{f.severity}">{f.severity}</td><td>{_text(f.message)}</td></tr>'
-        for f in inspection.findings
+        f'<tr><td class="{f.severity}">{f.severity}</td><td>{_text(f.message)}</td></tr>' for f in inspection.findings
     )
     advice = "".join(f"<li>{_text(line)}</li>" for line in inspection.recommendations)
-    numbers = "".join(
-        f"<tr><td>{_text(name)}</td><td>{_text(value)}</td></tr>" for name, value in _rows(inspection)
-    )
+    numbers = "".join(f"<tr><td>{_text(name)}</td><td>{_text(value)}</td></tr>" for name, value in _rows(inspection))
     plots = "".join(
         f'<h2>{_text(title)}</h2><img alt="{_text(title)}" src="data:image/png;base64,{_png(figure)}">'
         for title, figure in figures_of(inspection, recording)
     )
     against = (
-        f"against the loop {_text(inspection.loop)}"
-        if inspection.loop
-        else "without a loop, by a generic inverse"
+        f"against the loop {_text(inspection.loop)}" if inspection.loop else "without a loop, by a generic inverse"
     )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>{_text(inspection.recording)}: {inspection.verdict}</title><style>{STYLE}</style></head><body>"
+        f"<title>{_text(inspection.recording)}: {inspection.verdict}</title>"
+        f"<style>{STYLE}</style></head><body>"
         f"<h1>Is {_text(inspection.recording)} usable?</h1>"
         f'<p class="verdict" style="background:{SIGNS[inspection.verdict]}">{_text(inspection.summary)}</p>'
         f'<p class="small">Inspected {against}.</p>'

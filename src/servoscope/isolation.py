@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -167,8 +168,10 @@ class _Search:
         i = int(np.argmin([self.J(float(x)) for x in grid]))
         bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
         width = bracket[1] - bracket[0]
-        steps = {"xatol": 1e-4 * width, "maxiter": 40 if fine else 8}
-        optimize.minimize_scalar(self.J, bounds=bracket, method="bounded", options=steps)
+        rounds = 40 if fine else 8
+        optimize.minimize_scalar(
+            self.J, bounds=bracket, method="bounded", options={"xatol": 1e-4 * width, "maxiter": rounds}
+        )
         best = min(self.known, key=lambda x: self.known[x][0])
         if fine:
             # a parabola through the minimum says how wide to look; the integral itself uses the true curve
@@ -184,7 +187,7 @@ class _Search:
         log_weight = -(J + logdet) / 2.0
         top = float(log_weight.max())
         # fine enough for a smooth posterior between the points that were simulated
-        dense = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in zip(x[:-1], x[1:], strict=True)]))
+        dense = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in pairwise(x)]))
         density = np.exp(np.interp(dense, x, np.maximum(log_weight, top - 1e4)) - top)
         area = np.concatenate([[0.0], np.cumsum(np.diff(dense) * (density[1:] + density[:-1]) / 2.0)])
         low, high = np.interp([0.025, 0.975], area / area[-1], dense)

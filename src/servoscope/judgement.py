@@ -26,7 +26,7 @@ MODEL_ERROR = 0.005
 
 
 class Finding(Said):
-    """One reason: ``stop`` makes a recording not usable, ``care`` usable with care, ``note`` is good to know."""
+    """A reason: ``stop`` makes a recording not usable, ``care`` usable with care, ``note`` just informs."""
 
     kind: str
     severity: Severity
@@ -47,9 +47,7 @@ def judge(m: Measured, loop: Loop | None, constant: tuple[str, ...] = ()) -> tup
     """
     found = [*_of_signals(m, loop, constant), *_of_excitation(m, loop), *_of_model(m, loop)]
     rank = {"stop": 0, "care": 1, "note": 2}
-    return tuple(
-        sorted((Finding(kind=k, severity=s, message=w) for k, s, w in found), key=lambda f: rank[f.severity])
-    )
+    return tuple(sorted((Finding(kind=k, severity=s, message=w) for k, s, w in found), key=lambda f: rank[f.severity]))
 
 
 def verdict_of(findings: tuple[Finding, ...]) -> Verdict:
@@ -89,12 +87,7 @@ def _of_signals(m: Measured, loop: Loop | None, constant: tuple[str, ...]) -> It
             events = f"{defect.events} times, first: " if defect.events > 1 else ""
             yield defect.kind, severity, f"{events}{defect.first}"
     for q in m.quantisation:
-        if (
-            q.signal != "r"
-            and q.step is not None
-            and q.effective_bits is not None
-            and q.effective_bits < 14.0
-        ):
+        if q.signal != "r" and q.step is not None and q.effective_bits is not None and q.effective_bits < 14.0:
             severity = "care" if q.effective_bits < FEW_BITS else "note"
             words = f"{q.signal} comes in steps of {q.step:.4g}, {q.effective_bits:.1f} bits over its range"
             yield (
@@ -105,17 +98,15 @@ def _of_signals(m: Measured, loop: Loop | None, constant: tuple[str, ...]) -> It
     at = m.saturation
     share = at.share_low + at.share_high if at is not None else 0.0
     if at is not None and share > 0.0:
-        limits = " and ".join(
-            f"{x:g}" for x, part in ((at.low, at.share_low), (at.high, at.share_high)) if part
-        )
+        limits = " and ".join(f"{x:g}" for x, part in ((at.low, at.share_low), (at.high, at.share_high)) if part)
         words = f"u is at {limits} for {percent(share)} of the time, {at.longest_s:.3g} s at most"
         before = loop is not None and loop.input_logged == "before_limiter"
         yield "saturation", "care" if share > 0.05 and not before else "note", words
     if m.dead_zone is not None:
         z = m.dead_zone
         known = loop is not None and loop.input_deadzone is not None
-        words = f"the output does not move while u is between {z.low:.4g} and {z.high:.4g} (dead zone, or friction at rest)"
-        yield "dead_zone", "note" if known else "care", words
+        words = f"the output does not move while u is between {z.low:.4g} and {z.high:.4g}"
+        yield "dead_zone", "note" if known else "care", f"{words} (dead zone, or friction at rest)"
 
 
 def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
@@ -133,8 +124,8 @@ def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
             f"the output rests {percent(m.rest.share)} of the time (speed below {m.rest.speed:.2g} per s)",
         )
     if m.band is None:
-        words = "no band of frequencies in which both u and y follow the reference: it excites little, or the loop is not linear"
-        yield "band", "care", words
+        words = "no band of frequencies in which both u and y follow the reference"
+        yield "band", "care", f"{words}: it excites little, does not repeat, or the loop is not linear"
     else:
         yield (
             "band",
@@ -144,23 +135,22 @@ def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
     asked: Severity = "care" if loop is not None else "note"
     for at in m.frequencies:
         if at.snr < SNR:
-            words = f"{at.frequency_hz:g} Hz is hardly excited, or u and y do not follow the reference linearly there"
+            words = f"{at.frequency_hz:g} Hz is hardly excited, or u and y do not follow the reference there"
             yield (
                 "frequency",
                 asked,
                 f"{words} (signal to noise {at.snr:.2g}): estimates there rest on other frequencies",
             )
         elif at.relative_std_memory is not None and at.relative_std_memory > 2.0 * PRECISE:
-            words = f"at {at.frequency_hz:g} Hz the memory of the estimator allows {percent(at.relative_std_memory)}"
+            precision = percent(at.relative_std_memory)
+            words = f"at {at.frequency_hz:g} Hz the memory of the estimator allows {precision}"
             yield "frequency", asked, f"{words} (standard deviation of the inverse frequency response)"
     if m.fit is not None and m.fit.condition > CONDITION:
         words = f"the motion hardly tells apart {m.fit.weakest} (condition number {m.fit.condition:.2g})"
         yield "conditioning", "care", words
     memory = loop.monitor.memory if loop is not None else 5.0
     if m.sampling.duration_s < LEAST_MEMORIES * memory:
-        words = (
-            f"{m.sampling.duration_s:.3g} s is short of {LEAST_MEMORIES:g} times the memory of {memory:g} s"
-        )
+        words = f"{m.sampling.duration_s:.3g} s is short of {LEAST_MEMORIES:g} times the memory of {memory:g} s"
         yield "short", "note", f"{words}: enough to diagnose, little to learn from"
 
 
@@ -188,8 +178,8 @@ def _of_model(m: Measured, loop: Loop | None) -> Iterator[_Said]:
     if m.best_order is not None and loop is not None:
         better = (1.0 - m.best_order.explained) / max(1.0 - explained, 1e-12)
         if better < 0.7 and explained < 0.99:
-            words = f"{described(m.best_order)} would leave only {percent(better)} of what the loop's model leaves over"
-            yield "plant", "care", words
+            words = f"{described(m.best_order)} would leave only {percent(better)}"
+            yield "plant", "care", f"{words} of what the loop's model leaves over"
     d = m.delay
     if d is not None and not d.identifiable:
         yield "delay", "note", f"delay from u to y {d.words}"
@@ -220,7 +210,7 @@ def _of_residual(left: Residual) -> Iterator[_Said]:
                 f"{words}: the model lacks something",
             )
         else:
-            yield "residual", "note", f"{words}: what is left over is noise"
+            yield "residual", "note", words if left.white is False else f"{words}: what is left over is noise"
     if left.white is False:
         words = "the residual is structured beyond the filters' memory"
         if left.repeating is not None and left.repeating < 0.1:

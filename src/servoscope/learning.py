@@ -1,4 +1,4 @@
-"""Healthy recordings -> Baseline: coefficients, noise, delay, healthy parameters, threshold, and what it can promise."""
+"""Healthy recordings -> Baseline: coefficients, noise, delay, healthy parameters, threshold, promises."""
 
 from __future__ import annotations
 
@@ -8,22 +8,19 @@ from dataclasses import replace
 import numpy as np
 
 from servoscope.baseline import Baseline, Promise, Source, digest
+from servoscope.delays import check_delay
 from servoscope.detection import SECONDS_PER_YEAR, noncentrality, required_noncentrality, statistic, threshold
-from servoscope.errors import LoopError, NotEnoughError, RecordingError
-from servoscope.inverse import nominal_theta
-from servoscope.linear import Linear, autocovariances
+from servoscope.errors import LoopError, NotEnoughError
+from servoscope.identification import fault_directions, healthy_parameters, noise_of, simulated
 from servoscope.loop import Loop
 from servoscope.pipeline import Estimates, Pipeline, Regression
-from servoscope.plants import FloatArray, Plant
+from servoscope.plants import FloatArray
 from servoscope.recording import Recording
-from servoscope.signatures import Expectation, Noise, course, noise_system
+from servoscope.signatures import Expectation, course
 from servoscope.simulation import reference, simulate
-from servoscope.tuning import Fit, autocovariance, fit, least_squares
+from servoscope.tuning import Fit, fit
 
-PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
 SHORTEST = 10.0  # memories; a shorter baseline is warned about
-DELAY_TOLERANCE = 0.5  # samples; intersample models alone move the estimate by a tenth
-DELAY_SIGNIFICANT = 0.1  # relative gain in residual variance below which a delay is not worth a refusal
 WORTH_A_LOOK = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
 
 Progress = Callable[[str], None]
@@ -57,7 +54,7 @@ def learn(loop: Loop, recordings: Sequence[Recording], progress: Progress = lamb
     regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
     found = fit(regressions, pipeline.memory, pipeline.bank.names)
     progress("delay")
-    delay_s, notes = _delay(loop, recordings, found)
+    delay_s, notes = check_delay(loop, recordings, found)
     return _assemble(loop, recordings, pipeline, regressions, found, delay_s, notes, progress)
 
 
@@ -82,11 +79,6 @@ def nominal(loop: Loop, progress: Progress = lambda _: None, duration_s: float =
     return _assemble(loop, [healthy], pipeline, regressions, found, loop.delay, [note], progress, exact=True)
 
 
-def simulated(loop: Loop) -> bool:
-    """Return whether the loop can be simulated as a linear closed loop, which expectations and signatures need."""
-    return loop.controller is not None and loop.plant.has_physics and not loop.plant.extras
-
-
 def _assemble(
     loop: Loop,
     recordings: Sequence[Recording],
@@ -101,15 +93,16 @@ def _assemble(
     covariance = found.covariance + _scatter(found)
     error = loop.monitor.model_error * found.rms_eta / found.tuning.scale
     covariance = covariance + np.diag(error**2)
-    theta, noise, ratios, model_theta = found.tuning.theta, None, {}, np.zeros(0)
+    theta, noise, model_theta = found.tuning.theta, None, np.zeros(0)
+    ratios: dict[str, float] = {}
     if simulated(loop):
         progress("healthy parameters")
-        noise = _noise(pipeline, found, regressions)
+        noise = noise_of(pipeline, found, regressions)
         expectations = [Expectation(pipeline, found.tuning, noise, course(rec)) for rec in recordings]
         if exact:
             theta = model_theta = expectations[0].batch(loop.plant)
         else:
-            ratios, model_theta, misfit = _healthy_parameters(expectations, found, covariance)
+            ratios, model_theta, misfit = healthy_parameters(expectations, found, covariance)
             if misfit > 10.0 * pipeline.bank.n:
                 notes.append(
                     f"[plant] and [controller] do not explain the healthy recordings (misfit {misfit:.0f}, about "
@@ -196,70 +189,6 @@ def _scatter(found: Fit) -> FloatArray:
     return np.diag(beyond * students * (1.0 + 1.0 / m))
 
 
-def _noise(pipeline: Pipeline, found: Fit, regressions: Sequence[Regression]) -> Noise:
-    """Split the residual into n_u and n_y: its autocovariance is a non-negative mixture of theirs."""
-    from scipy.optimize import nnls
-
-    lags = 20
-    n = pipeline.bank.n
-    residual = np.concatenate([[1.0], -nominal_theta(pipeline.loop)])  # v = eta - phi' theta
-    system = noise_system(pipeline, pipeline.loop.plant)
-    v = Linear(system.A, system.B, residual @ system.C[None, : 1 + n], residual @ system.D[None, : 1 + n])
-    columns = [
-        autocovariances(Linear(v.A, v.B[:, [i]], v.C, v.D[:, [i]]), lags, pipeline.stride)[:, 0, 0] for i in (0, 1)
-    ]
-    measured = autocovariance([(g.eta - g.phi @ found.tuning.theta)[g.ok] for g in regressions], lags)
-    size = np.array([column[0] for column in columns])
-    shares, _ = nnls(np.column_stack(columns) / size, measured)
-    u_std, y_std = np.sqrt(shares / size).tolist()
-    return Noise(u_std=u_std, y_std=y_std)
-
-
-def _healthy_parameters(
-    expectations: Sequence[Expectation], found: Fit, covariance: FloatArray
-) -> tuple[dict[str, float], FloatArray, float]:
-    """Fit the plant's parameters to the healthy coefficients, held near the loop file's by a prior.
-
-    Maximum a posteriori by Gauss and Newton on the expected least squares estimate; also returns that estimate and
-    the misfit, which is chi-square with n degrees of freedom when the loop file is right.
-    """
-    from scipy.optimize import least_squares as minimise
-
-    plant = expectations[0].pipeline.loop.plant
-    size = np.sqrt(np.diag(covariance))
-    L = np.linalg.cholesky(covariance / np.outer(size, size) + 1e-9 * np.eye(len(size)))
-    weights = [len(e.course.kept) for e in expectations]
-
-    def ratios(x: FloatArray) -> dict[str, float]:
-        return dict(zip(plant.parameters, np.exp(x).tolist(), strict=True))
-
-    def expected(x: FloatArray) -> FloatArray:
-        changed = plant.with_ratios(ratios(x))
-        return np.asarray(np.average([e.batch(changed) for e in expectations], axis=0, weights=weights))
-
-    def misfit(x: FloatArray) -> FloatArray:
-        return np.concatenate([np.linalg.solve(L, (found.tuning.theta - expected(x)) / size), x / PRIOR])
-
-    start = np.zeros(len(plant.parameters))
-    result = minimise(misfit, start, x_scale=PRIOR, diff_step=1e-3, max_nfev=12, bounds=(-1.5, 1.5))
-    return ratios(result.x), expected(result.x), 2.0 * float(result.cost)
-
-
-def fault_directions(loop: Loop, plant: Plant, theta: FloatArray) -> dict[str, FloatArray]:
-    """Return d theta / d log(parameter) for every parameter of the plant's faults, each of shape (n,)."""
-    if plant.has_physics and not plant.extras and loop.plant.kind != "polynomial":
-        step = 1e-4
-
-        def at(ratio: float, parameter: str) -> FloatArray:
-            return nominal_theta(loop.model_copy(update={"plant": plant.with_ratios({parameter: ratio})}))
-
-        return {p: (at(np.exp(step), p) - at(np.exp(-step), p)) / (2.0 * step) for p in plant.parameters}
-    names = plant.names
-    return {
-        p: np.where(np.array(names) == p, theta, 0.0) if p in names else np.array(theta) for p in plant.parameters
-    }
-
-
 def _excess(
     estimates: Sequence[Estimates], deviations: Sequence[FloatArray], covariance: FloatArray, found: Fit
 ) -> tuple[float, float]:
@@ -279,7 +208,8 @@ def _excess(
     excess = mean(0.0)
     if excess <= 1.0 or mean(0.5) > 1.0:
         return excess, 0.0 if excess <= 1.0 else 0.5
-    return excess, float(brentq(lambda rho: mean(rho) - 1.0, 0.0, 0.5, xtol=1e-4))
+    root = brentq(lambda rho: mean(rho) - 1.0, 0.0, 0.5, xtol=1e-4)
+    return excess, float(root)
 
 
 def _supported_budget(n: int, loop: Loop, dof: float, excess: float) -> float:
@@ -322,42 +252,3 @@ def _promises(
         )
         for fault, information in zip(loop.plant.faults, best, strict=True)
     )
-
-
-def _delay(loop: Loop, recordings: Sequence[Recording], found: Fit) -> tuple[float | None, list[str]]:
-    """Find the delay with the smallest residual; refuse a recording that is out of step with the loop file.
-
-    One sample that the model does not know costs 63 % at 10 Hz (THEORY section 6), so half a sample matters.
-    """
-    dt = 1.0 / loop.sample_rate
-    late = loop.delay + dt * np.arange(-1.5, 3.1, 0.5)
-    late = np.unique(np.append(late[late >= 0.0], loop.delay))
-    log_R = []
-    for delay in late:
-        shifted = Pipeline.of(loop.model_copy(update={"delay": float(delay)}))
-        square = count = 0.0
-        for rec in recordings:
-            g = shifted.regression(rec.r, rec.u, rec.y, rec.restart)
-            v = (g.eta - g.phi @ least_squares(g))[g.ok]
-            square, count = square + float(v @ v), count + len(v)
-        log_R.append(np.log(max(square / count, 1e-300)))
-    values = np.array(log_R)
-    here = values[int(np.argmin(np.abs(late - loop.delay)))]
-    i = int(np.argmin(values))
-    best = float(late[i])
-    inside = 0 < i < len(late) - 1  # at an end the residual only falls: a misfit of another kind
-    if inside:
-        left, mid, right = values[i - 1 : i + 2]
-        step_left, step_right = late[i] - late[i - 1], late[i + 1] - late[i]
-        slope = (right - mid) / step_right - (mid - left) / step_left
-        if slope > 0.0:
-            best -= float(((right - mid) / step_right * step_left + (mid - left) / step_left * step_right) / (2 * slope))
-    gain = found.dof * (here - values[i]) / 2.0  # log likelihood ratio of the best delay
-    if (i and not inside) or (gain < 5.0 and values.max() - values.min() < 10.0 / found.dof):
-        return None, ["the recordings do not tell the delay between u and y"]
-    if gain > 10.0 and abs(best - loop.delay) > DELAY_TOLERANCE * dt and here - values[i] > DELAY_SIGNIFICANT:
-        raise RecordingError(
-            f"{recordings[0].name}: y answers u {best * 1e3:.3g} ms late, the loop file says delay = {loop.delay:g} s: "
-            f"set delay = {best:.4g} or align the channels"
-        )
-    return best, []

@@ -1,4 +1,4 @@
-"""What a fit leaves over: white beyond the filters' memory or structured, repeating with the reference or noise."""
+"""What a fit leaves over: white or structured, repeating with the reference or noise."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Residual(Said):
     period_s
         Period of the reference [s]; None if it does not repeat.
     repeating, repeating_std
-        Share of the residual's variance that repeats with that period: what the model lacks, rather than noise.
-        Both None without a period.
+        Share of the residual's variance that repeats with that period: what the model lacks, not noise. Both
+        None without a period.
     model_error
         Share of u (rms) that the model leaves unexplained apart from noise, as far as this recording shows.
     """
@@ -47,7 +47,7 @@ class Residual(Said):
 
 
 def on_grid(recording: Recording, x: FloatArray, mask: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Put x, shape (N,), on the uniform grid of sample times; rows that are missing or masked are 0 and False."""
+    """Put x, shape (N,), on the uniform grid of sample times; what is missing or masked is 0 and False."""
     slots = np.round((recording.t - recording.t[0]) * recording.sample_rate).astype(np.int64)
     values = np.zeros(int(slots[-1]) + 1)
     there = np.zeros(values.size, dtype=bool)
@@ -130,8 +130,10 @@ def describe(
     covariance, pairs = correlations(x, there)
     variance = max(float(covariance[0]), np.finfo(np.float64).tiny)
     rho = covariance / variance
+    # Few pairs make wild correlations; the biased estimate lets them fade.
+    faded = rho * pairs / max(float(pairs[0]), 1.0)
     rows = int(used.sum())
-    inflation = 1.0 + 2.0 * float((rho[1:memory] ** 2).sum())
+    inflation = 1.0 + 2.0 * float((faded[1:memory] ** 2).sum())
     p_value = None
     lags = memory * np.arange(1, LAGS + 1)
     lags = lags[lags < rho.size // 2]
@@ -150,12 +152,12 @@ def describe(
             repeating = float((weight * rho[multiples]).sum() / weight.sum())
             std = math.sqrt(inflation / float(weight.sum()))
     relative = math.sqrt(variance / max(float(eta[used].var()), np.finfo(np.float64).tiny))
-    far = float(np.median(np.abs(rho[memory : 3 * memory]))) if rho.size > 3 * memory else 0.0
+    far = float(np.median(np.abs(faded[memory : 3 * memory]))) if rho.size > 3 * memory else 0.0
     structured = max(repeating - 2.0 * (std or 0.0), 0.0) if repeating is not None else far
     if p_value is not None and p_value > SIGNIFICANT and repeating is None:
         structured = 0.0
     reach = min(rho.size, 50 * memory)
-    below = np.flatnonzero(np.abs(rho[:reach]) < 0.1)
+    below = np.flatnonzero(np.abs(faded[:reach]) < 0.1)
     residual = Residual(
         relative=relative,
         p_value=p_value,
@@ -166,4 +168,4 @@ def describe(
         repeating_std=std,
         model_error=relative * math.sqrt(min(structured, 1.0)),
     )
-    return residual, effective(rho, rows, reach), rho[:reach]
+    return residual, effective(faded, rows, reach), faded[:reach]

@@ -32,7 +32,7 @@ class Said(BaseModel):
 
 
 class Sampling(Said):
-    """How the signals were sampled; a stretch is what lies between two gaps or run ends, jitter a standard deviation."""
+    """How the signals were sampled; a stretch lies between gaps or run ends, jitter is a standard deviation."""
 
     sample_rate_hz: float
     samples: int
@@ -54,7 +54,7 @@ class DefectCount(Said):
 
 
 class Quantisation(Said):
-    """Resolution of one signal: smallest step, log2 of range over step, share of samples that repeat the one before.
+    """Resolution of one signal: smallest step, log2 of range over step, share of samples that repeat.
 
     `step` and `effective_bits` are None where no grid is visible.
     """
@@ -67,7 +67,7 @@ class Quantisation(Said):
 
 
 class Saturation(Said):
-    """Shares of time that u spends at its limits; `source` says whether the loop names them or u shows them."""
+    """Shares of time that u is at its limits; `source` says whether the loop names them or u shows them."""
 
     low: float | None
     high: float | None
@@ -152,7 +152,7 @@ def _step(values: FloatArray, span: float) -> float | None:
 
 
 def noise_of(x: FloatArray, restart: BoolArray, step: float | None) -> float:
-    """Return the standard deviation of what is white in a signal, shape (N,), robustly from its third differences."""
+    """Return the standard deviation of what is white in x, shape (N,), robustly from third differences."""
     third = np.diff(x, 3)
     whole = ~(restart[1:-2] | restart[2:-1] | restart[3:])
     third = np.abs(third[whole])
@@ -277,7 +277,8 @@ def swapped(recording: Recording) -> str | None:
     follows_u, follows_y = (abs(float(np.corrcoef(r, x)[0, 1])) for x in (u, y))
     rough_u, rough_y = (float(np.std(np.diff(x)) / np.std(x)) for x in (u, y))
     if follows_u > 0.98 and follows_y < 0.9 and rough_u < 0.5 * rough_y:
-        return f"u goes with the reference (correlation {follows_u:.3f}, y {follows_y:.3f}) and is the smoother of the two"
+        correlations = f"correlation {follows_u:.3f}, y {follows_y:.3f}"
+        return f"u goes with the reference ({correlations}) and is the smoother of the two"
     return None
 
 

@@ -89,8 +89,8 @@ def autocovariances(system: Linear, lags: int, stride: int = 1) -> FloatArray:
     if not len(A):
         return np.concatenate([(D @ D.T)[None], np.zeros((lags, len(D), len(D)))])
     # states of very different units would spoil the solution
-    A, T = matrix_balance(A, permute=False)
-    B, C = np.linalg.solve(T, B), C @ T
+    balanced, T = matrix_balance(A, permute=False)
+    A, B, C = np.asarray(balanced, dtype=np.float64), np.asarray(np.linalg.solve(T, B), dtype=np.float64), C @ T
     X = solve_discrete_lyapunov(A, B @ B.T)
     with_output = A @ X @ C.T + B @ D.T  # E[x(k + 1) v(k)']
     covariances = [C @ X @ C.T + D @ D.T]
@@ -132,9 +132,7 @@ def taps(weights: Sequence[float] | FloatArray) -> Linear:
     return Linear(A, B, W[:, 1:], W[:, :1])
 
 
-def sampled(
-    continuous: StateSpace, sample_rate: float, hold: Literal["zoh", "foh"], late: float = 0.0
-) -> Linear:
+def sampled(continuous: StateSpace, sample_rate: float, hold: Literal["zoh", "foh"], late: float = 0.0) -> Linear:
     """Discretise a strictly proper system exactly for an input that is held or runs in straight lines.
 
     Parameters

@@ -1,4 +1,4 @@
-"""All that is measured on a recording before anything is concluded from it: one frozen model, ready for JSON."""
+"""All that is measured on a recording before anything is concluded from it, ready for JSON."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Fit(Said):
 class Measured(Said):
     """All that is measured on a recording; parts that could not be measured are None or empty.
 
-    `cutoff_hz` is the state-variable filter's in the fit, `suggested_cutoff_hz` the one that the recording asks for;
+    `cutoff_hz` is the state-variable filter's in the fit, `suggested_cutoff_hz` what the recording asks for;
     `orders` are the generic inverses tried, the best of them in `best_order`.
     """
 
@@ -76,7 +76,5 @@ class Measured(Said):
 
 def described(order: OrderTried) -> str:
     """Say what a generic inverse consists of."""
-    parts = (
-        ["stiffness"] * order.stiffness + ["Coulomb friction"] * (order.friction == "coulomb") + ["offset"]
-    )
+    parts = ["stiffness"] * order.stiffness + ["Coulomb friction"] * (order.friction == "coulomb") + ["offset"]
     return f"an inverse of order {order.order} with {', '.join(parts)}"

@@ -23,7 +23,7 @@ IndexArray = npt.NDArray[np.intp]
 
 
 class OrderTried(Said):
-    """A generic inverse with offset: order, friction, stiffness, and the share of the filtered u that it explains."""
+    """A generic inverse with offset, and the share of the filtered u that it explains."""
 
     order: int
     friction: Friction
@@ -79,7 +79,7 @@ class Fitted:
 
 
 def generic_loop(rate: float, cutoff: float, sign_speed: float = 0.0) -> Loop:
-    """Build a loop around the most general inverse tried: order 3 with stiffness, Coulomb friction and offset."""
+    """Build a loop around the most general inverse: order 3 with stiffness, Coulomb friction and offset."""
     plant = Polynomial(
         order=3,
         stiffness=True,
@@ -119,9 +119,7 @@ def regressors(recording: Recording, loop: Loop, delay: float | None = None) -> 
     return Regressors(loop, bank, rows[:, 0], rows[:, 1 : 1 + bank.n], said == USED)
 
 
-def fit(
-    names: tuple[str, ...], eta: FloatArray, phi: FloatArray, used: BoolArray, block: int
-) -> Fitted | None:
+def fit(names: tuple[str, ...], eta: FloatArray, phi: FloatArray, used: BoolArray, block: int) -> Fitted | None:
     """Fit eta = phi theta; None if there are too few rows or eta does not vary.
 
     Parameters
@@ -170,19 +168,15 @@ def fit(
 def columns_of(g: Regressors, order: int, friction: Friction, stiffness: bool = True) -> IndexArray:
     """Return which columns of the most general inverse belong to a smaller one."""
     n_powers = len(g.bank.powers)
-    extras = [
-        i + n_powers for i, extra in enumerate(g.bank.extras) if friction == "coulomb" or extra != "sign_v"
-    ]
+    extras = [i + n_powers for i, extra in enumerate(g.bank.extras) if friction == "coulomb" or extra != "sign_v"]
     return np.array([*range(0 if stiffness else 1, order + 1), *extras], dtype=np.intp)
 
 
-def try_orders(
-    g: Regressors, used: BoolArray, block: int
-) -> tuple[tuple[OrderTried, ...], OrderTried | None]:
-    """Fit the generic inverses of order 1 to 3, then the best of them without stiffness and with Coulomb friction.
+def try_orders(g: Regressors, used: BoolArray, block: int) -> tuple[tuple[OrderTried, ...], OrderTried | None]:
+    """Fit the generic inverses of order 1 to 3, then the best with Coulomb friction and without stiffness.
 
-    The best is the lowest whose successor takes away less than 2 % of the unexplained variance; stiffness stays
-    if it takes away as much, friction if it takes away 20 %.
+    The best is the lowest whose successor takes away less than 2 % of the unexplained variance; stiffness
+    stays if it takes away as much, friction if it takes away 20 %.
 
     Returns
     -------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -122,10 +122,12 @@ class Monitor:
         shape = (len(self.baselines), signals[0].shape[1])
         if any(signal.shape != shape for signal in signals) or state.shape != self._shape:
             raise RecordingError(
-                f"r, u, y must have the same shape ({'assets, N' if self.fleet else 'N,'}) for {shape[0]} asset(s), and "
-                f"the state must come from this monitor's init or run"
+                f"r, u, y must have the same shape ({'assets, N' if self.fleet else 'N,'}) for {shape[0]} asset(s), "
+                "and the state must come from this monitor's init or run"
             )
-        flags = np.zeros(shape, dtype=np.bool_) if restart is None else np.atleast_2d(np.asarray(restart, dtype=np.bool_))
+        flags = np.zeros(shape, dtype=np.bool_)
+        if restart is not None:
+            flags = np.atleast_2d(np.ascontiguousarray(restart, dtype=np.bool_))
         if flags.shape != shape:
             raise RecordingError("restart must have the shape of r")
         new = np.array(state, dtype=np.float64, copy=True)
@@ -184,7 +186,7 @@ class Monitor:
         )
 
 
-def _watch(baseline: Baseline, e: Estimates) -> tuple[FloatArray, ...]:
+def _watch(baseline: Baseline, e: Estimates) -> tuple[npt.NDArray[Any], ...]:
     covariance = e.S + baseline.cov()
     expected = np.broadcast_to(np.array(baseline.theta), e.theta.shape)
     ready = e.updates > 0

@@ -1,4 +1,4 @@
-"""One loop's chain of bank and recursion turned into constants: a recording -> regressors, estimates. No faults here."""
+"""One loop's chain of bank and recursion as constants: a recording -> regressors, estimates; no faults here."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class Pipeline:
 
     @property
     def stride(self) -> int:
-        """Samples between updates: 1 up to 20 times the cutoff; beyond, neighbours in a filtered signal repeat each other.
+        """Samples between updates: 1 up to 20 times the cutoff; beyond, neighbours in a filtered signal are alike.
 
         Their noise would be so nearly a polynomial in time that no autoregression of it can be solved for.
         """

@@ -62,7 +62,12 @@ def progress(parts: int, each: int) -> Iterator[Steps]:
     if not err.is_terminal:
         yield Steps(None, parts, each)
         return
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TimeElapsedColumn(),
+    )
     # Results go to stdout, which may be a file: it must not be drawn into the bar's console.
     with Progress(*columns, console=err, transient=True, redirect_stdout=False) as bar:
         steps = Steps(bar, parts, each)
@@ -75,7 +80,7 @@ def on_compiling(tell: Callable[[], None]) -> Iterator[None]:
     """Call `tell` whenever machine code is made that was not in the cache yet."""
     from numba.core.event import Event, Listener, install_listener
 
-    class Told(Listener):
+    class Told(Listener):  # type: ignore[misc]  # numba has no complete types
         def on_start(self, event: Event) -> None:
             tell()
 

@@ -21,7 +21,7 @@ INPUT, FAULT, INTERRUPTED = 1, 3, 130  # exit codes; 2 is the command line's
 
 
 class Commands(typer.core.TyperGroup):
-    """Commands whose errors, where they are the user's, are one line and an exit code; others keep their traceback."""
+    """Commands whose users' errors are one line and an exit code; other errors keep their traceback."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""

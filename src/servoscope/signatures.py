@@ -132,7 +132,7 @@ class Expectation:
         SimulationError
             If the loop is unstable with one of the plants.
         """
-        from servoscope.recursion import mean_path
+        from servoscope.propagation import mean_path
 
         r, kept, restart = self.course
         u, y = response(self.pipeline.loop, r, plants=plants, switch=[int(kept[k]) for k in onsets])

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -14,8 +12,6 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from servoscope.baseline import Baseline
     from servoscope.diagnosis import Diagnosis, Warning
     from servoscope.inspection import Inspection
@@ -35,6 +31,7 @@ COLOURS = {
     "care": "yellow",
     "note": "blue",
 }
+INDENT = (0, 0, 0, 2)
 MOST_WARNINGS = 12
 LEAST_SHOWN = 0.0005  # probability below which a candidate is not worth its line
 
@@ -69,7 +66,7 @@ def table(out: Console, header: Sequence[str], rows: Sequence[Sequence[str]], wo
         grid.add_column(name, justify="left" if i < words else "right", overflow="fold")
     for row in rows:
         grid.add_row(*(Text(cell) for cell in row))
-    out.print(Padding(grid, (0, 0, 0, 2)))
+    out.print(Padding(grid, INDENT, expand=False))
 
 
 def facts(out: Console, pairs: Sequence[tuple[str, str]]) -> None:
@@ -79,17 +76,17 @@ def facts(out: Console, pairs: Sequence[tuple[str, str]]) -> None:
     grid.add_column(overflow="fold")
     for name, value in pairs:
         grid.add_row(name, Text(value))
-    out.print(Padding(grid, (0, 0, 0, 2)))
+    out.print(Padding(grid, INDENT, expand=False))
 
 
-def notes(out: Console, texts: Sequence[str], colour: str = "yellow") -> None:
+def notes(out: Console, texts: Sequence[str], colour: str = "yellow", mark: str = "!") -> None:
     """Print sentences as a list, wrapped under their own beginning."""
     for text in texts:
         grid = Table.grid(padding=(0, 1, 0, 0))
         grid.add_column()
         grid.add_column(overflow="fold")
-        grid.add_row(Text("!", style=colour), Text(text))
-        out.print(Padding(grid, (0, 0, 0, 2)))
+        grid.add_row(Text(mark, style=colour), Text(text))
+        out.print(Padding(grid, INDENT, expand=False))
 
 
 def baseline(out: Console, b: Baseline) -> None:
@@ -97,13 +94,17 @@ def baseline(out: Console, b: Baseline) -> None:
     out.print(Text.assemble((b.loop.name, "bold"), f": baseline from {_sources(b)}"))
     std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
     rows = [
-        (name, f"{value:.5g}", f"{s:.2g}", percent(abs(s / value)) if value else "-")
+        (name, f"{value:.5g}", f"{s:.2g}", f"{100.0 * abs(s / value):.2g} %" if value else "-")
         for name, value, s in zip(b.names, b.theta, std, strict=True)
     ]
     table(out, ("coefficient", "value", "std. dev.", "relative"), rows)
     out.print()
     if b.ratios:
-        table(out, ("parameter", "healthy / nominal"), [(name, f"{ratio:.4g}") for name, ratio in b.ratios.items()])
+        table(
+            out,
+            ("parameter", "healthy / nominal"),
+            [(name, f"{ratio:.4g}") for name, ratio in b.ratios.items()],
+        )
         out.print()
     seen = [(p.name, p.parameter, percent(p.change) if p.change is not None else "never") for p in b.promises]
     if seen:
@@ -113,8 +114,8 @@ def baseline(out: Console, b: Baseline) -> None:
     told = [
         ("explained", f"{percent(b.explained)} of u's variance (R = {b.R:.3g})"),
         ("delay", f"{1e3 * b.delay_s:.3g} ms" if b.delay_s is not None else "the recordings do not tell"),
-        ("threshold", f"T² = {b.limit:.4g} for {monitor.false_alarms_per_year:g} false alarms per year"),
-        ("supported", f"the data speak for {b.supported_false_alarms_per_year:.3g} false alarms per year or more"),
+        ("false alarms", f"T² = {b.limit:.4g}, for a budget of {monitor.false_alarms_per_year:g} per year"),
+        ("data support", f"budgets of {b.supported_false_alarms_per_year:.3g} per year or more"),
         ("model_error", f"{monitor.model_error:g} set, {b.suggested_model_error:.2g} suggested"),
     ]
     if b.noise is not None:
@@ -123,35 +124,10 @@ def baseline(out: Console, b: Baseline) -> None:
     notes(out, b.notes)
 
 
-def baseline_facts(b: Baseline) -> dict[str, object]:
-    """Return what `baseline` prints, ready for JSON."""
-    said = b.model_dump(mode="json", by_alias=True)
-    std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
-    return {
-        "loop": b.loop.name,
-        "sources": said["sources"],
-        "parameters": {
-            name: {"value": value, "std": s} for name, value, s in zip(b.names, b.theta, std, strict=True)
-        },
-        "healthy_ratios": said["ratios"],
-        "noise": said["noise"],
-        "delay_s": b.delay_s,
-        "explained": b.explained,
-        "R": b.R,
-        "threshold": b.limit,
-        "false_alarms_per_year": b.loop.monitor.false_alarms_per_year,
-        "supported_false_alarms_per_year": b.supported_false_alarms_per_year,
-        "model_error": b.loop.monitor.model_error,
-        "suggested_model_error": b.suggested_model_error,
-        "promises": said["promises"],
-        "notes": said["notes"],
-    }
-
-
 def diagnosis(out: Console, d: Diagnosis) -> None:
     """Print a verdict, what stands behind it, and the warnings."""
     out.print(Text.assemble((d.recording, "bold"), f": {span(d.duration_s)}, {d.samples} samples"))
-    out.print(Padding(Text(d.summary, style=f"bold {COLOURS[d.verdict]}"), (0, 0, 0, 2)))
+    out.print(Padding(Text(d.summary, style=f"bold {COLOURS[d.verdict]}"), INDENT, expand=False))
     told = []
     if d.detected_at_s is not None:
         told.append(("detected", f"{d.detected_at_s:.4g} s"))
@@ -164,33 +140,23 @@ def diagnosis(out: Console, d: Diagnosis) -> None:
     rows = []
     for c in shown:
         fault = c.faults[0] if c.faults else None
-        size = (fault.parameter, f"{fault.ratio:.4g}", f"{fault.interval[0]:.4g} to {fault.interval[1]:.4g}") if fault else ("", "", "")
+        size = (
+            (fault.parameter, f"{fault.ratio:.4g}", f"{fault.interval[0]:.4g} to {fault.interval[1]:.4g}")
+            if fault
+            else ("", "", "")
+        )
         rows.append((c.name, percent(c.probability), *size))
     if rows:
         table(out, ("candidate", "probability", "parameter", "ratio", "95 % interval"), rows)
     _warnings(out, d.warnings)
 
 
-def plain(said: BaseModel) -> object:
-    """Return a result ready for JSON; what is no number becomes null."""
-    return json.loads(said.model_dump_json())
-
-
-def channel_facts(name: str, found: Sequence[ChannelInfo]) -> dict[str, object]:
-    """Return the columns of a file, ready for JSON."""
-    told = [
-        {"name": c.name, "type": c.dtype, **{key: x if math.isfinite(x) else None for key, x in (("min", c.min), ("max", c.max))}}
-        for c in found
-    ]
-    return {"recording": name, "channels": told}
-
-
 def channels(out: Console, name: str, found: Sequence[ChannelInfo]) -> None:
     """Print the columns of a file."""
     out.print(Text.assemble((name, "bold"), f": {len(found)} columns"))
     rows = [(c.name, c.dtype, f"{c.min:.6g}", f"{c.max:.6g}") for c in found]
-    rows = [tuple(cell if cell != "nan" else "-" for cell in row) for row in rows]
-    table(out, ("column", "type", "smallest", "largest"), rows, words=2)
+    shown = [[cell if cell != "nan" else "-" for cell in row] for row in rows]
+    table(out, ("column", "type", "smallest", "largest"), shown, words=2)
 
 
 def _sources(b: Baseline) -> str:
@@ -212,18 +178,6 @@ def _warnings(out: Console, warnings: Sequence[Warning]) -> None:
     if more > 1:
         texts[MOST_WARNINGS:] = [f"and {more} more, all of them with --json"]
     notes(out, texts)
-
-
-def simulated_facts(recording: Recording, truth: Truth, columns: Columns) -> dict[str, object]:
-    """Return what was simulated, ready for JSON."""
-    named = {fault.parameter: fault.name for fault in truth.plant.faults}
-    return {
-        "samples": recording.samples,
-        "duration_s": recording.duration_s,
-        "sample_rate_hz": recording.sample_rate,
-        "columns": {"t": columns.time or "t", "r": columns.reference, "u": columns.input, "y": columns.output},
-        "faults": [{"name": named.get(event.parameter, event.parameter), **asdict(event)} for event in truth.faults],
-    }
 
 
 def renamed(out: Console, columns: Columns) -> None:
@@ -254,14 +208,12 @@ def inspection(out: Console, i: Inspection) -> None:
     size = f"{span(s.duration_s)}, {s.samples} samples at {s.sample_rate_hz:.6g} Hz"
     out.print(Text.assemble((i.recording, "bold"), f": {size}"))
     summary = i.summary.removeprefix(f"{i.recording}: ")
-    out.print(Padding(Text(summary[:1].upper() + summary[1:], style=f"bold {COLOURS[i.verdict]}"), (0, 0, 0, 2)))
+    out.print(
+        Padding(Text(summary[:1].upper() + summary[1:], style=f"bold {COLOURS[i.verdict]}"), INDENT, expand=False)
+    )
     told = []
     if s.runs > 1 or s.stretches > 1:
         told.append(("stretches", f"{s.stretches} in {s.runs} runs, the longest {span(s.longest_stretch_s)}"))
-    if i.fit is not None:
-        told.append(("model", f"{i.fit.model} explains {percent(i.fit.explained)} of the filtered u"))
-    if i.free_run is not None:
-        told.append(("free run", i.free_run.words))
     if i.suggested_cutoff_hz is not None:
         told.append(("cutoff", f"{i.suggested_cutoff_hz:g} Hz suggested"))
     facts(out, told)
@@ -278,10 +230,10 @@ def inspection(out: Console, i: Inspection) -> None:
         ]
         table(out, ("frequency", "coherence r, u", "coherence r, y", "signal / noise", "iFRF std."), rows)
     for finding in i.findings:
-        notes(out, [finding.message], COLOURS[finding.severity])
+        notes(out, [finding.message], COLOURS[finding.severity], "-" if finding.severity == "note" else "!")
     if i.recommendations:
         out.print("  What to do:")
-        notes(out, i.recommendations, "blue")
+        notes(out, i.recommendations, "green", "-")
 
 
 def written(out: Console, path: object) -> None:

@@ -108,7 +108,8 @@ def fit(regressions: Sequence[Regression], memory: float, names: Sequence[str]) 
     usable = sum(int(g.ok.sum()) for g in regressions)
     if usable < 20 * n:
         raise NotEnoughError(
-            f"only {usable} usable samples after filters settle and rest is left out: record longer, or lower rest_speed"
+            f"only {usable} usable samples when filters have settled and rest is left out: record longer, or lower "
+            "rest_speed"
         )
     phi = np.vstack([g.phi[g.ok] for g in regressions])
     z = np.vstack([g.z[g.ok] for g in regressions])

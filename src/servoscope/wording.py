@@ -15,6 +15,7 @@ from servoscope.plants import FloatArray
 __all__ = [
     "axis_scale",
     "clock_time",
+    "count",
     "meaning",
     "number",
     "plain_symbol",
@@ -38,7 +39,7 @@ UNITS = {"eha": ("m", "A")}  # of y and u, where the kind of plant fixes them
 
 
 def symbol(name: str) -> str:
-    """Return a parameter's or coefficient's name as HTML: C_ie with a subscript, viscous_friction in words."""
+    """Return a parameter's name as HTML: C_ie with a subscript, viscous_friction in words."""
     found = re.fullmatch(r"([A-Za-z]{1,5})(?:_(\w{1,3}))?", name)
     if found is None:
         return html.escape(name.replace("_", " "))
@@ -70,6 +71,11 @@ def number(value: float | None, digits: int = 4) -> str:
     return _signed(f"{value / 10.0**exponent:.{digits - 1}f}") + _power(exponent)
 
 
+def count(value: int) -> str:
+    """Return a whole number with thin spaces between the thousands."""
+    return _signed(f"{value:,}".replace(",", "\N{THIN SPACE}"))
+
+
 def quantity(value: float) -> str:
     """Return a setting as it was written, with a true minus sign and powers of ten, as HTML."""
     text = f"{value:.10g}" if abs(value) < 1e6 else re.sub(r"\.?0*e", "e", f"{value:.9e}")
@@ -78,7 +84,7 @@ def quantity(value: float) -> str:
 
 
 def with_std(value: float, std: float, *others: float) -> tuple[str, ...]:
-    """Return value, standard deviation and further values of the same kind, to the digits that the std supports.
+    """Return value, standard deviation and further values, all to the digits that the deviation supports.
 
     Returns
     -------
@@ -94,8 +100,7 @@ def with_std(value: float, std: float, *others: float) -> tuple[str, ...]:
     decimals = _decimals(std / 10.0**exponent, most=7)
     power = _power(exponent) if exponent else ""
     return tuple(
-        _signed(f"{each / 10.0**exponent:.{decimals}f}") + power if math.isfinite(each) else DASH
-        for each in values
+        _signed(f"{each / 10.0**exponent:.{decimals}f}") + power if math.isfinite(each) else DASH for each in values
     )
 
 
@@ -121,9 +126,9 @@ def signed_percent(change: float) -> str:
 
 
 def size_of(ratio: float, low: float, high: float) -> tuple[str, str, str]:
-    """Return a fault's size and its interval as a person would say them: +20 %, or a factor where it is large.
+    """Return a fault's size and its interval: as +20 %, or as a factor where it is large.
 
-    To the digits that the interval supports.
+    All to the digits that the interval supports.
     """
     values = (ratio, low, high)
     if all(0.2 <= value < 3.0 for value in values):

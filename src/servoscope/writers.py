@@ -45,7 +45,7 @@ def write(path: str | Path, recording: Recording, columns: Columns | None = None
         If the suffix is another, or the file cannot be written.
     """
     used = _plain_names(columns or Columns())
-    assigned = {
+    assigned: dict[str, npt.NDArray[Any]] = {
         used.time or "t": np.round(recording.t / UNITS[used.time_unit], 9),
         used.reference: recording.r,
         used.input: recording.u,

@@ -1,0 +1,85 @@
+"""The signatures of one recording's possible faults: simulated with its loop, from physics alone, or by coefficient."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from servoscope.baseline import Baseline
+from servoscope.identification import fault_directions
+from servoscope.inverse import nominal_theta
+from servoscope.isolation import Signature, curve, line
+from servoscope.plants import Fault, FloatArray
+from servoscope.recording import Recording
+from servoscope.signatures import Expectation
+
+Shift = Callable[[float], FloatArray]
+
+
+def candidates_of(
+    baseline: Baseline, recording: Recording, expectation: Expectation | None, since: int, last: int
+) -> list[Signature]:
+    """Return one signature per fault of the loop's plant.
+
+    Parameters
+    ----------
+    baseline, recording
+        What is compared with what.
+    expectation
+        Of the recording; None where the loop cannot be simulated.
+    since
+        Sample of the onset.
+    last
+        Sample of the evaluation that is explained.
+    """
+    faults, plant = baseline.loop.plant.faults, baseline.plant
+    if expectation is not None:
+        shift = _simulated(baseline, expectation.until(last + 1), since)
+        return [curve(fault, shift(fault)) for fault in faults]
+    learned = _learned(baseline, recording, since, last)
+    if plant.has_physics and plant.kind != "polynomial":
+        shift = _physical(baseline, learned)
+        return [curve(fault, shift(fault)) for fault in faults]
+    directions = fault_directions(baseline.loop, plant, np.array(baseline.theta))
+    moving = [fault for fault in faults if np.any(directions[fault.parameter])]
+    return [line(fault, learned @ directions[fault.parameter]) for fault in moving]
+
+
+def _simulated(baseline: Baseline, expectation: Expectation, since: int) -> Callable[[Fault], Shift]:
+    """Let the fault step in at the onset, and ask what the recursion would say at the end."""
+    plant, start = baseline.plant, np.array(baseline.model_theta)
+    healthy = expectation.path([plant], [0], start)[-1]
+
+    def of(fault: Fault) -> Shift:
+        def shift(ratio: float) -> FloatArray:
+            ill = plant.with_ratios({fault.parameter: ratio})
+            plants, onsets = ([plant, ill], [0, since]) if since > 0 else ([ill], [0])
+            return expectation.path(plants, onsets, start)[-1] - healthy
+
+        return shift
+
+    return of
+
+
+def _physical(baseline: Baseline, learned: FloatArray) -> Callable[[Fault], Shift]:
+    """Take the coefficients of the changed plant, as far as the recursion has taken them up."""
+    loop, plant = baseline.loop, baseline.plant
+    healthy = nominal_theta(loop.model_copy(update={"plant": plant}))
+
+    def of(fault: Fault) -> Shift:
+        def shift(ratio: float) -> FloatArray:
+            ill = loop.model_copy(update={"plant": plant.with_ratios({fault.parameter: ratio})})
+            return np.asarray(learned @ (nominal_theta(ill) - healthy))
+
+        return shift
+
+    return of
+
+
+def _learned(baseline: Baseline, recording: Recording, since: int, last: int) -> FloatArray:
+    """Return I - Psi from the onset to the evaluation: the share of a change that theta_hat has taken up by then."""
+    after = recording.part(float(recording.t[since]), float(recording.t[last]) + 0.5 / recording.sample_rate)
+    Psi = baseline.pipeline().estimate(baseline.tuning, after).Psi
+    n = len(baseline.theta)
+    return np.eye(n) - Psi[-1] if len(Psi) else np.eye(n)

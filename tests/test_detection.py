@@ -1,0 +1,173 @@
+"""T^2, its threshold and power against simulated draws; the onset against a loop and against the truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import naive
+import numpy as np
+import pytest
+from scipy import stats
+
+from servoscope.detection import (
+    SECONDS_PER_YEAR,
+    noncentrality,
+    onset,
+    required_noncentrality,
+    statistic,
+    threshold,
+    whiten,
+)
+from servoscope.loop import Loop
+from servoscope.pipeline import Pipeline, Tuning
+from servoscope.recording import Recording
+from servoscope.simulation import FaultEvent, reference, simulate
+from servoscope.tuning import fit
+
+SCALE = np.array([1.0, 1e-2, 1e-5, 1e-7])
+
+
+def covariance(seed: int = 0) -> naive.Array:
+    L = np.random.default_rng(seed).standard_normal((4, 4)) * SCALE[:, None]
+    return np.asarray(L @ L.T)
+
+
+def draws(C: naive.Array, count: int, seed: int = 1) -> naive.Array:
+    L = np.linalg.cholesky(C / np.outer(SCALE, SCALE)) * SCALE[:, None]
+    return np.asarray(np.random.default_rng(seed).standard_normal((count, 4)) @ L.T)
+
+
+class TestStatistic:
+    def test_is_the_plain_inverse(self) -> None:
+        C = np.array([covariance(seed) for seed in range(20)])
+        theta, expected = np.random.default_rng(2).standard_normal((2, 20, 4)) * SCALE
+        assert statistic(theta, expected, C) == pytest.approx(naive.t_squared(theta, expected, C), rel=1e-6)
+
+    def test_whitens_vectors_and_matrices_alike(self) -> None:
+        C = np.array([covariance(seed) for seed in range(3)])
+        d = np.random.default_rng(3).standard_normal((3, 4, 5)) * SCALE[:, None]
+        together = whiten(C, d)
+        for i in range(5):
+            assert whiten(C, d[:, :, i]) == pytest.approx(together[:, :, i], rel=1e-12)
+
+    def test_gaussian_deviations_are_chi_square(self) -> None:
+        C = covariance()
+        d = draws(C, 20_000)
+        T2 = statistic(d, 0.0 * d, np.broadcast_to(C, (len(d), 4, 4)))
+        assert stats.kstest(T2, stats.chi2(4).cdf).pvalue > 0.01
+
+
+class TestThreshold:
+    def test_is_chi_square_where_the_noise_is_known(self) -> None:
+        tail = 1.0 / (SECONDS_PER_YEAR * 10.0)
+        assert threshold(4, 10.0, 1.0, 1e12) == pytest.approx(stats.chi2.isf(tail, 4), rel=1e-6)
+        assert threshold(4, 10.0, 1.0, 1e12) == pytest.approx(46.9, abs=0.1)
+
+    def test_is_hotelling_where_it_is_not(self) -> None:
+        """With a covariance estimated from m draws, as many deviations pass as the budget says."""
+        m, budget = 60, 0.01 * SECONDS_PER_YEAR  # one look in a hundred
+        rng = np.random.default_rng(4)
+        samples = rng.standard_normal((20_000, m, 4))
+        S = np.einsum("kmi,kmj->kij", samples, samples) / m
+        T2 = statistic(rng.standard_normal((20_000, 4)), np.zeros((20_000, 4)), S)
+        assert (T2 > threshold(4, 1.0, budget, m)).mean() == pytest.approx(0.01, abs=0.002)
+
+    def test_is_monotone(self) -> None:
+        by_budget = [threshold(4, 10.0, budget, 200.0) for budget in (0.1, 1.0, 10.0, 1e4)]
+        by_dof = [threshold(4, 10.0, 1.0, dof) for dof in (20.0, 50.0, 200.0, 1e4, 1e9)]
+        by_rate = [threshold(4, rate, 1.0, 200.0) for rate in (100.0, 10.0, 1.0)]
+        for values in (by_budget, by_dof, by_rate):
+            assert np.all(np.diff(values) < 0.0) and np.all(np.isfinite(values))
+
+    def test_promised_power(self) -> None:
+        limit = 40.0
+        needed = required_noncentrality(4, limit)
+        C = covariance()
+        shift = np.linalg.cholesky(C)[:, 2] * np.sqrt(needed)
+        d = draws(C, 20_000) + shift
+        T2 = statistic(d, 0.0 * d, np.broadcast_to(C, (len(d), 4, 4)))
+        assert (T2 > limit).mean() == pytest.approx(0.9, abs=0.01)
+
+
+def tuned(loop: Loop, kind: str, seconds: float = 60.0) -> tuple[Pipeline, Tuning]:
+    pipeline = Pipeline.of(loop)
+    healthy, _ = simulate(loop, reference(kind, seconds, 100.0), seed=99)
+    g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
+    return pipeline, fit([g], pipeline.memory, pipeline.bank.names).tuning
+
+
+def test_noncentrality_foretells_the_mean_of_the_statistic(rig: dict[str, Any]) -> None:
+    """A change that is there from the start moves theta_hat by (I - Psi) Delta, so T^2 by the noncentrality."""
+    loop = Loop.from_dict(rig)
+    pipeline, tuning = tuned(loop, "multisine", 200.0)
+    r = reference("multisine", 12.0, 100.0)
+    ratio = 1.05
+    Delta = loop.plant.with_ratios({"C_ie": ratio}).theta() - loop.plant.theta()
+    at = [19, 49, 119]
+    rises = []
+    for seed in range(100):
+        healthy, _ = simulate(loop, r, seed=seed)
+        leaking, _ = simulate(loop, r, faults=[FaultEvent("C_ie", ratio, 0.0)], seed=seed)
+        e, f = pipeline.estimate(tuning, healthy), pipeline.estimate(tuning, leaking)
+        expected = noncentrality(e.S[at], e.Psi[at], Delta[None, :])[:, 0]
+        nominal = np.broadcast_to(tuning.theta, e.theta.shape)
+        T2 = [statistic(x.theta[at], nominal[at], x.S[at]) for x in (e, f)]
+        rises.append((T2[1] - T2[0]) / expected)
+    assert expected[0] > 5.0 and np.all(np.diff(expected) > 0.0)
+    assert np.mean(rises, axis=0) == pytest.approx(np.ones(3), abs=0.15)
+
+
+class TestOnset:
+    def broken(self, rig: dict[str, Any], kind: str, fault: str, seed: int) -> tuple[Any, ...]:
+        loop = Loop.from_dict(rig)
+        pipeline, tuning = tuned(loop, kind)
+        recording, _ = simulate(
+            loop, reference(kind, 26.0, 100.0), faults=[FaultEvent.parse(fault)], seed=seed
+        )
+        e = pipeline.estimate(tuning, recording)
+        T2 = statistic(e.theta, np.broadcast_to(tuning.theta, e.theta.shape), e.S)
+        alarm = int(np.flatnonzero(T2 > threshold(4, 10.0, 1.0, 500.0))[0])
+        return pipeline, tuning, recording, e, tuning.theta, e.theta[-1], int(e.index[alarm]), int(e.index[-1])
+
+    @pytest.mark.parametrize("seed", [1, 2])
+    @pytest.mark.parametrize(
+        ("kind", "fault"),
+        [("multisine", f"{x}@17.03") for x in ("C_ie=1.2", "p_s=0.8", "b_p=20", "beta=0.1")]
+        + [("profile", "C_ie=1.1@12.51"), ("profile", "beta=0.005@12.51"), ("profile", "b_p=10@12.51")],
+    )
+    def test_finds_the_step(self, rig: dict[str, Any], kind: str, fault: str, seed: int) -> None:
+        found = onset(*self.broken(rig, kind, fault, seed))
+        truth = FaultEvent.parse(fault).at_s
+        assert found.likely_s == pytest.approx(truth, abs=0.15)
+        assert found.low_s <= truth <= found.high_s
+        assert found.low_s <= found.likely_s <= found.high_s
+        assert found.high_s - found.low_s < 1.0
+        assert found.sample == round(100.0 * found.likely_s)
+
+    def test_is_the_likelihood_of_every_sample(self, rig: dict[str, Any]) -> None:
+        pipeline, tuning, recording, e, healthy, faulty, until, last = self.broken(rig, "multisine", "C_ie=1.1@3", 1)
+        until, last = 450, 600
+        cut = recording.restart.copy()
+        cut[200] = True  # a gap: its samples do not count
+        recording = Recording(
+            recording.name, recording.t, recording.r, recording.u, recording.y, 100.0, cut, recording.run
+        )
+        g = pipeline.regression(recording.r, recording.u, recording.y, cut)
+        used = np.flatnonzero(g.ok[: last + 1])
+        before, after = ((g.eta - g.phi @ theta)[used] for theta in (healthy, faulty))
+        variance = tuning.innovation * max(1.0, float(e.power[-1]))
+        of_used = naive.change_point(before, after, tuning.noise_a, variance)
+        log_likelihood = np.array([of_used[min(np.searchsorted(used, k), len(used) - 1)] for k in range(until + 1)])
+        weight = np.exp(log_likelihood - log_likelihood.max())
+        share = np.cumsum(weight) / weight.sum()
+        found = onset(pipeline, tuning, recording, e, healthy, faulty, until, last)
+        blur = pipeline.bank.wait / 200.0
+        assert found.sample == int(np.argmax(log_likelihood))
+        assert found.low_s == pytest.approx(np.argmax(share >= 0.025) / 100.0 - blur)
+        assert found.high_s == pytest.approx(np.argmax(share >= 0.975) / 100.0 + blur)
+
+    def test_never_leaves_the_recording(self, rig: dict[str, Any]) -> None:
+        arguments = self.broken(rig, "multisine", "C_ie=1.4@0", 1)
+        found = onset(*arguments)
+        assert 0.0 <= found.low_s <= found.likely_s <= found.high_s <= arguments[6] / 100.0
+        assert found.low_s == 0.0

@@ -1,0 +1,35 @@
+"""Writing files whole: errors in one line, nothing half-written left, links and devices."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from servoscope.errors import OutputError
+from servoscope.output import atomic_write
+
+
+def test_where_nothing_can_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    for path, reason in (
+        (tmp_path / "none" / "r.html", "there is no folder"),
+        (tmp_path / "file" / "r.html", "there is no folder"),
+        (tmp_path, "is a directory"),
+        (tmp_path / ("x" * 300), "name too long"),
+        (f"{tmp_path}/a\0b", "cannot be written"),
+    ):
+        with pytest.raises(OutputError, match=f"(?i){reason}") as caught:
+            atomic_write(path, b"x")
+        assert "\n" not in str(caught.value) and "\0" not in str(caught.value)
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+def test_writing_follows_links_and_leaves_devices_alone(tmp_path: Path) -> None:
+    (tmp_path / "real").write_bytes(b"old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    atomic_write(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
+    atomic_write(os.devnull, b"gone")
+    assert not Path(os.devnull).is_file()
