@@ -7,7 +7,7 @@ from typing import Any
 import naive
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 from servoscope.detection import (
     SECONDS_PER_YEAR,
@@ -59,25 +59,39 @@ class TestStatistic:
 
 class TestThreshold:
     def test_is_chi_square_where_the_noise_is_known(self) -> None:
-        tail = 1.0 / (SECONDS_PER_YEAR * 10.0)
-        assert threshold(4, 10.0, 1.0, 1e12) == pytest.approx(stats.chi2.isf(tail, 4), rel=1e-6)
-        assert threshold(4, 10.0, 1.0, 1e12) == pytest.approx(46.9, abs=0.1)
+        """And a level is looked at as often as the estimator forgets what it saw, 1/(2 memory) per unit of level."""
+        limit = threshold(4, 10.0, 5.0, 1.0, 1e12)
+        looks = SECONDS_PER_YEAR * limit / (2.0 * 5.0)
+        assert looks * stats.chi2.sf(limit, 4) == pytest.approx(1.0, rel=1e-3)
 
     def test_is_hotelling_where_it_is_not(self) -> None:
         """With a covariance estimated from m draws, as many deviations pass as the budget says."""
-        m, budget = 60, 0.01 * SECONDS_PER_YEAR  # one look in a hundred
+        m, budget = 60, 0.01 * SECONDS_PER_YEAR  # one look in a hundred, and every evaluation is a look
         rng = np.random.default_rng(4)
         samples = rng.standard_normal((20_000, m, 4))
         S = np.einsum("kmi,kmj->kij", samples, samples) / m
         T2 = statistic(rng.standard_normal((20_000, 4)), np.zeros((20_000, 4)), S)
-        assert (T2 > threshold(4, 1.0, budget, m)).mean() == pytest.approx(0.01, abs=0.002)
+        assert (T2 > threshold(4, 1.0, 1.0, budget, m)).mean() == pytest.approx(0.01, abs=0.002)
+
+    @pytest.mark.parametrize("memory", [5.0, 0.5])
+    def test_keeps_the_budget_where_the_estimate_wanders(self, memory: float) -> None:
+        """On simulated deviations that forget like the estimator, two hundred alarms are about two hundred."""
+        rate, samples, alarms = 10.0, 1_000_000, 200.0
+        a = np.exp(-1.0 / (memory * rate))
+        white = np.random.default_rng(6).standard_normal((4, samples))
+        T2 = (signal.lfilter([np.sqrt(1.0 - a**2)], [1.0, -a], white, axis=1) ** 2).sum(axis=0)
+        limit = threshold(4, rate, memory, alarms * SECONDS_PER_YEAR * rate / samples, 1e9)
+        above = np.flatnonzero(T2 > limit)
+        seen = 1 + int((np.diff(above) > memory * rate).sum())  # crossings within a memory are one alarm
+        assert 0.6 < seen / alarms < 1.2
 
     def test_is_monotone(self) -> None:
-        by_budget = [threshold(4, 10.0, budget, 200.0) for budget in (0.1, 1.0, 10.0, 1e4)]
-        by_dof = [threshold(4, 10.0, 1.0, dof) for dof in (20.0, 50.0, 200.0, 1e4, 1e9)]
-        by_rate = [threshold(4, rate, 1.0, 200.0) for rate in (100.0, 10.0, 1.0)]
-        for values in (by_budget, by_dof, by_rate):
+        by_budget = [threshold(4, 10.0, 5.0, budget, 200.0) for budget in (0.1, 1.0, 10.0, 1e4)]
+        by_dof = [threshold(4, 10.0, 5.0, 1.0, dof) for dof in (20.0, 50.0, 200.0, 1e4, 1e9)]
+        by_memory = [threshold(4, 10.0, memory, 1.0, 200.0) for memory in (2.0, 5.0, 20.0)]
+        for values in (by_budget, by_dof, by_memory):
             assert np.all(np.diff(values) < 0.0) and np.all(np.isfinite(values))
+        assert threshold(4, 1.0, 5.0, 1.0, 200.0) <= threshold(4, 10.0, 5.0, 1.0, 200.0)
 
     def test_promised_power(self) -> None:
         limit = 40.0
@@ -126,7 +140,7 @@ class TestOnset:
         )
         e = pipeline.estimate(tuning, recording)
         T2 = statistic(e.theta, np.broadcast_to(tuning.theta, e.theta.shape), e.S)
-        alarm = int(np.flatnonzero(T2 > threshold(4, 10.0, 1.0, 500.0))[0])
+        alarm = int(np.flatnonzero(T2 > threshold(4, 10.0, 5.0, 1.0, 500.0))[0])
         return pipeline, tuning, recording, e, tuning.theta, e.theta[-1], int(e.index[alarm]), int(e.index[-1])
 
     @pytest.mark.parametrize("seed", [1, 2])

@@ -97,6 +97,26 @@ def test_probabilities_are_the_integrals_over_the_prior() -> None:
     assert share["first"] / known == pytest.approx(evidence[0] / sum(evidence), abs=0.01)
 
 
+@pytest.mark.xfail(reason="the coarse grid alone decides which curves are refined, and it can miss a sharp minimum")
+def test_interval_is_as_sharp_where_the_grid_misses_the_truth() -> None:
+    """The truth lies half-way between two points of its own grid, while a rival's grid happens to fit better."""
+    along, aside = np.ones(4), np.array([1.0, -1.0, 1.0, -1.0])
+    sigma, ratio = 1e-3, 5.0 ** (3.0 / 16.0)
+    rival = 0.75 * along + 0.15 * aside
+    pair = [
+        curve(fault("true"), lambda q: along * np.log(q)),
+        curve(fault("rival"), lambda q: rival * np.log(q)),
+    ]
+    widths = []
+    for seed in range(10):
+        d = along * np.log(ratio) + sigma * np.random.default_rng(seed).standard_normal(4)
+        best = isolate(pair, d, sigma**2 * np.eye(4))[0]
+        assert best.name == "true"
+        widths.append(np.log(best.faults[0].interval[1] / best.faults[0].interval[0]))
+    expected = 3.92 * np.hypot(sigma, SYSTEMATIC * np.log(ratio)) / np.linalg.norm(along)
+    assert np.mean(widths) == pytest.approx(expected, rel=0.3)
+
+
 def test_two_curves_that_coincide_are_ambiguous() -> None:
     twins = [curve(fault("one"), bent(RUB)), curve(fault("other"), bent(RUB)), three()[0]]
     candidates = isolate(twins, draw(bent(RUB)(1.5), 2), SIGMA)

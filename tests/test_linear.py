@@ -8,7 +8,7 @@ import naive
 import numpy as np
 import pytest
 
-from servoscope.linear import Linear, sampled, settling, stack, state_variable_filter, taps
+from servoscope.linear import Linear, autocovariances, sampled, settling, stack, state_variable_filter, taps
 
 RATE = 100.0
 HOLDS: tuple[Literal["zoh", "foh"], ...] = ("zoh", "foh")
@@ -70,6 +70,30 @@ class TestAlgebra:
     def test_a_single_tap_is_a_gain_without_state(self) -> None:
         w = noise(5)[:, None]
         assert taps(np.array([2.5])).simulate(w) == pytest.approx(2.5 * w)
+
+
+class TestAutocovariances:
+    @pytest.mark.parametrize("stride", [1, 3])
+    def test_are_those_of_the_impulse_responses(self, stride: int) -> None:
+        """E[v(k + lag) v(k)'] under white inputs is the sum over the past of the responses' products."""
+        first = sampled(state_variable_filter(5.0, 2), RATE, "zoh")
+        system = stack([first, sampled(state_variable_filter(20.0, 2), RATE, "foh")])
+        mix = np.array([[1.0, 0.02, 0.0, 0.0], [0.3, 0.0, 1.0, 1e-3]])
+        system = Linear(system.A, system.B, mix @ system.C, mix @ system.D)
+        pulse = np.zeros((2000, 2, 2))
+        for i in range(2):
+            w = np.zeros((2001, 2))
+            w[1, i] = 1.0  # the first sample sets the steady state
+            pulse[:, :, i] = system.simulate(w)[1:]
+        ours = autocovariances(system, 4, stride)
+        for lag in range(5):
+            shift = lag * stride
+            theirs = np.einsum("kpi,kqi->pq", pulse[shift:], pulse[: 2000 - shift])
+            assert ours[lag] == pytest.approx(theirs, rel=1e-8, abs=1e-10), lag
+
+    def test_of_a_gain(self) -> None:
+        gain = taps(np.array([2.0]))
+        assert autocovariances(gain, 2)[:, 0, 0] == pytest.approx([4.0, 0.0, 0.0])
 
 
 class TestStateVariableFilter:

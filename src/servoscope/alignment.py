@@ -18,7 +18,8 @@ LATEST = 8  # samples
 CHI2_95 = 3.841458820694124
 PARABOLA = 1e-12  # curvature relative to the variance below which there is none
 WIDEST = 1.5  # samples that the interval may span in total
-PRIOR = 1.0  # standard deviation of a coefficient around its nominal value, relative to it
+PRIOR = 0.3  # standard deviation of a coefficient around its nominal value, relative to it
+FLOOR = 0.005  # share of eta (rms) that the intersample model of y alone leaves unexplained
 
 
 class Delay(Said):
@@ -45,7 +46,8 @@ def estimate(recording: Recording, g: Regressors, which: IndexArray, fitted: Fit
 
     Delay looks like more of the higher powers of s, and the other way round: with three of them free, all but
     the third power of the delay is absorbed. Where the plant has nominal values they therefore hold the
-    coefficients, each within a standard deviation of 100 %.
+    coefficients, each within a standard deviation of 30 %; where it has not, the powers above the one that
+    carries most of u are left out, and what they would explain counts as delay.
 
     Parameters
     ----------
@@ -77,13 +79,10 @@ def estimate(recording: Recording, g: Regressors, which: IndexArray, fitted: Fit
     for part in range(FRACTIONS):
         shifted = regressors(recording, g.loop, part / FRACTIONS / rate)
         for whole in range(EARLIEST, latest + 1):
-            eta = shifted.eta[rows - whole]
-            eta = eta - eta.mean()
-            total = float(eta @ eta)
-            eta = np.concatenate([eta, goal])
+            eta = np.concatenate([shifted.eta[rows - whole], goal])
             left = eta - Q @ (Q.T @ eta)
             delays.append(whole + part / FRACTIONS)
-            variances.append(float(left @ left) / max(total, np.finfo(np.float64).tiny))
+            variances.append(float(left @ left))
     order = np.argsort(delays)
     return _described(np.array(delays)[order], np.array(variances)[order], configured, independent, rate)
 
@@ -94,18 +93,21 @@ def _held(
     """Return an orthonormal basis of the columns over rows that hold them, and what those rows aim at."""
     phi = g.columns(which)[rows]
     size = np.sqrt((phi**2).mean(axis=0))
-    plant = g.loop.plant
-    extra = np.zeros((0, len(which)))
-    goal = np.zeros(0)
-    if plant.has_physics and len(plant.theta()) == len(which):
-        nominal = plant.theta()
-        # Correlated residuals weigh as much as the independent ones among them.
-        weight = math.sqrt(float(fitted.v[fitted.used].var()) * rows.size / max(independent, 1.0))
-        pull = np.divide(weight, PRIOR * np.abs(nominal), out=np.zeros_like(nominal), where=nominal != 0.0)
-        extra, goal = np.diag(pull), pull * nominal
-    phi = np.vstack([phi, extra])[:, size > 0.0] / size[size > 0.0]
-    Q, _ = np.linalg.qr(phi)
-    return np.asarray(Q), goal
+    n_powers, plant = len(g.bank.powers), g.loop.plant
+    if not plant.has_physics:
+        powers = [k for k, i in enumerate(which) if i < n_powers]
+        carrier = max(powers, key=lambda k: abs(fitted.theta[k]) * size[k], default=0)
+        keep = [k for k in range(len(which)) if (k <= carrier or k not in powers) and size[k] > 0.0]
+        return np.asarray(np.linalg.qr(phi[:, keep] / size[keep])[0]), np.zeros(0)
+    nominal = plant.theta()
+    # Correlated residuals weigh as much as the independent ones among them.
+    floor = FLOOR**2 * float((g.eta[rows] ** 2).mean())
+    weight = max(float(fitted.v[fitted.used].var()), floor) * rows.size / max(independent, 1.0)
+    spread = PRIOR * np.abs(nominal)
+    pull = np.divide(math.sqrt(weight), spread, out=np.zeros_like(nominal), where=spread > 0.0)
+    keep = list(np.flatnonzero(size > 0.0))
+    held = np.vstack([phi, np.diag(pull)])[:, keep] / size[keep]
+    return np.asarray(np.linalg.qr(held)[0]), pull * nominal
 
 
 def _described(d: FloatArray, J: FloatArray, configured: float, independent: float, rate: float) -> Delay:

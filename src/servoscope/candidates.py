@@ -55,7 +55,8 @@ def _simulated(baseline: Baseline, expectation: Expectation, since: int) -> Call
         def shift(ratio: float) -> FloatArray:
             ill = plant.with_ratios({fault.parameter: ratio})
             plants, onsets = ([plant, ill], [0, since]) if since > 0 else ([ill], [0])
-            return expectation.path(plants, onsets, start)[-1] - healthy
+            moved: FloatArray = expectation.path(plants, onsets, start)[-1] - healthy
+            return moved
 
         return shift
 

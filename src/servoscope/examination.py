@@ -124,7 +124,7 @@ class Examination:
             samples=recording.samples,
             duration_s=recording.duration_s,
             verdict=verdict,
-            summary=_summary(self.baseline, verdict, faults, candidates, onset_s, warnings),
+            summary=_summary(verdict, faults, candidates, onset_s, warnings),
             detected_at_s=detected_at,
             onset_s=onset_s,
             probability=probability,
@@ -217,7 +217,6 @@ class Examination:
 
 
 def _summary(
-    baseline: Baseline,
     verdict: Verdict,
     faults: tuple[FoundFault, ...],
     candidates: tuple[Candidate, ...],
@@ -229,14 +228,13 @@ def _summary(
     if verdict == "undetermined":
         reason = next(warning.message for warning in warnings if warning.kind == "power")
         return f"Undetermined: {reason}."
-    words = {fault.name: fault.words for fault in baseline.loop.plant.faults}
     since = f"since {onset_s[1]:.1f} s" if onset_s is not None else ""
     if faults:
         (fault,) = faults
         low, high = fault.interval
         return (
-            f"Fault, {fault.name} ({words[fault.name]}): {fault.parameter} is {fault.ratio:.4g} times its healthy "
-            f"value ({low:.4g} to {high:.4g}) {since}."
+            f"Fault: {fault.name}. {fault.parameter} is {fault.ratio:.4g} times its healthy value ({low:.4g} to "
+            f"{high:.4g}) {since}."
         )
     likely = [c for c in candidates if c.probability >= 0.05]
     if likely[0].name == UNKNOWN and likely[0].probability >= 0.5:

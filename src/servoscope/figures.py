@@ -270,7 +270,7 @@ def _legend_above(figure: Figure, diagnosis: Diagnosis | None, lines: Sequence[L
 
 def _empty(ax: Axes, words: str) -> None:
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=MUTED)
-    ax.set_xticks([])
+    ax.tick_params(axis="x", bottom=False, labelbottom=False)  # of this panel alone: ticks are shared
     ax.set_yticks([])
 
 

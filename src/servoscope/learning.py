@@ -203,7 +203,8 @@ def _excess(
     unit = np.diag((found.rms_eta / found.tuning.scale) ** 2)
 
     def mean(rho: float) -> float:
-        return float(statistic(d, 0.0 * d, S + covariance + rho**2 * unit).mean()) / d.shape[1]
+        T2 = statistic(d, np.zeros_like(d), S + covariance + rho**2 * unit)
+        return float(T2.mean()) / float(d.shape[1])
 
     excess = mean(0.0)
     if excess <= 1.0 or mean(0.5) > 1.0:

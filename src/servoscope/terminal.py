@@ -207,10 +207,7 @@ def inspection(out: Console, i: Inspection) -> None:
     s = i.sampling
     size = f"{span(s.duration_s)}, {s.samples} samples at {s.sample_rate_hz:.6g} Hz"
     out.print(Text.assemble((i.recording, "bold"), f": {size}"))
-    summary = i.summary.removeprefix(f"{i.recording}: ")
-    out.print(
-        Padding(Text(summary[:1].upper() + summary[1:], style=f"bold {COLOURS[i.verdict]}"), INDENT, expand=False)
-    )
+    out.print(Padding(Text(i.verdict.capitalize(), style=f"bold {COLOURS[i.verdict]}"), INDENT, expand=False))
     told = []
     if s.runs > 1 or s.stretches > 1:
         told.append(("stretches", f"{s.stretches} in {s.runs} runs, the longest {span(s.longest_stretch_s)}"))

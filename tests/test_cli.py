@@ -1,0 +1,432 @@
+"""The command line from end to end: results, exit codes, one-line errors, pure JSON, whole files."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+
+from commands import Run, run
+from servoscope import demo
+
+PROJECT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with loop.toml, healthy.csv, suspect.csv and baseline.json, made by the commands themselves."""
+    folder = tmp_path_factory.mktemp("made")
+    demo.prepare(folder)
+    for step in demo.steps(folder)[:3]:
+        assert run(*step.arguments).code == 0
+    return folder
+
+
+def rows_of(path: Path) -> dict[str, Any]:
+    table = pacsv.read_csv(path)
+    return {name: table.column(name).to_numpy().copy() for name in table.column_names}
+
+
+def write_rows(path: Path, rows: dict[str, Any]) -> Path:
+    lines = [",".join(rows), *(",".join(map(str, row)) for row in zip(*rows.values(), strict=True))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def one_line(result: Run, *words: str) -> str:
+    """Assert that a command refused its input in one line on stderr that has the words."""
+    assert result.code == 1, result.err
+    (line,) = result.err.splitlines()
+    assert line.startswith("servoscope: ")
+    for word in words:
+        assert word in line
+    return line
+
+
+def loop_with(folder: Path, made: Path, old: str, new: str) -> Path:
+    text = (made / "loop.toml").read_text(encoding="utf-8")
+    assert old in text
+    path = folder / "changed.toml"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    return path
+
+
+def test_demo_says_what_it_does_and_leaves_all_its_files(tmp_path: Path) -> None:
+    result = run("demo", "-o", tmp_path / "out")
+    assert result.code == 0
+    assert "Fault, leakage" in result.out
+    assert result.out.count("$ servoscope ") == 4
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "baseline.json",
+        "diagnosis.json",
+        "healthy.csv",
+        "loop.toml",
+        "report.html",
+        "suspect.csv",
+        "trace.parquet",
+    }
+    diagnosis = json.loads((tmp_path / "out" / "diagnosis.json").read_text(encoding="utf-8"))
+    (fault,) = diagnosis["faults"]
+    assert fault["interval"][0] < 1.2 < fault["interval"][1]
+    assert abs(diagnosis["onset_s"][1] - 30.0) < 0.5
+
+
+def test_simulate_tells_the_truth(made: Path, tmp_path: Path) -> None:
+    result = run(
+        *("simulate", made / "loop.toml", "-o", tmp_path / "x.parquet", "--reference", "multisine"),
+        *("--duration", 20, "--fault", "leakage=1.5@10~5", "--fault", "p_s=0.9@15", "--seed", 3, "--json"),
+    )
+    assert result.code == 0
+    said = json.loads(result.out)
+    assert said["samples"] == 2000
+    assert [(f["name"], f["parameter"], f["ratio"], f["at_s"], f["ramp_s"]) for f in said["faults"]] == [
+        ("leakage", "C_ie", 1.5, 10.0, 5.0),
+        ("pump", "p_s", 0.9, 15.0, 0.0),
+    ]
+    assert pq.read_table(tmp_path / "x.parquet").column_names == ["t", "r", "u", "y"]
+
+
+def test_simulate_writes_what_the_loop_reads(made: Path, tmp_path: Path) -> None:
+    names = '[columns]\ntime = "Time"\ntime_unit = "ms"\nreference = "set point"\nsegment = ["run"]\n\n[plant]'
+    loop = loop_with(tmp_path, made, "[plant]", names)
+    for suffix in ("csv", "parquet"):
+        path = tmp_path / f"x.{suffix}"
+        assert run("simulate", loop, "-o", path, "--duration", 20).code == 0
+        said = json.loads(run("inspect", path, "--loop", loop, "--json").out)
+        assert said["sampling"]["samples"] == 2000
+        assert said["sampling"]["sample_rate_hz"] == pytest.approx(100.0)
+        assert said["defects"] == []
+
+
+def test_simulate_says_how_to_read_columns_that_are_no_plain_names(made: Path, tmp_path: Path) -> None:
+    loop = loop_with(tmp_path, made, "[plant]", '[columns]\noutput = "0.025 * counts"\n\n[plant]')
+    result = run("simulate", loop, "-o", tmp_path / "x.csv", "--duration", 5)
+    assert "--columns 't=t, r=r, u=u, y=y'" in " ".join(result.out.split())
+    assert list(rows_of(tmp_path / "x.csv")) == ["t", "r", "u", "y"]
+
+
+def test_inspect_lists_the_columns_of_a_file_that_needs_a_mapping(made: Path, tmp_path: Path) -> None:
+    rows = rows_of(made / "healthy.csv")
+    path = write_rows(tmp_path / "x.csv", {"zeit": rows["t"], "soll": rows["r"], "i": rows["u"], "ist": rows["y"]})
+    result = run("inspect", path)
+    one_line(result, "--columns", "--loop")
+    for name in ("zeit", "soll", "i", "ist"):
+        assert f"  {name} " in result.out
+    listed = json.loads(run("inspect", path, "--json").out)
+    assert [channel["name"] for channel in listed["channels"]] == ["zeit", "soll", "i", "ist"]
+    mapped = run("inspect", path, "--columns", "t=zeit, r=soll, u=i, y=ist", "--report", tmp_path / "x.html")
+    assert mapped.code == 0
+    assert "Usable" in mapped.out
+    assert (tmp_path / "x.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+
+
+def test_learn_prints_what_it_found(made: Path, tmp_path: Path) -> None:
+    result = run("learn", made / "loop.toml", made / "healthy.csv", "-o", tmp_path / "b.json")
+    for word in ("theta_3", "C_ie", "leakage", "noise", "delay", "explained", "false alarms", "model_error"):
+        assert word in result.out
+    assert max(map(len, result.out.splitlines()[:-1])) <= 80
+    said = json.loads(run("learn", made / "loop.toml", made / "healthy.csv", "-o", tmp_path / "c.json", "--json").out)
+    assert said["healthy_ratios"]["C_ie"] == pytest.approx(1.0, abs=0.02)
+    assert said["explained"] > 0.99
+    assert (tmp_path / "b.json").read_bytes() == (tmp_path / "c.json").read_bytes()
+
+
+def test_a_nominal_baseline_needs_no_recording(made: Path, tmp_path: Path) -> None:
+    assert run("learn", made / "loop.toml", "--nominal", "-o", tmp_path / "b.json").code == 0
+    said = json.loads(run("diagnose", tmp_path / "b.json", made / "suspect.csv", "--json").out)
+    assert said["verdict"] == "fault"
+
+
+def test_learn_keeps_its_columns_in_the_baseline(made: Path, tmp_path: Path) -> None:
+    for name in ("healthy", "suspect"):
+        rows = rows_of(made / f"{name}.csv")
+        write_rows(
+            tmp_path / f"{name}.csv", {"time": rows["t"], "r": rows["r"], "amps": 0.5 * rows["u"], "y": rows["y"]}
+        )
+    mapping = ("--columns", "t=time, u=2 * amps")
+    baseline = tmp_path / "b.json"
+    assert run("learn", made / "loop.toml", tmp_path / "healthy.csv", "-o", baseline, *mapping).code == 0
+    result = run("diagnose", baseline, tmp_path / "suspect.csv")
+    assert result.code == 0
+    assert "Fault, leakage" in result.out
+    assert run("diagnose", baseline, made / "suspect.csv", "--columns", "t=t, u=u").code == 0
+
+
+def test_diagnose_writes_json_report_and_trace(made: Path, tmp_path: Path) -> None:
+    outputs = ("--report", tmp_path / "r.html", "--trace", tmp_path / "t.parquet")
+    result = run("diagnose", made / "baseline.json", made / "suspect.csv", "--json", *outputs)
+    assert result.code == 0
+    said = json.loads(result.out)
+    assert said["verdict"] == "fault"
+    assert said["faults"][0]["name"] == "leakage"
+    assert "leakage" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    trace = pq.read_table(tmp_path / "t.parquet")
+    assert trace.column_names[:2] == ["t", "theta_0"]
+    assert trace.column_names[-2:] == ["statistic", "threshold"]
+    assert {"ifrf_1Hz_real", "ifrf_20Hz_imag"} <= set(trace.column_names)
+    statistic, threshold = trace.column("statistic").to_numpy(), trace.column("threshold").to_numpy()
+    assert trace.column("t").to_numpy()[np.argmax(statistic > threshold)] == said["detected_at_s"]
+
+
+def test_the_exit_code_says_what_happened(made: Path, tmp_path: Path) -> None:
+    baseline, healthy, suspect = (made / name for name in ("baseline.json", "healthy.csv", "suspect.csv"))
+    missing = tmp_path / "missing.csv"
+    assert run("diagnose", baseline, suspect).code == 0
+    assert run("diagnose", baseline, healthy, "--fail-on-fault").code == 0
+    assert run("diagnose", baseline, suspect, "--fail-on-fault").code == 3
+    assert run("diagnose", baseline, missing, "--fail-on-fault").code == 1
+    assert run("diagnose", baseline, missing, suspect, "--fail-on-fault").code == 3
+    assert run("diagnose", baseline, missing, suspect).code == 1
+    assert run("diagnose", baseline).code == 2
+
+
+def test_a_bad_file_does_not_stop_the_good_ones(made: Path, tmp_path: Path) -> None:
+    paths = (tmp_path / "missing.csv", made / "healthy.csv", made / "suspect.csv")
+    result = run("diagnose", made / "baseline.json", *paths, "--json")
+    one_line(result, "missing.csv")
+    said = [json.loads(line) for line in result.out.splitlines()]
+    assert [(each["recording"], each["verdict"]) for each in said] == [
+        ("healthy.csv", "healthy"),
+        ("suspect.csv", "fault"),
+    ]
+    learned = run("learn", made / "loop.toml", *paths[:2], "-o", tmp_path / "b.json", "--json")
+    one_line(learned, "missing.csv")
+    assert [source["name"] for source in json.loads(learned.out)["sources"]] == ["healthy.csv"]
+    assert run("inspect", *paths[:2], "--json").code == 1
+    one_line(run("learn", made / "loop.toml", paths[0], "-o", tmp_path / "none.json"), "missing.csv")
+    assert not (tmp_path / "none.json").exists()
+
+
+def test_recordings_of_one_name_do_not_overwrite_each_other(made: Path, tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    twin = tmp_path / "a" / "healthy.csv"
+    twin.write_bytes((made / "healthy.csv").read_bytes())
+    outputs = ("--trace", tmp_path / "t.parquet", "--report", tmp_path / "pages")
+    result = run("diagnose", made / "baseline.json", made / "healthy.csv", twin, *outputs)
+    assert result.code == 0
+    for name in ("t-healthy.parquet", "t-healthy-2.parquet", "pages/healthy.html", "pages/healthy-2.html"):
+        assert (tmp_path / name).is_file()
+        assert name.rpartition("/")[2] in result.out
+
+
+def test_one_recording_per_value_of_a_column(made: Path, tmp_path: Path) -> None:
+    rows = rows_of(made / "suspect.csv")
+    part = np.where(rows["t"] < 30.0, 1, 2)
+    path = write_rows(tmp_path / "x.csv", {**rows, "part": part})
+    result = run("diagnose", made / "baseline.json", path, "--by", "part", "--json", "--trace", tmp_path / "t.parquet")
+    said = [json.loads(line) for line in result.out.splitlines()]
+    assert [(each["recording"], each["verdict"]) for each in said] == [
+        ("x.csv[part=1]", "healthy"),
+        ("x.csv[part=2]", "fault"),
+    ]
+    assert (tmp_path / "t-x-part-2.parquet").is_file()
+    only = json.loads(run("diagnose", made / "baseline.json", path, "--where", "part=1", "--json").out)
+    assert only["samples"] == 3000
+
+
+def spoiled(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Path, Path], Path]:
+    def make(folder: Path, made: Path) -> Path:
+        return write_rows(folder / "bad.csv", change(rows_of(made / "healthy.csv")))
+
+    return make
+
+
+def text_in(rows: dict[str, Any]) -> dict[str, Any]:
+    y = rows["y"].astype(object)
+    y[100] = "error 7"
+    return {**rows, "y": y}
+
+
+def raw(content: bytes) -> Callable[[Path, Path], Path]:
+    def make(folder: Path, made: Path) -> Path:
+        (folder / "bad.csv").write_bytes(content)
+        return folder / "bad.csv"
+
+    return make
+
+
+BAD_RECORDINGS = {
+    "empty": (raw(b""), "empty"),
+    "no column": (spoiled(lambda rows: {k: x for k, x in rows.items() if k != "u"}), "'u'"),
+    "text": (spoiled(text_in), "error 7"),
+    "constant": (spoiled(lambda rows: {**rows, "y": 0.0 * rows["y"]}), "y"),
+    "another type": (raw(b"%PDF-1.7\n%\xe2\xe3\xcf\xd3\n1 0 obj\n" * 50), "PDF"),
+    "backwards": (spoiled(lambda rows: {**rows, "t": rows["t"][::-1]}), "backwards"),
+    "sample rate": (spoiled(lambda rows: {**rows, "t": 1.02 * rows["t"]}), "Hz"),
+    "all NaN": (spoiled(lambda rows: {**rows, "u": np.nan * rows["u"]}), "u"),
+    "five samples": (spoiled(lambda rows: {k: x[:5] for k, x in rows.items()}), "5"),
+    "swapped": (spoiled(lambda rows: {**rows, "u": rows["y"], "y": rows["u"]}), "swapped"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_RECORDINGS)
+def test_a_bad_recording_is_one_line(case: str, made: Path, tmp_path: Path) -> None:
+    make, word = BAD_RECORDINGS[case]
+    path = make(tmp_path, made)
+    before = set(tmp_path.iterdir())
+    one_line(run("diagnose", made / "baseline.json", path), "bad.csv", word)
+    one_line(run("learn", made / "loop.toml", path, "-o", tmp_path / "b.json"), "bad.csv", word)
+    assert set(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("sample_rate", "sample_rat", "'sample_rate'"),
+        ("m_p = 4.0", "m_p = -4.0", "m_p"),
+        ("[controller]", "[monitor]\ncutoff = 60.0\n\n[controller]", "Nyquist"),
+        ("[controller]", "[controller", "TOML"),
+    ],
+)
+def test_a_bad_loop_file_is_one_line(old: str, new: str, word: str, made: Path, tmp_path: Path) -> None:
+    loop = loop_with(tmp_path, made, old, new)
+    one_line(run("learn", loop, made / "healthy.csv", "-o", tmp_path / "b.json"), "changed.toml", word)
+    one_line(run("simulate", loop, "-o", tmp_path / "x.csv"), "changed.toml", word)
+    one_line(run("inspect", made / "healthy.csv", "--loop", loop), "changed.toml", word)
+    assert [path.name for path in tmp_path.iterdir()] == ["changed.toml"]
+
+
+def test_a_bad_baseline_is_one_line(made: Path, tmp_path: Path) -> None:
+    content = json.loads((made / "baseline.json").read_text(encoding="utf-8"))
+    path = tmp_path / "b.json"
+    path.write_text(json.dumps({**content, "version": 99}), encoding="utf-8")
+    one_line(run("diagnose", path, made / "healthy.csv"), "b.json", "99", "learn it again")
+    path.write_text(json.dumps({**content, "R": "much"}), encoding="utf-8")
+    one_line(run("diagnose", path, made / "healthy.csv"), "b.json", "R")
+    one_line(run("diagnose", made / "loop.toml", made / "healthy.csv"), "loop.toml", "not a baseline")
+    one_line(run("diagnose", tmp_path / "none.json", made / "healthy.csv"), "none.json", "no such file")
+
+
+def test_an_output_that_cannot_be_written_is_one_line_and_leaves_nothing(made: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("here")
+    for folder in (tmp_path / "file", tmp_path / "none"):
+        one_line(run("simulate", made / "loop.toml", "-o", folder / "x.csv"), "x.csv", "cannot be written")
+        one_line(run("learn", made / "loop.toml", made / "healthy.csv", "-o", folder / "b.json"), "b.json")
+        for option, name in (("--report", "r.html"), ("--trace", "t.parquet")):
+            one_line(run("diagnose", made / "baseline.json", made / "healthy.csv", option, folder / name), name)
+    pages = run("diagnose", made / "baseline.json", made / "healthy.csv", "--report", tmp_path / "file" / "pages")
+    one_line(pages, "pages")
+    one_line(run("demo", "-o", tmp_path / "file"), "file")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "here"
+
+
+def test_a_wrong_command_line_exits_with_2(made: Path, tmp_path: Path) -> None:
+    loop, healthy, baseline = made / "loop.toml", made / "healthy.csv", made / "baseline.json"
+    wrong: list[tuple[Any, ...]] = [
+        ("diagnos", baseline),
+        ("diagnose", baseline, healthy, "--jsn"),
+        ("diagnose", baseline, healthy, "--where", "load"),
+        ("diagnose", baseline, healthy, "--columns", "output"),
+        ("diagnose", baseline, healthy, "--report", tmp_path / "r.pdf"),
+        ("diagnose", baseline, healthy, "--trace", tmp_path / "t.csv"),
+        ("learn", loop, "-o", tmp_path / "b.json"),
+        ("learn", loop, healthy, "--nominal", "-o", tmp_path / "b.json"),
+        ("simulate", loop, "-o", tmp_path / "x.xlsx"),
+        ("simulate", loop, "-o", tmp_path / "x.csv", "--fault", "C_ie"),
+        ("simulate", loop, "-o", tmp_path / "x.csv", "--reference", "sinus"),
+        ("simulate", loop, "-o", tmp_path / "x.csv", "--duration", "long"),
+        ("simulate", loop),
+    ]
+    for words in wrong:
+        result = run(*words)
+        assert result.code == 2, words
+        assert result.out == ""
+        assert "Traceback" not in result.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_command_overwrites_its_inputs(made: Path, tmp_path: Path) -> None:
+    loop = tmp_path / "loop.csv"
+    loop.write_bytes((made / "loop.toml").read_bytes())
+    recording = tmp_path / "x.parquet"
+    assert run("simulate", loop, "-o", recording, "--duration", 20, "--seed", 9).code == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert run("simulate", loop, "-o", loop).code == 2
+    assert run("learn", loop, recording, "-o", recording).code == 2
+    assert run("diagnose", made / "baseline.json", recording, "--trace", recording).code == 2
+    one_line(run("diagnose", made / "baseline.json", recording, "--trace", tmp_path), "overwritten")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_an_interrupt_is_quiet(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(path: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("servoscope.loop.Loop.load", interrupted)
+    result = run("simulate", made / "loop.toml", "-o", tmp_path / "x.csv")
+    assert (result.code, result.out, result.err) == (130, "", "")
+
+
+def test_a_fault_of_the_program_keeps_its_traceback(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(path: Path) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("servoscope.loop.Loop.load", broken)
+    with pytest.raises(ZeroDivisionError):
+        run("simulate", made / "loop.toml", "-o", tmp_path / "x.csv")
+
+
+def process(*words: object, **settings: Any) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT / "src"), "COLUMNS": "80"}
+    command = [sys.executable, "-m", "servoscope", *map(str, words)]
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **settings
+    )
+
+
+def test_the_real_command_prints_pure_json(made: Path) -> None:
+    done = process("diagnose", made / "baseline.json", made / "suspect.csv", "--json", "--fail-on-fault")
+    out, err = done.communicate()
+    assert done.returncode == 3
+    assert err == ""
+    assert json.loads(out)["verdict"] == "fault"
+
+
+def test_help_and_version_start_fast_and_without_colour() -> None:
+    helped = process("--help")
+    out, err = helped.communicate()
+    assert helped.returncode == 0
+    assert err == ""
+    assert "\x1b" not in out
+    assert max(map(len, out.splitlines())) <= 80
+    shown = process("--version")
+    assert shown.communicate()[0].startswith("servoscope 0.")
+    code = "import sys; import servoscope.cli; print(sorted(set(sys.modules) & {'numpy', 'numba', 'scipy', 'pyarrow'}))"
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT / "src")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_reader_that_leaves_is_no_error(made: Path) -> None:
+    gone = process("inspect", made / "healthy.csv", "--json")
+    assert gone.stdout is not None
+    assert gone.stderr is not None
+    gone.stdout.close()
+    err = gone.stderr.read()
+    gone.stderr.close()
+    assert gone.wait() == 1
+    assert err == ""
+
+
+def test_a_full_disk_is_one_line(made: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("there is no full disk to write to")
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT / "src")}
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "servoscope", "inspect", str(made / "healthy.csv"), "--json"]
+        done = subprocess.run(command, env=environment, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("servoscope: ")
