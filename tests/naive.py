@@ -1,4 +1,4 @@
-"""Slow, obvious oracles for the compiled chain: textbook matrices, dense sub-steps and loops; nothing is shared with it."""
+"""Slow, obvious oracles for the compiled chain: textbook matrices, dense sub-steps, loops; nothing is shared."""
 
 from __future__ import annotations
 
@@ -24,7 +24,13 @@ def between_samples(w: Array, rate: float, hold: str, steps: int, delay: float =
 
 
 def continuous(
-    numerator: npt.ArrayLike, denominator: npt.ArrayLike, w: Array, rate: float, hold: str, delay: float = 0.0, steps: int = 1
+    numerator: npt.ArrayLike,
+    denominator: npt.ArrayLike,
+    w: Array,
+    rate: float,
+    hold: str,
+    delay: float = 0.0,
+    steps: int = 1,
 ) -> Array:
     """Pass samples through a continuous transfer function (highest power first), from its steady state at w[0]."""
     t, fine = between_samples(w - w[0], rate, hold, steps, delay)
@@ -61,7 +67,9 @@ def akf(theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z:
     return theta + K * (eta - phi @ theta), new, K
 
 
-def iv_akf(theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array) -> tuple[Array, Array, Array]:
+def iv_akf(
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array
+) -> tuple[Array, Array, Array]:
     """Take one step of the instrumental-variable AKF, skipped where the instrument points away."""
     if phi @ P @ z < 0.0 or phi @ P_d @ z < 0.0:
         return theta, P, np.zeros_like(theta)
@@ -134,7 +142,12 @@ def stretches(r: Array, u: Array, y: Array, restart: npt.NDArray[np.bool_]) -> l
 
 
 def usable(
-    r: Array, u: Array, y: Array, restart: npt.NDArray[np.bool_], wait: int, resting: npt.NDArray[np.bool_] | None = None
+    r: Array,
+    u: Array,
+    y: Array,
+    restart: npt.NDArray[np.bool_],
+    wait: int,
+    resting: npt.NDArray[np.bool_] | None = None,
 ) -> npt.NDArray[np.bool_]:
     """Return which samples come `wait` after the start of their stretch and after the last sample at rest in it."""
     ok = np.zeros(len(r), dtype=bool)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import naive
 import numpy as np
 import pytest
 
+import naive
 from servoscope import estimators
 from servoscope.errors import LoopError
 
@@ -49,7 +49,7 @@ def samples(steps: int, seed: int = 5, mismatch: float = 0.1) -> list[tuple[floa
 def test_names_and_oracles() -> None:
     assert set(ALL) == set(naive.UPDATES), "every estimator has its textbook version in naive.py"
     for name in ALL:
-        assert estimators.load(name).NAME == name
+        assert name == estimators.load(name).NAME
     with pytest.raises(LoopError, match="choose from akf"):
         estimators.load("kalmann")
 
@@ -67,7 +67,7 @@ class TestContract:
             scale = np.abs(P).max()
             assert np.abs(run.P - P).max() < 1e-12 * scale
             assert run.theta == pytest.approx(theta, rel=1e-12, abs=1e-12)
-            assert run.K == pytest.approx(K, rel=1e-12, abs=1e-12)
+            assert pytest.approx(K, rel=1e-12, abs=1e-12) == run.K
         assert updated > 200
 
     def test_no_excitation_no_windup(self, name: str) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import naive
 import numpy as np
 import pytest
 
+import naive
 from servoscope.ifrf import response
 from servoscope.inverse import build
 from servoscope.loop import Loop

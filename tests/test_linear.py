@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-import naive
 import numpy as np
 import pytest
 
+import naive
 from servoscope.linear import Linear, autocovariances, sampled, settling, stack, state_variable_filter, taps
 
 RATE = 100.0

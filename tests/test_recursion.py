@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from typing import Any
 
-import naive
 import numpy as np
 import numpy.typing as npt
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import naive
 from servoscope.baseline import Baseline
 from servoscope.diagnosis import Trace
 from servoscope.errors import BaselineError, RecordingError
@@ -194,7 +195,9 @@ def same(parts: list[Trace], whole: Trace, axis: int = 0) -> None:
     """Check that traces laid end to end are the other one to the last bit."""
     joined = [columns(part) for part in parts]
     for name, values in columns(whole).items():
-        assert np.array_equal(np.concatenate([part[name] for part in joined], axis=axis if name != "t" else 0), values), name
+        assert np.array_equal(
+            np.concatenate([part[name] for part in joined], axis=axis if name != "t" else 0), values
+        ), name
 
 
 class TestMonitor:
@@ -202,14 +205,14 @@ class TestMonitor:
     def baseline(self, rig: dict[str, Any]) -> Baseline:
         return learned(rig, 1)
 
-    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(cuts=st.lists(st.integers(0, 607), max_size=6), data=st.data())
     def test_split_and_resumed_anywhere(self, baseline: Baseline, cuts: list[int], data: st.DataObject) -> None:
         signals, monitor = _signals(2), Monitor(baseline)
         whole_state, whole = monitor.run(monitor.init(), *signals)
         state, parts = monitor.init(), []
         edges = [0, *sorted(cuts), 607]
-        for begin, end in zip(edges[:-1], edges[1:], strict=True):
+        for begin, end in itertools.pairwise(edges):
             state, trace = monitor.run(state, *(signal[begin:end] for signal in signals))
             parts.append(trace)
             if data.draw(st.booleans()):

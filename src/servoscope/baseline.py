@@ -64,9 +64,10 @@ class Baseline(_Part):
         The recursion's tuning (see `servoscope.pipeline.Tuning`).
     noise
         n_u and n_y; None without a controller or physics.
-    ratios, model_theta
-        Healthy parameters relative to the loop file's nominal values, and the coefficients that they lead to under
-        the references of the baseline; empty without a controller or physics.
+    ratios, ratios_std, model_theta
+        Healthy parameters relative to the loop file's nominal values, the standard deviations of their logarithms,
+        and the coefficients that they lead to under the references of the baseline; empty without a controller or
+        physics.
     dof
         Effective number of independent residuals.
     limit
@@ -94,6 +95,7 @@ class Baseline(_Part):
     noise_gamma: Vector
     noise: Noise | None
     ratios: dict[str, float]
+    ratios_std: dict[str, float]
     model_theta: Vector
     dof: float
     limit: float

@@ -36,7 +36,7 @@ def candidates_of(
     faults, plant = baseline.loop.plant.faults, baseline.plant
     if expectation is not None:
         shift = _simulated(baseline, expectation.until(last + 1), since)
-        return [curve(fault, shift(fault)) for fault in faults]
+        return [curve(fault, shift(fault), baseline.ratios_std.get(fault.parameter, 0.0)) for fault in faults]
     learned = _learned(baseline, recording, since, last)
     if plant.has_physics and plant.kind != "polynomial":
         shift = _physical(baseline, learned)

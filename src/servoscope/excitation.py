@@ -96,8 +96,8 @@ def spectra(recording: Recording, period: int | None = None) -> Spectra | None:
     X = np.stack(rows)[:, :, 1:]  # (segments, 3, F), without the mean
     power = scale * np.mean(np.abs(X) ** 2, axis=0)
     cross = scale * np.mean(np.conj(X[:, :1]) * X[:, 1:], axis=0)
-    floor = NOTHING * power.max(axis=1, keepdims=True) + np.finfo(np.float64).tiny
-    raw = np.abs(cross) ** 2 / np.maximum(power[:1] * power[1:], floor[:1] * floor[1:])
+    floor = NOTHING * power.max(axis=1, keepdims=True) + 1e-150
+    raw = np.abs(cross) ** 2 / (np.maximum(power[:1], floor[:1]) * np.maximum(power[1:], floor[1:]))
     # Half-overlapping Hann segments hold about 0.9 independent ones each; noise alone shows 1/K.
     K = max(0.9 * len(rows), 2.0)
     coherence = np.clip((K * raw - 1.0) / (K - 1.0), 0.0, 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +14,28 @@ from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray, Plant
 from servoscope.signatures import Expectation, Noise, noise_system
 from servoscope.tuning import Fit, autocovariance
+
+@dataclass(frozen=True, eq=False)
+class HealthyPlant:
+    """The plant that the healthy recordings show.
+
+    Parameters
+    ----------
+    ratios
+        Parameters relative to the loop file's.
+    std
+        Standard deviations of the ratios' logarithms.
+    theta
+        Coefficients that the plant leads to under the recordings' references, shape (n,).
+    misfit
+        Chi-square with n degrees of freedom when the loop file is right.
+    """
+
+    ratios: dict[str, float]
+    std: dict[str, float]
+    theta: FloatArray
+    misfit: float
+
 
 PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
 
@@ -43,11 +66,10 @@ def noise_of(pipeline: Pipeline, found: Fit, regressions: Sequence[Regression]) 
 
 def healthy_parameters(
     expectations: Sequence[Expectation], found: Fit, covariance: FloatArray
-) -> tuple[dict[str, float], FloatArray, float]:
+) -> HealthyPlant:
     """Fit the plant's parameters to the healthy coefficients, held near the loop file's by a prior.
 
-    Maximum a posteriori by Gauss and Newton on the expected least squares estimate; also returns that estimate and
-    the misfit, which is chi-square with n degrees of freedom when the loop file is right.
+    Maximum a posteriori by Gauss and Newton on the expected least squares estimate.
     """
     from scipy.optimize import least_squares as minimise
 
@@ -68,7 +90,13 @@ def healthy_parameters(
 
     start = np.zeros(len(plant.parameters))
     result = minimise(misfit, start, x_scale=PRIOR, diff_step=[1e-3], max_nfev=12, bounds=(-1.5, 1.5))
-    return ratios(result.x), expected(result.x), 2.0 * float(result.cost)
+    std = np.sqrt(np.diag(np.linalg.inv(result.jac.T @ result.jac)))
+    return HealthyPlant(
+        ratios(result.x),
+        dict(zip(plant.parameters, std.tolist(), strict=True)),
+        expected(result.x),
+        2.0 * float(result.cost),
+    )
 
 
 def fault_directions(loop: Loop, plant: Plant, theta: FloatArray) -> dict[str, FloatArray]:

@@ -32,6 +32,8 @@ class Signature:
         Coordinate -> ratio of the parameter to its healthy value.
     low, high
         Range of the coordinate; the prior is uniform on it.
+    vague
+        Standard deviation of the healthy value on the coordinate's scale: the size is relative to it.
     """
 
     fault: Fault
@@ -39,12 +41,17 @@ class Signature:
     ratio: Callable[[float], float]
     low: float
     high: float
+    vague: float = 0.0
 
 
-def curve(fault: Fault, shift_of_ratio: Callable[[float], FloatArray]) -> Signature:
+def curve(fault: Fault, shift_of_ratio: Callable[[float], FloatArray], vague: float = 0.0) -> Signature:
     """Return the signature of a physical parameter: the coordinate is the logarithm of the ratio."""
     low, high = np.log(fault.ratio_range)
-    return Signature(fault, lambda x: shift_of_ratio(float(np.exp(x))), lambda x: float(np.exp(x)), low, high)
+
+    def shift(x: float) -> FloatArray:
+        return shift_of_ratio(float(np.exp(x)))
+
+    return Signature(fault, shift, lambda x: float(np.exp(x)), low, high, vague)
 
 
 def line(fault: Fault, direction: FloatArray) -> Signature:
@@ -191,5 +198,9 @@ class _Search:
         density = np.exp(np.interp(dense, x, np.maximum(log_weight, top - 1e4)) - top)
         area = np.concatenate([[0.0], np.cumsum(np.diff(dense) * (density[1:] + density[:-1]) / 2.0)])
         low, high = np.interp([0.025, 0.975], area / area[-1], dense)
+        low, high = (
+            best - np.hypot(best - low, 1.96 * signature.vague),
+            best + np.hypot(high - best, 1.96 * signature.vague),
+        )
         evidence = top + float(np.log(area[-1] / (signature.high - signature.low)))
         return _Fitted(signature, self.known[best][0], evidence, best, float(low), float(high))

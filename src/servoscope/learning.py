@@ -95,6 +95,7 @@ def _assemble(
     covariance = covariance + np.diag(error**2)
     theta, noise, model_theta = found.tuning.theta, None, np.zeros(0)
     ratios: dict[str, float] = {}
+    ratios_std: dict[str, float] = {}
     if simulated(loop):
         progress("healthy parameters")
         noise = noise_of(pipeline, found, regressions)
@@ -102,10 +103,11 @@ def _assemble(
         if exact:
             theta = model_theta = expectations[0].batch(loop.plant)
         else:
-            ratios, model_theta, misfit = healthy_parameters(expectations, found, covariance)
-            if misfit > 10.0 * pipeline.bank.n:
+            healthy = healthy_parameters(expectations, found, covariance)
+            ratios, ratios_std, model_theta = healthy.ratios, healthy.std, healthy.theta
+            if healthy.misfit > 10.0 * pipeline.bank.n:
                 notes.append(
-                    f"[plant] and [controller] do not explain the healthy recordings (misfit {misfit:.0f}, about "
+                    f"[plant] and [controller] do not explain the healthy recordings (misfit {healthy.misfit:.0f}, about "
                     f"{pipeline.bank.n} expected): sizes of faults are uncertain, check the parameters"
                 )
     tuning = replace(found.tuning, theta=theta)
@@ -158,6 +160,7 @@ def _assemble(
         noise_gamma=tuple(tuning.noise_gamma),
         noise=noise,
         ratios=ratios,
+        ratios_std=ratios_std,
         model_theta=tuple(model_theta),
         dof=found.dof,
         limit=limit,

@@ -276,7 +276,7 @@ def swapped(recording: Recording) -> str | None:
         return None
     follows_u, follows_y = (abs(float(np.corrcoef(r, x)[0, 1])) for x in (u, y))
     rough_u, rough_y = (float(np.std(np.diff(x)) / np.std(x)) for x in (u, y))
-    if follows_u > 0.98 and follows_y < 0.9 and rough_u < 0.5 * rough_y:
+    if follows_u > 0.9 and follows_y < 0.7 and rough_u < 0.5 * rough_y:
         correlations = f"correlation {follows_u:.3f}, y {follows_y:.3f}"
         return f"u goes with the reference ({correlations}) and is the smoother of the two"
     return None
