@@ -15,6 +15,9 @@ from servoscope.plants import FloatArray, Plant
 from servoscope.signatures import Expectation, Noise, noise_system
 from servoscope.tuning import Fit, autocovariance
 
+PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
+
+
 @dataclass(frozen=True, eq=False)
 class HealthyPlant:
     """The plant that the healthy recordings show.
@@ -35,9 +38,6 @@ class HealthyPlant:
     std: dict[str, float]
     theta: FloatArray
     misfit: float
-
-
-PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
 
 
 def simulated(loop: Loop) -> bool:
@@ -64,9 +64,7 @@ def noise_of(pipeline: Pipeline, found: Fit, regressions: Sequence[Regression]) 
     return Noise(u_std=u_std, y_std=y_std)
 
 
-def healthy_parameters(
-    expectations: Sequence[Expectation], found: Fit, covariance: FloatArray
-) -> HealthyPlant:
+def healthy_parameters(expectations: Sequence[Expectation], found: Fit, covariance: FloatArray) -> HealthyPlant:
     """Fit the plant's parameters to the healthy coefficients, held near the loop file's by a prior.
 
     Maximum a posteriori by Gauss and Newton on the expected least squares estimate.
@@ -90,7 +88,8 @@ def healthy_parameters(
 
     start = np.zeros(len(plant.parameters))
     result = minimise(misfit, start, x_scale=PRIOR, diff_step=[1e-3], max_nfev=12, bounds=(-1.5, 1.5))
-    std = np.sqrt(np.diag(np.linalg.inv(result.jac.T @ result.jac)))
+    slope = np.asarray(result.jac)
+    std = np.sqrt(np.diag(np.linalg.inv(slope.T @ slope)))
     return HealthyPlant(
         ratios(result.x),
         dict(zip(plant.parameters, std.tolist(), strict=True)),

@@ -107,8 +107,8 @@ def _assemble(
             ratios, ratios_std, model_theta = healthy.ratios, healthy.std, healthy.theta
             if healthy.misfit > 10.0 * pipeline.bank.n:
                 notes.append(
-                    f"[plant] and [controller] do not explain the healthy recordings (misfit {healthy.misfit:.0f}, about "
-                    f"{pipeline.bank.n} expected): sizes of faults are uncertain, check the parameters"
+                    f"[plant] and [controller] do not explain the healthy recordings (misfit {healthy.misfit:.0f}, "
+                    f"about {pipeline.bank.n} expected): sizes of faults are uncertain, check the parameters"
                 )
     tuning = replace(found.tuning, theta=theta)
     plant = loop.plant.with_ratios(ratios) if ratios else loop.plant
