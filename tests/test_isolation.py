@@ -14,7 +14,6 @@ from servoscope.errors import SimulationError
 from servoscope.isolation import SYSTEMATIC, Signature, curve, isolate, line
 from servoscope.plants import Fault
 
-NOT_REFINED = "the coarse grid alone decides which curves are refined, and it can miss a sharp minimum"
 SCALE = np.array([1.0, 1e-2, 1e-5, 1e-7])  # coefficients have very different sizes
 CORRELATION = np.array([[1.0, 0.3, 0.0, 0.1], [0.3, 1.0, -0.2, 0.0], [0.0, -0.2, 1.0, 0.5], [0.1, 0.0, 0.5, 1.0]])
 SIGMA = 1e-4 * CORRELATION * np.outer(SCALE, SCALE)
@@ -74,7 +73,6 @@ def test_intervals_hold_the_truth_19_times_of_20() -> None:
     assert 181 <= hits <= 198, hits
 
 
-@pytest.mark.xfail(reason=NOT_REFINED)
 def test_probabilities_are_the_integrals_over_the_prior() -> None:
     """Against adaptive quadrature, where two faults fit about equally well."""
     first, second = bent(PUMP), bent(PUMP + np.array([0.0, 0.0, 0.0, 0.15]))
@@ -99,7 +97,6 @@ def test_probabilities_are_the_integrals_over_the_prior() -> None:
     assert share["first"] / known == pytest.approx(evidence[0] / sum(evidence), abs=0.01)
 
 
-@pytest.mark.xfail(reason=NOT_REFINED)
 def test_interval_is_as_sharp_where_the_grid_misses_the_truth() -> None:
     """The truth lies half-way between two points of its own grid, while a rival's grid happens to fit better."""
     along, aside = np.ones(4), np.array([1.0, -1.0, 1.0, -1.0])

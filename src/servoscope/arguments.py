@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Outputs",
     "Source",
+    "check_length",
     "check_output",
     "check_reference",
     "columns_from",
@@ -31,6 +33,8 @@ __all__ = [
     "provenance",
     "stem_of",
 ]
+
+MOST_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
 
 
 def conditions(texts: Sequence[str]) -> dict[str, str]:
@@ -74,17 +78,28 @@ def columns_from(text: str | None, base: Columns | None = None) -> Columns | Non
         raise typer.BadParameter(f"--{error}; as in --columns 't=Time, r=Ref, u=2 * Current, y=Pos'") from None
 
 
+EVERYTHING = (-math.inf, math.inf)
+
+
 @dataclass(frozen=True)
 class Source:
-    """How the recordings of one command are read: the loop, ``--columns``, ``--where`` and ``--by``."""
+    """How the recordings of one command are read: the loop, ``--columns``, ``--where``, ``--by``, ``--from``, ``--to``."""
 
     loop: Loop | None
     columns: Columns | None
     where: dict[str, str]
     by: str | None
+    span: tuple[float, float]
 
     @classmethod
-    def of(cls, loop: Loop | None, columns: str | None, where: Sequence[str] | None, by: str | None) -> Source:
+    def of(
+        cls,
+        loop: Loop | None,
+        columns: str | None,
+        where: Sequence[str] | None,
+        by: str | None,
+        span: tuple[float | None, float | None],
+    ) -> Source:
         """Read the options.
 
         Raises
@@ -93,7 +108,10 @@ class Source:
             If one of them cannot be read.
         """
         mapping = columns_from(columns, loop.columns if loop is not None else None)
-        return cls(loop, mapping, conditions(where or ()), by)
+        start, end = (bound if bound is not None else limit for bound, limit in zip(span, EVERYTHING, strict=True))
+        if not start < end:
+            raise typer.BadParameter(f"--from {start:g} must be before --to {end:g}")
+        return cls(loop, mapping, conditions(where or ()), by, (start, end))
 
     def read(self, path: Path) -> list[Recording]:
         """Return the recordings in a file: one, or one per value of the column in ``--by``.
@@ -105,7 +123,10 @@ class Source:
         """
         from servoscope import readers
 
-        return readers.read_parts(path, self.loop, columns=self.columns, where=self.where, by=self.by)
+        parts = readers.read_parts(path, self.loop, columns=self.columns, where=self.where, by=self.by)
+        if self.span == EVERYTHING:
+            return parts
+        return [part.part(*self.span) for part in parts]
 
     def many(self, paths: Sequence[Path]) -> bool:
         """Return whether several recordings are to be expected."""
@@ -149,6 +170,20 @@ def check_reference(text: str) -> None:
 
     if text not in KINDS and not Path(text).suffix and not Path(text).exists():
         raise typer.BadParameter(f"--reference {text}: choose from {', '.join(KINDS)}, or name a file")
+
+
+def check_length(duration_s: float, sample_rate: float) -> None:
+    """Refuse a ``--duration`` that has no samples, or more than a machine's memory is sure to hold.
+
+    Raises
+    ------
+    typer.BadParameter
+        If so.
+    """
+    samples = duration_s * sample_rate
+    if not 0.5 < samples <= MOST_SAMPLES:  # not a number is refused too
+        most = MOST_SAMPLES / sample_rate
+        raise typer.BadParameter(f"--duration {duration_s:g}: give more than 0 s and at most {most:g} s")
 
 
 def check_output(

@@ -36,6 +36,8 @@ Where = Annotated[
     typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges."),
 ]
 By = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
+From = Annotated[float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time [s].")]
+To = Annotated[float | None, typer.Option("--to", metavar="S", help="Leave out this time [s] and what is after it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
 Report = Annotated[
     Path | None,
@@ -100,6 +102,7 @@ def simulate(
     from servoscope.progress import progress
 
     settings = Loop.load(loop)
+    arguments.check_length(duration, settings.sample_rate)
     with progress(1, 1) as steps:
         steps.begin("simulating")
         r = simulation.reference(reference, duration, settings.sample_rate, amplitude=amplitude)
@@ -126,6 +129,8 @@ def inspect(
     columns: ColumnsText = None,
     where: Where = None,
     by: By = None,
+    from_s: From = None,
+    to_s: To = None,
     as_json: AsJson = False,
     report: Report = None,
 ) -> None:
@@ -137,7 +142,7 @@ def inspect(
     from servoscope.progress import progress
 
     settings = Loop.load(loop) if loop is not None else None
-    source = Source.of(settings, columns, where, by)
+    source = Source.of(settings, columns, where, by, (from_s, to_s))
     many = source.many(logs)
     pages = Outputs.of(report, ".html", many, logs)
     out, failures = terminal.console(), Failures()
@@ -179,6 +184,8 @@ def learn(
     columns: ColumnsText = None,
     where: Where = None,
     by: By = None,
+    from_s: From = None,
+    to_s: To = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn from healthy recordings what healthy looks like."""
@@ -192,7 +199,7 @@ def learn(
     from servoscope.progress import progress
 
     settings = Loop.load(loop)
-    source = Source.of(settings, columns, where, by)
+    source = Source.of(settings, columns, where, by, (from_s, to_s))
     if source.columns is not None:  # into the baseline with it: whoever diagnoses need not say it again
         settings = settings.model_copy(update={"columns": source.columns})
     failures = Failures()
@@ -223,6 +230,8 @@ def diagnose(
     columns: ColumnsText = None,
     where: Where = None,
     by: By = None,
+    from_s: From = None,
+    to_s: To = None,
     as_json: AsJson = False,
     report: Report = None,
     trace: Trace = None,
@@ -238,7 +247,7 @@ def diagnose(
     from servoscope.progress import progress
 
     healthy = Baseline.load(baseline)
-    source = Source.of(healthy.loop, columns, where, by)
+    source = Source.of(healthy.loop, columns, where, by, (from_s, to_s))
     many = source.many(recordings)
     pages, traces = Outputs.of(report, ".html", many, inputs), Outputs.of(trace, ".parquet", many, inputs)
     out, failures, faulty = terminal.console(), Failures(), False

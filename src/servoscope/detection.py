@@ -11,6 +11,7 @@ from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 
 SECONDS_PER_YEAR = 365.25 * 86400.0
+TEMPER = 0.5  # power of the onset's likelihood: while the filters settle, neither model is true
 POWER = 0.9  # probability with which a promised change is seen
 
 
@@ -142,17 +143,17 @@ def onset(
     innovation = tuning.innovation * max(1.0, float(estimates.power[-1]))
     gain[used] = (white[0] ** 2 - white[1] ** 2) / (2.0 * innovation)
     log_likelihood = np.cumsum(gain[::-1])[::-1][: until + 1]  # of a change at each sample, up to a constant
-    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight = np.exp(TEMPER * (log_likelihood - log_likelihood.max()))
     share = np.cumsum(weight) / weight.sum()
     likely = int(np.argmax(log_likelihood))
     low, high = np.searchsorted(share, [0.025, 0.975])
-    # the filters blur a step over their settling time, to either side of the sample that the likelihood picks
-    blur = pipeline.bank.wait / (2.0 * recording.sample_rate)
+    # the filters delay and blur a step: it may have come up to their settling time before it shows
+    blur = pipeline.bank.wait / recording.sample_rate
     t = recording.t
     return Onset(
         max(float(t[min(low, until)]) - blur, float(t[0])),
         float(t[likely]),
-        min(float(t[min(high, until)]) + blur, float(t[until])),
+        min(float(t[min(high, until)]) + blur / 2.0, float(t[until])),
         likely,
     )
 

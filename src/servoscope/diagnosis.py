@@ -138,7 +138,7 @@ class Trace:
     statistic
         T^2, shape (K,).
     threshold
-        Alarm limit of the statistic.
+        Alarm limit of the statistic; for a fleet one per asset, shape (assets, 1).
     ifrf, ifrf_expected
         Responses at the monitored frequencies, of `theta` and of `expected`.
     ready
@@ -151,7 +151,7 @@ class Trace:
     covariance: FloatArray
     expected: FloatArray
     statistic: FloatArray
-    threshold: float
+    threshold: float | FloatArray
     ifrf: Response
     ifrf_expected: Response
     ready: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]

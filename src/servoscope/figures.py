@@ -76,23 +76,24 @@ def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     ax.set_ylabel("statistic T²")
     if not usable.any():
         return _nothing(figure, ax)
+    limit = float(np.max(trace.threshold))
     t = trace.t / factor
     value = np.where(usable, trace.statistic, np.nan)
-    lowest = min(float(np.nanpercentile(value, 1.0)), trace.threshold) / 2.0
+    lowest = min(float(np.nanpercentile(value, 1.0)), limit) / 2.0
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter("{x:g}")
     ax.plot(*envelope(t, value), color=MEASURED, marker="o" if usable.sum() < 20 else "", markersize=3)
-    ax.axhline(trace.threshold, color=ALARM, linewidth=1.0, linestyle=(0, (5, 2.5)))
-    over = np.where(usable, np.maximum(trace.statistic, trace.threshold), np.nan)
-    ax.fill_between(*envelope(t, over), trace.threshold, color=ALARM, alpha=0.16, linewidth=0)
-    ax.set_ylim(lowest, 3.0 * max(float(np.nanmax(value)), trace.threshold))
+    ax.axhline(limit, color=ALARM, linewidth=1.0, linestyle=(0, (5, 2.5)))
+    over = np.where(usable, np.maximum(trace.statistic, limit), np.nan)
+    ax.fill_between(*envelope(t, over), limit, color=ALARM, alpha=0.16, linewidth=0)
+    ax.set_ylim(lowest, 3.0 * max(float(np.nanmax(value)), limit))
     ax.margins(x=0.0)
     if usable.sum() == 1:
         ax.set_xlim(t[usable][0] - 1.0, t[usable][0] + 1.0)
     _marks(ax, diagnosis, factor)
     lines = [
         Line2D([], [], color=MEASURED, label="statistic T²"),
-        Line2D([], [], color=ALARM, linestyle=(0, (5, 2.5)), label=f"threshold {trace.threshold:.3g}"),
+        Line2D([], [], color=ALARM, linestyle=(0, (5, 2.5)), label=f"threshold {limit:.3g}"),
     ]
     _legend_above(figure, diagnosis, lines)
     return figure

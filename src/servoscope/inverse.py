@@ -178,7 +178,7 @@ def cutoff_of(loop: Loop) -> float:
 def _svf_paths(loop: Loop) -> tuple[Linear, Linear, list[Linear], int]:
     """Return u -> eta, y -> phi, extras -> phi, and the samples to wait."""
     plant, rate, cutoff = loop.plant, loop.sample_rate, cutoff_of(loop)
-    order = max(plant.powers) + 1
+    order = max((1, *plant.powers)) + 1
     continuous = state_variable_filter(cutoff, order)
     to_eta = sampled(continuous, rate, loop.hold, loop.delay).output(plant.input_gain * np.eye(1, order))
     to_phi = sampled(continuous, rate, "foh").output(np.eye(order)[list(plant.powers)])

@@ -162,30 +162,36 @@ class _Search:
         return J, float(np.linalg.slogdet(Sigma)[1])
 
     def coarse(self) -> float:
-        """Return the smallest misfit on the grid."""
+        """Return the smallest misfit on the grid and a few steps towards the minimum beside its best point."""
+        for x in np.linspace(self.signature.low, self.signature.high, GRID):
+            self.J(float(x))
+        best = min(self.known, key=lambda x: self.known[x][0])
+        if np.isfinite(self.known[best][0]):
+            self._refine(8)
+        return min(J for J, _ in self.known.values())
+
+    def _refine(self, steps: int) -> None:
+        from scipy import optimize
+
         grid = np.linspace(self.signature.low, self.signature.high, GRID)
-        return min(self.J(float(x)) for x in grid)
+        i = int(np.argmin([self.J(float(x)) for x in grid]))
+        bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
+        fine = 1e-4 * (bracket[1] - bracket[0])
+        optimize.minimize_scalar(self.J, bounds=bracket, method="bounded", options={"xatol": fine, "maxiter": steps})
 
     def fit(self, fine: bool) -> _Fitted:
         """Refine the minimum and integrate over the prior."""
-        from scipy import optimize
-
         signature = self.signature
-        grid = np.array(sorted(self.known))
-        i = int(np.argmin([self.J(float(x)) for x in grid]))
-        bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
-        width = bracket[1] - bracket[0]
-        rounds = 40 if fine else 8
-        optimize.minimize_scalar(
-            self.J, bounds=bracket, method="bounded", options={"xatol": 1e-4 * width, "maxiter": rounds}
-        )
+        width = 2.0 * (signature.high - signature.low) / (GRID - 1)
+        if fine:
+            self._refine(40)
         best = min(self.known, key=lambda x: self.known[x][0])
         if fine:
             # a parabola through the minimum says how wide to look; the integral itself uses the true curve
             h = 1e-2 * width
             left, right = max(best - h, signature.low), min(best + h, signature.high)
             rise = [(self.J(x) - self.J(best)) / max(abs(x - best), 1e-12) for x in (left, right)]
-            curvature = max(sum(rise) / (right - left), 1e-12)
+            curvature = max(sum(slope for slope in rise if np.isfinite(slope)) / (right - left), 1e-12)
             reach = min(4.0 / np.sqrt(curvature), signature.high - signature.low)
             for x in best + reach * np.linspace(-1.0, 1.0, 17):
                 self.J(float(np.clip(x, signature.low, signature.high)))

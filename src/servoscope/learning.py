@@ -54,7 +54,7 @@ def learn(loop: Loop, recordings: Sequence[Recording], progress: Progress = lamb
     regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
     found = fit(regressions, pipeline.memory, pipeline.bank.names)
     progress("delay")
-    delay_s, notes = check_delay(loop, recordings, found)
+    delay_s, notes = check_delay(loop, recordings)
     return _assemble(loop, recordings, pipeline, regressions, found, delay_s, notes, progress)
 
 

@@ -171,7 +171,7 @@ class Monitor:
         stacked = [np.array(column) if self.fleet else column[0] for column in zip(*parts, strict=True)]
         theta, covariance, expected, T2, ready = stacked
         respond = self.pipeline.bank, self.loop.monitor.frequencies
-        limits = [baseline.limit for baseline in self.baselines]
+        limits = np.array([[baseline.limit] for baseline in self.baselines])
         return Trace(
             t=index / self.loop.sample_rate,
             names=self.pipeline.bank.names,
@@ -179,7 +179,7 @@ class Monitor:
             covariance=covariance,
             expected=expected,
             statistic=T2,
-            threshold=float(np.min(limits)),
+            threshold=limits if self.fleet else float(limits[0, 0]),
             ifrf=ifrf.response(*respond, theta, covariance),
             ifrf_expected=ifrf.response(*respond, expected, 0.0 * covariance),
             ready=ready.astype(np.bool_),

@@ -182,7 +182,8 @@ def _quiet_facts(diagnosis: Diagnosis, trace: Trace) -> Iterator[Fact]:
     yield "Watched", clock_time(diagnosis.duration_s), f"{count(value.size)} evaluations"
     if value.size:
         top = float(value.max())
-        share = f"{100.0 * top / trace.threshold:.0f} % of the threshold of {number(trace.threshold, 3)}"
+        limit = float(np.max(trace.threshold))
+        share = f"{100.0 * top / limit:.0f} % of the threshold of {number(limit, 3)}"
         yield "Largest statistic T²", number(top, 3), share
     told = len(diagnosis.warnings)
     yield "Warnings", str(told) if told else "none", "listed below" if told else "about this recording"
