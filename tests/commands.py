@@ -9,8 +9,7 @@ from typing import Any
 import pyarrow.csv as pacsv
 from typer.testing import CliRunner
 
-from servoscope import demo
-from servoscope.cli import app
+from servoscope.cli import app, demo
 
 
 @dataclass(frozen=True)

@@ -95,15 +95,12 @@ def test_a_room_imports_only_rooms_above_it(path: Path) -> None:
     assert not wrong, f"{'; '.join(wrong)}: not above {room} in docs/architecture.md"
 
 
-def test_the_imports_of_a_room_are_found_wherever_they_stand(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_imports_of_a_room_are_found_wherever_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path)
     path = tmp_path / "plants" / "x.py"
     path.parent.mkdir()
     path.write_text(
-        "import servoscope.a\n"
-        "def f():\n  from servoscope.b import c\n  from .base import d\n  from .. import e\n"
+        "import servoscope.a\ndef f():\n  from servoscope.b import c\n  from .base import d\n  from .. import e\n"
     )
     names = {name for _, name in imports_of(path)}
     assert names == {"servoscope.a", "servoscope.b.c", "servoscope.plants.base.d", "servoscope.e"}
@@ -112,8 +109,7 @@ def test_the_imports_of_a_room_are_found_wherever_they_stand(
 @pytest.mark.parametrize("module", ["servoscope", "servoscope.loop", "servoscope.cli"])
 def test_importing_loads_nothing_heavy(module: str) -> None:
     loaded = python(
-        f"import sys, {module}\n"
-        f"print(*sorted({{name.split('.')[0] for name in sys.modules}} & {set(HEAVY)!r}))"
+        f"import sys, {module}\nprint(*sorted({{name.split('.')[0] for name in sys.modules}} & {set(HEAVY)!r}))"
     )
     assert loaded == "", f"import {module} loads {loaded}: import these where they are used"
 

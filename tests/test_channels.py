@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from servoscope.channels import Combination, parse_columns, parse_combination
 from servoscope.errors import LoopError, RecordingError
 from servoscope.loop import Columns
+from servoscope.readers.columns import Combination, parse_columns, parse_combination
 
 KNOWN = ["set_point", "position_error", "vir", "counts", "x", "motor speed", "log.y", "m[0]", "a-b"]
 
@@ -86,9 +86,7 @@ def test_a_mapping_on_one_line() -> None:
     assert found.output == "set_point - position_error"
     assert found.segment == ("load", "run")
     assert parse_columns("t=").time is None
-    assert parse_columns("u=`a,b`, time=`time stamp`[us]") == Columns(
-        input="`a,b`", time="time stamp", time_unit="us"
-    )
+    assert parse_columns("u=`a,b`, time=`time stamp`[us]") == Columns(input="`a,b`", time="time stamp", time_unit="us")
 
 
 def test_a_mapping_changes_what_it_names_only() -> None:

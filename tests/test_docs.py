@@ -106,9 +106,7 @@ def test_every_command_and_option_is_documented() -> None:
             if parameter.param_type_name == "option" and not parameter.hidden:
                 long = [option for option in parameter.opts if option.startswith("--")]
                 missing += [
-                    f"servoscope {name} {option}"
-                    for option in long or parameter.opts
-                    if not has_line(text, option)
+                    f"servoscope {name} {option}" for option in long or parameter.opts if not has_line(text, option)
                 ]
     assert not missing, f"not in docs/reference/cli.md: {', '.join(missing)}"
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope import inspection_figures
 from servoscope.errors import OutputError
 from servoscope.inspection import Inspection, inspect
-from servoscope.leftover import period_of
-from servoscope.levels import quantisation
+from servoscope.inspection import pages as inspection_figures
+from servoscope.inspection.leftover import period_of
+from servoscope.inspection.levels import quantisation
 from servoscope.loop import Columns, Loop
 from servoscope.readers import read
 from servoscope.recording import Recording

@@ -160,9 +160,7 @@ def test_the_default_sign_filter_gives_way_to_a_slow_sample_rate(rig: dict[str, 
     plant = {"kind": "polynomial", "order": 2, "friction": "coulomb"}
     assert Loop.from_dict({"sample_rate": 25.0, "plant": plant}).plant.sign_cutoff == 6.25  # type: ignore[attr-defined]
     text = refusal({"sample_rate": 25.0, "plant": plant | {"sign_cutoff": 20.0}})
-    assert text.startswith(
-        "loop.toml: [plant] sign_cutoff: 20 Hz is not below the Nyquist frequency of 12.5 Hz"
-    )
+    assert text.startswith("loop.toml: [plant] sign_cutoff: 20 Hz is not below the Nyquist frequency of 12.5 Hz")
 
 
 def test_an_unknown_key_names_the_nearest(rig: dict[str, Any]) -> None:
@@ -257,9 +255,7 @@ def test_a_missing_gain_is_named(rig: dict[str, Any]) -> None:
 
 def test_wrong_coefficients_of_a_polynomial_are_told() -> None:
     plant = {"kind": "polynomial", "order": 2, "coefficients": {"mass": 1.0}}
-    assert refusal({"sample_rate": 100.0, "plant": plant}).startswith(
-        "loop.toml: [plant] coefficients: unknown mass"
-    )
+    assert refusal({"sample_rate": 100.0, "plant": plant}).startswith("loop.toml: [plant] coefficients: unknown mass")
 
 
 def test_what_is_no_table_is_refused() -> None:

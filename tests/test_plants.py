@@ -106,9 +106,7 @@ class TestInversion:
         b_p=st.floats(0.2, 100.0),
         beta=st.floats(0.001, 30.0),
     )
-    def test_round_trip_of_simultaneous_faults(
-        self, p_s: float, C_ie: float, b_p: float, beta: float
-    ) -> None:
+    def test_round_trip_of_simultaneous_faults(self, p_s: float, C_ie: float, b_p: float, beta: float) -> None:
         eha = EHA.model_validate(RIG)
         faulty = eha.with_ratios({"p_s": p_s, "C_ie": C_ie, "b_p": b_p, "beta": beta})
         kappa = eha.kappa_from_theta(faulty.theta())

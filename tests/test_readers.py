@@ -69,9 +69,7 @@ def test_a_forgotten_unit_is_guessed_aloud(tmp_path: Path, loop: Loop) -> None:
 
 @pytest.mark.parametrize(("separator", "zone"), [("T", ""), (" ", ""), ("T", "Z"), ("T", "+02:00")])
 def test_date_and_time_count_from_the_first_row(tmp_path: Path, separator: str, zone: str) -> None:
-    stamps = np.datetime64("2024-02-29T23:59:59.000") + np.round(signals()["t"] * 1e3).astype(
-        "timedelta64[ms]"
-    )
+    stamps = np.datetime64("2024-02-29T23:59:59.000") + np.round(signals()["t"] * 1e3).astype("timedelta64[ms]")
     path = written(tmp_path, lines(t=[str(stamp).replace("T", separator) + zone for stamp in stamps]))
     as_expected(read(path))
 
@@ -110,9 +108,7 @@ def test_constant_channels_are_named_with_their_column(tmp_path: Path) -> None:
 
 
 def test_swapped_columns_are_refused(tmp_path: Path) -> None:
-    assert "swap the two columns" in refusal(
-        written(tmp_path, lines()), columns=Columns(input="y", output="u")
-    )
+    assert "swap the two columns" in refusal(written(tmp_path, lines()), columns=Columns(input="y", output="u"))
 
 
 def test_a_segment_column_starts_runs(tmp_path: Path) -> None:
@@ -177,9 +173,7 @@ def test_every_measured_csv_is_sound(shared_data: Path) -> None:
         assert recording.duration_s == pytest.approx(31.0)
     for path in sorted((shared_data / "real" / "qube").glob("*.csv")):
         for angle in ("theta", "alpha"):
-            recording = read(
-                path, columns=Columns(reference=f"target_{angle}", input="plant_input", output=angle)
-            )
+            recording = read(path, columns=Columns(reference=f"target_{angle}", input="plant_input", output=angle))
             no_spikes(recording)
             assert (recording.samples, recording.sample_rate) == (10000, 500.0)
 

@@ -84,9 +84,7 @@ def test_a_gap_beside_a_nan_counts_only_the_rows_that_the_file_lacks() -> None:
 
 @pytest.mark.parametrize("channel", "uy")
 def test_a_constant_channel_is_refused(channel: str) -> None:
-    assert f"{channel} is constant: 0.5 in all 2000 rows" in refusal(
-        signals() | {channel: np.full(2000, 0.5)}
-    )
+    assert f"{channel} is constant: 0.5 in all 2000 rows" in refusal(signals() | {channel: np.full(2000, 0.5)})
 
 
 def test_a_channel_constant_but_for_its_spike_is_refused() -> None:

@@ -15,9 +15,7 @@ from servoscope.simulation import reference
 class TestReferences:
     @pytest.mark.parametrize("kind", ["profile", "multisine", "trapezoid"])
     def test_test_data_to_the_printed_digits(self, eha_cases: Path, eha_truth: Any, kind: str) -> None:
-        files = [
-            name for name, case in eha_truth.items() if case["reference"] == kind and "defects" not in case
-        ]
+        files = [name for name, case in eha_truth.items() if case["reference"] == kind and "defects" not in case]
         assert files
         for name in files:
             r = np.loadtxt(eha_cases / name, delimiter=",", skiprows=1)[:, 1]
@@ -38,9 +36,7 @@ class TestReferences:
         assert reference(kind, 20.0, 33.3).shape == (666,)
 
     def test_seed(self) -> None:
-        assert not np.array_equal(
-            reference("multisine", 10.0, 100.0), reference("multisine", 10.0, 100.0, seed=1)
-        )
+        assert not np.array_equal(reference("multisine", 10.0, 100.0), reference("multisine", 10.0, 100.0, seed=1))
 
     def test_multisine_stays_below_the_nyquist_frequency(self) -> None:
         assert np.abs(reference("multisine", 10.0, 20.0)).max() < 0.1

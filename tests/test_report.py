@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope import canvas, figures, report
+from servoscope import report
 from servoscope.diagnosis import Candidate, Diagnosis, FoundFault, Parameter, ResponsePoint, Trace, Warning
 from servoscope.errors import OutputError
 from servoscope.ifrf import Response
 from servoscope.loop import Loop
 from servoscope.recording import Recording
+from servoscope.report import canvas, figures
 
 PROVENANCE = {"baseline": "healthy.json", "hash": "0123456789abcdef", "threshold": "46.2"}
 VOID = {"meta", "br", "path", "use", "circle", "link", "img"}

@@ -74,9 +74,7 @@ class TestStability:
         poles = closed_loop_poles(loop, loop.plant.with_ratios({parameter: ratio}))
         assert np.abs(poles).max() < 1.0
 
-    @pytest.mark.parametrize(
-        "change", [{}, {"hold": "foh"}, {"delay": 0.004}, {"delay": 0.013}, {"delay": 0.03}]
-    )
+    @pytest.mark.parametrize("change", [{}, {"hold": "foh"}, {"delay": 0.004}, {"delay": 0.013}, {"delay": 0.03}])
     def test_poles_rule_the_decay(self, rig: dict[str, Any], change: dict[str, Any]) -> None:
         loop = make(rig, controller={"kind": "pi", "k_p": 10.0, "k_i": 0.1}, **change)
         # After an impulse in r only the closed loop's own modes are left; its poles annihilate them.
@@ -197,9 +195,7 @@ class TestSimulate:
         assert FaultEvent.parse(text) == event
         assert FaultEvent.parse(str(event)) == event
 
-    @pytest.mark.parametrize(
-        "text", ["", "C_ie", "C_ie=", "C_ie=x@3", "C_ie=-1@3", "C_ie=1.2@-3", "C_ie=nan"]
-    )
+    @pytest.mark.parametrize("text", ["", "C_ie", "C_ie=", "C_ie=x@3", "C_ie=-1@3", "C_ie=1.2@-3", "C_ie=nan"])
     def test_events_that_are_not(self, text: str) -> None:
         with pytest.raises(SimulationError, match="fault"):
             FaultEvent.parse(text)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dirty import RATE, cleaned, only, signals
-from servoscope.spikes import find_spikes, steps_in
+from servoscope.recording.spikes import find_spikes, steps_in
 
 
 @pytest.mark.parametrize("channel", "ruy")

@@ -63,9 +63,7 @@ def test_latin_1_is_read(tmp_path: Path) -> None:
 
 def test_comments_do_not_matter(tmp_path: Path) -> None:
     rows = lines()
-    as_expected(
-        read(written(tmp_path, ["# rig 7", "% 100 Hz, after service", *rows[:50], "# pause", *rows[50:]]))
-    )
+    as_expected(read(written(tmp_path, ["# rig 7", "% 100 Hz, after service", *rows[:50], "# pause", *rows[50:]])))
 
 
 def test_windows_line_ends_and_blank_lines_do_not_matter(tmp_path: Path) -> None:
@@ -76,9 +74,7 @@ def test_windows_line_ends_and_blank_lines_do_not_matter(tmp_path: Path) -> None
 
 def test_numbers_in_quotes_are_numbers(tmp_path: Path) -> None:
     rows = lines()
-    as_expected(
-        read(written(tmp_path, [rows[0], *(",".join(f'" {c}"' for c in row.split(",")) for row in rows[1:])]))
-    )
+    as_expected(read(written(tmp_path, [rows[0], *(",".join(f'" {c}"' for c in row.split(",")) for row in rows[1:])])))
 
 
 @pytest.mark.parametrize("empty", ["", "NaN", "nan", "null", "N/A", "-"])
@@ -236,9 +232,7 @@ def test_parquet_of_single_precision_nulls_and_dictionaries(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 def test_parquet_with_time_stamps(tmp_path: Path, unit: str) -> None:
-    stamps = np.datetime64("2024-01-01T00:00:00", unit) + np.round(signals()["t"] * 1e3).astype(
-        "timedelta64[ms]"
-    )
+    stamps = np.datetime64("2024-01-01T00:00:00", unit) + np.round(signals()["t"] * 1e3).astype("timedelta64[ms]")
     as_expected(read(parquet(tmp_path, signals() | {"t": stamps})))
 
 
@@ -254,9 +248,7 @@ def test_parquet_with_times_for_numbers_is_refused(tmp_path: Path) -> None:
 def test_mat_with_structs_matrices_and_scalars(tmp_path: Path) -> None:
     data = signals()
     both = np.column_stack([data["r"], data["u"]])
-    path = mat5(
-        tmp_path, {"t": data["t"], "log": {"motor": {"y": data["y"]}}, "both": both, "gain": 3.0, "who": "me"}
-    )
+    path = mat5(tmp_path, {"t": data["t"], "log": {"motor": {"y": data["y"]}}, "both": both, "gain": 3.0, "who": "me"})
     assert [info.name for info in channels(path)] == ["t", "log.motor.y", "both[0]", "both[1]"]
     as_expected(read(path, columns=Columns(reference="both[0]", input="1*both[1]", output="log.motor.y")))
     assert "'gain' has 1 values, the channels have 300" in refusal(path, columns=Columns(reference="gain"))

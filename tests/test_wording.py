@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from servoscope import wording
+from servoscope.report import wording
 
 
 @pytest.mark.parametrize(

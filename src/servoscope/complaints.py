@@ -33,9 +33,7 @@ RELATIONS = {
 def nearest(name: str, known: Iterable[str], count: int = 1) -> list[str]:
     """Return up to `count` of the known names that look like `name`, whatever their case, best first."""
     folded = {candidate.casefold(): candidate for candidate in known}
-    return [
-        folded[match] for match in difflib.get_close_matches(name.casefold(), folded, n=count, cutoff=0.5)
-    ]
+    return [folded[match] for match in difflib.get_close_matches(name.casefold(), folded, n=count, cutoff=0.5)]
 
 
 def describe(error: ValidationError, model: type[BaseModel], section: str = "") -> str:
@@ -65,10 +63,7 @@ def describe(error: ValidationError, model: type[BaseModel], section: str = "") 
     if first["type"] == "missing" and entry is not None:
         return _one_line(f"{key}: has too few entries")
     if len(path) == 1 and not section and isinstance(first["input"], Mapping) and first["type"] == "missing":
-        table = (
-            any(path[0] == name and _submodel(model, name) for name in model.model_fields)
-            or path[0] == "plant"
-        )
+        table = any(path[0] == name and _submodel(model, name) for name in model.model_fields) or path[0] == "plant"
         return f"[{path[0]}]: missing, add the section" if table else f"{key}: missing, add it"
     return _one_line(f"{key}: {_text(first)}")
 

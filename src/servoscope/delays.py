@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servoscope import alignment, leftover, modelfit
 from servoscope.errors import RecordingError
+from servoscope.inspection import alignment, leftover, modelfit
 from servoscope.inverse import cutoff_of
 from servoscope.linear import settling
 from servoscope.loop import Loop
 from servoscope.recording import Recording
 
-TOLERANCE = 0.5  # samples; an inverse that is too simple moves the estimate by a fraction of one
+TOLERANCE = 0.5  # samples, beyond which a recording is refused
+NOTED = 0.1  # samples; an inverse that is too simple moves the estimate by a fraction of one, so this is only said
 SIGNIFICANT = 0.1  # share of the residual variance below which a delay is not worth a refusal
 UNTOLD = "the recordings do not tell the delay between u and y"
 
@@ -44,9 +45,13 @@ def check_delay(loop: Loop, recordings: Sequence[Recording]) -> tuple[float | No
     delay = alignment.estimate(recording, g, which, fitted, independent)
     if delay.samples is None or delay.seconds is None:
         return None, [UNTOLD]
-    if abs(delay.samples - delay.configured_samples) > TOLERANCE and delay.gain > SIGNIFICANT:
-        raise RecordingError(
-            f"{recording.name}: y answers u {delay.seconds * 1e3:.3g} ms late, the loop file says delay = {loop.delay:g} "
-            f"s: set delay = {max(delay.seconds, 0.0):.4g} or align the channels"
-        )
-    return delay.seconds, []
+    off = abs(delay.samples - delay.configured_samples)
+    if delay.gain < SIGNIFICANT or off < NOTED:
+        return delay.seconds, []
+    told = (
+        f"{recording.name}: y answers u {delay.seconds * 1e3:.3g} ms late, the loop file says delay = {loop.delay:g}: "
+        f"set delay = {max(delay.seconds, 0.0):.4g} or align the channels"
+    )
+    if off > TOLERANCE:
+        raise RecordingError(told)
+    return delay.seconds, [told]

@@ -200,18 +200,12 @@ class Loop(_Settings):
                 f"[monitor] memory: {self.monitor.memory:g} s is shorter than two samples, give it in seconds"
             )
         if self.delay * self.sample_rate > LONGEST_DELAY:
-            raise ValueError(
-                f"delay: {self.delay:g} s is more than {LONGEST_DELAY} samples, give it in seconds"
-            )
+            raise ValueError(f"delay: {self.delay:g} s is more than {LONGEST_DELAY} samples, give it in seconds")
         for key, interval in (("input_limits", self.input_limits), ("input_deadzone", self.input_deadzone)):
             if interval is not None and interval[0] >= interval[1]:
-                raise ValueError(
-                    f"{key}: [{interval[0]:g}, {interval[1]:g}] must be [lo, hi] with lo below hi"
-                )
+                raise ValueError(f"{key}: [{interval[0]:g}, {interval[1]:g}] must be [lo, hi] with lo below hi")
         if self.input_logged == "before_limiter" and self.input_limits is None:
-            raise ValueError(
-                'input_limits: missing, input_logged = "before_limiter" needs input_limits = [lo, hi]'
-            )
+            raise ValueError('input_limits: missing, input_logged = "before_limiter" needs input_limits = [lo, hi]')
         return self
 
     @classmethod

@@ -18,9 +18,7 @@ __all__ = ["EXTRAS", "Fault", "FloatArray", "Plant", "StateSpace", "kinds", "par
 def _classes() -> dict[str, type[Plant]]:
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}")
-    return {
-        str(found.model_fields["kind"].default): found for found in sorted(Plant.__subclasses__(), key=str)
-    }
+    return {str(found.model_fields["kind"].default): found for found in sorted(Plant.__subclasses__(), key=str)}
 
 
 def kinds() -> list[str]:

@@ -132,10 +132,6 @@ class Plant(BaseModel, abc.ABC):
     def _check_ratios(self, ratios: Mapping[str, float]) -> None:
         for name, ratio in ratios.items():
             if name not in self.parameters:
-                raise LoopError(
-                    f"{name}: not a parameter of plant {self.kind}, which has {', '.join(self.parameters)}"
-                )
+                raise LoopError(f"{name}: not a parameter of plant {self.kind}, which has {', '.join(self.parameters)}")
             if not (np.isfinite(ratio) and ratio > 0.0):
-                raise LoopError(
-                    f"{name}={ratio:g}: the ratio to the nominal value must be positive and finite"
-                )
+                raise LoopError(f"{name}={ratio:g}: the ratio to the nominal value must be positive and finite")

@@ -118,9 +118,7 @@ class EHA(Plant):
     def with_ratios(self, ratios: Mapping[str, float]) -> Self:
         """Return the same plant with p_s, C_ie, b_p, beta multiplied by the ratios."""
         self._check_ratios(ratios)
-        return self.model_copy(
-            update={name: getattr(self, name) * float(ratio) for name, ratio in ratios.items()}
-        )
+        return self.model_copy(update={name: getattr(self, name) * float(ratio) for name, ratio in ratios.items()})
 
     def state_space(self) -> StateSpace:
         """Return A (3, 3), B (3, 1), C (1, 3), states y [m], y' [m/s], p_L [Pa]; integrates if k_p = 0."""
@@ -186,9 +184,7 @@ class EHA(Plant):
         """Return the same actuator with the p_s, C_ie, b_p and beta of `kappa_from_theta`."""
         return self.model_copy(update=self.kappa_from_theta(theta))
 
-    def _with_spring(
-        self, theta_0: float, theta_1: float, theta_2: float, theta_3: float
-    ) -> dict[str, float]:
+    def _with_spring(self, theta_0: float, theta_1: float, theta_2: float, theta_3: float) -> dict[str, float]:
         with np.errstate(divide="ignore", invalid="ignore"):
             compliance = np.float64(self.k_p) / theta_0
             g = theta_3 * compliance / self.m_p

@@ -66,9 +66,7 @@ class Polynomial(Plant):
         missing = [name for name in self.names if name not in self.coefficients]
         if unknown or missing:
             told = [
-                f"{word} {', '.join(names)}"
-                for word, names in (("unknown", unknown), ("missing", missing))
-                if names
+                f"{word} {', '.join(names)}" for word, names in (("unknown", unknown), ("missing", missing)) if names
             ]
             raise ValueError(f"coefficients: {'; '.join(told)} (this plant has {', '.join(self.names)})")
         for name, value in self.coefficients.items():
@@ -88,9 +86,7 @@ class Polynomial(Plant):
     @property
     def names(self) -> tuple[str, ...]:
         """Stiffness, viscous friction, inertia, jerk, snap as far as present, then the extras."""
-        return tuple(POWER_NAMES[power] for power in self.powers) + tuple(
-            EXTRA_NAMES[extra] for extra in self.extras
-        )
+        return tuple(POWER_NAMES[power] for power in self.powers) + tuple(EXTRA_NAMES[extra] for extra in self.extras)
 
     @property
     def powers(self) -> tuple[int, ...]:

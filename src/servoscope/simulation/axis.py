@@ -34,13 +34,10 @@ def motion(plants: Sequence[Plant], loop: Loop) -> Motion:
     if loop.hold != "zoh":
         raise SimulationError('friction and offset are simulated with hold = "zoh" only')
     duration = 1.0 / loop.sample_rate / SUB_STEPS
-    steps = [
-        [_sub_step(value, direction, duration) for direction in ("forward", "backward")] for value in values
-    ]
+    steps = [[_sub_step(value, direction, duration) for direction in ("forward", "backward")] for value in values]
     gain = [plant.input_gain for plant in plants]
     stiffness, coulomb, offset = (
-        np.array([value.get(name, 0.0) for value in values])
-        for name in ("stiffness", "coulomb_friction", "offset")
+        np.array([value.get(name, 0.0) for value in values]) for name in ("stiffness", "coulomb_friction", "offset")
     )
     return Motion(
         order=2 if "inertia" in values[0] else 1,

@@ -185,9 +185,7 @@ def _run(
     settings = _settings(loop)
     from servoscope.simulation import axis, kernels
 
-    discrete = [
-        discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants
-    ]
+    discrete = [discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants]
     for each, what in zip(discrete, words, strict=True):
         check_stable(loop, each, what)
     if loop.plant.extras:

@@ -65,15 +65,11 @@ class FaultEvent:
         """
         found = _FORM.fullmatch(text)
         if found is None:
-            raise SimulationError(
-                f"fault {text!r}: write PARAMETER=RATIO@SECONDS, or PARAMETER=RATIO@SECONDS~RAMP"
-            )
+            raise SimulationError(f"fault {text!r}: write PARAMETER=RATIO@SECONDS, or PARAMETER=RATIO@SECONDS~RAMP")
         try:
             ratio, at_s, ramp_s = (float(part) if part else 0.0 for part in found.groups()[1:])
         except ValueError:
-            raise SimulationError(
-                f"fault {text!r}: ratio and times must be numbers, as in C_ie=1.2@30"
-            ) from None
+            raise SimulationError(f"fault {text!r}: ratio and times must be numbers, as in C_ie=1.2@30") from None
         return cls(found[1], ratio, at_s, ramp_s)
 
 
@@ -145,12 +141,10 @@ def schedule(plant: Plant, events: Sequence[FaultEvent], samples: int, sample_ra
     ends = np.append(edges[1:], samples)
     middles = 0.5 * (edges + ends)
     ratios = {
-        name: _ratio(name, events, middles, sample_rate)
-        for name in sorted({event.parameter for event in events})
+        name: _ratio(name, events, middles, sample_rate) for name in sorted({event.parameter for event in events})
     }
     plants = tuple(
-        plant.with_ratios({name: float(values[i]) for name, values in ratios.items()})
-        for i in range(edges.size)
+        plant.with_ratios({name: float(values[i]) for name, values in ratios.items()}) for i in range(edges.size)
     )
     which = np.repeat(np.arange(edges.size, dtype=np.int64), ends - edges)
     return Schedule(plants, ratios, which)
@@ -160,9 +154,7 @@ def _first_sample(time: float, sample_rate: float) -> int:
     return int(np.ceil(time * sample_rate - 1e-6))
 
 
-def _ratio(
-    parameter: str, events: Sequence[FaultEvent], middles: FloatArray, sample_rate: float
-) -> FloatArray:
+def _ratio(parameter: str, events: Sequence[FaultEvent], middles: FloatArray, sample_rate: float) -> FloatArray:
     """Return the ratio (M,) of a parameter at some times (M,) [samples]."""
     own = [event for event in events if event.parameter == parameter]
 

@@ -112,9 +112,7 @@ def _from_file(path: Path, t: FloatArray, sample_rate: float) -> FloatArray:
     elif "t" in names and "r" in names:
         times, r = columns[names.index("t")], columns[names.index("r")]
     else:
-        raise SimulationError(
-            f"reference {path}: needs columns t and r, or a single column; it has {', '.join(names)}"
-        )
+        raise SimulationError(f"reference {path}: needs columns t and r, or a single column; it has {', '.join(names)}")
     if r.size < 2 or not (np.all(np.isfinite(r)) and np.all(np.isfinite(times))):
         raise SimulationError(f"reference {path}: needs two or more rows, all of them numbers")
     if np.any(np.diff(times) <= 0.0):

@@ -24,9 +24,7 @@ def gains(loop: Loop) -> tuple[float, float]:
         If the loop has no controller.
     """
     if loop.controller is None:
-        raise SimulationError(
-            f"loop {loop.name!r} has no [controller]: a simulation needs one, kind, k_p and k_i"
-        )
+        raise SimulationError(f"loop {loop.name!r} has no [controller]: a simulation needs one, kind, k_p and k_i")
     return loop.controller.k_p, loop.controller.k_i / loop.sample_rate
 
 

@@ -70,7 +70,7 @@ def columns_from(text: str | None, base: Columns | None = None) -> Columns | Non
     """
     if text is None:
         return None
-    from servoscope.channels import parse_columns
+    from servoscope.readers.columns import parse_columns
 
     try:
         return parse_columns(text, base)
@@ -83,7 +83,7 @@ EVERYTHING = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class Source:
-    """How the recordings of one command are read: the loop, ``--columns``, ``--where``, ``--by``, ``--from``, ``--to``."""
+    """How one command reads recordings: the loop, ``--columns``, ``--where``, ``--by``, ``--from``, ``--to``."""
 
     loop: Loop | None
     columns: Columns | None

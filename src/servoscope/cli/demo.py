@@ -13,9 +13,9 @@ from pathlib import Path
 import typer
 from rich.text import Text
 
+from servoscope.cli.progress import on_compiling
 from servoscope.errors import OutputError
 from servoscope.output import atomic_write
-from servoscope.progress import on_compiling
 
 __all__ = ["Step", "prepare", "show", "steps"]
 
@@ -106,7 +106,7 @@ def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
     OutputError
         If the folder cannot be written.
     """
-    from servoscope import terminal
+    from servoscope.cli import terminal
     from servoscope.diagnosis import Diagnosis
 
     prepare(folder)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Literal
 
-from servoscope.leftover import Residual
-from servoscope.levels import Said, percent
+from servoscope.inspection.leftover import Residual
+from servoscope.inspection.levels import Said, percent
+from servoscope.inspection.measured import Measured, described
 from servoscope.loop import Loop
-from servoscope.measured import Measured, described
 
 Severity = Literal["stop", "care", "note"]
 Verdict = Literal["usable", "usable with care", "not usable"]

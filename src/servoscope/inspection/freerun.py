@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from servoscope.defects import spans
-from servoscope.levels import Said, percent
+from servoscope.inspection.levels import Said, percent
+from servoscope.inspection.modelfit import Fitted, IndexArray, Regressors
 from servoscope.linear import sampled
-from servoscope.modelfit import Fitted, IndexArray, Regressors
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
+from servoscope.recording.defects import spans
 
 
 class FreeRun(Said):

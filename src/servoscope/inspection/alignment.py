@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from servoscope.levels import Said
-from servoscope.modelfit import Fitted, IndexArray, Regressors, regressors
+from servoscope.inspection.levels import Said
+from servoscope.inspection.modelfit import Fitted, IndexArray, Regressors, regressors
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 

@@ -14,8 +14,8 @@ from servoscope.diagnosis import UNKNOWN, Diagnosis, Trace
 from servoscope.loop import Loop
 from servoscope.output import atomic_write
 from servoscope.recording import Recording
-from servoscope.sheets import candidates, numbers, section, settings, warnings
-from servoscope.wording import (
+from servoscope.report.sheets import candidates, numbers, section, settings, warnings
+from servoscope.report.wording import (
     clock_time,
     count,
     meaning,
@@ -83,7 +83,7 @@ def page(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loop, p
         warnings(diagnosis),
         settings(loop, provenance),
     )
-    style = files("servoscope").joinpath("report.css").read_text(encoding="utf-8")
+    style = files("servoscope.report").joinpath("report.css").read_text(encoding="utf-8")
     title = f"{KINDS[diagnosis.verdict][0]}: {diagnosis.recording}"
     lines = (
         "<!DOCTYPE html>",
@@ -190,7 +190,7 @@ def _quiet_facts(diagnosis: Diagnosis, trace: Trace) -> Iterator[Fact]:
 
 
 def _pictures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loop) -> str:
-    from servoscope import canvas, figures  # late: matplotlib takes half a second to import
+    from servoscope.report import canvas, figures  # late: matplotlib takes half a second to import
 
     allowed = loop.monitor.false_alarms_per_year
     budget = "at most once a year" if allowed == 1.0 else f"at most {quantity(allowed)} times a year"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from servoscope.alignment import Delay
-from servoscope.excitation import Band, Excited
-from servoscope.freerun import FreeRun
-from servoscope.leftover import Residual
-from servoscope.levels import DeadZone, DefectCount, Quantisation, Rest, Said, Sampling, Saturation
-from servoscope.modelfit import OrderTried
+from servoscope.inspection.alignment import Delay
+from servoscope.inspection.excitation import Band, Excited
+from servoscope.inspection.freerun import FreeRun
+from servoscope.inspection.leftover import Residual
+from servoscope.inspection.levels import DeadZone, DefectCount, Quantisation, Rest, Said, Sampling, Saturation
+from servoscope.inspection.modelfit import OrderTried
 
 
 class Coefficient(Said):

@@ -10,7 +10,7 @@ import numpy as np
 
 from servoscope.diagnosis import Diagnosis, FoundFault
 from servoscope.loop import Loop
-from servoscope.wording import (
+from servoscope.report.wording import (
     DASH,
     count,
     meaning,

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from servoscope.canvas import COLOURS, BoolArray, envelope, robust_range, save, spans_on, styled
 from servoscope.diagnosis import Diagnosis, Trace
 from servoscope.ifrf import Response
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
-from servoscope.wording import axis_scale, plain_symbol, times
+from servoscope.report.canvas import COLOURS, BoolArray, envelope, robust_range, save, spans_on, styled
+from servoscope.report.wording import axis_scale, plain_symbol, times
 
 __all__ = ["coefficients", "ifrf", "save", "signals", "statistic"]
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from servoscope import csvtext
 from servoscope.errors import RecordingError
+from servoscope.readers import csvtext
 
 __all__ = ["SUFFIXES", "Table", "number_column", "open_table", "seconds"]
 
@@ -136,9 +136,7 @@ def number_column(table: Table, name: str, what: str) -> FloatArray:
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
         return _from_text(table, name, column.to_pylist())
     if pa.types.is_temporal(kind):
-        raise RecordingError(
-            f"{table.name}: {what}: column {name!r} holds times, not numbers, choose another column"
-        )
+        raise RecordingError(f"{table.name}: {what}: column {name!r} holds times, not numbers, choose another column")
     try:
         if pa.types.is_boolean(kind):
             column = column.cast(pa.int8())
@@ -206,9 +204,7 @@ def _check_kind(path: Path, head: bytes) -> str:
     is_mat = wanted == "MAT" and found in ("MAT", "HDF5")
     if is_mat or found == wanted or (wanted == "CSV" and found is None):
         return wanted
-    advice = {"Parquet": "rename it to .parquet", "MAT": "rename it to .mat"}.get(
-        found or "", f"export it as {wanted}"
-    )
+    advice = {"Parquet": "rename it to .parquet", "MAT": "rename it to .mat"}.get(found or "", f"export it as {wanted}")
     raise RecordingError(f"{path}: is not {wanted} but a {found or 'text file'}: {advice}")
 
 
@@ -231,18 +227,12 @@ def _mat(path: Path) -> Table:
         variables = dict(_flat(_load_mat(path)))
     # SciPy and h5py raise nearly anything at damaged files, from MatReadError to AttributeError.
     except Exception as error:
-        raise RecordingError(
-            f"{path}: is a damaged or unknown MAT file ({_short(error)}), save it again"
-        ) from None
+        raise RecordingError(f"{path}: is a damaged or unknown MAT file ({_short(error)}), save it again") from None
     lengths = [x.size for x in variables.values() if x.size > 1]
     # The channels are the vectors of the length that most of them, and of those the longest, have.
     rows = max(lengths, key=lambda size: (lengths.count(size), size), default=0)
     columns = {name: pa.chunked_array([x]) for name, x in variables.items() if x.size == rows}
-    others = {
-        name: f"has {x.size} values, the channels have {rows}"
-        for name, x in variables.items()
-        if x.size != rows
-    }
+    others = {name: f"has {x.size} values, the channels have {rows}" for name, x in variables.items() if x.size != rows}
     return Table(path.name, columns, others=others)
 
 

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import PrivateAttr
 
-from servoscope import alignment, excitation, freerun, leftover, levels, modelfit
-from servoscope.advice import recommend
-from servoscope.excitation import Excited, Spectra
+from servoscope.inspection import alignment, excitation, freerun, leftover, levels, modelfit
+from servoscope.inspection.advice import recommend
+from servoscope.inspection.excitation import Excited, Spectra
+from servoscope.inspection.judgement import Finding, Verdict, judge, verdict_of
+from servoscope.inspection.levels import BoolArray, Said
+from servoscope.inspection.measured import Coefficient, Fit, Measured, described
+from servoscope.inspection.modelfit import Fitted, IndexArray, Regressors
 from servoscope.inverse import cutoff_of
-from servoscope.judgement import Finding, Verdict, judge, verdict_of
-from servoscope.levels import BoolArray, Said
 from servoscope.linear import settling
 from servoscope.loop import DEFAULT_FREQUENCIES, Loop
-from servoscope.measured import Coefficient, Fit, Measured, described
-from servoscope.modelfit import Fitted, IndexArray, Regressors
 from servoscope.plants import FloatArray
 from servoscope.recording import LEAST_SAMPLES, Recording
 

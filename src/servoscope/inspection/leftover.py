@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from servoscope.levels import BoolArray, Said
+from servoscope.inspection.levels import BoolArray, Said
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 

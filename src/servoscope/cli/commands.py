@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servoscope import arguments
-from servoscope.arguments import Outputs, Source
-from servoscope.shell import FAULT, Commands, Failures, print_json
+from servoscope.cli import arguments
+from servoscope.cli.arguments import Outputs, Source
+from servoscope.cli.shell import FAULT, Commands, Failures, print_json
 
 if TYPE_CHECKING:
     from servoscope.recording import Recording
@@ -97,9 +97,10 @@ def simulate(
     arguments.check_reference(reference)
     events = arguments.fault_events(fault or [])
 
-    from servoscope import simulation, summaries, terminal, writers
+    from servoscope import simulation, writers
+    from servoscope.cli import summaries, terminal
+    from servoscope.cli.progress import progress
     from servoscope.loop import Loop
-    from servoscope.progress import progress
 
     settings = Loop.load(loop)
     arguments.check_length(duration, settings.sample_rate)
@@ -137,9 +138,11 @@ def inspect(
     """Say whether a log is usable, and if not, why; without a mapping, say which columns it has."""
     arguments.check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
 
-    from servoscope import inspection, inspection_figures, summaries, terminal
+    from servoscope import inspection
+    from servoscope.cli import summaries, terminal
+    from servoscope.cli.progress import progress
+    from servoscope.inspection import pages as inspection_figures
     from servoscope.loop import Loop
-    from servoscope.progress import progress
 
     settings = Loop.load(loop) if loop is not None else None
     source = Source.of(settings, columns, where, by, (from_s, to_s))
@@ -194,9 +197,10 @@ def learn(
         raise typer.BadParameter("give healthy recordings or --nominal, and not both")
     arguments.check_output(output, "-o", (), [loop, *paths])
 
-    from servoscope import learning, summaries, terminal
+    from servoscope import learning
+    from servoscope.cli import summaries, terminal
+    from servoscope.cli.progress import progress
     from servoscope.loop import Loop
-    from servoscope.progress import progress
 
     settings = Loop.load(loop)
     source = Source.of(settings, columns, where, by, (from_s, to_s))
@@ -242,9 +246,10 @@ def diagnose(
     arguments.check_output(report, "--report", REPORTS, inputs, folder=True)
     arguments.check_output(trace, "--trace", TRACES, inputs, folder=True)
 
-    from servoscope import monitor, summaries, terminal, writers
+    from servoscope import monitor, writers
     from servoscope.baseline import Baseline
-    from servoscope.progress import progress
+    from servoscope.cli import summaries, terminal
+    from servoscope.cli.progress import progress
 
     healthy = Baseline.load(baseline)
     source = Source.of(healthy.loop, columns, where, by, (from_s, to_s))
@@ -289,6 +294,6 @@ def demo(
     ),
 ) -> None:
     """Simulate a rig, break it, learn and diagnose: the main job in four commands."""
-    from servoscope import demo as demonstration
+    from servoscope.cli import demo as demonstration
 
     demonstration.show(output, lambda words: app(list(words), standalone_mode=False))

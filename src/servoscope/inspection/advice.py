@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from servoscope.judgement import DELAY_GAIN, DELAY_TOLERANCE, FEW_BITS, MODEL_ERROR, PRECISE, SNR
+from servoscope.inspection.judgement import DELAY_GAIN, DELAY_TOLERANCE, FEW_BITS, MODEL_ERROR, PRECISE, SNR
+from servoscope.inspection.measured import Measured
 from servoscope.loop import Loop
-from servoscope.measured import Measured
 
 
 def recommend(m: Measured, loop: Loop | None) -> tuple[str, ...]:

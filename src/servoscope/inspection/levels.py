@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
-from servoscope.defects import spans
 from servoscope.loop import Loop
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
+from servoscope.recording.defects import spans
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.channels import find_channel, parse_combination
 from servoscope.errors import RecordingError
 from servoscope.loop import Columns, Loop
+from servoscope.readers.columns import find_channel, parse_combination
+from servoscope.readers.tables import SUFFIXES, Table, number_column, open_table, seconds
 from servoscope.recording import Defect, Recording, clean, with_defects
-from servoscope.tables import SUFFIXES, Table, number_column, open_table, seconds
 
 __all__ = ["SUFFIXES", "ChannelInfo", "channels", "read", "read_parts"]
 
@@ -49,9 +49,7 @@ def channels(path: str | Path) -> list[ChannelInfo]:
             numbers = numbers[np.isfinite(numbers)]
         except RecordingError:
             numbers = np.empty(0)
-        low, high = (
-            (float(numbers.min()), float(numbers.max())) if numbers.size else (float("nan"), float("nan"))
-        )
+        low, high = (float(numbers.min()), float(numbers.max())) if numbers.size else (float("nan"), float("nan"))
         infos.append(ChannelInfo(name, str(column.type), low, high))
     return infos
 
@@ -114,21 +112,14 @@ def read_parts(
         return [_recording(table, loop, columns, chosen, table.name)]
     cells = _cells(table, find_channel(by, table.columns, f"{table.name}: by"))
     values = list(dict.fromkeys(cells[chosen].tolist()))
-    return [
-        _recording(table, loop, columns, chosen & (cells == v), f"{table.name}[{by}={_plain(v)}]")
-        for v in values
-    ]
+    return [_recording(table, loop, columns, chosen & (cells == v), f"{table.name}[{by}={_plain(v)}]") for v in values]
 
 
-def _recording(
-    table: Table, loop: Loop | None, columns: Columns | None, chosen: BoolArray, name: str
-) -> Recording:
+def _recording(table: Table, loop: Loop | None, columns: Columns | None, chosen: BoolArray, name: str) -> Recording:
     columns = columns or (loop.columns if loop is not None else Columns())
     rate = loop.sample_rate if loop is not None else None
     keys = {"reference": columns.reference, "input": columns.input, "output": columns.output}
-    signals = {
-        key: _combined(table, text, f"{table.name}: [columns] {key}")[chosen] for key, text in keys.items()
-    }
+    signals = {key: _combined(table, text, f"{table.name}: [columns] {key}")[chosen] for key, text in keys.items()}
     t, uniform = _time(table, columns, rate, int(chosen.sum()))
     notes = _torn_notes(table, t, chosen)
     t = t[chosen] if not uniform else t
@@ -145,9 +136,7 @@ def _recording(
     )
     if uniform:
         message = f"no time column: rows taken as uniform at {recording.sample_rate:g} Hz"
-        notes.append(
-            Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, message)
-        )
+        notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, message))
     return with_defects(recording, *notes)
 
 
@@ -214,9 +203,7 @@ def _cells(table: Table, name: str) -> npt.NDArray[np.generic]:
     if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
         # NaN differs from itself and would start a run at every row: an empty cell becomes a value.
         return np.nan_to_num(number_column(table, name, "segment"), nan=np.inf)
-    return np.array(
-        [str(cell if cell is not None else "").strip() for cell in table.columns[name].to_pylist()]
-    )
+    return np.array([str(cell if cell is not None else "").strip() for cell in table.columns[name].to_pylist()])
 
 
 def _plain(value: object) -> str:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.defects import Defect, spans
 from servoscope.errors import RecordingError
+from servoscope.recording.defects import Defect, spans
 
 __all__ = ["GAP", "SAME", "Axis", "arrange", "gaps"]
 
@@ -84,9 +84,7 @@ def arrange(t: FloatArray, marks: npt.NDArray[np.generic], sample_rate: float | 
     if wild:
         notes.append(Defect("clock", start, end, wild, f"{wild} rows with an absurd time stamp dropped"))
     if jitter:
-        words = (
-            f"time stamps jitter: {jitter} steps off by more than {JITTER:.0%} of a sample, taken as uniform"
-        )
+        words = f"time stamps jitter: {jitter} steps off by more than {JITTER:.0%} of a sample, taken as uniform"
         notes.append(Defect("jitter", start, end, jitter, words))
     if abs(rate / used - 1.0) > RATE_NOTE:
         words = f"time stamps say {rate:.6g} Hz, the loop says {used:.6g} Hz: the loop's is used"
@@ -100,13 +98,10 @@ def _check_direction(t: FloatArray, change: Index, name: str) -> float:
     steps = steps if steps.size else np.diff(t)
     backwards = int((steps < 0.0).sum())
     if backwards > 0.9 * steps.size:
-        raise RecordingError(
-            f"{name}: time runs backwards throughout, sort the rows or choose another time column"
-        )
+        raise RecordingError(f"{name}: time runs backwards throughout, sort the rows or choose another time column")
     if backwards > DISORDER * steps.size:
         raise RecordingError(
-            f"{name}: {backwards} of {steps.size} time steps go backwards,"
-            " choose another time column or sort the rows"
+            f"{name}: {backwards} of {steps.size} time steps go backwards, choose another time column or sort the rows"
         )
     repeated = int((steps == 0.0).sum())
     if repeated > COARSE * steps.size:
@@ -157,17 +152,11 @@ def _measure(t: FloatArray, run: IntArray, expected: float | None, name: str) ->
     rate = float(f"{1.0 / near.mean():.9g}")  # stamps are no better than that, and 25 Hz should read 25
     if expected is not None and abs(rate / expected - 1.0) > RATE_TOLERANCE:
         factor = next(
-            (
-                unit
-                for unit, f in (("ms", 1e3), ("us", 1e6), ("ns", 1e9))
-                if abs(rate * f / expected - 1) < 0.02
-            ),
+            (unit for unit, f in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if abs(rate * f / expected - 1) < 0.02),
             None,
         )
         hint = (
-            f'is the time in {factor}? then say time_unit = "{factor}"'
-            if factor
-            else "correct sample_rate or resample"
+            f'is the time in {factor}? then say time_unit = "{factor}"' if factor else "correct sample_rate or resample"
         )
         raise RecordingError(f"{name}: sampled at {rate:.6g} Hz, the loop says {expected:.6g} Hz: {hint}")
     period = 1.0 / (expected if expected is not None else rate)

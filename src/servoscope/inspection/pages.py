@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from servoscope.inspection import Inspection
-from servoscope.levels import percent
+from servoscope.inspection.inspecting import Inspection
+from servoscope.inspection.levels import percent
 from servoscope.recording import Recording
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def figures_of(inspection: Inspection, recording: Recording) -> list[tuple[str, 
     Parameters
     ----------
     inspection
-        As `servoscope.inspection.inspect` returned it; read back from JSON it has only the signals to show.
+        As `servoscope.inspection.inspecting.inspect` returned it; read back from JSON it has only the signals to show.
     recording
         The recording that was inspected.
 

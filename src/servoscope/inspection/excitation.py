@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoscope.levels import Said
+from servoscope.inspection.levels import Said
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 

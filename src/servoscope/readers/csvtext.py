@@ -93,18 +93,14 @@ def read_csv(path: Path, head: bytes) -> CsvColumns:
         table = pc.read_csv(
             source or path,
             # Row numbers, which messages name, exist without threads only.
-            read_options=pc.ReadOptions(
-                column_names=layout.names, skip_rows=layout.skipped, use_threads=False
-            ),
+            read_options=pc.ReadOptions(column_names=layout.names, skip_rows=layout.skipped, use_threads=False),
             parse_options=pc.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=invalid),
             convert_options=pc.ConvertOptions(
                 null_values=list(NULLS), strings_can_be_null=True, decimal_point=layout.decimal
             ),
         )
     except pa.ArrowInvalid as error:
-        raise RecordingError(
-            f"{path}: cannot be read as CSV ({' '.join(str(error).split())[:100]})"
-        ) from None
+        raise RecordingError(f"{path}: cannot be read as CSV ({' '.join(str(error).split())[:100]})") from None
     if len(broken) > max(1, MOST_BROKEN * table.num_rows):
         number, actual, _ = broken[0]
         raise RecordingError(
@@ -128,13 +124,9 @@ def _encoding(head: bytes) -> str:
 
 def _layout(lines: list[str], path: Path) -> _Layout:
     skipped = 0
-    while skipped < len(lines) and (
-        not lines[skipped].strip() or lines[skipped].lstrip().startswith(COMMENTS)
-    ):
+    while skipped < len(lines) and (not lines[skipped].strip() or lines[skipped].lstrip().startswith(COMMENTS)):
         skipped += 1
-    sample = [line for line in lines[skipped:] if line.strip() and not line.lstrip().startswith(COMMENTS)][
-        :SNIFFED
-    ]
+    sample = [line for line in lines[skipped:] if line.strip() and not line.lstrip().startswith(COMMENTS)][:SNIFFED]
     if not sample:
         raise RecordingError(f"{path}: holds comments only, no rows")
     delimiter = _delimiter(sample)
@@ -164,11 +156,7 @@ def _delimiter(sample: list[str]) -> str:
 def _cells(line: str, delimiter: str) -> list[str]:
     import csv
 
-    cells = (
-        line.split()
-        if delimiter == " "
-        else next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-    )
+    cells = line.split() if delimiter == " " else next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     return [cell.strip().strip("'\"") for cell in cells]
 
 

@@ -71,9 +71,7 @@ def steps_in(r: FloatArray, run: npt.NDArray[np.int32]) -> BoolArray:
     return mask
 
 
-def _one_pass(
-    z: FloatArray, run: npt.NDArray[np.int32], share: float, excused: BoolArray | None
-) -> BoolArray:
+def _one_pass(z: FloatArray, run: npt.NDArray[np.int32], share: float, excused: BoolArray | None) -> BoolArray:
     found = np.zeros(z.size, dtype=bool)
     if z.size < 2 * NEIGHBOURS:
         return found

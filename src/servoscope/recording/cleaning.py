@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from servoscope import clock
-from servoscope.defects import Defect, listed, shortened, spans
 from servoscope.errors import NotEnoughError, RecordingError
-from servoscope.spikes import find_spikes, steps_in
+from servoscope.recording import clock
+from servoscope.recording.defects import Defect, listed, shortened, spans
+from servoscope.recording.spikes import find_spikes, steps_in
 
 __all__ = ["LEAST_SAMPLES", "Defect", "Recording", "clean", "with_defects"]
 
@@ -97,9 +97,7 @@ class Recording:
 
 def with_defects(recording: Recording, *more: Defect) -> Recording:
     """Return the recording with further defects, all in the order of time."""
-    return replace(
-        recording, defects=tuple(sorted((*recording.defects, *more), key=lambda defect: defect.from_s))
-    )
+    return replace(recording, defects=tuple(sorted((*recording.defects, *more), key=lambda defect: defect.from_s)))
 
 
 def clean(
@@ -155,17 +153,13 @@ def clean(
     r_all, u_all, y_all = (channel[axis.rows] for channel in raw[1:])
 
     unusable = ~(np.isfinite(r_all) & np.isfinite(u_all) & np.isfinite(y_all))
-    which = [
-        label for label, x in zip(labels, (r_all, u_all, y_all), strict=True) if not np.isfinite(x).all()
-    ]
+    which = [label for label, x in zip(labels, (r_all, u_all, y_all), strict=True) if not np.isfinite(x).all()]
     notes += listed("nan", unusable, t_all, f"not a number in {', '.join(which)}, row{{s}} dropped")
     kept = np.flatnonzero(~unusable)
     kept, repeated = _without_repeats(kept, t_all, run_all, period)
     notes += listed("repeat", _mask(repeated, t_all.size), t_all, "time stamp repeated, later row{s} dropped")
     spike, spiky = _spikes(r_all[kept], u_all[kept], y_all[kept], run_all[kept], labels)
-    notes += listed(
-        "spike", _mask(kept[spike], t_all.size), t_all, f"spike in {', '.join(spiky)}, row{{s}} dropped"
-    )
+    notes += listed("spike", _mask(kept[spike], t_all.size), t_all, f"spike in {', '.join(spiky)}, row{{s}} dropped")
     dropped = np.union1d(np.flatnonzero(unusable), kept[spike])
     kept = kept[~spike]
     if dropped.size > MOST_LOST * t_all.size:
@@ -205,9 +199,7 @@ def _check_channels(channels: list[FloatArray], name: str, labels: tuple[str, st
 
 def _check_length(samples: int, runs: int, name: str) -> None:
     if samples < LEAST_SAMPLES:
-        raise NotEnoughError(
-            f"{name}: {samples} usable rows are too few, at least {LEAST_SAMPLES} are needed"
-        )
+        raise NotEnoughError(f"{name}: {samples} usable rows are too few, at least {LEAST_SAMPLES} are needed")
     if samples < LEAST_SAMPLES * runs:
         raise NotEnoughError(
             f"{name}: falls into {runs} runs of about {samples // runs} rows, too short to use;"
@@ -215,9 +207,7 @@ def _check_length(samples: int, runs: int, name: str) -> None:
         )
 
 
-def _check_swapped(
-    r: FloatArray, u: FloatArray, y: FloatArray, name: str, labels: tuple[str, str, str]
-) -> None:
+def _check_swapped(r: FloatArray, u: FloatArray, y: FloatArray, name: str, labels: tuple[str, str, str]) -> None:
     scale, of_u, of_y = float(np.std(r)), float(np.std(u - r)), float(np.std(y - r))
     if of_u < FOLLOWS * scale and of_u < FOLLOWS * of_y:
         raise RecordingError(
@@ -248,9 +238,7 @@ def _spikes(
     return in_r | in_u | in_y, spiky
 
 
-def _gap_notes(
-    t: FloatArray, after: npt.NDArray[np.intp], dropped: FloatArray, period: float
-) -> list[Defect]:
+def _gap_notes(t: FloatArray, after: npt.NDArray[np.intp], dropped: FloatArray, period: float) -> list[Defect]:
     notes = []
     for index in after:
         start, end = t[index], t[index + 1]

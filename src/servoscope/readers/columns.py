@@ -67,9 +67,7 @@ def parse_columns(text: str, base: Columns | None = None) -> Columns:
     for pair in re.findall(r"(?:`[^`]*`|[^,`])+", text):
         key, equals, value = (part.strip() for part in pair.partition("="))
         if not equals or key not in FIELDS or (not value and key not in ("t", "time")):
-            raise LoopError(
-                f"columns: {pair.strip()!r} is not one of t=, r=, u=, y=, segment= and a column's name"
-            )
+            raise LoopError(f"columns: {pair.strip()!r} is not one of t=, r=, u=, y=, segment= and a column's name")
         field = FIELDS[key]
         if field == "segment":
             told[field] = tuple(_bare(part) for part in value.split("+"))
@@ -157,16 +155,10 @@ def _evaluate(node: ast.expr, quoted: Mapping[str, str], known: list[str], where
     if isinstance(node, ast.Name | ast.Attribute | ast.Subscript):
         name = ast.unparse(node)
         return Combination({find_channel(quoted.get(name, name), known, where): 1.0}, 0.0)
-    if (
-        isinstance(node, ast.Constant)
-        and isinstance(node.value, int | float)
-        and type(node.value) is not bool
-    ):
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and type(node.value) is not bool:
         return Combination({}, float(node.value))
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.UAdd | ast.USub):
-        return _evaluate(node.operand, quoted, known, where).scaled(
-            -1.0 if isinstance(node.op, ast.USub) else 1.0
-        )
+        return _evaluate(node.operand, quoted, known, where).scaled(-1.0 if isinstance(node.op, ast.USub) else 1.0)
     if not isinstance(node, ast.BinOp):
         raise ValueError("not linear")
     left, right = (_evaluate(side, quoted, known, where) for side in (node.left, node.right))
@@ -185,6 +177,4 @@ def _evaluate(node: ast.expr, quoted: Mapping[str, str], known: list[str], where
 
 def _bare(name: str) -> str:
     name = name.strip()
-    return (
-        name[1:-1].strip() if len(name) > 2 and name[0] == name[-1] == "`" and "`" not in name[1:-1] else name
-    )
+    return name[1:-1].strip() if len(name) > 2 and name[0] == name[-1] == "`" and "`" not in name[1:-1] else name

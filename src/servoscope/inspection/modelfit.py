@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope import inverse
+from servoscope.inspection.levels import BoolArray, Said
 from servoscope.inverse import FilterBank
-from servoscope.levels import BoolArray, Said
 from servoscope.loop import Loop, MonitorSettings
 from servoscope.pipeline import Pipeline
 from servoscope.plants import FloatArray

@@ -1,0 +1,6 @@
+"""A recording: r, u and y of one asset on one clock, and the defects that were found on the way in."""
+
+from servoscope.recording.cleaning import LEAST_SAMPLES, Recording, clean, with_defects
+from servoscope.recording.defects import Defect
+
+__all__ = ["LEAST_SAMPLES", "Defect", "Recording", "clean", "with_defects"]
