@@ -197,15 +197,16 @@ def t_squared(theta: Array, expected: Array, covariance: Array) -> Array:
     return np.array([(t - m) @ np.linalg.inv(C) @ (t - m) for t, m, C in zip(theta, expected, covariance, strict=True)])
 
 
-def change_point(before: Array, after: Array, a: Array, variance: float) -> Array:
-    """Return the log-likelihood of a change at every sample from two residuals, N(0, variance) once whitened."""
-    N = len(before)
-
-    def white(v: Array, k: int) -> float:
-        return float(v[k] - sum(a[j - 1] * v[k - j] for j in range(1, min(len(a), k) + 1)))
-
-    costs = [[white(v, k) ** 2 / (2.0 * variance) for k in range(N)] for v in (before, after)]
-    return np.array([-sum(costs[0][:k]) - sum(costs[1][k:]) for k in range(N)])
+def change_point(v: Array, changed: Array, a: Array, ramp: Array, variance: float) -> Array:
+    """Return the log-likelihood of a change at every update i: v - ramp(k - i) changed is AR noise, N(0, variance)."""
+    N = len(v)
+    found = []
+    for i in range(N):
+        share = [0.0 if k < i else ramp[k - i] if k - i < len(ramp) else 1.0 for k in range(N)]
+        left = v - np.array(share) * changed
+        white = [left[k] - sum(a[j - 1] * left[k - j] for j in range(1, min(len(a), k) + 1)) for k in range(N)]
+        found.append(-sum(e**2 for e in white) / (2.0 * variance))
+    return np.array(found)
 
 
 def inside(points: Array, polygon: Array) -> npt.NDArray[np.bool_]:

@@ -11,7 +11,6 @@ from scipy import signal, stats
 import naive
 from servoscope.detection import (
     SECONDS_PER_YEAR,
-    TEMPER,
     noncentrality,
     onset,
     required_noncentrality,
@@ -177,17 +176,20 @@ class TestOnset:
         )
         g = pipeline.regression(recording.r, recording.u, recording.y, cut)
         used = np.flatnonzero(g.ok[: last + 1])
-        before, after = ((g.eta - g.phi @ theta)[used] for theta in (healthy, faulty))
+        v, changed = (g.eta - g.phi @ healthy)[used], (g.phi @ (faulty - healthy))[used]
         variance = tuning.innovation * max(1.0, float(e.power[-1]))
-        of_used = naive.change_point(before, after, tuning.noise_a, variance)
+        step = np.zeros((pipeline.bank.wait + 1, 3))
+        step[1:, 1] = 1.0
+        ramp = pipeline.bank.system.simulate(step)[1:, 0]
+        of_used = naive.change_point(v, changed, tuning.noise_a, ramp / ramp[-1], variance)
         log_likelihood = np.array([of_used[min(np.searchsorted(used, k), len(used) - 1)] for k in range(until + 1)])
-        weight = np.exp(TEMPER * (log_likelihood - log_likelihood.max()))
+        weight = np.exp(log_likelihood - log_likelihood.max())
         share = np.cumsum(weight) / weight.sum()
         found = onset(pipeline, tuning, recording, e, healthy, faulty, until, last)
-        blur = pipeline.bank.wait / 100.0
+        blur = pipeline.bank.wait / 200.0
         assert found.sample == int(np.argmax(log_likelihood))
         assert found.low_s == pytest.approx(np.argmax(share >= 0.025) / 100.0 - blur)
-        assert found.high_s == pytest.approx(np.argmax(share >= 0.975) / 100.0 + blur / 2.0)
+        assert found.high_s == pytest.approx(np.argmax(share >= 0.975) / 100.0 + blur)
 
     def test_never_leaves_the_recording(self, rig: dict[str, Any]) -> None:
         arguments = self.broken(rig, "multisine", "C_ie=1.4@0", 1)

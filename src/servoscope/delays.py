@@ -13,8 +13,8 @@ from servoscope.linear import settling
 from servoscope.loop import Loop
 from servoscope.recording import Recording
 
-TOLERANCE = 0.5  # samples, beyond which a recording is refused
-NOTED = 0.1  # samples; an inverse that is too simple moves the estimate by a fraction of one, so this is only said
+TOLERANCE = 0.3  # rad at the filter's cutoff, beyond which a recording is refused: half a sample at f_s = 10 cutoff
+NOTED = 0.06  # rad; an inverse that is too simple moves the estimate a little, so this is only said
 SIGNIFICANT = 0.1  # share of the residual variance below which a delay is not worth a refusal
 UNTOLD = "the recordings do not tell the delay between u and y"
 
@@ -22,7 +22,7 @@ UNTOLD = "the recordings do not tell the delay between u and y"
 def check_delay(loop: Loop, recordings: Sequence[Recording]) -> tuple[float | None, list[str]]:
     """Estimate the delay from the longest recording; refuse one that is out of step with the loop file.
 
-    One sample that the model does not know costs 63 % at 10 Hz (THEORY section 6), so half a sample matters.
+    One sample at 100 Hz that the model does not know costs 63 % at 10 Hz (THEORY section 6), so half of it matters.
 
     Returns
     -------
@@ -32,7 +32,7 @@ def check_delay(loop: Loop, recordings: Sequence[Recording]) -> tuple[float | No
     Raises
     ------
     RecordingError
-        If the delay differs by more than half a sample and explains a tenth of the residual.
+        If the delay differs by more than `TOLERANCE` and explains a tenth of the residual.
     """
     recording = max(recordings, key=lambda each: each.samples)
     g = modelfit.regressors(recording, loop)
@@ -45,7 +45,7 @@ def check_delay(loop: Loop, recordings: Sequence[Recording]) -> tuple[float | No
     delay = alignment.estimate(recording, g, which, fitted, independent)
     if delay.samples is None or delay.seconds is None:
         return None, [UNTOLD]
-    off = abs(delay.samples - delay.configured_samples)
+    off = 2.0 * np.pi * cutoff_of(loop) * abs(delay.seconds - loop.delay)
     if delay.gain < SIGNIFICANT or off < NOTED:
         return delay.seconds, []
     told = (

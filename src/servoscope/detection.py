@@ -11,7 +11,6 @@ from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 
 SECONDS_PER_YEAR = 365.25 * 86400.0
-TEMPER = 0.5  # power of the onset's likelihood: while the filters settle, neither model is true
 POWER = 0.9  # probability with which a promised change is seen
 
 
@@ -125,7 +124,8 @@ def onset(
     """Find when the regression stopped following `healthy` and began to follow `faulty`.
 
     Change point by maximum likelihood on the residual whitened by the noise's own autoregression, with a flat prior
-    over the samples before the alarm (Basseville and Nikiforov, 1993, section 2.6).
+    over the samples before the alarm (Basseville and Nikiforov, 1993, section 2.6). While the filters settle, the
+    share of the change that they have let through counts.
 
     Parameters
     ----------
@@ -138,24 +138,60 @@ def onset(
     """
     g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
     used = np.flatnonzero(g.ok[: last + 1])
-    gain = np.zeros(last + 1)
-    white = [_whitened((g.eta - g.phi @ theta)[used], tuning.noise_a) for theta in (healthy, faulty)]
-    innovation = tuning.innovation * max(1.0, float(estimates.power[-1]))
-    gain[used] = (white[0] ** 2 - white[1] ** 2) / (2.0 * innovation)
-    log_likelihood = np.cumsum(gain[::-1])[::-1][: until + 1]  # of a change at each sample, up to a constant
-    weight = np.exp(TEMPER * (log_likelihood - log_likelihood.max()))
+    phi = g.phi[used]
+    changed = phi @ (faulty - healthy)
+    costs = _change_costs(g.eta[used] - phi @ healthy, changed, tuning.noise_a, _onset_of_filters(pipeline))
+    scale = 2.0 * tuning.innovation * max(1.0, float(estimates.power[-1]))
+    # a change between two updates shows at the later one
+    at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
+    log_likelihood = -costs[at_update] / scale
+    weight = np.exp(log_likelihood - log_likelihood.max())
     share = np.cumsum(weight) / weight.sum()
     likely = int(np.argmax(log_likelihood))
     low, high = np.searchsorted(share, [0.025, 0.975])
-    # the filters delay and blur a step: it may have come up to their settling time before it shows
-    blur = pipeline.bank.wait / recording.sample_rate
+    # what the filters leave of a step is known only about, so neither end is surer than half their settling time
+    blur = pipeline.bank.wait / (2.0 * recording.sample_rate)
     t = recording.t
     return Onset(
         max(float(t[min(low, until)]) - blur, float(t[0])),
         float(t[likely]),
-        min(float(t[min(high, until)]) + blur / 2.0, float(t[until])),
+        min(float(t[min(high, until)]) + blur, float(t[until])),
         likely,
     )
+
+
+def _onset_of_filters(pipeline: Pipeline) -> FloatArray:
+    """Return how much of a sudden change the filters have let through, update by update: 0 to 1, shape (W,)."""
+    bank = pipeline.bank
+    w = np.zeros((bank.wait + 1, bank.system.B.shape[1]))
+    w[1:, 1] = 1.0  # u steps
+    response = bank.system.simulate(w)[1:, 0] / bank.gain
+    share = response[pipeline.stride - 1 :: pipeline.stride] / max(float(response[-1]), 1e-12)
+    return np.asarray(np.clip(share, 0.0, 1.0))
+
+
+def _change_costs(v: FloatArray, changed: FloatArray, a: FloatArray, ramp: FloatArray) -> FloatArray:
+    """Return the sum of squared innovations for a change at each update, shape (N,).
+
+    The residual under a change at i is v(k) - ramp(k - i) changed(k): v before, v - changed once the filters have
+    settled, and in between the share of the change that they have let through.
+    """
+    N, p, W = len(v), len(a), len(ramp)
+    before, after = (_whitened(each, a) ** 2 for each in (v, v - changed))
+    sum_before = np.concatenate([[0.0], np.cumsum(before)])
+    sum_after = np.concatenate([[0.0], np.cumsum(after)])
+    span = W + p  # updates whose innovation mixes the two
+    padded_v = np.concatenate([np.zeros(p), v, np.zeros(span)])
+    padded_changed = np.concatenate([np.zeros(p), changed, np.zeros(span)])
+    share = np.concatenate([np.zeros(p), ramp, np.ones(p)])
+    windows = np.lib.stride_tricks.sliding_window_view
+    residual = windows(padded_v, p + span)[:N] - share * windows(padded_changed, p + span)[:N]
+    white = residual[:, p:].copy()
+    for lag, weight in enumerate(a, start=1):
+        white -= weight * residual[:, p - lag : p - lag + span]
+    inside = np.arange(N)[:, None] + np.arange(span) < N
+    end = np.minimum(np.arange(N) + span, N)
+    return np.asarray(sum_before[:N] + (white**2 * inside).sum(axis=1) + sum_after[N] - sum_after[end])
 
 
 def _whitened(v: FloatArray, a: FloatArray) -> FloatArray:
