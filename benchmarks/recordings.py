@@ -193,8 +193,8 @@ def qube(data: Path) -> Iterator[Table]:
             rows.append((words, str(i + 1), judged.named, _ratio(judged), f"{judged.seconds:.2f} s"))
     yield Table(
         "QUBE",
-        f"Measured, three healthy runs of 20 s at 500 Hz, model_error = {loop.monitor.model_error:g}. "
-        + _promised(ss.learn(loop, runs)),
+        f"Measured, three healthy runs of 20 s at 500 Hz, model_error = {loop.monitor.model_error:g}; "
+        f"{ss.learn(loop, runs).explained:.1%} of the variance of u explained. " + _promised(ss.learn(loop, runs)),
         ("learned from", "judged", "verdict", "largest T^2 / threshold", "time"),
         tuple(rows),
     )

@@ -13,6 +13,7 @@ from servoscope.errors import LoopError
 
 n = 4
 R = 0.3
+MEMORY = 500.0
 ALL = estimators.names()
 WITH_INSTRUMENT = [name for name in ALL if estimators.load(name).NEEDS_INSTRUMENT]
 
@@ -36,7 +37,7 @@ class Run:
 
     def step(self, eta: float, phi: naive.Array, z: naive.Array | None = None) -> int:
         z = phi if z is None else z
-        return int(self.update(self.theta, self.P, self.P_d, R, eta, phi, z, self.K))
+        return int(self.update(self.theta, self.P, self.P_d, R, MEMORY, eta, phi, z, self.K))
 
 
 def samples(steps: int, seed: int = 5, mismatch: float = 0.1) -> list[tuple[float, naive.Array, naive.Array]]:

@@ -30,6 +30,9 @@ from servoscope.recording import Recording
 from servoscope.signatures import Expectation, course
 
 SURE = 0.95  # probability from which a fault is named
+MOST_REFUSED = 0.2  # share of updates that the instrument's guard may skip before the AKF takes over
+WORTH_TELLING = 0.01  # share of them that is warned about
+FALL_BACK = {"estimator": "akf"}
 WEAKER = 3.0  # a recording that sees only changes this much larger than promised is called undetermined
 
 
@@ -44,6 +47,7 @@ class Examination:
     estimates: Estimates
     expectation: Expectation | None
     trace: Trace
+    refused: float  # share of the updates that the instrument's guard skipped
 
     @classmethod
     def of(cls, baseline: Baseline, recording: Recording) -> Examination:
@@ -62,6 +66,10 @@ class Examination:
             )
         pipeline, tuning = baseline.pipeline(), baseline.tuning
         estimates = pipeline.estimate(tuning, recording)
+        refused = _refused(estimates)
+        if refused > MOST_REFUSED:
+            pipeline = Pipeline.of(loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)}))
+            estimates = pipeline.estimate(tuning, recording)
         expectation = None
         expected = np.broadcast_to(tuning.theta, estimates.theta.shape)
         if baseline.noise is not None:
@@ -85,7 +93,7 @@ class Examination:
             ),
             ready=ready,
         )
-        return cls(baseline, recording, pipeline, tuning, estimates, expectation, trace)
+        return cls(baseline, recording, pipeline, tuning, estimates, expectation, trace, refused)
 
     def diagnosis(self, progress: Callable[[str], None] = lambda _: None) -> Diagnosis:
         """Return the verdict; `progress` is told what is being done."""
@@ -173,11 +181,11 @@ class Examination:
         """Return warnings about the estimate itself."""
         doubts = []
         e, t = self.estimates, self.recording.t
-        if len(e.updates) and e.skipped[-1] > 0.01 * (e.skipped[-1] + e.updates[-1]):
-            count = int(e.skipped[-1])
-            message = f"the instrument was too weak for {count} updates, which were skipped"
+        if self.refused > WORTH_TELLING:
+            instead = ", so estimator = 'akf' was used instead" if self.refused > MOST_REFUSED else ""
+            message = f"the instrument was too weak for {self.refused:.0%} of the updates{instead}"
             span = float(t[0]), float(t[-1])
-            doubts.append(Warning(kind="instrument", from_s=span[0], to_s=span[1], count=count, message=message))
+            doubts.append(Warning(kind="instrument", from_s=span[0], to_s=span[1], count=1, message=message))
         if len(e.updates) and e.updates[-1] > 0:
             last = int(e.index[int(np.searchsorted(e.updates, e.updates[-1]))])
             if t[-1] - t[last] > self.baseline.loop.monitor.memory:
@@ -214,6 +222,13 @@ class Examination:
             )
             for f, H, s, H0 in zip(now.frequencies, now.H[-1], std, healthy.H[-1], strict=True)
         )
+
+
+def _refused(estimates: Estimates) -> float:
+    if not len(estimates.updates):
+        return 0.0
+    refused, updated = float(estimates.skipped[-1]), float(estimates.updates[-1])
+    return refused / max(refused + updated, 1.0)
 
 
 def _summary(

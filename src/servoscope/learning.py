@@ -21,6 +21,7 @@ from servoscope.simulation import reference, simulate
 from servoscope.tuning import Fit, fit
 
 SHORTEST = 10.0  # memories; a shorter baseline is warned about
+WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
 WORTH_A_LOOK = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
 
 Progress = Callable[[str], None]
@@ -49,13 +50,26 @@ def learn(loop: Loop, recordings: Sequence[Recording], progress: Progress = lamb
     """
     if not recordings:
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
-    pipeline = Pipeline.of(loop)
     progress("regressors")
-    regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
-    found = fit(regressions, pipeline.memory, pipeline.bank.names)
+    pipeline, regressions, found = _tuned(loop, recordings)
+    notes: list[str] = []
+    if found.strength < WEAKEST_INSTRUMENT:
+        notes.append(
+            f"the instrument is too weak (strength {found.strength:.2g} of 1, at least {WEAKEST_INSTRUMENT:g} needed): "
+            "estimator = 'akf' is used instead"
+        )
+        loop = loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"estimator": "akf"})})
+        pipeline, regressions, found = _tuned(loop, recordings)
     progress("delay")
-    delay_s, notes = check_delay(loop, recordings)
+    delay_s, told = check_delay(loop, recordings)
+    notes += told
     return _assemble(loop, recordings, pipeline, regressions, found, delay_s, notes, progress)
+
+
+def _tuned(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline, list[Regression], Fit]:
+    pipeline = Pipeline.of(loop)
+    regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
+    return pipeline, regressions, fit(regressions, pipeline.memory, pipeline.bank.names)
 
 
 def nominal(loop: Loop, progress: Progress = lambda _: None, duration_s: float = 60.0) -> Baseline:
@@ -70,11 +84,8 @@ def nominal(loop: Loop, progress: Progress = lambda _: None, duration_s: float =
     """
     if not loop.plant.has_physics or loop.controller is None:
         raise LoopError(f"{loop.name}: a nominal baseline needs [controller] and the plant's nominal values")
-    r = reference("profile", duration_s, loop.sample_rate)
-    healthy, _ = simulate(loop, r)
-    pipeline = Pipeline.of(loop)
-    regressions = [pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)]
-    found = fit(regressions, pipeline.memory, pipeline.bank.names)
+    healthy, _ = simulate(loop, reference("profile", duration_s, loop.sample_rate))
+    pipeline, regressions, found = _tuned(loop, [healthy])
     note = "computed from nominal parameters: an asset that differs from them by construction counts as a fault"
     return _assemble(loop, [healthy], pipeline, regressions, found, loop.delay, [note], progress, exact=True)
 

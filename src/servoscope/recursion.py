@@ -229,7 +229,7 @@ def _block(
                 e = v_out[0]
                 for i in range(n):
                     e -= phi[i] * theta[i]
-                if _update(theta, P, c.P_d, c.R, v_out[0], phi, z, K) == 0:
+                if _update(theta, P, c.P_d, c.R, c.memory, v_out[0], phi, z, K) == 0:
                     s[UPDATES] += 1.0
                     s[POWER] += (e * e - s[POWER]) / c.memory
                 else:

@@ -32,6 +32,9 @@ class Fit:
         Share of eta's variance that the model explains, 0 to 1.
     dof
         Effective number of independent residuals.
+    strength
+        Of the instrument: smallest real part of the eigenvalues of E[phi phi']^-1 E[z phi'], 1 where z is phi. The
+        recursion diverges where it is negative (THEORY section 5).
     rms_eta
         Root mean square of eta.
     """
@@ -42,6 +45,7 @@ class Fit:
     each_covariance: FloatArray
     explained: float
     dof: float
+    strength: float
     rms_eta: float
 
 
@@ -129,6 +133,8 @@ def fit(regressions: Sequence[Regression], memory: float, names: Sequence[str]) 
     a, gamma = autoregression(residuals)
     R = float(gamma[0])
     P_d = R / memory * np.linalg.inv(scaled) / np.outer(scale, scale)
+    own = phi.T @ phi / len(eta) / np.outer(scale, scale)
+    strength = float(np.linalg.eigvals(np.linalg.solve(own, scaled)).real.min())
     covariances = np.array([coloured_covariance(g, a, gamma) for g in regressions])
     joint = Regression(eta, phi, z, np.ones(len(eta), dtype=bool))
     correlation = gamma / gamma[0]
@@ -139,5 +145,6 @@ def fit(regressions: Sequence[Regression], memory: float, names: Sequence[str]) 
         each_covariance=covariances,
         explained=1.0 - R / float(eta.var()),
         dof=len(eta) / float(1.0 + 2.0 * (correlation[1:] ** 2).sum()),
+        strength=strength,
         rms_eta=float(np.sqrt((eta**2).mean())),
     )

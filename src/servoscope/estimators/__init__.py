@@ -2,7 +2,7 @@
 
 Each module offers ``NAME`` (as in a loop file), ``NEEDS_INSTRUMENT`` and a compiled
 
-    update(theta, P, P_d, R, eta, phi, z, K) -> status
+    update(theta, P, P_d, R, memory, eta, phi, z, K) -> status
 
 that changes `theta` (n,) and `P` (n, n) in place, writes the gain it used into `K` (n,), and returns 0 when it
 updated or 1 when a guard made it skip (then theta and P are untouched and K is zero).

@@ -17,6 +17,7 @@ def update(
     P: FloatArray,
     P_d: FloatArray,
     R: float,
+    memory: float,
     eta: float,
     phi: FloatArray,
     z: FloatArray,

@@ -1,0 +1,154 @@
+"""What a baseline is made of: noise, delay, healthy parameters, promises, notes; saved, read back, or refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from servoscope.baseline import Baseline
+from servoscope.errors import BaselineError, NotEnoughError, RecordingError
+from servoscope.learning import learn, nominal
+from servoscope.loop import Loop
+from servoscope.monitor import diagnose
+from servoscope.recording import Recording
+from servoscope.simulation import FaultEvent, reference, simulate
+
+
+@pytest.fixture(scope="module")
+def record() -> Callable[..., Recording]:
+    def simulated(loop: Loop, kind: str = "profile", seconds: float = 60.0, seed: int = 1, **options: Any) -> Recording:
+        return simulate(loop, reference(kind, seconds, loop.sample_rate), seed=seed, **options)[0]
+
+    return simulated
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory, record: Callable[..., Recording]) -> Path:
+    loop = Loop.load(Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml")
+    path = tmp_path_factory.mktemp("baseline") / "b.json"
+    learn(loop, [record(loop)]).save(path)
+    return path
+
+
+def test_finds_noise_and_healthy_parameters(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    aged = loop.model_copy(update={"plant": loop.plant.with_ratios({"p_s": 0.8, "C_ie": 1.5})})
+    baseline = learn(loop, [record(aged)])  # the loop file is wrong by as much: the recording knows better
+    assert baseline.noise is not None
+    assert baseline.noise.y_std == pytest.approx(np.sqrt(1e-7), rel=0.1)
+    assert baseline.ratios["p_s"] == pytest.approx(0.8, rel=0.01)
+    assert baseline.ratios["C_ie"] == pytest.approx(1.5, rel=0.01)
+    worse = record(aged, seed=2, faults=[FaultEvent("C_ie", 1.2, 30.0)])
+    (fault,) = diagnose(baseline, worse).faults
+    assert fault.ratio == pytest.approx(1.2, rel=0.01)
+
+
+def test_scatter_between_recordings_counts(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    colder = loop.model_copy(update={"plant": loop.plant.with_ratios({"C_ie": 1.03})})
+    same = learn(loop, [record(loop, seed=1), record(loop, seed=2)])
+    mixed = learn(loop, [record(loop, seed=1), record(colder, seed=2)])
+    assert mixed.covariance[0][0] > 10.0 * same.covariance[0][0]
+    by_parameter = {p.parameter: p.change for p in mixed.promises}
+    assert by_parameter["C_ie"] is not None and by_parameter["C_ie"] > 0.05
+
+
+def test_more_data_promise_more(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    short, long = (learn(loop, [record(loop, seconds=seconds)]) for seconds in (30.0, 120.0))
+    assert any("short" in note for note in short.notes)
+    for few, many in zip(short.promises, long.promises, strict=True):
+        assert few.change is not None and many.change is not None and few.change > many.change
+    assert short.limit > long.limit  # the noise itself is known less well
+
+
+def test_refuses_recordings_out_of_step(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    late = record(Loop.from_dict(rig | {"delay": 0.01}))
+    with pytest.raises(RecordingError, match=r"delay = 0\.01"):
+        learn(loop, [late])
+    told = learn(Loop.from_dict(rig | {"delay": 0.01}), [late])
+    assert told.delay_s == pytest.approx(0.01, abs=0.001)
+
+
+def test_refuses_what_excites_nothing(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    with pytest.raises(NotEnoughError, match="usable samples"):
+        learn(loop, [record(loop).part(0.0, 0.9)])
+    with pytest.raises(NotEnoughError, match="at least one"):
+        learn(loop, [])
+
+
+def test_suggests_a_model_error_where_the_model_is_wrong(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    bent = record(loop)
+    bent = replace(bent, u=bent.u * (1.0 + 2.0 * np.abs(bent.u)))  # a valve that saturates
+    baseline = learn(loop, [bent])
+    assert baseline.suggested_model_error > 0.001
+    assert learn(loop, [record(loop)]).suggested_model_error < 0.001
+
+
+def test_a_useless_instrument_is_replaced_and_told(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig | {"monitor": {"estimator": "iv-akf"}})
+    good = record(loop, kind="multisine")
+    assert learn(loop, [good]).loop.monitor.estimator == "iv-akf"
+    shuffled = replace(good, r=np.roll(good.r, 333))  # an r that u and y know nothing of
+    baseline = learn(loop, [shuffled])
+    assert baseline.loop.monitor.estimator == "akf"
+    assert any("instrument is too weak" in note for note in baseline.notes)
+
+
+def test_an_instrument_that_fails_later_is_replaced_and_told(
+    rig: dict[str, Any], record: Callable[..., Recording]
+) -> None:
+    loop = Loop.from_dict(rig | {"monitor": {"estimator": "iv-akf"}})
+    baseline = learn(loop, [record(loop, kind="multisine")])
+    other = record(loop, kind="multisine", seed=2)
+    diagnosis = diagnose(baseline, replace(other, r=-other.r))
+    assert any(warning.kind == "instrument" and "akf" in warning.message for warning in diagnosis.warnings)
+
+
+def test_nominal_baseline_finds_faults_without_learning(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    baseline = nominal(loop)
+    assert diagnose(baseline, record(loop, kind="multisine", seed=3)).verdict == "healthy"
+    (fault,) = diagnose(baseline, record(loop, seed=4, faults=[FaultEvent("p_s", 1.4, 20.0)])).faults
+    assert fault.name == "pump"
+    assert fault.ratio == pytest.approx(1.4, rel=0.01)
+
+
+class TestFile:
+    def test_round_trip_changes_nothing(self, saved: Path, tmp_path: Path) -> None:
+        baseline = Baseline.load(saved)
+        baseline.save(tmp_path / "again.json")
+        assert (tmp_path / "again.json").read_bytes() == saved.read_bytes()
+        assert baseline.loop == Baseline.load(tmp_path / "again.json").loop
+
+    @pytest.mark.parametrize(
+        ("change", "told"),
+        [
+            ({"version": 99}, "version 99"),
+            ({"format": "other"}, "not a baseline"),
+            ({"theta": None}, "theta"),
+            ({"loop": {"name": "x"}}, "damaged"),
+            ({"unheard": 1}, "unheard"),
+        ],
+    )
+    def test_damage_is_refused(self, saved: Path, tmp_path: Path, change: dict[str, Any], told: str) -> None:
+        path = tmp_path / "b.json"
+        path.write_text(json.dumps(json.loads(saved.read_text()) | change))
+        with pytest.raises(BaselineError, match=told) as caught:
+            Baseline.load(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+    def test_torn_file_is_refused(self, saved: Path, tmp_path: Path) -> None:
+        path = tmp_path / "b.json"
+        path.write_text(saved.read_text()[:500])
+        with pytest.raises(BaselineError, match="no JSON"):
+            Baseline.load(path)
