@@ -76,7 +76,7 @@ def commands() -> Iterator[tuple[str, typing.Any]]:
 def models_in(annotation: object) -> list[type[BaseModel]]:
     if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [model for argument in typing.get_args(annotation) for model in models_in]
+    return [model for argument in typing.get_args(annotation) for model in models_in(argument)]
 
 
 def keys_of_loop_file() -> Iterator[tuple[tuple[str, ...], str]]:

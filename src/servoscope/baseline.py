@@ -18,6 +18,7 @@ from servoscope.output import atomic_write
 from servoscope.pipeline import Pipeline, Tuning
 from servoscope.plants import FloatArray, Plant
 from servoscope.signatures import Noise
+from servoscope.twostage import StageOne
 
 FORMAT = "servoscope-baseline"
 VERSION = 1
@@ -62,6 +63,8 @@ class Baseline(_Part):
         of the baseline, scatter between recordings and model error.
     scale, P_d, R, noise_a, noise_gamma
         The recursion's tuning (see `servoscope.pipeline.Tuning`).
+    stage_one
+        Stage 1 of a loop with two stages.
     noise
         n_u and n_y; None without a controller or physics.
     ratios, ratios_std, model_theta
@@ -93,6 +96,7 @@ class Baseline(_Part):
     R: float
     noise_a: Vector
     noise_gamma: Vector
+    stage_one: StageOne | None = None
     noise: Noise | None
     ratios: dict[str, float]
     ratios_std: dict[str, float]
@@ -125,7 +129,7 @@ class Baseline(_Part):
 
     def pipeline(self) -> Pipeline:
         """Return the loop's chain of constant matrices."""
-        return Pipeline.of(self.loop)
+        return Pipeline.of(self.loop, self.stage_one)
 
     def cov(self) -> FloatArray:
         """Return `covariance` as an array (n, n)."""

@@ -35,25 +35,24 @@ def threshold(n: int, evaluation_rate: float, memory: float, false_alarms_per_ye
     dof
         Effective number of independent values behind the noise's variance.
     """
-    from scipy import stats
+    from scipy import special  # not scipy.stats: half a second to import
 
     dof = max(dof, n + 2.0)
+    rest = dof - n + 1.0
     limit = 10.0
     for _ in range(20):
         looks = SECONDS_PER_YEAR * min(evaluation_rate, max(limit / (2.0 * memory), 1.0 / memory))
         tail = min(false_alarms_per_year / looks, 0.5)
-        limit = float(n * dof / (dof - n + 1.0) * stats.f.isf(tail, n, dof - n + 1.0))
+        share = float(special.betaincinv(rest / 2.0, n / 2.0, tail))  # upper quantile of F(n, rest) through the beta's
+        limit = dof * (1.0 - share) / share
     return limit
 
 
 def required_noncentrality(n: int, limit: float) -> float:
     """Return the noncentrality at which a chi-square with n degrees of freedom exceeds `limit` with `POWER`."""
-    from scipy import optimize, stats
+    from scipy import special
 
-    def miss(noncentrality: float) -> float:
-        return float(stats.ncx2.sf(limit, n, noncentrality)) - POWER
-
-    return float(optimize.brentq(miss, 1e-6, 10.0 * limit + 100.0))
+    return float(special.chndtrinc(limit, n, 1.0 - POWER))
 
 
 def whiten(covariance: FloatArray, deviation: FloatArray) -> FloatArray:

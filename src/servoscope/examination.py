@@ -68,7 +68,8 @@ class Examination:
         estimates = pipeline.estimate(tuning, recording)
         refused = _refused(estimates)
         if refused > MOST_REFUSED:
-            pipeline = Pipeline.of(loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)}))
+            fallen = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
+            pipeline = Pipeline.of(fallen, baseline.stage_one)
             estimates = pipeline.estimate(tuning, recording)
         expectation = None
         expected = np.broadcast_to(tuning.theta, estimates.theta.shape)

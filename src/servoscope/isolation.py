@@ -98,10 +98,10 @@ def isolate(
     tuple of Candidate
         Most probable first, ``unknown`` among them; probabilities sum to 1.
     """
-    from scipy import stats
+    from scipy import special
 
     n = len(deviation)
-    limit = float(stats.chi2.isf(MISFIT, max(n - 1, 1)))
+    limit = float(special.chdtri(max(n - 1, 1), MISFIT))
     searches = [_Search(signature, deviation, covariance) for signature in signatures]
     coarse = [search.coarse() for search in searches]
     fitted = []

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoscope import twostage
 from servoscope.baseline import Baseline, Promise, Source, digest
 from servoscope.delays import check_delay
 from servoscope.detection import SECONDS_PER_YEAR, noncentrality, required_noncentrality, statistic, threshold
@@ -67,7 +68,7 @@ def learn(loop: Loop, recordings: Sequence[Recording], progress: Progress = lamb
 
 
 def _tuned(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline, list[Regression], Fit]:
-    pipeline = Pipeline.of(loop)
+    pipeline = Pipeline.of(loop, twostage.tune(loop, recordings))
     regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
     return pipeline, regressions, fit(regressions, pipeline.memory, pipeline.bank.names)
 
@@ -166,6 +167,7 @@ def _assemble(
         covariance=_rows(covariance),
         scale=tuple(tuning.scale),
         P_d=_rows(tuning.P_d),
+        stage_one=pipeline.stage_one,
         R=tuning.R,
         noise_a=tuple(tuning.noise_a),
         noise_gamma=tuple(tuning.noise_gamma),

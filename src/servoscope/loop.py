@@ -83,7 +83,13 @@ class MonitorSettings(_Settings):
     estimator
         Name of a recursive estimator.
     two_stage
-        ``adaptive`` puts the paper's stage 1 in front.
+        ``adaptive`` puts the paper's stage 1 in front: u_a, simulated from r, takes the place of u.
+    stage_one
+        What stage 1 makes of r: ``fir``, its past samples, or ``laguerre``, Laguerre functions.
+    stage_one_length
+        How many of them; None: 40 samples or 8 functions.
+    stage_one_pole
+        Pole of the Laguerre functions, per sample.
     memory
         Memory of the estimator [s].
     model_error
@@ -103,7 +109,10 @@ class MonitorSettings(_Settings):
     structure: Literal["svf", "tustin", "tustin-held"] = "svf"
     cutoff: Positive | None = None
     estimator: Word = "akf"
-    two_stage: Literal["none"] = "none"
+    two_stage: Literal["none", "adaptive"] = "none"
+    stage_one: Literal["fir", "laguerre"] = "fir"
+    stage_one_length: Annotated[int, Field(strict=True, ge=1, le=500)] | None = None
+    stage_one_pole: Annotated[Finite, Field(gt=-1.0, lt=1.0)] = 0.8
     memory: Positive = 5.0
     model_error: Annotated[NotNegative, Field(lt=1.0)] = 0.0
     update_when: Literal["always", "moving"] = "always"

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from servoscope import inverse
+from servoscope.errors import LoopError
 from servoscope.inverse import FilterBank
 from servoscope.plants import EXTRAS, FloatArray
 from servoscope.recording import Recording
+from servoscope.twostage import Stage, StageOne
 
 if TYPE_CHECKING:
     from servoscope.loop import Loop
@@ -100,25 +102,37 @@ class Estimates:
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """A loop and its filter bank; build it with `of`."""
+    """A loop, its filter bank and what is known of stage 1, if it has one; build it with `of`."""
 
     loop: Loop
     bank: FilterBank
+    stage_one: StageOne | None = None
 
     @classmethod
-    def of(cls, loop: Loop) -> Pipeline:
+    def of(cls, loop: Loop, stage_one: StageOne | None = None) -> Pipeline:
         """Turn a loop's settings into constant matrices.
+
+        Parameters
+        ----------
+        loop
+            The loop.
+        stage_one
+            What `servoscope.twostage.tune` found; needed with ``two_stage = "adaptive"``.
 
         Raises
         ------
         LoopError
-            If the structure does not suit the plant, or the estimator needs an instrument and the loop has
-            neither a controller nor nominal values to make one of.
+            If the structure does not suit the plant, the estimator needs an instrument and the loop has neither a
+            controller nor nominal values to make one of, or stage 1 is demanded and not tuned.
         """
         from servoscope import estimators
 
+        if loop.monitor.two_stage != "none" and stage_one is None:
+            raise LoopError(f"{loop.name}: [monitor] two_stage = 'adaptive' needs a tuned stage 1: learn a baseline")
+
         needs = estimators.load(loop.monitor.estimator).NEEDS_INSTRUMENT
-        return cls(loop, inverse.build(loop, inverse.instrument_of(loop) if needs else None))
+        bank = inverse.build(loop, inverse.instrument_of(loop) if needs else None)
+        return cls(loop, bank, stage_one if loop.monitor.two_stage != "none" else None)
 
     @property
     def every(self) -> int:
@@ -190,6 +204,11 @@ class Pipeline:
         n = self.bank.n
         return Tuning(np.zeros(n), np.ones(n), np.eye(n), 1.0, np.zeros(1), np.ones(1))
 
+    def input(self, r: FloatArray, u: FloatArray, restart: BoolArray) -> FloatArray:
+        """Return what takes the place of u in eta, shape (N,): u_a of stage 1, or u itself without one."""
+        stage = Stage(self.loop, self.stage_one)
+        return stage.run(stage.start(), r, u, restart)
+
     def regression(
         self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray, tuning: Tuning | None = None
     ) -> Regression:
@@ -200,7 +219,7 @@ class Pipeline:
         state = Layout(c).start(c, 1)
         out = np.empty((len(r), len(c.C)))
         ok = np.empty(len(r), dtype=np.int64)
-        regressors(c, state[0], r, u, y, restart, out, ok)
+        regressors(c, state[0], r, self.input(r, u, restart), y, restart, out, ok)
         n = self.bank.n
         scale = np.ones(n) if tuning is None else tuning.scale
         return Regression(out[:, 0], out[:, 1 : 1 + n] * scale, out[:, -n:] * scale, ok == 1)
@@ -213,7 +232,8 @@ class Pipeline:
         layout = Layout(c)
         state = layout.start(c, 1)
         out = np.empty((1, recording.samples // self.every, layout.row))
-        signals = (recording.r, recording.u, recording.y, recording.restart)
+        r, restart = recording.r, recording.restart
+        signals = (r, self.input(r, recording.u, restart), recording.y, restart)
         block(self.loop.monitor.estimator)(c, state, *(signal[None, :] for signal in signals), out)
         index = (np.arange(out.shape[1]) + 1) * self.every - 1
         return self.unpack(tuning, out[0], index)

@@ -71,7 +71,10 @@ def noise_system(pipeline: Pipeline, plant: Plant) -> Linear:
     except LoopError as error:
         raise SimulationError(str(error)) from None
     bank = pipeline.bank.system
-    noisy = Linear(loop.A, loop.B[:, 1:], loop.C, loop.D[:, 1:])
+    C, D = loop.C.copy(), loop.D.copy()
+    if pipeline.stage_one is not None:
+        C[0], D[0] = 0.0, 0.0  # u_a is simulated from r: the noise does not reach eta
+    noisy = Linear(loop.A, loop.B[:, 1:], C, D[:, 1:])
     return noisy.then(Linear(bank.A, bank.B[:, 1:3], bank.C, bank.D[:, 1:3]))
 
 
