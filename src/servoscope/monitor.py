@@ -17,6 +17,7 @@ from servoscope.examination import Examination
 from servoscope.pipeline import Estimates
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
+from servoscope.twostage import Stage
 
 if TYPE_CHECKING:
     from servoscope.recursion import Constants, Layout
@@ -52,7 +53,8 @@ class Monitor:
     """Follows one asset, or a fleet of assets that share one loop, block by block or sample by sample.
 
     Its state is one plain array, shape (size,) for one asset and (assets, size) for a fleet: saving it is copying it,
-    resuming is bit-identical, and splitting the samples into blocks anywhere changes nothing.
+    resuming is bit-identical, and splitting the samples into blocks anywhere changes nothing. With two stages, that of
+    stage 1 stands before that of stage 2.
 
     Parameters
     ----------
@@ -79,6 +81,8 @@ class Monitor:
         self.tunings = tuple(each.tuning for each in self.baselines)
         self._constants: tuple[Constants, ...] = tuple(self.pipeline.constants(t) for t in self.tunings)
         self._layout: Layout = Layout(self._constants[0])
+        self._stages = tuple(Stage(self.loop, each.stage_one) for each in self.baselines)
+        self._head = self._stages[0].size  # where the state of stage 2 begins
         self._block = block(self.loop.monitor.estimator)
         self._one = np.empty((3, 1, 1))
         self._go_on = np.zeros((1, 1), dtype=np.bool_)
@@ -86,7 +90,10 @@ class Monitor:
 
     def init(self) -> FloatArray:
         """Return the state before the first sample."""
-        states = [self._layout.start(c, 1)[0] for c in self._constants]
+        states = [
+            np.concatenate([stage.start(), self._layout.start(c, 1)[0]])
+            for stage, c in zip(self._stages, self._constants, strict=True)
+        ]
         return np.array(states) if self.fleet else states[0]
 
     def run(
@@ -132,13 +139,15 @@ class Monitor:
             raise RecordingError("restart must have the shape of r")
         new = np.array(state, dtype=np.float64, copy=True)
         rows = new if self.fleet else new[None, :]
-        sample = int(rows[0, 2])
+        sample = int(rows[0, self._head + 2])
         every = self.pipeline.every
         count = (sample + shape[1]) // every - sample // every
         out = np.empty((shape[0], count, self._layout.row))
         for i, c in enumerate(self._constants):
             one = slice(i, i + 1)
-            self._block(c, rows[one], *(signal[one] for signal in signals), flags[one], out[one])
+            r, u, y = (signal[one] for signal in signals)
+            u = self._stages[i].run(rows[i, : self._head], r[0], u[0], flags[i])[None, :]
+            self._block(c, rows[one, self._head :], r, u, y, flags[one], out[one])
         index = (sample // every + 1 + np.arange(count)) * every - 1
         return new, self._trace(out, index)
 
@@ -148,19 +157,21 @@ class Monitor:
         Read it with `latest`. NaN in any of the three is a gap.
         """
         self._one[0, 0, 0], self._one[1, 0, 0], self._one[2, 0, 0] = r, u, y
-        one = self._one
-        return self._block(self._constants[0], state[None, :], one[0], one[1], one[2], self._go_on, self._row) == 1
+        one, head = self._one, self._head
+        if head:
+            one[1] = self._stages[0].run(state[:head], one[0, 0], one[1, 0], self._go_on[0])
+        return self._block(self._constants[0], state[None, head:], one[0], one[1], one[2], self._go_on, self._row) == 1
 
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of this moment, one evaluation, from a state."""
-        rows = state if self.fleet else state[None, :]
+        rows = (state if self.fleet else state[None, :])[:, self._head :]
         at = self._layout.slices
         out = np.concatenate([rows[:, 3:6], rows[:, at["theta"]], rows[:, at["S"]], rows[:, at["Psi"]]], axis=1)
         return self._trace(out[:, None, :], np.array([int(rows[0, 2]) - 1]))
 
     @property
     def _shape(self) -> tuple[int, ...]:
-        size = self._layout.size
+        size = self._head + self._layout.size
         return (len(self.baselines), size) if self.fleet else (size,)
 
     def _trace(self, out: FloatArray, index: npt.NDArray[np.int64]) -> Trace:
