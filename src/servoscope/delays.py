@@ -45,13 +45,20 @@ def check_delay(loop: Loop, recordings: Sequence[Recording]) -> tuple[float | No
     delay = alignment.estimate(recording, g, which, fitted, independent)
     if delay.samples is None or delay.seconds is None:
         return None, [UNTOLD]
-    off = 2.0 * np.pi * cutoff_of(loop) * abs(delay.seconds - loop.delay)
-    if delay.gain < SIGNIFICANT or off < NOTED:
+    to_rad = 2.0 * np.pi * cutoff_of(loop)  # at the cutoff
+    possible = max(delay.seconds, 0.0)
+    if delay.gain < SIGNIFICANT or to_rad * abs(delay.seconds - loop.delay) < NOTED:
         return delay.seconds, []
+    if to_rad * abs(possible - loop.delay) < NOTED:
+        early = (
+            f"{recording.name}: y seems to answer u {-delay.seconds * 1e3:.3g} ms before it comes: the channels are out "
+            "of step, or the plant is too simple"
+        )
+        return delay.seconds, [early]
     told = (
         f"{recording.name}: y answers u {delay.seconds * 1e3:.3g} ms late, the loop file says delay = {loop.delay:g}: "
-        f"set delay = {max(delay.seconds, 0.0):.4g} or align the channels"
+        f"set delay = {possible:.4g} or align the channels"
     )
-    if off > TOLERANCE:
+    if to_rad * abs(possible - loop.delay) > TOLERANCE:
         raise RecordingError(told)
     return delay.seconds, [told]

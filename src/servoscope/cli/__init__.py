@@ -5,6 +5,6 @@ import os
 # matrices here are tiny: threads of the linear algebra would only wait for each other (a tenth of a verdict's time)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from servoscope.cli.commands import app, main  # noqa: E402 (after the environment is set)
+from servoscope.cli.commands import app, main
 
 __all__ = ["app", "main"]

@@ -36,8 +36,8 @@ Where = Annotated[
     typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges."),
 ]
 By = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
-From = Annotated[float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time [s].")]
-To = Annotated[float | None, typer.Option("--to", metavar="S", help="Leave out this time [s] and what is after it.")]
+From = Annotated[float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time, in s.")]
+To = Annotated[float | None, typer.Option("--to", metavar="S", help="Leave out this time, in s, and what is after it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
 Report = Annotated[
     Path | None,
