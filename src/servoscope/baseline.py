@@ -77,6 +77,8 @@ class Baseline(_Part):
         Threshold of T^2.
     explained
         Share of eta's variance that the model explains.
+    still_speed
+        Speed below which the axis stands still [output per s]; 0 where rest is part of what is expected.
     delay_s
         Delay that the recordings show [s]; None where they do not tell.
     promises
@@ -104,6 +106,7 @@ class Baseline(_Part):
     dof: float
     limit: float
     explained: float
+    still_speed: float
     delay_s: float | None
     suggested_model_error: float
     supported_false_alarms_per_year: float
@@ -129,7 +132,7 @@ class Baseline(_Part):
 
     def pipeline(self) -> Pipeline:
         """Return the loop's chain of constant matrices."""
-        return Pipeline.of(self.loop, self.stage_one)
+        return Pipeline.of(self.loop, self.stage_one, self.still_speed)
 
     def cov(self) -> FloatArray:
         """Return `covariance` as an array (n, n)."""

@@ -51,7 +51,7 @@ def check_delay(loop: Loop, recordings: Sequence[Recording]) -> tuple[float | No
         return delay.seconds, []
     if to_rad * abs(possible - loop.delay) < NOTED:
         early = (
-            f"{recording.name}: y seems to answer u {-delay.seconds * 1e3:.3g} ms before it comes: the channels are out "
+            f"{recording.name}: y seems to answer u {-delay.seconds * 1e3:.3g} ms before it comes: channels are out "
             "of step, or the plant is too simple"
         )
         return delay.seconds, [early]

@@ -69,7 +69,7 @@ class Examination:
         refused = _refused(estimates)
         if refused > MOST_REFUSED:
             fallen = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
-            pipeline = Pipeline.of(fallen, baseline.stage_one)
+            pipeline = Pipeline.of(fallen, baseline.stage_one, baseline.still_speed)
             estimates = pipeline.estimate(tuning, recording)
         expectation = None
         expected = np.broadcast_to(tuning.theta, estimates.theta.shape)
@@ -102,6 +102,7 @@ class Examination:
         warnings = [Warning.of(defect) for defect in recording.defects] + self._doubts()
         alarms = np.flatnonzero(trace.ready & (trace.statistic > trace.threshold))
         detected_at, since, probability = None, None, None
+        seen: dict[str, tuple[float, float]] = {}
         candidates: tuple[Candidate, ...] = ()
         faults: tuple[FoundFault, ...] = ()
         verdict: Verdict
@@ -123,7 +124,8 @@ class Examination:
             if probability >= SURE and candidates[0].name != UNKNOWN:
                 faults = candidates[0].faults
         else:
-            blind = self._blind_to()
+            seen = self._seen()
+            blind = self._blind_to(seen)
             verdict = "undetermined" if blind else "healthy"
             span = float(recording.t[0]), float(recording.t[-1])
             warnings += [Warning(kind="power", from_s=span[0], to_s=span[1], count=1, message=text) for text in blind]
@@ -133,7 +135,7 @@ class Examination:
             samples=recording.samples,
             duration_s=recording.duration_s,
             verdict=verdict,
-            summary=_summary(verdict, faults, candidates, onset_s, warnings),
+            summary=_summary(verdict, faults, candidates, self._since(since), seen, warnings),
             detected_at_s=detected_at,
             onset_s=onset_s,
             probability=probability,
@@ -157,9 +159,17 @@ class Examination:
             int(index[at]),
         )
 
-    def _blind_to(self) -> list[str]:
-        """Return what this recording could not have shown although the baseline promises it."""
-        promised = {p.parameter: p for p in self.baseline.promises if p.change is not None}
+    def _since(self, found: Onset | None) -> str:
+        if found is None:
+            return ""
+        start = float(self.recording.t[0])
+        if found.likely_s - start <= 3.0 * self.pipeline.bank.wait / self.recording.sample_rate:
+            return "since the start of the recording or before"
+        return f"since {found.likely_s:.1f} s"
+
+    def _seen(self) -> dict[str, tuple[float, float]]:
+        """Return, by parameter, the smallest change that would have shown here, and what the baseline promises."""
+        promised = {p.parameter: p.change for p in self.baseline.promises if p.change is not None}
         directions = fault_directions(self.baseline.loop, self.baseline.plant, self.tuning.theta)
         rows = np.array([directions[parameter] for parameter in promised])
         best = np.zeros(len(rows))
@@ -167,16 +177,21 @@ class Examination:
             ok = self.trace.ready
             best = noncentrality(self.trace.covariance[ok], self.estimates.Psi[ok], rows).max(axis=0)
         needed = required_noncentrality(self.pipeline.bank.n, self.baseline.limit)
-        told = []
-        for promise, information in zip(promised.values(), best, strict=True):
-            seen = np.sqrt(needed / information) if information > 0.0 else np.inf
-            if promise.change is not None and seen > WEAKER * promise.change:
-                size = "not at all" if np.isinf(seen) else f"only from {seen:.0%} on"
-                told.append(
-                    f"too short or too little motion: a change of {promise.parameter} ({promise.name}) would show "
-                    f"{size}, the baseline promises {promise.change:.0%}"
-                )
-        return told
+        smallest = (float(np.sqrt(needed / one)) if one > 0.0 else np.inf for one in best)
+        return dict(zip(promised, zip(smallest, promised.values(), strict=True), strict=True))
+
+    def _blind_to(self, seen: dict[str, tuple[float, float]]) -> list[str]:
+        """Return what this recording could not have shown although the baseline promises it."""
+        if not seen:
+            return ["the baseline promises to see no change at all: learn it from recordings with more motion"]
+        if all(np.isinf(smallest) for smallest, _ in seen.values()):
+            return ["too short or too little motion: no change of any size would have shown"]
+        return [
+            f"too short or too little motion: a change of {parameter} would show "
+            f"{'not at all' if np.isinf(smallest) else f'only from {smallest:.0%} on'}, promised is {promise:.0%}"
+            for parameter, (smallest, promise) in seen.items()
+            if smallest > WEAKER * promise
+        ]
 
     def _doubts(self) -> list[Warning]:
         """Return warnings about the estimate itself."""
@@ -236,15 +251,17 @@ def _summary(
     verdict: Verdict,
     faults: tuple[FoundFault, ...],
     candidates: tuple[Candidate, ...],
-    onset_s: tuple[float, float, float] | None,
+    since: str,
+    seen: dict[str, tuple[float, float]],
     warnings: list[Warning],
 ) -> str:
     if verdict == "healthy":
-        return "Healthy: no change beyond what noise explains."
+        smallest = sorted((size, parameter) for parameter, (size, _) in seen.items())
+        told = ", ".join(f"{parameter} {100.0 * size:.3g} %" for size, parameter in smallest)
+        return f"Healthy: no change that would have shown here (from {told} on)."
     if verdict == "undetermined":
         reason = next(warning.message for warning in warnings if warning.kind == "power")
         return f"Undetermined: {reason}."
-    since = f"since {onset_s[1]:.1f} s" if onset_s is not None else ""
     if faults:
         (fault,) = faults
         low, high = fault.interval

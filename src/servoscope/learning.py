@@ -22,7 +22,10 @@ from servoscope.simulation import reference, simulate
 from servoscope.tuning import Fit, fit
 
 SHORTEST = 10.0  # memories; a shorter baseline is warned about
+SPEED_OVER = 0.05  # s over which a speed is measured here
+STILL_SHARE = 0.02  # of the speed of motion, below which an axis stands still
 WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
+LEAST_EXPLAINED = 0.9  # share of u's variance
 WORTH_A_LOOK = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
 
 Progress = Callable[[str], None]
@@ -67,8 +70,30 @@ def learn(loop: Loop, recordings: Sequence[Recording], progress: Progress = lamb
     return _assemble(loop, recordings, pipeline, regressions, found, delay_s, notes, progress)
 
 
+def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
+    """Return the speed below which the axis stands still: a small share of the speed at which it moves.
+
+    At rest the controller may push as it likes against static friction, and u then says nothing of the plant. Where
+    the loop can be simulated, rest is part of what is expected, and nothing is held (0).
+    """
+    if loop.monitor.update_when != "auto" or simulated(loop):
+        return 0.0
+    span = max(1, round(SPEED_OVER * loop.sample_rate))
+    speeds = []
+    for rec in recordings:
+        source = rec.r if getattr(loop.plant, "sign_from", "output") == "reference" else rec.y
+        stretch = np.cumsum(rec.restart)
+        together = stretch[span:] == stretch[:-span]
+        speeds.append(np.abs(source[span:] - source[:-span])[together] * loop.sample_rate / span)
+    speed = np.concatenate(speeds)
+    if not len(speed) or not speed.max() > 0.0:
+        return 0.0
+    moving = speed[speed > 0.1 * speed.max()]
+    return STILL_SHARE * float(np.sqrt((moving**2).mean()))
+
+
 def _tuned(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline, list[Regression], Fit]:
-    pipeline = Pipeline.of(loop, twostage.tune(loop, recordings))
+    pipeline = Pipeline.of(loop, twostage.tune(loop, recordings), still_speed(loop, recordings))
     regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
     return pipeline, regressions, fit(regressions, pipeline.memory, pipeline.bank.names)
 
@@ -140,6 +165,10 @@ def _assemble(
             expected = Expectation(pipeline, tuning, noise, course(rec)).healthy(plant, model_theta)
         deviations.append(e.theta - expected)
     excess, suggestion = _excess(estimates, deviations, covariance, found)
+    if found.explained < LEAST_EXPLAINED:
+        notes.append(
+            f"the motion explains only {found.explained:.0%} of u: not a baseline to trust, check columns, units, plant"
+        )
     duration = sum(rec.duration_s for rec in recordings)
     if excess > WORTH_A_LOOK and loop.monitor.model_error < suggestion:
         notes.append(
@@ -178,6 +207,7 @@ def _assemble(
         dof=found.dof,
         limit=limit,
         explained=found.explained,
+        still_speed=pipeline.still_speed,
         delay_s=delay_s,
         suggested_model_error=suggestion,
         supported_false_alarms_per_year=supported,

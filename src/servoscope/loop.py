@@ -87,7 +87,7 @@ class MonitorSettings(_Settings):
     stage_one
         What stage 1 makes of r: ``fir``, its past samples, or ``laguerre``, Laguerre functions.
     stage_one_length
-        How many of them; None: 40 samples or 8 functions.
+        How many of them; None: 40 samples or 12 functions.
     stage_one_pole
         Pole of the Laguerre functions, per sample.
     memory
@@ -95,7 +95,9 @@ class MonitorSettings(_Settings):
     model_error
         Share of u (rms) that the model may leave unexplained, 0 to 1.
     update_when
-        ``moving`` holds the estimator at rest and inside the dead zone.
+        When the estimator may learn: ``auto``, until the axis has stood still for longer than the filters remember
+        (a loop that can be simulated learns at rest too, which is then expected); ``always``; ``moving``, neither at
+        the shortest rest nor inside the dead zone.
     rest_speed
         Speed [output per s] below which the output counts as resting.
     evaluation_rate
@@ -112,10 +114,10 @@ class MonitorSettings(_Settings):
     two_stage: Literal["none", "adaptive"] = "none"
     stage_one: Literal["fir", "laguerre"] = "fir"
     stage_one_length: Annotated[int, Field(strict=True, ge=1, le=500)] | None = None
-    stage_one_pole: Annotated[Finite, Field(gt=-1.0, lt=1.0)] = 0.8
+    stage_one_pole: Annotated[Finite, Field(gt=-1.0, lt=1.0)] = 0.5
     memory: Positive = 5.0
     model_error: Annotated[NotNegative, Field(lt=1.0)] = 0.0
-    update_when: Literal["always", "moving"] = "always"
+    update_when: Literal["auto", "always", "moving"] = "auto"
     rest_speed: NotNegative = 0.0
     evaluation_rate: Positive = 10.0
     frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
@@ -207,6 +209,11 @@ class Loop(_Settings):
         if self.monitor.memory * self.sample_rate < 2:
             raise ValueError(
                 f"[monitor] memory: {self.monitor.memory:g} s is shorter than two samples, give it in seconds"
+            )
+        if self.monitor.update_when == "moving" and not (self.monitor.rest_speed or self.input_deadzone):
+            raise ValueError(
+                '[monitor] rest_speed: missing, update_when = "moving" needs the speed below which the axis rests '
+                "(inspect tells one), or input_deadzone"
             )
         if self.delay * self.sample_rate > LONGEST_DELAY:
             raise ValueError(f"delay: {self.delay:g} s is more than {LONGEST_DELAY} samples, give it in seconds")

@@ -102,14 +102,15 @@ class Estimates:
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """A loop, its filter bank and what is known of stage 1, if it has one; build it with `of`."""
+    """A loop, its filter bank, stage 1 if it has one, and the speed of standing still; build it with `of`."""
 
     loop: Loop
     bank: FilterBank
     stage_one: StageOne | None = None
+    still_speed: float = 0.0
 
     @classmethod
-    def of(cls, loop: Loop, stage_one: StageOne | None = None) -> Pipeline:
+    def of(cls, loop: Loop, stage_one: StageOne | None = None, still_speed: float = 0.0) -> Pipeline:
         """Turn a loop's settings into constant matrices.
 
         Parameters
@@ -118,6 +119,9 @@ class Pipeline:
             The loop.
         stage_one
             What `servoscope.twostage.tune` found; needed with ``two_stage = "adaptive"``.
+        still_speed
+            Speed below which the axis stands still; the estimator is held once it has done so for longer than the
+            filters remember. 0: never.
 
         Raises
         ------
@@ -132,7 +136,7 @@ class Pipeline:
 
         needs = estimators.load(loop.monitor.estimator).NEEDS_INSTRUMENT
         bank = inverse.build(loop, inverse.instrument_of(loop) if needs else None)
-        return cls(loop, bank, stage_one if loop.monitor.two_stage != "none" else None)
+        return cls(loop, bank, stage_one if loop.monitor.two_stage != "none" else None, still_speed)
 
     @property
     def every(self) -> int:
@@ -156,6 +160,7 @@ class Pipeline:
 
     def constants(self, tuning: Tuning) -> Constants:
         """Turn loop and tuning into what the compiled recursion takes; phi is divided by the tuning's scale."""
+        from servoscope import estimators
         from servoscope.recursion import Constants
 
         loop, bank, n = self.loop, self.bank, self.bank.n
@@ -191,12 +196,14 @@ class Pipeline:
             v_of_r=bank.velocity_of_reference,
             sign_speed=float(getattr(loop.plant, "sign_speed", 0.0)),
             rest_speed=loop.monitor.rest_speed,
+            still_speed=self.still_speed,
             only_moving=loop.monitor.update_when == "moving",
             wait=bank.wait,
             stride=self.stride,
             every=self.every,
             R=tuning.R,
             memory=self.memory,
+            extra=estimators.extra(loop.monitor.estimator, n, self.memory),
         )
 
     def blank(self) -> Tuning:

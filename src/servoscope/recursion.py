@@ -26,8 +26,8 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 # counters at the head of the state row
-ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, POWER = range(6)
-HEAD = 6
+ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, POWER, STILL, DRIFT = range(8)
+HEAD = 8
 # what `sense` says of a sample
 MISSING, HELD, USED, BETWEEN = -1, 0, 1, 2
 
@@ -37,7 +37,8 @@ class Constants(NamedTuple):
 
     ``A, B, C, D, X0`` are the filter bank and its steady state per unit input, ``vA ... vX0`` the velocity filter,
     `codes` the non-linear inputs, `limits` and `deadzone` of u, `a` and `gamma` the noise's autoregression and
-    autocovariance (gamma[0] its variance), in updates: of every `stride`-th sample.
+    autocovariance (gamma[0] its variance), in updates: of every `stride`-th sample; `extra` is the size of the
+    estimator's private state.
     """
 
     A: FloatArray
@@ -56,6 +57,7 @@ class Constants(NamedTuple):
     deadzone: FloatArray
     sign_speed: float
     rest_speed: float
+    still_speed: float
     only_moving: bool
     wait: int
     stride: int
@@ -66,6 +68,7 @@ class Constants(NamedTuple):
     a: FloatArray
     gamma: FloatArray
     memory: float
+    extra: int
 
 
 class Layout:
@@ -89,6 +92,7 @@ class Layout:
             "S": n * n,
             "M": n * p,
             "Psi": n * n,
+            "extra": c.extra,
         }
         ends = np.cumsum(list(sizes.values()))
         self.slices = {
@@ -177,7 +181,11 @@ def sense(
             new[i] += c.A[i, j] * x[j]
     for i in range(nx):
         x[i] = new[i]
-    if c.only_moving and (abs(v) <= c.rest_speed or (c.deadzone[0] <= w[1] <= c.deadzone[1])):
+    # a reversal is short; an axis that has stood longer than the filters remember is at rest
+    s[DRIFT] += (v - s[DRIFT]) / c.wait  # the speed without its noise
+    s[STILL] = s[STILL] + 1.0 if abs(s[DRIFT]) < c.still_speed else 0.0
+    at_rest = s[STILL] > c.wait
+    if at_rest or (c.only_moving and (abs(v) <= c.rest_speed or (c.deadzone[0] <= w[1] <= c.deadzone[1]))):
         # what enters the filters now has nothing to do with the motion: wait until they have forgotten it
         s[WAIT] = c.wait
         return HELD
@@ -219,7 +227,9 @@ def _block(
         o += n + n * n
         S = s[o : o + n * n].reshape((n, n))
         M = s[o + n * n : o + n * n + n * p].reshape((n, p))
-        Psi = s[o + n * n + n * p : o + 2 * n * n + n * p].reshape((n, n))
+        o += n * n + n * p
+        Psi = s[o : o + n * n].reshape((n, n))
+        extra = s[o + n * n : o + n * n + c.extra]
         phi = v_out[1 : 1 + n]
         z = v_out[len(v_out) - n :]
         row = 0
@@ -229,7 +239,7 @@ def _block(
                 e = v_out[0]
                 for i in range(n):
                     e -= phi[i] * theta[i]
-                if _update(theta, P, c.P_d, c.R, c.memory, v_out[0], phi, z, K) == 0:
+                if _update(theta, P, c.P_d, c.R, c.memory, v_out[0], phi, z, K, extra) == 0:
                     s[UPDATES] += 1.0
                     s[POWER] += (e * e - s[POWER]) / c.memory
                 else:
