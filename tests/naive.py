@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -60,15 +61,17 @@ def tustin(u: Array, y: Array, held: bool = False) -> tuple[Array, Array]:
     return eta, np.column_stack([past(y, lag) for lag in range(4)])
 
 
-def akf(theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array) -> tuple[Array, Array, Array]:
-    """Take one step of eqs. (7) to (9) and (11); `z` is not used."""
+def akf(
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
+) -> tuple[Array, Array, Array]:
+    """Take one step of eqs. (7) to (9) and (11); `z`, `memory` and `past`, what an estimator keeps, are not used."""
     K = P @ phi / (R + phi @ P @ phi)
     new = P - P @ np.outer(phi, phi) @ P / (R + phi @ P @ phi) + P_d @ np.outer(phi, phi) @ P_d / (R + phi @ P_d @ phi)
     return theta + K * (eta - phi @ theta), new, K
 
 
 def iv_akf(
-    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
 ) -> tuple[Array, Array, Array]:
     """Take one step of the instrumental-variable AKF, skipped where the instrument points away."""
     if phi @ P @ z < 0.0 or phi @ P_d @ z < 0.0:
@@ -78,7 +81,80 @@ def iv_akf(
     return theta + K * (eta - phi @ theta), new, K
 
 
-UPDATES: dict[str, Update] = {"akf": akf, "iv-akf": iv_akf}
+def kf(
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
+) -> tuple[Array, Array, Array]:
+    """Take one step of the Kalman filter of a random walk, in Joseph's form."""
+    K = P @ phi / (R + phi @ P @ phi)
+    keep = np.eye(len(theta)) - np.outer(K, phi)
+    return theta + K * (eta - phi @ theta), keep @ P @ keep.T + R * np.outer(K, K) + P_d / memory, K
+
+
+def rls(
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
+) -> tuple[Array, Array, Array]:
+    """Take one step of weighted least squares: the information is forgotten, then that of the sample is added."""
+    new = np.linalg.inv((1.0 - 1.0 / memory) * np.linalg.inv(P) + np.outer(phi, phi) / R)
+    return theta + new @ phi / R * (eta - phi @ theta), new, new @ phi / R
+
+
+def dfrls(
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
+) -> tuple[Array, Array, Array]:
+    """Take one step of Kulhavy and Karny for unit residual variance, that is for p = P/R, on the information."""
+    p = P / R
+    s, l = phi @ p @ phi, memory / (memory + len(theta))
+    eps = l - (1.0 - l) / s
+    K = p @ phi / (1.0 + s)
+    return theta + K * (eta - phi @ theta), R * np.linalg.inv(np.linalg.inv(p) + eps * np.outer(phi, phi)), K
+
+
+def rls_reset(
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
+) -> tuple[Array, Array, Array]:
+    """Take one step of least squares without forgetting, on the information; reset after `memory` steps."""
+    past.append(phi)
+    new = np.linalg.inv(np.linalg.inv(P) + np.outer(phi, phi) / R)
+    K = new @ phi / R
+    return theta + K * (eta - phi @ theta), (math.e - 1.0) * P_d if len(past) % round(memory) == 0 else new, K
+
+
+def nlms(
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
+) -> tuple[Array, Array, Array]:
+    """Take one step of normalised least mean squares."""
+    K = phi / (memory + phi @ phi)
+    return theta + K * (eta - phi @ theta), P, K
+
+
+def sliding_window(
+    theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
+) -> tuple[Array, Array, Array]:
+    """Solve the window from its samples; the baseline counts as samples that leave one by one."""
+    if not past:
+        root = math.sqrt(R) * np.linalg.inv(np.linalg.cholesky(P))
+        past.append((root, root @ theta))
+    past.append((phi[None, :], np.array([eta])))
+    N = round(memory)
+    share = math.sqrt(max(0.0, 1.0 - (len(past) - 1) / N))
+    rows = [(share * past[0][0], share * past[0][1]), *past[1:][-N:]]
+    X, y = np.vstack([row[0] for row in rows]), np.concatenate([row[1] for row in rows])
+    G = np.linalg.inv(X.T @ X)
+    # RLS of the window's information halved, which stands for the exponential window of half the memory
+    K = np.linalg.inv((X.T @ X) / 2.0 + np.outer(phi, phi)) @ phi
+    return np.linalg.lstsq(X, y, rcond=None)[0], R * G, K
+
+
+UPDATES: dict[str, Update] = {
+    "akf": akf,
+    "dfrls": dfrls,
+    "iv-akf": iv_akf,
+    "kf": kf,
+    "nlms": nlms,
+    "rls": rls,
+    "rls-reset": rls_reset,
+    "sliding-window": sliding_window,
+}
 
 
 class Spread:
@@ -177,10 +253,11 @@ def chain(
     spread = Spread(n, a, gamma)
     updates, power = 0, gamma[0]
     rows: list[tuple[Array, Array, Array, int, float]] = []
+    past: list[Any] = []
     for k in range(N):
         if used[k]:
             e = eta[k] - phi[k] @ theta
-            theta, P, K = update(theta, P, P_d, R, eta[k], phi[k], z[k])
+            theta, P, K = update(theta, P, P_d, R, eta[k], phi[k], z[k], memory, past)
             if np.any(K):
                 updates += 1
                 power += (e**2 - power) / memory

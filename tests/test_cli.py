@@ -28,6 +28,9 @@ def test_demo_says_what_it_does_and_leaves_all_its_files(tmp_path: Path) -> None
     assert result.code == 0
     assert "C_ie is 1.2" in result.out or "C_ie is 1.19" in result.out
     assert result.out.count("$ servoscope ") == 4
+    commands = [line for line in result.out.splitlines() if line.startswith(("$", "    "))]
+    assert all(len(line) <= 80 or len(line.split()) <= 3 for line in commands)
+    assert any(line.endswith(" \\") for line in commands) and "coefficients of s^0 ... s^3" in result.out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "baseline.json",
         "diagnosis.json",

@@ -164,7 +164,7 @@ def test_the_multisine_excites_20_hz_and_the_trapezoid_does_not(rig: dict[str, A
     multisine, trapezoid = (inspect(recorded(rig, kind), loop) for kind in ("multisine", "trapezoid"))
     rich, poor = multisine.frequencies[2], trapezoid.frequencies[2]
     assert rich.frequency_hz == poor.frequency_hz == 20.0
-    assert rich.snr > 30.0 > 1.0 > poor.snr
+    assert rich.snr is not None and poor.snr is not None and rich.snr > 30.0 > 1.0 > poor.snr
     assert rich.relative_std is not None and poor.relative_std is not None
     assert poor.relative_std > 10.0 * rich.relative_std
     assert multisine.band is not None and multisine.band.high_hz == pytest.approx(19.9, abs=0.5)
@@ -203,6 +203,8 @@ def test_a_constant_reference_and_pure_noise_do_not_crash(rig: dict[str, Any]) -
     still, _ = simulate(Loop.from_dict(rig), np.zeros(3000))
     found = inspect(still, Loop.from_dict(rig))
     assert found.verdict == "not usable" and "constant" in kinds(found, "care") and "rest" in kinds(found, "stop")
+    assert found.recommendations == ("record while the machine moves",)
+    assert not {"frequency", "explained", "free_run", "band"} & {finding.kind for finding in found.findings}
     rng = np.random.default_rng(3)
     noise = replace(still, r=rng.normal(size=3000), u=rng.normal(size=3000), y=rng.normal(size=3000))
     assert inspect(noise).verdict == "not usable"
@@ -264,6 +266,22 @@ def test_emps_is_explained_and_its_parameters_are_the_authors(shared_data: Path)
     generic = inspect(recording)
     assert generic.best_order is not None
     assert (generic.best_order.order, generic.best_order.friction) == (2, "coulomb")
+    told = next(finding.message for finding in found.findings if finding.kind == "model_error")
+    assert told.startswith("only if healthy recordings raise alarms: a model_error up to 0.03")
+    assert "hides changes of inertia below about 3" in told
+    assert not any("model_error" in line for line in found.recommendations)
+    assert found.headline == "usable to diagnose; short to learn from"
+
+
+@pytest.mark.parametrize("half", [(0.0, 12.42), (12.42, 25.0)])
+def test_two_periods_of_a_reference_do_not_tell_coherence(shared_data: Path, half: tuple[float, float]) -> None:
+    loop = Loop.from_dict(EMPS)
+    found = inspect(read(shared_data / "real" / "emps" / "DATA_EMPS.mat", loop).part(*half), loop)
+    assert found.verdict == "usable" and found.band is None and found.periods == pytest.approx(2.0, abs=0.01)
+    assert "coherence" in kinds(found, "note") and found.recommendations == ()
+    for at in found.frequencies:
+        assert at.snr is None and at.coherence_u is None and at.coherence_y is None
+        assert at.relative_std is not None and at.relative_std < 0.02
 
 
 def test_the_pumps_dead_zone_quantisation_and_rest_are_seen(shared_data: Path) -> None:

@@ -19,7 +19,7 @@ from servoscope.errors import OutputError
 from servoscope.ifrf import Response
 from servoscope.loop import Loop
 from servoscope.recording import Recording
-from servoscope.report import canvas, figures
+from servoscope.report import canvas, figures, sheets
 
 PROVENANCE = {"baseline": "healthy.json", "hash": "0123456789abcdef", "threshold": "46.2"}
 VOID = {"meta", "br", "path", "use", "circle", "link", "img"}
@@ -192,6 +192,40 @@ def test_quiet_verdicts(loop: Loop, verdict: str, words: str) -> None:
     page = read(make_diagnosis(verdict), loop)
     assert words in page.text and "Largest statistic" in page.text
     assert "Since when" not in page.text and "Candidates" not in page.text
+
+
+AXIS: dict[str, Any] = {"sample_rate": 100.0, "plant": {"kind": "polynomial", "order": 2, "friction": "coulomb"}}
+
+
+@pytest.mark.parametrize(("ratio", "words"), [(1.3, "More u for the same motion"), (0.8, "Less u for the same motion")])
+def test_the_input_gain_is_told_in_words_and_once(ratio: float, words: str) -> None:
+    gain = FoundFault(name="input_gain", parameter="input_gain", ratio=ratio, interval=(ratio - 0.01, ratio + 0.01))
+    both = (
+        Candidate(name="input_gain", probability=0.9996, faults=(gain,)),
+        Candidate(name="inertia", probability=1e-4),
+    )
+    page = read(make_diagnosis(faults=(gain,), candidates=both, probability=0.9996), Loop.from_dict(AXIS))
+    assert words in page.text and "on loop" not in page.text.lower()
+    assert "input_gain" not in page.text.partition("Where this comes from")[0]
+    assert ("More u for the same motion: weak motor, magnet or amplifier, or all" in page.text) == (ratio > 1.0)
+    assert "> 99.9 % among the faults that this plant knows" in page.text and "< 0.1 %" in page.text
+    assert f"input gain {words.lower()} × {ratio}" in page.text
+    assert "inertia inertia" not in page.text
+    assert "by design at most once a year, if the noise stays as learned" in page.text
+
+
+def test_what_is_no_percentage_has_a_unit(loop: Loop) -> None:
+    assert sheets.coefficient_units(loop.plant) == ("A/m", "A s/m", "A s²/m", "A s³/m")
+    plant = {**AXIS["plant"], "friction": "directional", "offset": True}
+    told = sheets.coefficient_units(Loop.from_dict({**AXIS, "plant": plant}).plant)
+    assert told == ("u s²/y", "u s/y", "u s/y", "u", "u")
+
+
+def test_the_axes_give_way_to_a_path_but_not_to_a_wild_value() -> None:
+    values = np.concatenate([np.linspace(0.0, 1.0, 200), [1.8]])
+    assert canvas.robust_range(values)[1] < 1.2
+    assert canvas.robust_range(values, room=2.5)[1] > 1.8
+    assert canvas.robust_range(np.append(values, 50.0), room=2.5)[1] < 5.0
 
 
 def test_an_open_question_is_told_as_one(loop: Loop) -> None:

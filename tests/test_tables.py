@@ -37,7 +37,8 @@ def test_a_file_without_a_header_has_numbered_columns(tmp_path: Path) -> None:
     path = written(tmp_path, lines(header=False))
     assert [info.name for info in channels(path)] == ["c0", "c1", "c2", "c3"]
     as_expected(read(path, columns=Columns(time="c0", reference="c1", input="c2", output="c3")))
-    assert "no column 'r', the file has c0, c1, c2, c3" in refusal(path)
+    assert "no column 'r'; say where the signals stand: --columns 't=..., r=..., u=..., y=...'" in refusal(path)
+    assert refusal(path).endswith("or [columns] in the loop file; the file has c0, c1, c2, c3")
 
 
 def test_blanks_in_the_header_do_not_matter(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from servoscope.loop import Loop
     from servoscope.recursion import BoolArray
 
-LENGTHS = {"fir": 40, "laguerre": 8}  # functions, where a loop file does not say
+LENGTHS = {"fir": 40, "laguerre": 12}  # functions, where a loop file does not say
 RIDGE = 1e-4  # of the mean excitation: what r excites less is not learned, and adds no noise to u_a
 FORGOTTEN = 1e-3  # share of a start-up transient that is let through
 ARMED, WAIT = range(2)  # counters at the head of the state row
@@ -128,7 +128,8 @@ class Stage:
             memory=loop.monitor.memory * loop.sample_rate,
         )
         n = len(tuning.theta)
-        self.size = HEAD + len(system.A) + n + n * n
+        extra = estimators.extra(loop.monitor.estimator, n, self._constants.memory)
+        self.size = HEAD + len(system.A) + n + n * n + extra
         self._block = block(loop.monitor.estimator)
 
     def start(self) -> FloatArray:
@@ -136,7 +137,8 @@ class Stage:
         if not self.size:
             return np.zeros(0)
         c = self._constants
-        return np.concatenate([np.zeros(HEAD + len(c.A)), c.theta, c.P_d.ravel()])
+        used = HEAD + len(c.A) + len(c.theta) + c.P_d.size
+        return np.concatenate([np.zeros(HEAD + len(c.A)), c.theta, c.P_d.ravel(), np.zeros(self.size - used)])
 
     def run(self, state: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray) -> FloatArray:
         """Return u_a of a block, shape (N,), and change `state` (size,) in place.
@@ -198,14 +200,13 @@ def _update(*_: Any) -> int:  # the template's placeholder: `block` is built wit
     return 0
 
 
-def _block(
-    c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray, u_a: FloatArray
-) -> None:
+def _block(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray, u_a: FloatArray) -> None:
     nx = c.A.shape[0]
     n = len(c.theta)
     x = s[HEAD : HEAD + nx]
     theta = s[HEAD + nx : HEAD + nx + n]
-    P = s[HEAD + nx + n :].reshape((n, n))
+    P = s[HEAD + nx + n : HEAD + nx + n + n * n].reshape((n, n))
+    extra = s[HEAD + nx + n + n * n :]
     phi = np.empty(n)
     K = np.empty(n)
     new = np.empty(nx)
@@ -235,12 +236,15 @@ def _block(
         u_a[k] = 0.0
         for i in range(n):
             u_a[k] += phi[i] * theta[i]
-        _update(theta, P, c.P_d, c.R, c.memory, min(max(u[k], c.limits[0]), c.limits[1]), phi, phi, K)
+        _update(theta, P, c.P_d, c.R, c.memory, min(max(u[k], c.limits[0]), c.limits[1]), phi, phi, K, extra)
 
 
 @functools.cache
 def block(estimator: str) -> Callable[..., None]:
-    """Compile stage 1 around one estimator, ``block(c, state, r, u, restart, u_a)``, as `servoscope.recursion.block`."""
+    """Compile stage 1 around one estimator: ``block(c, state, r, u, restart, u_a)``.
+
+    As in `servoscope.recursion.block`, the sources are part of its name.
+    """
     from servoscope.compiled import kernel
 
     module = estimators.load(estimator)

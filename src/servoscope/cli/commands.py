@@ -288,6 +288,32 @@ def diagnose(
 
 
 @app.command()
+def reproduce(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for figures and claims.")
+    ] = Path("paper-output"),
+    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="Realisations of the noise.")] = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Reproduce the source paper: its figures, and every claim of it beside the measured number."""
+    from servoscope.cli import terminal
+    from servoscope.cli.progress import progress
+    from servoscope.paper import measures, reproduction
+
+    reproduction.prepare(output)
+    numbers = range(1, seeds + 1)
+    with progress(len(measures.jobs(numbers)) + reproduction.DRAWINGS + 1, 1) as steps:
+        steps.begin("measuring")
+        found = reproduction.run(numbers, steps.begin)
+        reproduction.write(found, output, steps.begin)
+    if as_json:
+        print_json(found.to_dict(), lines=False)
+    else:
+        terminal.claims(terminal.console(), [(c.claim, c.measured, c.verdict) for c in found.claims])
+        terminal.written(terminal.console(), output)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for what it writes.")] = Path(
         "demo-output"

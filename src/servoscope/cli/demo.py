@@ -19,6 +19,12 @@ from servoscope.output import atomic_write
 
 __all__ = ["Step", "prepare", "show", "steps"]
 
+WIDTH = 80
+COEFFICIENTS = (
+    "theta_0 ... theta_3 are the coefficients of s^0 ... s^3 of the inverse: the current u (A) that the "
+    "position y (m) and its three derivatives ask for, in A/m, A s/m, A s²/m and A s³/m."
+)
+
 
 @dataclass(frozen=True)
 class Step:
@@ -32,11 +38,14 @@ class Step:
         The command's words after ``servoscope``.
     into
         File that takes its standard output; None: the terminal.
+    after
+        What to know about what it said.
     """
 
     words: str
     arguments: tuple[str, ...]
     into: Path | None = None
+    after: str = ""
 
 
 def prepare(folder: Path) -> None:
@@ -73,6 +82,7 @@ def steps(folder: Path) -> tuple[Step, ...]:
         Step(
             "Learn what healthy looks like.",
             ("learn", at("loop.toml"), at("healthy.csv"), "-o", at("baseline.json")),
+            after=COEFFICIENTS,
         ),
         Step(
             "Diagnose the other day, from r, u and y alone.",
@@ -120,9 +130,8 @@ def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
 
     with on_compiling(compiling):
         for step in steps(folder):
-            into = f" > {shlex.quote(str(step.into))}" if step.into is not None else ""
             out.print(Text(step.words, style="bold"))
-            out.print(Text(f"$ servoscope {shlex.join(step.arguments)}{into}", style="cyan"), soft_wrap=True)
+            out.print(Text(_command(step), style="cyan"), soft_wrap=True)
             if step.into is None:
                 _checked(run(step.arguments))
             else:
@@ -131,11 +140,29 @@ def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
                     _checked(run(step.arguments))
                 atomic_write(step.into, said.getvalue().encode())
                 terminal.diagnosis(out, Diagnosis.model_validate_json(said.getvalue()))
+            if step.after:
+                terminal.notes(out, [step.after], "blue", "-")
             out.print()
     out.print(
         Text(f"Open {folder / 'report.html'} in a browser; {folder / 'loop.toml'} describes the rig."),
         soft_wrap=True,
     )
+
+
+def _command(step: Step) -> str:
+    """Return the command as one would type it, broken where it is too long for a line."""
+    words = [shlex.quote(word) for word in ("servoscope", *step.arguments)]
+    if step.into is not None:
+        words.append(f"> {shlex.quote(str(step.into))}")
+    lines = ["$"]
+    for i, word in enumerate(words):
+        value = i + 1 < len(words) and word.startswith("-") and not words[i + 1].startswith(("-", ">"))
+        needed = len(f"{word} {words[i + 1]}") if value else len(word)  # an option stays with its value
+        if len(lines[-1]) + needed + 3 > WIDTH and len(lines[-1].split()) > 1:
+            lines[-1] += " \\"
+            lines.append("   ")
+        lines[-1] += f" {word}"
+    return "\n".join(lines)
 
 
 def _checked(code: object) -> None:

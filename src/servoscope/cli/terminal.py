@@ -30,6 +30,9 @@ COLOURS = {
     "usable with care": "yellow",
     "care": "yellow",
     "note": "blue",
+    "holds": "green",
+    "holds partly": "yellow",
+    "does not hold": "red",
 }
 INDENT = (0, 0, 0, 2)
 MOST_WARNINGS = 12
@@ -91,7 +94,10 @@ def notes(out: Console, texts: Sequence[str], colour: str = "yellow", mark: str 
 
 def baseline(out: Console, b: Baseline) -> None:
     """Print what was learned."""
-    out.print(Text.assemble((b.loop.name, "bold"), f": baseline from {_sources(b)}"))
+    if b.loop.name == type(b.loop).model_fields["name"].default:
+        out.print(Text.assemble(("Baseline", "bold"), f" from {_sources(b)}"))
+    else:
+        out.print(Text.assemble((b.loop.name, "bold"), f": baseline from {_sources(b)}"))
     std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
     rows = [
         (name, f"{value:.5g}", f"{s:.2g}", f"{100.0 * abs(s / value):.2g} %" if value else "-")
@@ -108,7 +114,10 @@ def baseline(out: Console, b: Baseline) -> None:
         out.print()
     seen = [(p.name, p.parameter, percent(p.change) if p.change is not None else "never") for p in b.promises]
     if seen:
-        table(out, ("fault", "parameter", "seen from a change of"), seen, words=2)
+        if all(p.name == p.parameter for p in b.promises):
+            table(out, ("fault", "seen from a change of"), [(name, size) for name, _, size in seen])
+        else:
+            table(out, ("fault", "parameter", "seen from a change of"), seen, words=2)
         out.print()
     monitor = b.loop.monitor
     told = [
@@ -136,6 +145,8 @@ def diagnosis(out: Console, d: Diagnosis) -> None:
         told.append(("onset", f"{likely:.4g} s ({low:.4g} to {high:.4g} s, 95 %)"))
     if told:
         facts(out, told)
+    from servoscope.report.wording import probability
+
     shown = [c for c in d.candidates if c.probability >= LEAST_SHOWN or c.name == d.candidates[0].name]
     rows = []
     for c in shown:
@@ -145,9 +156,12 @@ def diagnosis(out: Console, d: Diagnosis) -> None:
             if fault
             else ("", "", "")
         )
-        rows.append((c.name, percent(c.probability), *size))
+        rows.append((c.name, probability(c.probability), *size))
+    twice = all(row[2] in ("", row[0]) for row in rows)  # the fault is called as its parameter
+    columns = [i for i in range(5) if i != 2 or not twice]
+    header = ("candidate", "probability", "parameter", "ratio", "95 % interval")
     if rows:
-        table(out, ("candidate", "probability", "parameter", "ratio", "95 % interval"), rows)
+        table(out, [header[i] for i in columns], [[row[i] for i in columns] for row in rows])
     _warnings(out, d.warnings)
 
 
@@ -207,7 +221,9 @@ def inspection(out: Console, i: Inspection) -> None:
     s = i.sampling
     size = f"{span(s.duration_s)}, {s.samples} samples at {s.sample_rate_hz:.6g} Hz"
     out.print(Text.assemble((i.recording, "bold"), f": {size}"))
-    out.print(Padding(Text(i.verdict.capitalize(), style=f"bold {COLOURS[i.verdict]}"), INDENT, expand=False))
+    out.print(
+        Padding(Text(i.headline[:1].upper() + i.headline[1:], style=f"bold {COLOURS[i.verdict]}"), INDENT, expand=False)
+    )
     told = []
     if s.runs > 1 or s.stretches > 1:
         told.append(("stretches", f"{s.stretches} in {s.runs} runs, the longest {span(s.longest_stretch_s)}"))
@@ -218,9 +234,9 @@ def inspection(out: Console, i: Inspection) -> None:
         rows = [
             (
                 f"{f.frequency_hz:g} Hz",
-                f"{f.coherence_u:.3f}",
-                f"{f.coherence_y:.3f}",
-                f"{f.snr:.3g}",
+                f"{f.coherence_u:.3f}" if f.coherence_u is not None else "-",
+                f"{f.coherence_y:.3f}" if f.coherence_y is not None else "-",
+                f"{f.snr:.3g}" if f.snr is not None else "-",
                 percent(f.relative_std) if f.relative_std is not None else "-",
             )
             for f in i.frequencies
@@ -236,3 +252,10 @@ def inspection(out: Console, i: Inspection) -> None:
 def written(out: Console, path: object) -> None:
     """Print that a file was written, on one line that can be copied."""
     out.print(Text(f"  wrote {path}"), soft_wrap=True)
+
+
+def claims(out: Console, found: Sequence[tuple[str, str, str]]) -> None:
+    """Print claims of the paper, each with what was measured and a verdict."""
+    for claim, measured, verdict in found:
+        out.print(Text.assemble((verdict, COLOURS[verdict]), f": {claim}"))
+        out.print(Padding(Text(measured, style="dim"), INDENT))

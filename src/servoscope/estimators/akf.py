@@ -22,6 +22,7 @@ def update(
     phi: FloatArray,
     z: FloatArray,
     K: FloatArray,
+    extra: FloatArray,
 ) -> int:
     """Take one step of eqs. (7) to (9) and (11); the erratum of (10), P(k-1) in the denominator, is mended.
 
@@ -31,8 +32,8 @@ def update(
     e = eta
     denominator = R
     denominator_d = R
-    g = np.empty(n)
-    g_d = np.empty(n)
+    g = np.empty_like(theta)
+    g_d = np.empty_like(theta)
     for i in range(n):
         g[i] = 0.0
         g_d[i] = 0.0

@@ -9,6 +9,7 @@ from servoscope.plants import FloatArray
 
 NAME = "iv-akf"
 NEEDS_INSTRUMENT = True
+EXCEPTIONS = {"positive": "phi and z differ, so P is not symmetric; it stays bounded and the guard keeps phi' P z >= 0"}
 
 
 @kernel
@@ -22,6 +23,7 @@ def update(
     phi: FloatArray,
     z: FloatArray,
     K: FloatArray,
+    extra: FloatArray,
 ) -> int:
     """Take one guarded step of THEORY section 5; P is not symmetric here.
 
@@ -32,10 +34,10 @@ def update(
     e = eta
     strength = 0.0
     strength_d = 0.0
-    g = np.empty(n)  # P z
-    h = np.empty(n)  # phi' P
-    g_d = np.empty(n)
-    h_d = np.empty(n)
+    g = np.empty_like(theta)  # P z
+    h = np.empty_like(theta)  # phi' P
+    g_d = np.empty_like(theta)
+    h_d = np.empty_like(theta)
     for i in range(n):
         g[i] = 0.0
         h[i] = 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from servoscope.inspection.judgement import DELAY_GAIN, DELAY_TOLERANCE, FEW_BITS, MODEL_ERROR, PRECISE, SNR
+from servoscope.inspection.judgement import DELAY_GAIN, DELAY_TOLERANCE, FEW_BITS, PRECISE, SNR, still
 from servoscope.inspection.measured import Measured
 from servoscope.loop import Loop
 
@@ -15,6 +15,9 @@ def recommend(m: Measured, loop: Loop | None) -> tuple[str, ...]:
 
 
 def _recommended(m: Measured, loop: Loop | None) -> Iterator[str]:
+    if still(m):
+        yield "record while the machine moves"
+        return
     if m.fit is None:
         yield "record at least ten times the memory of the estimator, with the machine in motion"
         return
@@ -27,7 +30,7 @@ def _recommended(m: Measured, loop: Loop | None) -> Iterator[str]:
         if loop is None:
             words = "up to there y follows the reference and is more than noise"
             yield f"[monitor] cutoff = {m.suggested_cutoff_hz:.2g}: {words}"
-        elif m.cutoff_hz > 1.8 * m.suggested_cutoff_hz:
+        elif m.coherent and m.cutoff_hz > 1.8 * m.suggested_cutoff_hz:
             words = f"above {m.suggested_cutoff_hz:.2g} Hz y is little but noise, or leaves the reference"
             yield f"[monitor] cutoff = {m.suggested_cutoff_hz:.2g} instead of {m.cutoff_hz:.3g}: {words}"
     d = m.delay
@@ -44,6 +47,8 @@ def _recommended(m: Measured, loop: Loop | None) -> Iterator[str]:
         and (m.dead_zone is not None or (excess > 1.3 and m.fit.explained_ungated < 0.99))
     ):
         words = "at rest u says nothing about the plant"
+        if loop is None or not (loop.plant.has_physics and loop.controller is not None):
+            words += "; this leaves out short rests too, long ones are left out anyway"
         yield f'[monitor] update_when = "moving", rest_speed = {m.rest.speed:.2g}: {words}'
     if m.dead_zone is not None and (loop is None or loop.input_deadzone is None):
         words = "if it is one rather than friction at rest"
@@ -51,16 +56,13 @@ def _recommended(m: Measured, loop: Loop | None) -> Iterator[str]:
     if m.saturation is not None and m.saturation.source == "seen":
         ends = " and ".join(f"{end:g}" for end in (m.saturation.low, m.saturation.high) if end is not None)
         yield f"input_limits, if u is limited at {ends}, and input_logged: before or after that"
-    if m.residual is not None and m.residual.model_error > MODEL_ERROR:
-        words = "the scatter between several healthy recordings says more"
-        yield f"[monitor] model_error = {min(m.residual.model_error, 0.1):.1g}, or a better model; {words}"
     memory = loop.monitor.memory if loop is not None else 5.0
-    wide = [at for at in m.frequencies if at.relative_std_memory is not None and at.snr >= SNR]
+    wide = [at for at in m.frequencies if at.relative_std_memory is not None and (at.snr is None or at.snr >= SNR)]
     worst = max((at.relative_std_memory or 0.0 for at in wide), default=0.0)
     if worst > PRECISE:
         longer = memory * min((worst / PRECISE) ** 2, 20.0)
         yield f"[monitor] memory = {longer:.2g} for 5 % at every frequency that is excited"
-    weak = [f"{at.frequency_hz:g}" for at in m.frequencies if at.snr < SNR]
+    weak = [f"{at.frequency_hz:g}" for at in m.frequencies if at.snr is not None and at.snr < SNR]
     if weak and loop is not None:
         yield f"[monitor] frequencies without {', '.join(weak)} Hz, or record a faster motion"
     coarse = [q.signal for q in m.quantisation if q.signal != "r" and (q.effective_bits or 99.0) < FEW_BITS]

@@ -12,6 +12,7 @@ from servoscope.recording import Recording
 
 COHERENT = 0.8
 LEAST_SEGMENTS = 4
+LEAST_PERIODS = 3.5  # of the reference; with fewer, segments differ by what part of the motion they hold
 NOTHING = 1e-12  # share of the largest power below which r is said to have none
 
 
@@ -52,13 +53,14 @@ class Excited(Said):
 
     `snr` is the power that follows r over the power that does not, the smaller of u and y; `relative_std`
     that of the iFRF after the whole recording, `relative_std_memory` that after the estimator's memory, both None
-    where the regression failed.
+    where the regression failed. Coherences and `snr` are None where the reference has too few periods in the
+    recording to judge them.
     """
 
     frequency_hz: float
-    coherence_u: float
-    coherence_y: float
-    snr: float
+    coherence_u: float | None
+    coherence_y: float | None
+    snr: float | None
     relative_std: float | None
     relative_std_memory: float | None
 

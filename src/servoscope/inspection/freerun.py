@@ -11,6 +11,8 @@ from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 from servoscope.recording.defects import spans
 
+SUBJECT = "running the model on u alone is not possible"
+
 
 class FreeRun(Said):
     """The estimated model driven by u alone: share of y that it explains, or why there is none."""
@@ -54,23 +56,23 @@ def free_run(recording: Recording, g: Regressors, which: IndexArray, fitted: Fit
     drive = g.eta - sum(theta[name] * columns[name] for name in theta)
     what, output = ("y", y) if y is not None else ("the speed", speed)
     if output is None:
-        return FreeRun(explained=None, words="not possible: the model has neither y nor its speed")
+        return FreeRun(explained=None, words=f"{SUBJECT}: the model has neither y nor its speed")
     if y is None:
         c = c[1:]
     if c[-1] == 0.0:
-        return FreeRun(explained=None, words="not possible: nothing excites the highest power of s")
+        return FreeRun(explained=None, words=f"{SUBJECT}: nothing excites the highest power of s")
     # A pole that takes longer than ten recordings is an integrator for all that this one can tell.
     slow = 0.1 / recording.duration_s
     poles = np.roots(c[::-1])
     if poles.size and poles.real.max() > slow:
         grows = 1.0 / float(poles.real.max())
-        words = f"not possible: the estimated model is unstable (grows by a factor e in {grows:.2g} s)"
+        words = f"{SUBJECT}: the estimated model is unstable (grows by a factor e in {grows:.2g} s)"
         return FreeRun(explained=None, words=words)
     if (np.abs(poles) < slow).sum() > 1:
-        return FreeRun(explained=None, words="not possible: the estimated model integrates twice, it would drift")
+        return FreeRun(explained=None, words=f"{SUBJECT}: the estimated model integrates twice, it would drift")
     share = _simulated(g, c, drive, output)
     if share is None:
-        return FreeRun(explained=None, words="not possible: no stretch without gaps is long enough")
+        return FreeRun(explained=None, words=f"{SUBJECT}: no stretch without gaps is long enough")
     return FreeRun(explained=share, words=f"driven by u alone, the model explains {percent(share)} of {what}")
 
 

@@ -11,7 +11,7 @@ from pydantic import PrivateAttr
 from servoscope.inspection import alignment, excitation, freerun, leftover, levels, modelfit
 from servoscope.inspection.advice import recommend
 from servoscope.inspection.excitation import Excited, Spectra
-from servoscope.inspection.judgement import Finding, Verdict, judge, verdict_of
+from servoscope.inspection.judgement import Finding, Verdict, headline_of, judge, still, verdict_of
 from servoscope.inspection.levels import BoolArray, Said
 from servoscope.inspection.measured import Coefficient, Fit, Measured, described
 from servoscope.inspection.modelfit import Fitted, IndexArray, Regressors
@@ -57,6 +57,11 @@ class Inspection(Measured):
     _traces: Traces | None = PrivateAttr(default=None)
 
     @property
+    def headline(self) -> str:
+        """The verdict, and whether the recording is short to learn from."""
+        return headline_of(self.findings)
+
+    @property
     def traces(self) -> Traces | None:
         """What figures are drawn from; None when the inspection was read back from JSON."""
         return self._traces
@@ -96,6 +101,8 @@ def inspect(recording: Recording, loop: Loop | None = None) -> Inspection:
 
 
 def _concluded(m: Measured, loop: Loop | None, constant: tuple[str, ...], traces: Traces | None) -> Inspection:
+    if still(m):  # what was measured around them is noise
+        m = m.model_copy(update={"frequencies": (), "suggested_cutoff_hz": None})
     findings = judge(m, loop, constant)
     verdict = verdict_of(findings)
     severity = {"not usable": "stop", "usable with care": "care", "usable": "none"}[verdict]
@@ -104,7 +111,7 @@ def _concluded(m: Measured, loop: Loop | None, constant: tuple[str, ...], traces
     inspection = Inspection(
         **{name: getattr(m, name) for name in Measured.model_fields},
         verdict=verdict,
-        summary=f"{m.recording}: {verdict}" + (f": {reasons[0]}{more}" if reasons else ""),
+        summary=f"{m.recording}: {headline_of(findings)}" + (f": {reasons[0]}{more}" if reasons else ""),
         findings=findings,
         recommendations=recommend(m, loop),
     )
@@ -116,6 +123,9 @@ def _modelled(recording: Recording, loop: Loop | None, m: Measured) -> tuple[Mea
     """Add spectra and all that needs a model."""
     period = leftover.period_of(recording)
     spectra = excitation.spectra(recording, period)
+    periods = recording.samples / period if period is not None else None
+    m = m.model_copy(update={"periods": periods})
+    judged = spectra if m.coherent else None
     rate, traces = recording.sample_rate, Traces(spectra, np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))
     noise = levels.noise_of(recording.y, recording.restart, m.quantisation[2].step)
     band = excitation.usable_band(spectra) if spectra is not None else None
@@ -135,8 +145,8 @@ def _modelled(recording: Recording, loop: Loop | None, m: Measured) -> tuple[Mea
         update={
             "rest": rest,
             "dead_zone": levels.dead_zone(recording.u, v, rest.speed),
-            "band": band,
-            "frequencies": _excited(spectra, loop, rate, None),
+            "band": band if m.coherent else None,
+            "frequencies": _excited(judged, loop, rate, None, m.coherent),
             "cutoff_hz": cutoff,
             "suggested_cutoff_hz": suggested,
             "orders": orders,
@@ -159,7 +169,7 @@ def _modelled(recording: Recording, loop: Loop | None, m: Measured) -> tuple[Mea
     residual, independent, rho = leftover.describe(recording, fitted.v, g.eta, used, block, period)
     m = m.model_copy(
         update={
-            "frequencies": _excited(spectra, loop, rate, (g, which, fitted)),
+            "frequencies": _excited(judged, loop, rate, (g, which, fitted), m.coherent),
             "fit": _told(model, g, which, fitted, ungated),
             "residual": residual,
             "delay": alignment.estimate(recording, g, which, fitted, independent),
@@ -190,8 +200,12 @@ def _moving(g: Regressors, at_rest: BoolArray) -> BoolArray:
 def _told(model: str, g: Regressors, which: IndexArray, fitted: Fitted, ungated: Fitted) -> Fit:
     std = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
     rms = np.sqrt((g.columns(which)[fitted.used] ** 2).mean(axis=0))
-    leading = int(np.argmax(rms * np.abs(fitted.theta)))
+    carried = rms * np.abs(fitted.theta)
+    leading = int(np.argmax(carried))
+    shares = np.where([name == "offset" for name in fitted.names], 0.0, carried)
+    most = int(np.argmax(shares))
     reversed_ = fitted.theta[leading] < -5.0 * std[leading] and fitted.names[leading] != "offset"
+    eta_rms = np.sqrt((g.eta[fitted.used] ** 2).mean())
     heavy = [i for i in np.argsort(-np.abs(fitted.weakest)) if abs(fitted.weakest[i]) > 0.3]
     return Fit(
         model=model,
@@ -204,6 +218,8 @@ def _told(model: str, g: Regressors, which: IndexArray, fitted: Fitted, ungated:
         explained_ungated=ungated.explained,
         condition=fitted.condition,
         weakest=" and ".join(fitted.names[i] for i in heavy),
+        leading=fitted.names[most],
+        leading_share=float(shares[most] / max(float(eta_rms), np.finfo(np.float64).tiny)),
         wrong_sign=fitted.names[leading] if reversed_ else None,
     )
 
@@ -213,6 +229,7 @@ def _excited(
     loop: Loop | None,
     rate: float,
     model: tuple[Regressors, IndexArray, Fitted] | None,
+    coherent: bool,
 ) -> tuple[Excited, ...]:
     frequencies = loop.monitor.frequencies if loop is not None else DEFAULT_FREQUENCIES
     memory = (loop.monitor.memory if loop is not None else MEMORY) * rate
@@ -221,6 +238,7 @@ def _excited(
         if f >= rate / 2.0:
             continue
         of_u, of_y, snr = excitation.signal_at(spectra, f) if spectra is not None else (0.0, 0.0, 0.0)
+        seen = (of_u, of_y, snr) if coherent else (None, None, None)
         relative = recent = None
         if model is not None:
             g, which, fitted = model
@@ -234,9 +252,9 @@ def _excited(
         told.append(
             Excited(
                 frequency_hz=f,
-                coherence_u=of_u,
-                coherence_y=of_y,
-                snr=snr,
+                coherence_u=seen[0],
+                coherence_y=seen[1],
+                snr=seen[2],
                 relative_std=relative,
                 relative_std_memory=recent,
             )

@@ -7,14 +7,14 @@ from typing import Literal
 
 from servoscope.inspection.leftover import Residual
 from servoscope.inspection.levels import Said, percent
-from servoscope.inspection.measured import Measured, described
+from servoscope.inspection.measured import Fit, Measured, described
 from servoscope.loop import Loop
 
 Severity = Literal["stop", "care", "note"]
 Verdict = Literal["usable", "usable with care", "not usable"]
 
 LEAST_EXPLAINED, WELL_EXPLAINED = 0.5, 0.9
-STILL, MOSTLY_STILL = 0.97, 0.8
+STILL, MOSTLY_STILL, HALF_STILL = 0.97, 0.8, 0.5
 SNR = 3.0
 PRECISE = 0.05  # relative standard deviation of the iFRF that the estimator's memory should allow
 CONDITION = 1e3
@@ -23,6 +23,7 @@ DELAY_TOLERANCE = 0.1  # samples
 DELAY_GAIN = 0.1  # share of the residual variance below which a delay is not worth a word
 LEAST_MEMORIES = 10.0
 MODEL_ERROR = 0.005
+SEEN = 7.0  # root of a usual threshold: so many standard deviations is a change that is seen
 
 
 class Finding(Said):
@@ -45,7 +46,13 @@ def judge(m: Measured, loop: Loop | None, constant: tuple[str, ...] = ()) -> tup
     constant
         Signals that never change.
     """
-    found = [*_of_signals(m, loop, constant), *_of_excitation(m, loop), *_of_model(m, loop)]
+    found = [*_of_signals(m, loop, constant)]
+    if still(m):
+        # Of a machine that does not move, spectra and models say nothing.
+        share = percent(m.rest.share) if m.rest is not None else ""
+        found.append(("rest", "stop", f"the output rests {share} of the time: record while the machine moves"))
+    else:
+        found += [*_of_excitation(m, loop), *_of_model(m, loop)]
     rank = {"stop": 0, "care": 1, "note": 2}
     return tuple(sorted((Finding(kind=k, severity=s, message=w) for k, s, w in found), key=lambda f: rank[f.severity]))
 
@@ -54,6 +61,23 @@ def verdict_of(findings: tuple[Finding, ...]) -> Verdict:
     """Return the verdict that the worst finding asks for."""
     severities = {finding.severity for finding in findings}
     return "not usable" if "stop" in severities else "usable with care" if "care" in severities else "usable"
+
+
+def headline_of(findings: tuple[Finding, ...]) -> str:
+    """Return the verdict in words, with what a short recording is good for."""
+    verdict = verdict_of(findings)
+    if verdict == "not usable" or not any(finding.kind == "short" for finding in findings):
+        return verdict
+    return "usable to diagnose; short to learn from" if verdict == "usable" else f"{verdict}; short to learn from"
+
+
+def still(m: Measured) -> bool:
+    """Return whether the output rests nearly all the time, or mostly, and noise alone makes up the remainder."""
+    if m.rest is None:
+        return False
+    commanded = not any(q.signal == "r" and q.values < 2 for q in m.quantisation)
+    noise = m.band is None and (m.fit is None or m.fit.explained < LEAST_EXPLAINED)
+    return m.rest.share > STILL or (noise and m.rest.share > (MOSTLY_STILL if commanded else HALF_STILL))
 
 
 _Said = tuple[str, Severity, str]
@@ -111,10 +135,9 @@ def _of_signals(m: Measured, loop: Loop | None, constant: tuple[str, ...]) -> It
 
 def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
     if m.rest is not None and m.rest.share > MOSTLY_STILL:
-        severity: Severity = "stop" if m.rest.share > STILL else "care"
         yield (
             "rest",
-            severity,
+            "care",
             f"the output rests {percent(m.rest.share)} of the time: record while the machine moves",
         )
     elif m.rest is not None and m.rest.share > 0.05:
@@ -123,7 +146,10 @@ def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
             "note",
             f"the output rests {percent(m.rest.share)} of the time (speed below {m.rest.speed:.2g} per s)",
         )
-    if m.band is None:
+    if not m.coherent:
+        words = f"the recording holds {m.periods:.2g} periods of the reference: too few periods to judge coherence"
+        yield "coherence", "note", f"{words}; the standard deviations of the iFRF come from the regression"
+    elif m.band is None:
         words = "no band of frequencies in which both u and y follow the reference"
         yield "band", "care", f"{words}: it excites little, does not repeat, or the loop is not linear"
     else:
@@ -134,7 +160,7 @@ def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
         )
     asked: Severity = "care" if loop is not None else "note"
     for at in m.frequencies:
-        if at.snr < SNR:
+        if at.snr is not None and at.snr < SNR:
             words = f"{at.frequency_hz:g} Hz is hardly excited, or u and y do not follow the reference there"
             yield (
                 "frequency",
@@ -150,8 +176,8 @@ def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
         yield "conditioning", "care", words
     memory = loop.monitor.memory if loop is not None else 5.0
     if m.sampling.duration_s < LEAST_MEMORIES * memory:
-        words = f"{m.sampling.duration_s:.3g} s is short of {LEAST_MEMORIES:g} times the memory of {memory:g} s"
-        yield "short", "note", f"{words}: enough to diagnose, little to learn from"
+        wanted = f"{LEAST_MEMORIES * memory:g} s or more, ten times the memory of {memory:g} s"
+        yield "short", "note", f"{m.sampling.duration_s:.3g} s are enough to diagnose; to learn from, record {wanted}"
 
 
 def _of_model(m: Measured, loop: Loop | None) -> Iterator[_Said]:
@@ -196,22 +222,32 @@ def _of_model(m: Measured, loop: Loop | None) -> Iterator[_Said]:
     if m.free_run is not None:
         yield "free_run", "note", m.free_run.words
     if m.residual is not None:
-        yield from _of_residual(m.residual)
+        yield from _of_residual(m.residual, m.fit)
 
 
-def _of_residual(left: Residual) -> Iterator[_Said]:
+def _of_residual(left: Residual, fit: Fit) -> Iterator[_Said]:
+    missing = False
     if left.repeating is not None and left.repeating_std is not None and left.period_s is not None:
-        spread = f"{100.0 * max(left.repeating, 0.0):.0f} +- {200.0 * left.repeating_std:.0f} %"
-        words = f"{spread} of the residual repeat with the reference every {left.period_s:.4g} s"
-        if left.repeating > 2.0 * left.repeating_std and left.model_error > MODEL_ERROR:
+        rest = f"of the {100.0 * max(1.0 - fit.explained, 0.0):.2g} % of u that are left over"
+        spread = f"{100.0 * max(left.repeating, 0.0):.0f} ± {200.0 * left.repeating_std:.0f} %"
+        words = f"{rest}, {spread} repeat with the reference every {left.period_s:.4g} s"
+        missing = left.repeating > 2.0 * left.repeating_std and left.model_error > MODEL_ERROR
+        if missing:
             yield (
                 "residual",
                 "care" if left.model_error > 0.05 else "note",
-                f"{words}: the model lacks something",
+                f"{words}: this is what the model lacks, for example in friction, and no noise",
             )
         else:
-            yield "residual", "note", words if left.white is False else f"{words}: what is left over is noise"
-    if left.white is False:
+            yield "residual", "note", words if left.white is False else f"{words}: it is noise"
+    if left.model_error > MODEL_ERROR:
+        hidden = SEEN * left.model_error / max(fit.leading_share, 1e-3)
+        size = f"below about {100.0 * hidden:.2g} %" if hidden < 1.0 else "of less than a factor of two"
+        words = (
+            f"only if healthy recordings raise alarms: a model_error up to {left.model_error:.1g} would silence them"
+        )
+        yield "model_error", "note", f"{words}; it hides changes of {fit.leading.replace('_', ' ')} {size}"
+    if left.white is False and not missing:
         words = "the residual is structured beyond the filters' memory"
         if left.repeating is not None and left.repeating < 0.1:
             words += ", but does not repeat with the reference: something changed during the recording"

@@ -12,6 +12,7 @@ import numpy as np
 
 from servoscope.inspection.inspecting import Inspection
 from servoscope.inspection.levels import percent
+from servoscope.loop import Loop
 from servoscope.recording import Recording
 
 if TYPE_CHECKING:
@@ -160,7 +161,8 @@ def _rows(inspection: Inspection) -> list[tuple[str, str]]:
         rows.append(("condition number", f"{fit.condition:.3g}, weakest: {fit.weakest}"))
     for at in inspection.frequencies:
         spread = "" if at.relative_std is None else f", inverse response known to {percent(at.relative_std)}"
-        rows.append((f"{at.frequency_hz:g} Hz", f"signal to noise {at.snr:.3g}{spread}"))
+        seen = "too few periods to judge coherence" if at.snr is None else f"signal to noise {at.snr:.3g}"
+        rows.append((f"{at.frequency_hz:g} Hz", f"{seen}{spread}"))
     return rows
 
 
@@ -176,7 +178,11 @@ def page(inspection: Inspection, recording: Recording) -> str:
         for title, figure in figures_of(inspection, recording)
     )
     against = (
-        f"against the loop {_text(inspection.loop)}" if inspection.loop else "without a loop, by a generic inverse"
+        "without a loop, by a generic inverse"
+        if inspection.loop is None
+        else "against its loop file"
+        if inspection.loop == Loop.model_fields["name"].default
+        else f"against the loop {_text(inspection.loop)}"
     )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'

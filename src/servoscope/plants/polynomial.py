@@ -20,6 +20,7 @@ EXTRA_NAMES = {
 }
 RATIO_RANGES = {"inertia": (0.2, 5.0), "input_gain": (0.3, 3.0)}
 DEFAULT_RANGE = (0.1, 10.0)
+INPUT_GAIN = "more u for the same motion (weak motor, magnet or amplifier, or all coefficients up together)"
 
 Friction = Literal["none", "coulomb", "directional"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -109,7 +110,7 @@ class Polynomial(Plant):
     def faults(self) -> tuple[Fault, ...]:
         """One per coefficient, and the input gain, which scales them all."""
         single = tuple(self._fault(name, name.replace("_", " ")) for name in self.names)
-        return (*single, self._fault("input_gain", "input gain (u needed for the same motion)"))
+        return (*single, self._fault("input_gain", INPUT_GAIN))
 
     @staticmethod
     def _fault(name: str, words: str) -> Fault:

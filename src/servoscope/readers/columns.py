@@ -24,6 +24,7 @@ FIELDS = {
 }
 ALLOWED = "only sums of channels and numbers, times or divided by numbers, are understood"
 MOST_SHOWN = 12
+SAY = "say where the signals stand: --columns 't=..., r=..., u=..., y=...' or [columns] in the loop file"
 
 
 class Combination(NamedTuple):
@@ -94,13 +95,20 @@ def find_channel(name: str, known: Iterable[str], where: str) -> str:
     Raises
     ------
     RecordingError
-        If there is none; the message lists the nearest names, or all.
+        If there is none; the message lists the nearest names, or all, and says how to name columns where
+        none were named.
     """
     known = list(known)
     name = _bare(name)
     if name in known:
         return name
     near = nearest(name, known, count=3)
+    defaults = Columns()
+    key = where.rpartition("[columns] ")[2]
+    if not near and name == getattr(defaults, key if key in Columns.model_fields else "name", None):
+        where = where.removesuffix(f": [columns] {key}")
+        name_ = f"no column {name!r}; {SAY}; the file has {', '.join(known[:MOST_SHOWN]) or 'none'}"
+        raise RecordingError(f"{where}: {name_}" + (", ..." if len(known) > MOST_SHOWN else ""))
     shown = ", ".join(near or known[:MOST_SHOWN]) + (", ..." if not near and len(known) > MOST_SHOWN else "")
     hint = f"did you mean {shown}?" if near else f"the file has {shown or 'none'}"
     raise RecordingError(f"{where}: no column {name!r}, {hint}")

@@ -31,7 +31,7 @@ COLOURS = {
     "measured": "#1f5fa8",
     "healthy": "#7d8894",
     "alarm": "#c6501c",
-    "reference": "#b9c3cd",
+    "reference": "#a9b5c0",
 }
 STYLE: dict[str, Any] = {
     "axes.edgecolor": COLOURS["muted"],
@@ -140,13 +140,15 @@ def spans_on(t: FloatArray, low: FloatArray, high: FloatArray, most: int = COLUM
     return list(zip(low[first].tolist(), high[last].tolist(), strict=True))
 
 
-def robust_range(values: FloatArray, always: FloatArray | None = None) -> tuple[float, float]:
+def robust_range(values: FloatArray, always: FloatArray | None = None, *, room: float = 1.0) -> tuple[float, float]:
     """Return limits of an axis that hold all but the wildest 2 % of the values, and all of `always`.
 
     Parameters
     ----------
     values, always
         Any shape; what is not finite is left out.
+    room
+        All values are held where that makes the axis at most so many times as long.
     """
     finite = values[np.isfinite(values)]
     kept = list(np.percentile(finite, [1.0, 99.0])) if finite.size else []
@@ -155,6 +157,8 @@ def robust_range(values: FloatArray, always: FloatArray | None = None) -> tuple[
     if not kept:
         return 0.0, 1.0
     low, high = float(min(kept)), float(max(kept))
+    if finite.size and np.ptp([*finite[[finite.argmin(), finite.argmax()]], low, high]) <= room * (high - low):
+        low, high = min(low, float(finite.min())), max(high, float(finite.max()))
     pad = 0.08 * (high - low) or 0.05 * abs(high) or 1.0
     return low - pad, high + pad
 

@@ -14,7 +14,7 @@ from servoscope.diagnosis import UNKNOWN, Diagnosis, Trace
 from servoscope.loop import Loop
 from servoscope.output import atomic_write
 from servoscope.recording import Recording
-from servoscope.report.sheets import candidates, numbers, section, settings, warnings
+from servoscope.report.sheets import candidates, coefficient_units, numbers, section, settings, warnings
 from servoscope.report.wording import (
     clock_time,
     count,
@@ -109,15 +109,18 @@ def _header(diagnosis: Diagnosis, loop: Loop) -> str:
         clock_time(diagnosis.duration_s),
         *([f"{told} warning{'s' * (told > 1)}"] if told else []),
     ]
-    name = f"<strong>{escape(diagnosis.recording)}</strong> on {escape(loop.name)}"
+    on = "" if loop.name == Loop.model_fields["name"].default else f" on {escape(loop.name)}"
+    name = f"<strong>{escape(diagnosis.recording)}</strong>{on}"
     return f"<header><span>{name}</span><span>{', '.join(watched)}</span></header>"
 
 
 def _verdict(diagnosis: Diagnosis, trace: Trace, words: Mapping[str, str]) -> str:
     kind, icon = KINDS[diagnosis.verdict]
     # What the words of a fault say in brackets, for example what it cannot be told from.
-    asides = [words.get(fault.name, "").partition(" (")[2].rstrip(")") for fault in diagnosis.faults]
-    notes = [f'<p class="note">{_with_symbols(a)}.</p>' for a in asides if a and a not in diagnosis.summary]
+    asides = [words[f.name].rstrip(")").split(" (") for f in diagnosis.faults if " (" in words.get(f.name, "")]
+    # What "more" of something means says nothing of less.
+    asides = [a for a, f in zip(asides, diagnosis.faults, strict=False) if f.ratio > 1.0 or not a[0].startswith("more")]
+    notes = [f'<p class="note">{_with_symbols(a[:1].upper() + a[1:])}: {_with_symbols(b)}.</p>' for a, b in asides]
     facts = _fault_facts(diagnosis) if diagnosis.verdict == "fault" else _quiet_facts(diagnosis, trace)
     lines = (
         '<div class="verdict">',
@@ -141,7 +144,7 @@ def _headline(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
     if diagnosis.verdict == "undetermined":
         return "This recording cannot tell"
     if diagnosis.faults:
-        names = " and ".join(meaning(fault.name, words) for fault in diagnosis.faults)
+        names = " and ".join(meaning(fault.name, words, fault.ratio) for fault in diagnosis.faults)
         return names[:1].upper() + names[1:]
     if diagnosis.candidates and diagnosis.candidates[0].name == UNKNOWN:
         return "The actuator has changed, in a way that no known fault explains"
@@ -166,9 +169,9 @@ def _fault_facts(diagnosis: Diagnosis) -> Iterator[Fact]:
         yield "Since when", "not known", seen
     for fault in diagnosis.faults:
         size, low, high = size_of(fault.ratio, *fault.interval)
-        yield "How large", f"{symbol(fault.parameter)} {size}", f"95 %: {low} to {high}"
+        yield "How large", f"{symbol(fault.parameter)} {size.replace(' ', '&nbsp;')}", f"95 %: {low} to {high}"
     if diagnosis.faults:
-        yield "How sure", probability(diagnosis.probability), "that it is this fault and no other"
+        yield "How sure", probability(diagnosis.probability), "among the faults that this plant knows"
     elif diagnosis.candidates:
         best = diagnosis.candidates[0]
         small = f"for {escape(best.name)}: too little to name it"
@@ -198,7 +201,7 @@ def _pictures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Lo
         (
             "Change over time",
             "One number for the distance from healthy. Above the dashed line, chance is no longer an"
-            f" explanation: a healthy loop gets there {budget}.",
+            f" explanation: a healthy loop gets there by design {budget}, if the noise stays as learned.",
             figures.statistic(trace, diagnosis),
         ),
         (
@@ -217,8 +220,8 @@ def _pictures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Lo
         (
             "Coefficients",
             "The estimated coefficients of the actuator's inverse, relative to what a healthy one would show"
-            " under the same reference.",
-            figures.coefficients(trace, diagnosis),
+            " under the same reference; as a difference where that is nearly zero.",
+            figures.coefficients(trace, diagnosis, units=coefficient_units(loop.plant)),
         ),
     )
     return "\n".join(

@@ -21,6 +21,7 @@ __all__ = ["coefficients", "ifrf", "save", "signals", "statistic"]
 
 WIDTH = 9.0  # inches; the page scales pictures to its own width
 MOST_POINTS = 1500  # of a path in the complex plane
+ROOM = 2.5  # times the range of 98 % of a path: so far the axes give way to the wildest 2 %
 PAPER, INK, MUTED, RULE = COLOURS["paper"], COLOURS["ink"], COLOURS["muted"], COLOURS["rule"]
 MEASURED, HEALTHY, ALARM = COLOURS["measured"], COLOURS["healthy"], COLOURS["alarm"]
 REFERENCE = COLOURS["reference"]
@@ -43,7 +44,7 @@ def signals(recording: Recording, diagnosis: Diagnosis | None = None, *, units: 
     axes = figure.subplots(3, 1, sharex=True, height_ratios=[3, 2, 3])
     unit, factor = times(recording.duration_s)
     t = recording.t / factor
-    both = ((recording.r, REFERENCE, "reference r"), (recording.y, MEASURED, "output y"))
+    both = ((recording.y, MEASURED, "output y"), (recording.r, REFERENCE, "reference r"))
     rows = (
         ("r, y", units[0], both),
         ("r − y", units[0], ((recording.r - recording.y, INK, ""),)),
@@ -52,13 +53,16 @@ def signals(recording: Recording, diagnosis: Diagnosis | None = None, *, units: 
     for ax, (label, of, lines) in zip(axes, rows, strict=True):
         prefix, scale = axis_scale([x for x, _, _ in lines], of)
         for x, colour, _ in lines:
-            # the reference shines out from under the output that follows it
-            width = 2.6 if x is recording.r else 0.85
+            # a thin light reference on a wide dark output: where one hides the other, both still show
+            width = 2.0 if x is recording.y else 0.9
             ax.plot(*envelope(t, x * scale, recording.restart), color=colour, linewidth=width)
         ax.set_ylabel(f"{label} [{prefix}]" if prefix else label)
         _gaps(ax, t, recording.restart, 1.5 / recording.sample_rate / factor)
         _marks(ax, diagnosis, factor)
-    two = [Line2D([], [], color=c, linewidth=w, label=words) for (_, c, words), w in zip(both, (2.6, 1.2), strict=True)]
+    two = [
+        Line2D([], [], color=colour, linewidth=width, label=words)
+        for (_, colour, words), width in zip(both, (2.0, 1.2), strict=True)
+    ]
     _legend_above(figure, diagnosis, two)
     axes[0].margins(x=0.0)
     axes[-1].set_xlabel(f"time [{unit}]")
@@ -100,11 +104,20 @@ def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
 
 
 @styled()
-def coefficients(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
+def coefficients(trace: Trace, diagnosis: Diagnosis | None = None, *, units: Sequence[str] = ()) -> Figure:
     """Draw each coefficient's deviation from its healthy expectation over time, with bands of two sigma.
 
     In percent of the expectation, or in units of the coefficient where the expectation is no larger than the
     estimate's standard deviation.
+
+    Parameters
+    ----------
+    trace
+        Of K evaluations.
+    diagnosis
+        Marks onset and detection.
+    units
+        Of the n coefficients; empty where unknown.
     """
     n = len(trace.names)
     columns = 1 if n == 1 else 2
@@ -114,7 +127,7 @@ def coefficients(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     unit, factor = times(float(np.ptp(trace.t)) if len(trace.t) else 0.0)
     for i, ax in enumerate(axes.flat):
         if i < n:
-            _coefficient(ax, trace, i, factor)
+            _coefficient(ax, trace, i, factor, units[i] if i < len(units) else "")
             _marks(ax, diagnosis, factor)
             ax.xaxis.set_tick_params(labelbottom=i + columns >= n)
             if i + columns >= n:
@@ -131,7 +144,7 @@ def coefficients(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     return figure
 
 
-def _coefficient(ax: Axes, trace: Trace, i: int, factor: float) -> None:
+def _coefficient(ax: Axes, trace: Trace, i: int, factor: float, unit: str) -> None:
     healthy = trace.expected[:, i]
     std = np.sqrt(np.maximum(trace.covariance[:, i, i], 0.0))
     deviation = trace.theta[:, i] - healthy
@@ -148,7 +161,7 @@ def _coefficient(ax: Axes, trace: Trace, i: int, factor: float) -> None:
         deviation, std = 100.0 * deviation / size, 100.0 * std / size
         ax.set_ylabel("deviation [%]")
     else:
-        ax.set_ylabel("deviation")
+        ax.set_ylabel(f"deviation [{unit}]" if unit else "deviation")
     middle = np.where(usable, deviation, np.nan)
     band = 2.0 * np.nan_to_num(std)
     t = trace.t / factor
@@ -224,8 +237,8 @@ def _plane(ax: Axes, trace: Trace, i: int, usable: BoolArray, onset: float) -> N
         ax.plot(H.real, H.imag, marker, markersize=5.5, mfc=face, mec=edge, zorder=4)
         shown.append(np.array([[H.real, H.imag]]))
     certain = np.vstack(shown[1:]) if len(shown) > 1 else shown[0]
-    ax.set_xlim(robust_range(shown[0][:, 0], certain[:, 0]))
-    ax.set_ylim(robust_range(shown[0][:, 1], certain[:, 1]))
+    ax.set_xlim(robust_range(shown[0][:, 0], certain[:, 0], room=ROOM))
+    ax.set_ylim(robust_range(shown[0][:, 1], certain[:, 1], room=ROOM))
     ax.locator_params(nbins=4)
     ax.grid(visible=True, color=RULE, linewidth=0.6)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from servoscope.diagnosis import Diagnosis, FoundFault
 from servoscope.loop import Loop
+from servoscope.plants import Plant
 from servoscope.report.wording import (
     DASH,
     count,
@@ -24,7 +25,7 @@ from servoscope.report.wording import (
     with_std,
 )
 
-__all__ = ["candidates", "numbers", "section", "settings", "warnings"]
+__all__ = ["candidates", "coefficient_units", "numbers", "section", "settings", "warnings"]
 
 MOST_WARNINGS = 60
 
@@ -39,7 +40,7 @@ def section(title: str, why: str, content: str, kind: str = "whole") -> str:
     content
         HTML.
     kind
-        ``whole`` stays on one page in print, ``long`` may not.
+        CSS classes: ``whole`` stays on one page in print, ``long`` may not.
     """
     lead = f"\n<p>{why}</p>" if why else ""
     return f'<section class="{kind}">\n<h2>{title}</h2>{lead}\n{content}\n</section>'
@@ -61,13 +62,19 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
     for i, candidate in enumerate(diagnosis.candidates):
         width = 100.0 * min(max(candidate.probability, 0.0), 1.0)
         bar = f'<span class="bar"><i style="width:{width:.1f}%"></i></span>'
-        means = meaning(candidate.name, words)
-        more = f"<br><small>{escape(means)}</small>" if means != candidate.name else ""
+        means = meaning(candidate.name, words, candidate.faults[0].ratio if len(candidate.faults) == 1 else 1.0)
+        plain = candidate.name.replace("_", " ")
+        more = f"<br><small>{escape(means)}</small>" if means != plain else ""
         sizes: Sequence[FoundFault | None] = candidate.faults or (None,)
-        told = [(symbol(f.parameter), *ratios(f.ratio, *f.interval)) if f else None for f in sizes]
+        told = [
+            ("" if f.parameter == candidate.name else f"{symbol(f.parameter)} ", *ratios(f.ratio, *f.interval))
+            if f
+            else None
+            for f in sizes
+        ]
         cells = (
-            f'<th scope="row">{escape(candidate.name)}{more}</th>',
-            _n("<br>".join(f"{each[0]} × {each[1]}" if each else DASH for each in told)),
+            f'<th scope="row">{escape(plain)}{more}</th>',
+            _n("<br>".join(f"{each[0]}× {each[1]}" if each else DASH for each in told)),
             _n("<br>".join(f"{each[2]} to {each[3]}" if each else DASH for each in told)),
             f'<td class="t p">{bar}{probability(candidate.probability)}</td>',
         )
@@ -75,7 +82,7 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         rows.append(f"<tr{mark}>{''.join(cells)}</tr>")
     head = ("Explanation", "*Size, relative to healthy", "*95 % interval", ".Probability")
     why = "What could explain the change, how large each explanation would have to be, how probable it is."
-    return section("Candidates", why, _table(head, rows))
+    return section("Candidates", why, _table(head, rows), "whole candidates")
 
 
 def numbers(diagnosis: Diagnosis, loop: Loop) -> str:
@@ -123,6 +130,16 @@ def _responses(diagnosis: Diagnosis, loop: Loop) -> str:
     unit = f" in {of_u}/{of_y}" if of_u else ""
     why = f"Parts{unit} with one standard deviation; magnitude and phase are changes from healthy."
     return section("Inverse frequency response at the end of the recording", why, _table(head, rows))
+
+
+def coefficient_units(plant: Plant) -> tuple[str, ...]:
+    """Return the unit of each coefficient, in u and y themselves where the machine's units are not known."""
+    of_y, of_u = units(plant.kind)
+    powers: tuple[int | None, ...] = (
+        *plant.powers,
+        *(1 if "_v" in e and e != "sign_v" else None for e in plant.extras),
+    )
+    return tuple(_unit(of_u or "u", of_y or "y", power) for power in powers)
 
 
 def _unit(of_u: str, of_y: str, power: int | None) -> str:

@@ -171,7 +171,7 @@ def clock_time(seconds: float, decimals: int = 1) -> str:
     return f"{text} ({f'{hours} h ' if hours else ''}{minutes} min {rest} s)"
 
 
-def meaning(name: str, words: Mapping[str, str]) -> str:
+def meaning(name: str, words: Mapping[str, str], ratio: float = 1.0) -> str:
     """Return what a candidate means, in plain words.
 
     Parameters
@@ -180,10 +180,13 @@ def meaning(name: str, words: Mapping[str, str]) -> str:
         Of the candidate, several faults joined by "+".
     words
         Name of a fault -> its words; what they say in brackets is left out.
+    ratio
+        Of the parameter, where there is one: below 1, what words call more is less.
     """
     if name == UNKNOWN:
         return "none of the known faults"
-    return " and ".join(words.get(part, part).partition(" (")[0] for part in name.split("+"))
+    text = " and ".join(words.get(part, part).partition(" (")[0] for part in name.split("+"))
+    return re.sub("^more ", "less ", text) if ratio < 1.0 else text
 
 
 def times(duration_s: float) -> tuple[str, float]:

@@ -1,0 +1,201 @@
+"""The paper's three steps: residual generator, evaluator with prescribed thresholds, fault manager."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from servoscope import twostage
+from servoscope.inverse import ComplexArray, nominal_theta
+from servoscope.loop import Loop
+from servoscope.paper.conditions import FREQUENCIES, SIZES, TABLE_2
+from servoscope.pipeline import Pipeline, Tuning
+from servoscope.plants import FloatArray
+from servoscope.recording import Recording
+from servoscope.tuning import fit
+
+IGNORANT = 100.0  # P(0)/P_d: where the recursion starts from zero it must not believe it
+MARGIN = 1.5  # prescribed thresholds, relative to the largest healthy residual
+HOLD = 1.0  # s that a residual has to stay beyond its threshold
+SETTLED = 20.0  # s after which the evaluator listens
+GRID = 121  # sizes along a signature
+REACH = {parameter: (min(sizes) / 2.0, max(sizes) * 2.0) for parameter, sizes in SIZES.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What the residual generator says over time.
+
+    Parameters
+    ----------
+    t
+        Times [s], shape (K,).
+    theta
+        Estimates, shape (K, n).
+    H, gamma
+        iFRF of eq. (13) and Gamma of eq. (14) at 1, 10 and 20 Hz [A/m], shape (K, 3).
+    """
+
+    t: FloatArray
+    theta: FloatArray
+    H: ComplexArray
+    gamma: ComplexArray
+
+    def between(self, from_s: float, to_s: float) -> Self:
+        """Return the part of it in from_s < t <= to_s."""
+        kept = (self.t > from_s) & (self.t <= to_s + 1e-9)
+        return replace(self, t=self.t[kept], theta=self.theta[kept], H=self.H[kept], gamma=self.gamma[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualGenerator:
+    """Step 1: r, u, y to Gamma(k), the iFRF estimated less the nominal one; build it with `of`.
+
+    Parameters
+    ----------
+    pipeline, tuning
+        The recursion; its filter bank, stage 1 and estimator are settings of the loop.
+    nominal
+        H(f_d; kappa_o) from the plant's parameters, shape (3,).
+    """
+
+    pipeline: Pipeline
+    tuning: Tuning
+    nominal: ComplexArray
+
+    @classmethod
+    def of(cls, loop: Loop, healthy: Recording) -> Self:
+        """Tune on a healthy recording, P_d = (R/N) R_phi^-1; the nominal iFRF needs none."""
+        pipeline = Pipeline.of(loop, twostage.tune(loop, [healthy]))
+        regression = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
+        tuning = fit([regression], pipeline.memory, pipeline.bank.names).tuning
+        return cls(pipeline, tuning, pipeline.bank.E(FREQUENCIES) @ nominal_theta(loop))
+
+    def run(self, recording: Recording, *, from_zero: bool = False) -> Course:
+        """Return the residuals of a recording.
+
+        Parameters
+        ----------
+        recording
+            r, u, y.
+        from_zero
+            Start at theta = 0 and P = 100 P_d, to see it converge; otherwise at the healthy estimate.
+        """
+        from servoscope.recursion import Layout, block
+
+        pipeline = self.pipeline
+        c = pipeline.constants(self.tuning)
+        layout = Layout(c)
+        state = layout.start(c, 1)
+        if from_zero:
+            state[:, layout.slices["theta"]] = 0.0
+            state[:, layout.slices["P"]] *= IGNORANT
+        out = np.empty((1, recording.samples // pipeline.every, layout.row))
+        r, restart = recording.r, recording.restart
+        signals = (r, pipeline.input(r, recording.u, restart), recording.y, restart)
+        block(pipeline.loop.monitor.estimator)(c, state, *(signal[None, :] for signal in signals), out)
+        index = (np.arange(out.shape[1]) + 1) * pipeline.every - 1
+        theta = pipeline.unpack(self.tuning, out[0], index).theta
+        H = theta @ pipeline.bank.E(FREQUENCIES).T
+        return Course(recording.t[index], theta, H, H - self.nominal)
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """What the evaluator says: when, which fault, its size; None: nothing."""
+
+    detected_at_s: float | None
+    fault: str | None
+    ratio: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluator:
+    """Step 2: residuals against prescribed thresholds, and the nearest signature.
+
+    Parameters
+    ----------
+    thresholds
+        Of the magnitudes of Gamma [A/m], shape (3,).
+    signatures
+        Name of the fault -> sizes (M,) and Gamma (M, 3) along them.
+    """
+
+    thresholds: FloatArray
+    signatures: Mapping[str, tuple[FloatArray, ComplexArray]]
+
+    @classmethod
+    def of(cls, loop: Loop, healthy: Course) -> Self:
+        """Prescribe 1.5 times the largest healthy residual, and take signatures from the plant's parameters."""
+        largest = np.abs(healthy.between(SETTLED, np.inf).gamma).max(axis=0)
+        return cls(MARGIN * largest, nominal_signatures(loop))
+
+    def evaluate(self, course: Course) -> Finding:
+        """Detect: one residual beyond its threshold for a second. Isolate at the end of the course."""
+        beyond = (np.abs(course.gamma) > self.thresholds).any(axis=1) & (course.t > SETTLED)
+        hold = round(HOLD / float(course.t[1] - course.t[0]))
+        lasting = np.convolve(beyond, np.ones(hold), mode="full")[: len(beyond)] >= hold - 0.5
+        if not lasting.any():
+            return Finding(None, None, None)
+        Gamma = course.between(float(course.t[-1]) - HOLD, np.inf).gamma.mean(axis=0)
+        fault, ratio = self.nearest(Gamma)
+        return Finding(float(course.t[int(np.argmax(lasting))]), fault, ratio)
+
+    def nearest(self, Gamma: ComplexArray) -> tuple[str, float]:
+        """Return the fault whose signature passes closest, distances in units of the thresholds, and the size."""
+        best: tuple[float, str, float] = (np.inf, "", np.nan)
+        for name, (sizes, curve) in self.signatures.items():
+            distance = (np.abs((Gamma - curve) / self.thresholds) ** 2).sum(axis=1)
+            i = int(np.argmin(distance))
+            best = min(best, (float(distance[i]), name, float(sizes[i])))
+        return best[1], best[2]
+
+
+def nominal_signatures(loop: Loop) -> dict[str, tuple[FloatArray, ComplexArray]]:
+    """Return Gamma as each fault of Table 2 grows, by the plant's parameters alone."""
+    E = Pipeline.of(_single_stage(loop)).bank.E(FREQUENCIES)
+    healthy = nominal_theta(loop)
+    found = {}
+    for fault in loop.plant.faults:
+        low, high = np.log(REACH[fault.parameter])
+        sizes = np.exp(np.linspace(low, high, GRID))
+        ill = [loop.plant.with_ratios({fault.parameter: float(size)}) for size in sizes]
+        theta = np.array([nominal_theta(loop.model_copy(update={"plant": plant})) for plant in ill])
+        found[fault.name] = (sizes, (theta - healthy) @ E.T)
+    return found
+
+
+def labelled_signatures(courses: Sequence[Course]) -> dict[str, tuple[FloatArray, ComplexArray]]:
+    """Return what labelled recordings of all cases of Table 2, in its order, show at their end: no physics needed."""
+    found: dict[str, tuple[list[float], list[ComplexArray]]] = {}
+    for case, course in zip(TABLE_2, courses, strict=True):
+        sizes, curve = found.setdefault(case.fault, ([], []))
+        sizes.append(case.ratio)
+        curve.append(course.between(50.0, np.inf).gamma.mean(axis=0))
+    return {name: (np.array(sizes), np.array(curve)) for name, (sizes, curve) in found.items()}
+
+
+def _single_stage(loop: Loop) -> Loop:
+    return loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"two_stage": "none"})})
+
+
+@dataclass(frozen=True, eq=False)
+class FaultManager:
+    """Step 3: what is done about a finding.
+
+    Parameters
+    ----------
+    reconfigurable
+        Faults that a change of the controller's gains can make up for.
+    """
+
+    reconfigurable: tuple[str, ...] = ("pump", "contamination")
+
+    def decide(self, finding: Finding) -> str:
+        """Return ``run on``, ``alarm`` or ``reconfigure``."""
+        if finding.detected_at_s is None:
+            return "run on"
+        return "reconfigure" if finding.fault in self.reconfigurable else "alarm"

@@ -1,0 +1,83 @@
+"""The paper's measures, mended where they need it, and those that its words ask for: pure functions."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.inverse import ComplexArray
+from servoscope.paper.sensitivity import angle
+from servoscope.plants import FloatArray
+
+
+def cv_theta(theta: FloatArray) -> float:
+    """Return CV_theta = sqrt(mean of sigma/|mu|) over time; the paper prints mu without its magnitude.
+
+    Parameters
+    ----------
+    theta
+        Shape (K, n).
+    """
+    return float(np.sqrt((theta.std(axis=0) / np.abs(theta.mean(axis=0))).mean()))
+
+
+def cv_H(H: ComplexArray) -> float:
+    """Return CV_H, likewise over the real and the imaginary part of H (K,)."""
+    return cv_theta(np.column_stack([H.real, H.imag]))
+
+
+def rise(t: FloatArray, H: ComplexArray, at_s: float, before: complex, after: complex, share: float = 0.5) -> float:
+    """Return how long after `at_s` the iFRF first gets `share` of the way from `before` to `after` [s]; NaN: never.
+
+    Parameters
+    ----------
+    t, H
+        Times [s] and iFRF at one frequency, shape (K,).
+    """
+    way = np.real((H - before) * np.conj(after - before)) / abs(after - before) ** 2
+    reached = np.flatnonzero((t > at_s) & (way >= share))
+    return float(t[reached[0]] - at_s) if reached.size else float("nan")
+
+
+def separation(a: ComplexArray, b: ComplexArray) -> float:
+    """Return the distance between the means of two clouds in units of their pooled scatter (Mahalanobis).
+
+    Parameters
+    ----------
+    a, b
+        Residuals, shapes (K,) and (L,).
+    """
+    both = [np.column_stack([x.real, x.imag]) for x in (a, b)]
+    difference = both[0].mean(axis=0) - both[1].mean(axis=0)
+    pooled = sum(np.cov(x, rowvar=False) for x in both) / 2.0
+    return float(np.sqrt(difference @ np.linalg.solve(pooled + 1e-18 * np.eye(2), difference)))
+
+
+def clouds(first: list[ComplexArray], second: list[ComplexArray], origin: complex) -> tuple[float, float]:
+    """Compare two families of residual clouds, one cloud per size of a fault.
+
+    Returns
+    -------
+    tuple of float
+        Median angle [degrees] between their directions from the healthy residual, and the smallest separation
+        between any cloud of the one and any of the other.
+    """
+    angles = [float(angle(a.mean() - origin, b.mean() - origin)) for a in first for b in second]
+    return float(np.median(angles)), min(separation(a, b) for a in first for b in second)
+
+
+def at_equal_rise(rise_a: npt.ArrayLike, cv_a: npt.ArrayLike, rise_b: npt.ArrayLike, cv_b: npt.ArrayLike) -> float:
+    """Return CV_a/CV_b, the geometric mean over the rise times that both curves cover; NaN if they share none."""
+    x, y = ([np.asarray(v, dtype=np.float64) for v in pair] for pair in ((rise_a, cv_a), (rise_b, cv_b)))
+    kept = [[v[np.isfinite(pair[0]) & np.isfinite(pair[1])] for v in pair] for pair in (x, y)]
+    if any(len(pair[0]) < 2 for pair in kept):
+        return float("nan")
+    low, high = max(pair[0].min() for pair in kept), min(pair[0].max() for pair in kept)
+    if low >= high:
+        return float("nan")
+    grid = np.exp(np.linspace(np.log(low), np.log(high), 21))
+    logs = []
+    for times, values in kept:
+        order = np.argsort(times)
+        logs.append(np.interp(np.log(grid), np.log(times[order]), np.log(values[order])))
+    return float(np.exp(np.mean(logs[0] - logs[1])))

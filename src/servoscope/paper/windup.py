@@ -1,0 +1,110 @@
+"""Covariance windup: P of AKF, DFRLS, KF and RLS at rest, without any excitation, and along eq. (12)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servoscope import estimators
+from servoscope.paper.conditions import PAPER, rig
+from servoscope.paper.method import IGNORANT, ResidualGenerator
+from servoscope.plants import FloatArray
+from servoscope.simulation import simulate
+
+ESTIMATORS = ("akf", "dfrls", "kf", "rls")
+MOVING, RESTING = 30.0, 600.0  # s
+DARK = 20_000  # updates at phi = 0
+
+
+def at_rest(estimator: str, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Return times [s] and the largest eigenvalue of P relative to P_d: 30 s of motion, then ten minutes of rest.
+
+    At rest the reference stands still; phi still carries the position and the noise.
+    """
+    from servoscope.recursion import Layout, block
+
+    loop = rig(structure="tustin", estimator=estimator, memory=10.0, evaluation_rate=1.0)
+    r = PAPER.r()
+    moving = r[: round(MOVING * loop.sample_rate)]
+    whole = np.concatenate([moving, np.full(round(RESTING * loop.sample_rate), moving[-1])])
+    made = ResidualGenerator.of(loop, PAPER.record(loop, seed + 1000))
+    recording = simulate(loop, whole, seed=seed)[0]
+    c = made.pipeline.constants(made.tuning)
+    layout = Layout(c)
+    state = layout.start(c, 1)
+    every = made.pipeline.every
+    run = block(estimator)
+    out = np.empty((1, 1, layout.row))
+    L = _root(c.P_d)
+    sizes = []
+    for begin in range(0, recording.samples, every):
+        signals = (getattr(recording, name)[None, begin : begin + every] for name in ("r", "u", "y", "restart"))
+        run(c, state, *signals, out)
+        P = state[0, layout.slices["P"]].reshape(layout.n, layout.n)
+        sizes.append(_largest(L, P))
+    return recording.t[every - 1 :: every], np.array(sizes)
+
+
+def in_the_dark(estimator: str, updates: int = DARK, memory: float = 1000.0) -> float:
+    """Return how much P has grown after so many updates at phi = 0."""
+    n = 4
+    update = estimators.load(estimator).update
+    theta, P, P_d, phi, K = np.zeros(n), np.eye(n), np.eye(n), np.zeros(n), np.zeros(n)
+    extra = np.zeros(estimators.extra(estimator, n, memory))
+    for _ in range(updates):
+        update(theta, P, P_d, 1.0, memory, 0.0, phi, phi, K, extra)
+    return float(np.abs(P).max())
+
+
+def contraction(seed: int) -> dict[str, float]:
+    """Return what is left of P - P_d, started at 99 P_d, by eigenvalue: eq. (12) measured on the paper's profile.
+
+    The largest and the smallest eigenvalue of P_d^-1/2 (P - P_d) P_d^-1/2, relative to the start, after 10 s (one
+    memory) and 60 s of the profile, and after 10 s of phi = 0.
+    """
+    from servoscope.estimators import akf
+
+    loop = rig(structure="tustin", memory=10.0)
+    made = ResidualGenerator.of(loop, PAPER.record(loop, seed + 1000))
+    recording = PAPER.record(loop, seed)
+    tuning = made.tuning
+    g = made.pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
+    phi = np.ascontiguousarray(g.phi[g.ok] / tuning.scale)
+    eta = np.ascontiguousarray(g.eta[g.ok])
+    P_d = np.ascontiguousarray(tuning.P_d * np.outer(tuning.scale, tuning.scale))
+    L = _root(P_d)
+    found: dict[str, float] = {}
+    for name, rows in (("motion", phi), ("dark", 0.0 * phi)):
+        theta, P, K, extra = np.zeros(4), IGNORANT * P_d, np.zeros(4), np.zeros(0)
+        for k in range(len(rows)):
+            akf.update(theta, P, P_d, tuning.R, made.pipeline.memory, eta[k], rows[k], rows[k], K, extra)
+            if k + 1 in (1000, len(rows)):
+                error = np.asarray(_whitened(L, P) - np.eye(4), dtype=np.float64)
+                left = np.linalg.eigvalsh(error) / (IGNORANT - 1.0)
+                after = "10" if k + 1 == 1000 else "60"
+                found[f"eq12.{name}.{after}.largest"] = float(left[-1])
+                found[f"eq12.{name}.{after}.smallest"] = float(left[0])
+    return found
+
+
+def measure(seed: int) -> dict[str, float]:
+    """Return the growth of P per estimator, at rest and in the dark, and what eq. (12) leaves."""
+    found = contraction(seed)
+    for estimator in ESTIMATORS:
+        t, sizes = at_rest(estimator, seed)
+        found[f"windup.rest.{estimator}"] = float(sizes[-1] / sizes[t <= MOVING][-1])
+        found[f"windup.dark.{estimator}"] = in_the_dark(estimator)
+    return found
+
+
+def _root(P: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.cholesky(P), dtype=np.float64)
+
+
+def _whitened(L: FloatArray, P: FloatArray) -> FloatArray:
+    half = np.linalg.solve(L, P)
+    return np.asarray(np.linalg.solve(L, half.T))
+
+
+def _largest(L: FloatArray, P: FloatArray) -> float:
+    white = _whitened(L, P)
+    return float(np.linalg.eigvalsh((white + white.T) / 2.0)[-1]) if np.isfinite(white).all() else float("inf")
