@@ -114,6 +114,47 @@ def test_an_instrument_that_fails_later_is_replaced_and_told(
     assert any(warning.kind == "instrument" and "akf" in warning.message for warning in diagnosis.warnings)
 
 
+def test_a_noisier_sensor_is_told_and_not_taken_for_a_fault(
+    rig: dict[str, Any], record: Callable[..., Recording]
+) -> None:
+    """The noise in the regressors moves theta; without its growth in the expectation it looks like contamination."""
+    loop = Loop.from_dict(rig)
+    baseline = learn(loop, [record(loop)])
+    for seed in (2, 3):
+        diagnosis = diagnose(baseline, record(loop, seed=seed, noise_y_std=3.0 * np.sqrt(1e-7)))
+        assert diagnosis.verdict == "healthy"
+        (told,) = [warning for warning in diagnosis.warnings if warning.kind == "noise"]
+        assert told.message.startswith(("2.9", "3 ", "3.0", "3.1"))
+
+
+def test_an_input_at_its_limits_says_nothing(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    baseline = learn(loop, [record(loop)])
+    stuck = Loop.from_dict(rig | {"input_limits": [-1e-3, 1e-3]})
+    pinned = record(loop)
+    pinned = replace(pinned, u=np.clip(pinned.u, -1e-3, 1e-3))
+    with pytest.raises(NotEnoughError, match="at a limit"):
+        learn(stuck, [pinned])
+    limited = baseline.model_copy(update={"loop_settings": stuck.to_dict()})
+    assert diagnose(limited, pinned).verdict != "healthy"
+
+
+def test_polynomial_with_nominal_values_needs_no_learning(record: Callable[..., Recording]) -> None:
+    axis = Loop.from_dict(
+        {
+            "sample_rate": 100.0,
+            "plant": {
+                "kind": "polynomial",
+                "order": 2,
+                "coefficients": {"viscous_friction": 50.0, "inertia": 2.0},
+            },
+            "controller": {"kind": "pi", "k_p": 300.0, "k_i": 0.0},
+        }
+    )
+    baseline = nominal(axis)
+    assert baseline.theta == pytest.approx((50.0, 2.0), rel=0.2)  # with the bias of this noise in it
+
+
 def test_nominal_baseline_finds_faults_without_learning(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
     baseline = nominal(loop)
@@ -138,6 +179,10 @@ class TestFile:
             ({"theta": None}, "theta"),
             ({"loop": {"name": "x"}}, "damaged"),
             ({"unheard": 1}, "unheard"),
+            ({"theta": [1.0]}, "theta must have 4"),
+            ({"R": -1.0}, "positive"),
+            ({"covariance": [[1.0, 0.0], [0.0, 1.0]]}, "4 by 4"),
+            ({"covariance": (-np.eye(4)).tolist()}, "positive"),
         ],
     )
     def test_damage_is_refused(self, saved: Path, tmp_path: Path, change: dict[str, Any], told: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from servoscope.errors import BaselineError, LoopError
 from servoscope.loop import Loop
@@ -113,6 +113,28 @@ class Baseline(_Part):
     promises: tuple[Promise, ...]
     notes: tuple[str, ...]
 
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        n, p = len(self.names), len(self.noise_a)
+        for name in ("theta", "scale"):
+            if len(getattr(self, name)) != n:
+                raise ValueError(f"{name} must have {n} values, one per coefficient")
+        for name in ("covariance", "P_d"):
+            rows = getattr(self, name)
+            if len(rows) != n or any(len(row) != n for row in rows):
+                raise ValueError(f"{name} must be {n} by {n}")
+        if len(self.noise_gamma) != p or not p or not self.noise_gamma[0] > 0.0:
+            raise ValueError("noise_a and noise_gamma must have the same length, and a positive variance")
+        if len(self.model_theta) not in (0, n):
+            raise ValueError(f"model_theta must be empty or have {n} values")
+        if not (n and self.R > 0.0 and self.limit > 0.0 and min(self.scale) > 0.0):
+            raise ValueError("names, R, limit and scale must be positive")
+        C, size = np.array(self.covariance), np.sqrt(np.abs(np.diag(self.covariance)))
+        scaled = C / np.outer(size, size) if size.all() else C
+        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
+            raise ValueError("covariance must be symmetric and positive")
+        return self
+
     @cached_property
     def loop(self) -> Loop:
         """The loop."""
@@ -165,7 +187,7 @@ class Baseline(_Part):
             raise BaselineError(f"{path}: no such file; make a baseline with servoscope learn") from None
         except OSError as error:
             raise BaselineError(f"{path}: cannot be read ({error.strerror or error})") from None
-        except ValueError:
+        except (ValueError, RecursionError):
             raise BaselineError(
                 f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
             ) from None

@@ -23,16 +23,19 @@ from servoscope.diagnosis import (
     Warning,
 )
 from servoscope.errors import RecordingError
-from servoscope.identification import fault_directions
+from servoscope.identification import MOST_SATURATED, fault_directions, saturated
 from servoscope.isolation import isolate
 from servoscope.pipeline import Estimates, Pipeline, Tuning
 from servoscope.recording import Recording
-from servoscope.signatures import Expectation, course
+from servoscope.sentence import summary
+from servoscope.signatures import Expectation, Noise, course
 
 SURE = 0.95  # probability from which a fault is named
 MOST_REFUSED = 0.2  # share of updates that the instrument's guard may skip before the AKF takes over
 WORTH_TELLING = 0.01  # share of them that is warned about
 FALL_BACK = {"estimator": "akf"}
+NO_PROMISE = 10.0  # relative change; who sees nothing smaller sees nothing
+LOUDER = 1.5  # growth of the noise's variance from which it is believed
 WEAKER = 3.0  # a recording that sees only changes this much larger than promised is called undetermined
 
 
@@ -48,6 +51,7 @@ class Examination:
     expectation: Expectation | None
     trace: Trace
     refused: float  # share of the updates that the instrument's guard skipped
+    growth: float  # of the noise's variance against the baseline's
 
     @classmethod
     def of(cls, baseline: Baseline, recording: Recording) -> Examination:
@@ -71,12 +75,15 @@ class Examination:
             fallen = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
             pipeline = Pipeline.of(fallen, baseline.stage_one, baseline.still_speed)
             estimates = pipeline.estimate(tuning, recording)
-        expectation = None
+        expectation, growth = None, 1.0
         expected = np.broadcast_to(tuning.theta, estimates.theta.shape)
         if baseline.noise is not None:
-            expectation = Expectation(pipeline, tuning, baseline.noise, course(recording))
+            growth = _noise_growth(pipeline, estimates)
+            louder = float(np.sqrt(growth))
+            noise = Noise(u_std=louder * baseline.noise.u_std, y_std=louder * baseline.noise.y_std)
+            expectation = Expectation(pipeline, tuning, noise, course(recording))
             expected = expectation.healthy(baseline.plant, np.array(baseline.model_theta))
-        covariance = estimates.S + baseline.cov()
+        covariance = growth * estimates.S + baseline.cov()
         ready = estimates.updates > 0
         T2 = np.where(ready, statistic(estimates.theta, expected, covariance), 0.0)
         frequencies = loop.monitor.frequencies
@@ -94,7 +101,7 @@ class Examination:
             ),
             ready=ready,
         )
-        return cls(baseline, recording, pipeline, tuning, estimates, expectation, trace, refused)
+        return cls(baseline, recording, pipeline, tuning, estimates, expectation, trace, refused, growth)
 
     def diagnosis(self, progress: Callable[[str], None] = lambda _: None) -> Diagnosis:
         """Return the verdict; `progress` is told what is being done."""
@@ -135,7 +142,7 @@ class Examination:
             samples=recording.samples,
             duration_s=recording.duration_s,
             verdict=verdict,
-            summary=_summary(verdict, faults, candidates, self._since(since), seen, warnings),
+            summary=summary(verdict, faults, candidates, self._since(since), seen, warnings),
             detected_at_s=detected_at,
             onset_s=onset_s,
             probability=probability,
@@ -169,7 +176,9 @@ class Examination:
 
     def _seen(self) -> dict[str, tuple[float, float]]:
         """Return, by parameter, the smallest change that would have shown here, and what the baseline promises."""
-        promised = {p.parameter: p.change for p in self.baseline.promises if p.change is not None}
+        promised = {
+            p.parameter: p.change for p in self.baseline.promises if p.change is not None and p.change < NO_PROMISE
+        }
         directions = fault_directions(self.baseline.loop, self.baseline.plant, self.tuning.theta)
         rows = np.array([directions[parameter] for parameter in promised])
         best = np.zeros(len(rows))
@@ -182,6 +191,8 @@ class Examination:
 
     def _blind_to(self, seen: dict[str, tuple[float, float]]) -> list[str]:
         """Return what this recording could not have shown although the baseline promises it."""
+        if (share := saturated(self.baseline.loop, self.recording)) > MOST_SATURATED:
+            return [f"u is at a limit in {share:.0%} of the rows: nothing would have shown"]
         if not seen:
             return ["the baseline promises to see no change at all: learn it from recordings with more motion"]
         if all(np.isinf(smallest) for smallest, _ in seen.values()):
@@ -202,6 +213,12 @@ class Examination:
             message = f"the instrument was too weak for {self.refused:.0%} of the updates{instead}"
             span = float(t[0]), float(t[-1])
             doubts.append(Warning(kind="instrument", from_s=span[0], to_s=span[1], count=1, message=message))
+        if self.growth > 1.0:
+            message = (
+                f"{np.sqrt(self.growth):.2g} times the baseline's noise: look at the sensor and its cable; the healthy "
+                "expectation was computed with it"
+            )
+            doubts.append(Warning(kind="noise", from_s=float(t[0]), to_s=float(t[-1]), count=1, message=message))
         if len(e.updates) and e.updates[-1] > 0:
             last = int(e.index[int(np.searchsorted(e.updates, e.updates[-1]))])
             if t[-1] - t[last] > self.baseline.loop.monitor.memory:
@@ -240,37 +257,21 @@ class Examination:
         )
 
 
+def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
+    """Return how much louder the noise is than the baseline's (variance), 1 where it is not.
+
+    Noise moves the expected estimate (errors in variables), so a failing sensor would look like an ailing plant. A
+    low quantile over time tells it from a fault, whose residual stands out only until the estimate has followed.
+    """
+    settled = estimates.power[estimates.updates > 3.0 * pipeline.memory]
+    if not len(settled):
+        return 1.0
+    growth = float(np.quantile(settled, 0.1))
+    return growth if growth > LOUDER else 1.0
+
+
 def _refused(estimates: Estimates) -> float:
     if not len(estimates.updates):
         return 0.0
     refused, updated = float(estimates.skipped[-1]), float(estimates.updates[-1])
     return refused / max(refused + updated, 1.0)
-
-
-def _summary(
-    verdict: Verdict,
-    faults: tuple[FoundFault, ...],
-    candidates: tuple[Candidate, ...],
-    since: str,
-    seen: dict[str, tuple[float, float]],
-    warnings: list[Warning],
-) -> str:
-    if verdict == "healthy":
-        smallest = sorted((size, parameter) for parameter, (size, _) in seen.items())
-        told = ", ".join(f"{parameter} {100.0 * size:.3g} %" for size, parameter in smallest)
-        return f"Healthy: no change that would have shown here (from {told} on)."
-    if verdict == "undetermined":
-        reason = next(warning.message for warning in warnings if warning.kind == "power")
-        return f"Undetermined: {reason}."
-    if faults:
-        (fault,) = faults
-        low, high = fault.interval
-        return (
-            f"Fault: {fault.name}. {fault.parameter} is {fault.ratio:.4g} times its healthy value ({low:.4g} to "
-            f"{high:.4g}) {since}."
-        )
-    likely = [c for c in candidates if c.probability >= 0.05]
-    if likely[0].name == UNKNOWN and likely[0].probability >= 0.5:
-        return f"Fault, unknown: a change {since} that no single known fault explains."
-    listed = " or ".join(f"{c.name} ({c.probability:.0%})" for c in likely)
-    return f"Fault {since}, not to be told apart here: {listed}."

@@ -12,10 +12,14 @@ from servoscope.linear import Linear, autocovariances
 from servoscope.loop import Loop
 from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray, Plant
+from servoscope.recording import Recording
 from servoscope.signatures import Expectation, Noise, noise_system
 from servoscope.tuning import Fit, autocovariance
 
 PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
+
+
+MOST_SATURATED = 0.5  # share of rows with u at a limit, from which u says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,14 @@ class HealthyPlant:
     std: dict[str, float]
     theta: FloatArray
     misfit: float
+
+
+def saturated(loop: Loop, recording: Recording) -> float:
+    """Return the share of samples with u at or beyond a limit of the loop."""
+    if loop.input_limits is None:
+        return 0.0
+    low, high = loop.input_limits
+    return float(((recording.u <= low) | (recording.u >= high)).mean())
 
 
 def simulated(loop: Loop) -> bool:

@@ -148,6 +148,8 @@ def closed_loop(loop: Loop, plant: Plant) -> Linear:
     y = output + d * (u + n_u) + n_y
     x_next = np.hstack([G.A, np.zeros((n, 4))]) + np.outer(G.B[:, 0], u + n_u)
     both = np.vstack([x_next, s + dt * e])
+    if not k_i:  # nobody listens to the sum then: its pole at 1 must not count
+        both[n, :n], both[n, n], both[n, n + 1 :] = 0.0, 0.0, 0.0
     if np.abs(np.linalg.eigvals(both[:, : n + 1])).max() >= 1.0:
         raise LoopError(f"{loop.name}: the closed loop is unstable, check [plant] and [controller]")
     outputs = np.vstack([u, y])
@@ -191,11 +193,11 @@ def _svf_paths(loop: Loop) -> tuple[Linear, Linear, list[Linear], int]:
 def _tustin_paths(loop: Loop) -> tuple[Linear, Linear, list[Linear], int]:
     """Return the paths of eq. (4) as printed, or with (u(k) + u(k-1))/2 in place of u for a held input."""
     plant = loop.plant
-    n = max(plant.powers)
+    n = max(plant.powers, default=0)
     if plant.extras or plant.powers != tuple(range(n + 1)):
         raise LoopError(
             f"{loop.name}: [monitor] structure = {loop.monitor.structure!r} needs a plant with all powers of s "
-            "and neither friction nor offset; use structure = 'svf'"
+            "(stiffness = true) and neither friction nor offset; use structure = 'svf'"
         )
     weights = plant.input_gain * np.array([math.comb(n, i) for i in range(n + 1)], dtype=np.float64)
     if loop.monitor.structure == "tustin-held":

@@ -8,14 +8,22 @@ from dataclasses import replace
 import numpy as np
 
 from servoscope import twostage
-from servoscope.baseline import Baseline, Promise, Source, digest
+from servoscope.baseline import Baseline, Source, digest
 from servoscope.delays import check_delay
-from servoscope.detection import SECONDS_PER_YEAR, noncentrality, required_noncentrality, statistic, threshold
+from servoscope.detection import threshold
 from servoscope.errors import LoopError, NotEnoughError
-from servoscope.identification import fault_directions, healthy_parameters, noise_of, simulated
+from servoscope.identification import (
+    MOST_SATURATED,
+    fault_directions,
+    healthy_parameters,
+    noise_of,
+    saturated,
+    simulated,
+)
 from servoscope.loop import Loop
-from servoscope.pipeline import Estimates, Pipeline, Regression
+from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray
+from servoscope.promises import WORTH_A_LOOK, misfit_of, promises, supported_budget
 from servoscope.recording import Recording
 from servoscope.signatures import Expectation, course
 from servoscope.simulation import reference, simulate
@@ -25,8 +33,8 @@ SHORTEST = 10.0  # memories; a shorter baseline is warned about
 SPEED_OVER = 0.05  # s over which a speed is measured here
 STILL_SHARE = 0.02  # of the speed of motion, below which an axis stands still
 WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
+MOST_SIMULATED = 2e6  # samples behind a nominal baseline
 LEAST_EXPLAINED = 0.9  # share of u's variance
-WORTH_A_LOOK = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
 
 Progress = Callable[[str], None]
 
@@ -55,6 +63,11 @@ def learn(loop: Loop, recordings: Sequence[Recording], progress: Progress = lamb
     if not recordings:
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
     progress("regressors")
+    for rec in recordings:
+        if (share := saturated(loop, rec)) > MOST_SATURATED:
+            raise NotEnoughError(
+                f"{rec.name}: u is at a limit in {share:.0%} of the rows: lower the demand, or check input_limits"
+            )
     pipeline, regressions, found = _tuned(loop, recordings)
     notes: list[str] = []
     if found.strength < WEAKEST_INSTRUMENT:
@@ -110,6 +123,7 @@ def nominal(loop: Loop, progress: Progress = lambda _: None, duration_s: float =
     """
     if not loop.plant.has_physics or loop.controller is None:
         raise LoopError(f"{loop.name}: a nominal baseline needs [controller] and the plant's nominal values")
+    duration_s = min(duration_s, MOST_SIMULATED / loop.sample_rate)
     healthy, _ = simulate(loop, reference("profile", duration_s, loop.sample_rate))
     pipeline, regressions, found = _tuned(loop, [healthy])
     note = "computed from nominal parameters: an asset that differs from them by construction counts as a fault"
@@ -164,7 +178,7 @@ def _assemble(
         if noise is not None:
             expected = Expectation(pipeline, tuning, noise, course(rec)).healthy(plant, model_theta)
         deviations.append(e.theta - expected)
-    excess, suggestion = _excess(estimates, deviations, covariance, found)
+    excess, suggestion = misfit_of(estimates, deviations, covariance, found)
     if found.explained < LEAST_EXPLAINED:
         notes.append(
             f"the motion explains only {found.explained:.0%} of u: not a baseline to trust, check columns, units, plant"
@@ -180,7 +194,7 @@ def _assemble(
             f"{duration:.0f} s are short for a memory of {loop.monitor.memory:g} s: record at least "
             f"{SHORTEST * loop.monitor.memory:.0f} s"
         )
-    supported = _supported_budget(pipeline.bank.n, loop, found.dof, excess)
+    supported = supported_budget(pipeline.bank.n, loop, found.dof, excess)
     if supported > loop.monitor.false_alarms_per_year:
         notes.append(
             f"the data support a budget of {supported:.3g} false alarms per year, not "
@@ -211,7 +225,7 @@ def _assemble(
         delay_s=delay_s,
         suggested_model_error=suggestion,
         supported_false_alarms_per_year=supported,
-        promises=_promises(loop, directions, estimates, covariance, limit),
+        promises=promises(loop, directions, estimates, covariance, limit),
         notes=tuple(notes),
     )
 
@@ -233,69 +247,3 @@ def _scatter(found: Fit) -> FloatArray:
     beyond = np.maximum(found.each.var(axis=0, ddof=1) - own, 0.0)
     students = (m - 1.0) / (m - 3.0) if m > 3 else 3.0
     return np.diag(beyond * students * (1.0 + 1.0 / m))
-
-
-def _excess(
-    estimates: Sequence[Estimates], deviations: Sequence[FloatArray], covariance: FloatArray, found: Fit
-) -> tuple[float, float]:
-    """Return T^2 per coefficient on the healthy data themselves, and the model error that would bring it to one."""
-    from scipy.optimize import brentq
-
-    learned = [e.updates > 0 for e in estimates]
-    S = np.concatenate([e.S[ok] for e, ok in zip(estimates, learned, strict=True)])
-    d = np.concatenate([each[ok] for each, ok in zip(deviations, learned, strict=True)])
-    if not len(d):
-        return 0.0, 0.0
-    unit = np.diag((found.rms_eta / found.tuning.scale) ** 2)
-
-    def mean(rho: float) -> float:
-        T2 = statistic(d, np.zeros_like(d), S + covariance + rho**2 * unit)
-        return float(T2.mean()) / float(d.shape[1])
-
-    excess = mean(0.0)
-    if excess <= 1.0 or mean(0.5) > 1.0:
-        return excess, 0.0 if excess <= 1.0 else 0.5
-    root = brentq(lambda rho: mean(rho) - 1.0, 0.0, 0.5, xtol=1e-4)
-    return excess, float(root)
-
-
-def _supported_budget(n: int, loop: Loop, dof: float, excess: float) -> float:
-    """Return the smallest budget that the data speak for [false alarms per year].
-
-    The tail of T^2 is extrapolated from the estimated noise; that is trusted while the noise's own uncertainty raises
-    the threshold by less than half, and not at all where healthy data contradict the noise model.
-    """
-    if excess > WORTH_A_LOOK:
-        return SECONDS_PER_YEAR / loop.monitor.memory
-    looks = loop.monitor.evaluation_rate, loop.monitor.memory
-    for exponent in np.arange(-3.0, 9.0, 0.5):
-        budget = float(10.0**exponent)
-        if threshold(n, *looks, budget, dof) <= 1.5 * threshold(n, *looks, budget, 1e9):
-            return budget
-    return SECONDS_PER_YEAR * looks[0]
-
-
-def _promises(
-    loop: Loop,
-    directions: dict[str, FloatArray],
-    estimates: Sequence[Estimates],
-    covariance: FloatArray,
-    limit: float,
-) -> tuple[Promise, ...]:
-    """Return the smallest change of each fault's parameter that the baseline's own excitation shows."""
-    rows = np.array(list(directions.values()))
-    seen = []
-    for e in estimates:
-        half = slice(len(e.theta) // 2, None)
-        if len(e.theta[half]):
-            seen.append(np.median(noncentrality(e.S[half] + covariance, e.Psi[half], rows), axis=0))
-    needed = required_noncentrality(covariance.shape[0], limit)
-    best = np.max(seen, axis=0) if seen else np.zeros(len(rows))
-    return tuple(
-        Promise(
-            name=fault.name,
-            parameter=fault.parameter,
-            change=float(np.sqrt(needed / information)) if information > 0.0 else None,
-        )
-        for fault, information in zip(loop.plant.faults, best, strict=True)
-    )

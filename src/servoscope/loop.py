@@ -246,7 +246,7 @@ class Loop(_Settings):
             raise LoopError(f"{path}: is not a text file, a loop file is TOML in UTF-8") from None
         try:
             mapping = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise LoopError(f"{path}: not valid TOML: {' '.join(str(error).split())}") from None
         return cls.from_dict(mapping, source=str(path))
 

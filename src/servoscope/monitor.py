@@ -156,6 +156,8 @@ class Monitor:
 
         Read it with `latest`. NaN in any of the three is a gap.
         """
+        if state.shape != self._shape or self.fleet:
+            raise RecordingError("step follows one asset: give the state of a monitor with one baseline, or use run")
         self._one[0, 0, 0], self._one[1, 0, 0], self._one[2, 0, 0] = r, u, y
         one, head = self._one, self._head
         if head:

@@ -224,7 +224,7 @@ class Pipeline:
 
         c = self.constants(self.blank() if tuning is None else tuning)
         state = Layout(c).start(c, 1)
-        out = np.empty((len(r), len(c.C)))
+        out = np.zeros((len(r), len(c.C)))  # a missing sample writes nothing
         ok = np.empty(len(r), dtype=np.int64)
         regressors(c, state[0], r, self.input(r, u, restart), y, restart, out, ok)
         n = self.bank.n

@@ -28,6 +28,7 @@ BoolArray = npt.NDArray[np.bool_]
 # counters at the head of the state row
 ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, POWER, STILL, DRIFT = range(8)
 HEAD = 8
+ABSURD = 1e100  # no physical signal; its square would overflow and stay in the state for ever
 # what `sense` says of a sample
 MISSING, HELD, USED, BETWEEN = -1, 0, 1, 2
 
@@ -128,7 +129,7 @@ def sense(
     dead, `BETWEEN` when the stride leaves it out, and `MISSING` for a NaN: then only the demand to re-arm stays.
     """
     s[SAMPLE] += 1.0
-    if not (np.isfinite(r) and np.isfinite(u) and np.isfinite(y)):
+    if not (abs(r) < ABSURD and abs(u) < ABSURD and abs(y) < ABSURD):  # NaN is not below anything either
         s[ARMED] = 0.0
         return MISSING
     nx = c.A.shape[0]

@@ -109,14 +109,15 @@ class Expectation:
     course: Course
 
     @cached_property
-    def _moments(self) -> dict[Plant, Moments]:
+    def _moments(self) -> dict[str, Moments]:
         return {}
 
     def moments(self, plant: Plant) -> Moments:
         """Return the noise's moments with a plant; remembered."""
-        if plant not in self._moments:
-            self._moments[plant] = noise_moments(self.pipeline, plant, self.noise)
-        return self._moments[plant]
+        key = plant.model_dump_json()
+        if key not in self._moments:
+            self._moments[key] = noise_moments(self.pipeline, plant, self.noise)
+        return self._moments[key]
 
     def path(self, plants: Sequence[Plant], onsets: Sequence[int], start: FloatArray) -> FloatArray:
         """Return the mean of theta_hat at every evaluation, shape (K, n).

@@ -215,7 +215,11 @@ def check_output(
         return
     if any(_same(path, each) for each in inputs):
         raise typer.BadParameter(f"{option} {path}: is an input and would be overwritten, give another name")
-    if folder and (path.is_dir() or not path.suffix):
+    try:
+        is_folder = path.is_dir()
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+    if folder and (is_folder or not path.suffix):
         return
     if suffixes and path.suffix.lower() not in suffixes:
         raise typer.BadParameter(f"{option} {path}: end the name in {' or '.join(suffixes)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from servoscope.inspection.judgement import DELAY_GAIN, DELAY_TOLERANCE, FEW_BITS, PRECISE, SNR, still
+from servoscope.inspection.judgement import DELAY_GAIN, DELAY_TOLERANCE, FEW_BITS, PRECISE, SNR, still, weak
 from servoscope.inspection.measured import Measured
 from servoscope.loop import Loop
 
@@ -62,9 +62,9 @@ def _recommended(m: Measured, loop: Loop | None) -> Iterator[str]:
     if worst > PRECISE:
         longer = memory * min((worst / PRECISE) ** 2, 20.0)
         yield f"[monitor] memory = {longer:.2g} for 5 % at every frequency that is excited"
-    weak = [f"{at.frequency_hz:g}" for at in m.frequencies if at.snr is not None and at.snr < SNR]
-    if weak and loop is not None:
-        yield f"[monitor] frequencies without {', '.join(weak)} Hz, or record a faster motion"
+    lacking = [f"{at.frequency_hz:g}" for at in m.frequencies if weak(m, at)]
+    if lacking and loop is not None:
+        yield f"[monitor] frequencies without {', '.join(lacking)} Hz, or record a faster motion"
     coarse = [q.signal for q in m.quantisation if q.signal != "r" and (q.effective_bits or 99.0) < FEW_BITS]
     if coarse:
         yield f"log {' and '.join(coarse)} with more digits, or over a larger stroke"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Literal
 
+from servoscope.inspection.excitation import Excited
 from servoscope.inspection.leftover import Residual
 from servoscope.inspection.levels import Said, percent
 from servoscope.inspection.measured import Fit, Measured, described
@@ -69,6 +70,12 @@ def headline_of(findings: tuple[Finding, ...]) -> str:
     if verdict == "not usable" or not any(finding.kind == "short" for finding in findings):
         return verdict
     return "usable to diagnose; short to learn from" if verdict == "usable" else f"{verdict}; short to learn from"
+
+
+def weak(m: Measured, at: Excited) -> bool:
+    """Return whether a frequency is too weak; without a period the regression may vouch for it, coherence says less."""
+    known = at.relative_std_memory is not None and at.relative_std_memory <= PRECISE
+    return at.snr is not None and at.snr < SNR and not (m.periods is None and known)
 
 
 def still(m: Measured) -> bool:
@@ -164,7 +171,7 @@ def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
             words = f"{at.frequency_hz:g} Hz is hardly excited, or u and y do not follow the reference there"
             yield (
                 "frequency",
-                asked,
+                asked if weak(m, at) else "note",
                 f"{words} (signal to noise {at.snr:.2g}): estimates there rest on other frequencies",
             )
         elif at.relative_std_memory is not None and at.relative_std_memory > 2.0 * PRECISE:
@@ -177,7 +184,11 @@ def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
     memory = loop.monitor.memory if loop is not None else 5.0
     if m.sampling.duration_s < LEAST_MEMORIES * memory:
         wanted = f"{LEAST_MEMORIES * memory:g} s or more, ten times the memory of {memory:g} s"
-        yield "short", "note", f"{m.sampling.duration_s:.3g} s are enough to diagnose; to learn from, record {wanted}"
+        lasts = f"{m.sampling.duration_s:.3g} s"
+        if m.sampling.duration_s < memory:
+            yield "short", "care", f"{lasts} are less than the memory of the estimator; to learn from, record {wanted}"
+        else:
+            yield "short", "note", f"{lasts} are enough to diagnose; to learn from, record {wanted}"
 
 
 def _of_model(m: Measured, loop: Loop | None) -> Iterator[_Said]:

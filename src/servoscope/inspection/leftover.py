@@ -15,6 +15,8 @@ SIGNIFICANT = 0.01  # probability below which a residual is called structured
 REPEATS = 0.002  # relative structure function of r at its period
 DIFFERS = 0.2  # and what it must have exceeded before
 
+LONGEST_PAUSE = 60.0  # s
+
 
 class Residual(Said):
     """The residual of the regression.
@@ -47,8 +49,12 @@ class Residual(Said):
 
 
 def on_grid(recording: Recording, x: FloatArray, mask: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Put x, shape (N,), on the uniform grid of sample times; what is missing or masked is 0 and False."""
-    slots = np.round((recording.t - recording.t[0]) * recording.sample_rate).astype(np.int64)
+    """Put x, shape (N,), on the uniform grid of sample times; what is missing or masked is 0 and False.
+
+    A pause counts as `LONGEST_PAUSE` at most: nothing repeats across a longer one, and a night would fill the memory.
+    """
+    steps = np.round(np.diff(recording.t) * recording.sample_rate)
+    slots = np.concatenate([[0], np.cumsum(np.clip(steps, 1, LONGEST_PAUSE * recording.sample_rate))]).astype(np.int64)
     values = np.zeros(int(slots[-1]) + 1)
     there = np.zeros(values.size, dtype=bool)
     values[slots[mask]] = x[mask]

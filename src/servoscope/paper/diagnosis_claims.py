@@ -72,7 +72,8 @@ def _isolation(n: Numbers) -> Row:
         "Sec. 4, Fig. 7",
         "Residual patterns identify and isolate specific faults by type and size.",
         f"Of 16 faults the paper's evaluator detects {n.say('paper.detected')} and names {n.say('paper.named')} with "
-        f"signatures from physics; this project's default detects {n.say('default.detected')} and names "
+        f"signatures from physics, and on residuals of the state-variable filter {n.say('unbiased.detected')} and "
+        f"{n.say('unbiased.named')}; this project's default detects {n.say('default.detected')} and names "
         f"{n.say('default.named')}, median error of the size {n.percent('default.size_error')}.",
         judge(n("paper.named") >= 0.95 * total, n("default.named") >= 0.95 * total),
         "The patterns are there, but thresholds around a biased healthy residual are wide and nominal signatures do "

@@ -81,6 +81,11 @@ def evaluated(seed: int, method: str = "akf") -> dict[str, float]:
         "paper.delay": float(np.median([t - FAULT_AT for t in late])) if late else float("nan"),
         "paper.healthy_alarm": float(evaluator.evaluate(tested.healthy).detected_at_s is not None),
     }
+    unbiased = residuals("default", seed)
+    same = Evaluator.of(loop_of("default"), residuals("default", seed, LABELS).healthy)
+    found = [same.evaluate(course) for course in unbiased.cases]
+    said["unbiased.detected"] = float(sum((f.detected_at_s or 0.0) > FAULT_AT for f in found))
+    said["unbiased.named"] = float(sum(f.fault == case.fault for f, case in zip(found, TABLE_2, strict=True)))
     taught = labelled_signatures(labelled.cases)
     ends = [course.between(50.0, 60.0).gamma.mean(axis=0) for course in tested.cases]
     said["labelled.named"] = float(_named(evaluator, taught, ends))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,6 +127,7 @@ def run(loop: Loop, case: Case, seed: int, change: tuple[float, Controller] | No
     return Recording(loop.name, t, r, u, y, loop.sample_rate, restart, np.zeros(r.size, dtype=np.int32), ())
 
 
+@functools.lru_cache(maxsize=4)
 def story(case: Case, seed: int) -> Story:
     """Let a fault happen, diagnose it from what was recorded until then, reschedule, and go on."""
     loop = default_loop()

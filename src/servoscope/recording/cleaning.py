@@ -19,6 +19,7 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int32]
 
 LEAST_SAMPLES = 20
+LARGEST = 1e60  # and its inverse: beyond, squares of squares leave the range of numbers
 MOST_LOST = 0.5  # share of rows that may be unusable
 PLATEAU = 5  # samples at the very extreme value before u is said to be at a limit
 FOLLOWS = 0.5  # share of the reference's variation that is left when a signal follows it
@@ -189,6 +190,12 @@ def _check_channels(channels: list[FloatArray], name: str, labels: tuple[str, st
         finite = x[np.isfinite(x)]
         if finite.size == 0:
             raise RecordingError(f"{name}: {label} holds no numbers at all, choose another column")
+        if np.abs(finite).max() > LARGEST:
+            raise RecordingError(
+                f"{name}: {label} reaches {np.abs(finite).max():g}, which is no physical signal: check its unit"
+            )
+        if not may_rest and np.ptp(finite) < 1.0 / LARGEST and finite.size > 1 and finite.min() != finite.max():
+            raise RecordingError(f"{name}: {label} varies by {np.ptp(finite):g} only: check its unit")
         if not may_rest and finite.size > 1 and finite.min() == finite.max():
             raise RecordingError(
                 f"{name}: {label} is constant: {finite[0]:g} in all {finite.size} rows;"

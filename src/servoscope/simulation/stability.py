@@ -80,6 +80,8 @@ def poles_of(loop: Loop, discrete: Discrete) -> npt.NDArray[np.complex128]:
         # A sum that nobody integrates stands still: no pole of the loop.
         keep = np.arange(size) != n
         loop_matrix = loop_matrix[np.ix_(keep, keep)]
+    if not integrating:  # s stays 0 then, and its pole at 1 is nobody's
+        loop_matrix = np.delete(np.delete(loop_matrix, n, axis=0), n, axis=1)
     # States in SI differ by ten decades, which eigvals evens out itself only in part.
     from scipy.linalg import matrix_balance
 
