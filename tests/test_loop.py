@@ -202,7 +202,7 @@ def test_a_key_outside_its_section_is_sent_home(rig: dict[str, Any]) -> None:
         ("", "monitor", 5, "monitor: 5 is not a table of settings"),
         ("", "plant", "eha", "plant: 'eha' is not a table of settings"),
         ("plant", "kind", "ehaa", "[plant] kind = 'ehaa': unknown, choose from"),
-        ("plant", "beta", -1e9, "[plant] beta: -1000000000.0 must be greater than 0"),
+        ("plant", "beta", -1e9, "[plant] beta: -1000000000.0 must be greater than 1e-30"),
         ("plant", "beta", "1e9", "[plant] beta: '1e9' is not a number"),
         ("controller", "kind", "pid", "[controller] kind: 'pid' is not one of 'pi'"),
         ("controller", "k_p", 0.0, "[controller] k_p: 0.0 must be greater than 0"),

@@ -141,8 +141,11 @@ class TestMonitor:
     def test_it_tells_healthy_from_faulty(self, baseline: Baseline) -> None:
         assert diagnose(baseline, recorded(baseline.loop, 2)).verdict == "healthy"
         fault = (FaultEvent("p_s", 1.2, 30.0),)
-        (found,) = diagnose(baseline, recorded(baseline.loop, 3, faults=fault)).faults
+        said = diagnose(baseline, recorded(baseline.loop, 3, faults=fault))
+        (found,) = said.faults
         assert found.name == "pump" and found.ratio == pytest.approx(1.2, rel=0.01)
+        assert said.onset_s is not None
+        assert said.onset_s[0] <= 30.0 <= said.onset_s[2] and said.onset_s[2] - said.onset_s[0] < 1.0
 
 
 def test_what_cannot_be_is_refused(rig: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -135,7 +135,9 @@ def onset(
     last
         Last sample that `faulty` speaks for.
     """
-    g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
+    # u itself changes at once, where u_a of stage 1 has to learn the change first
+    single = replace(pipeline, stage_one=None)
+    g = single.regression(recording.r, recording.u, recording.y, recording.restart)
     used = np.flatnonzero(g.ok[: last + 1])
     phi = g.phi[used]
     changed = phi @ (faulty - healthy)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope import twostage
+from servoscope import estimators, twostage
 from servoscope.baseline import Baseline, Source, digest
 from servoscope.delays import check_delay
 from servoscope.detection import threshold
@@ -69,7 +69,11 @@ def learn(loop: Loop, recordings: Sequence[Recording], progress: Progress = lamb
                 f"{rec.name}: u is at a limit in {share:.0%} of the rows: lower the demand, or check input_limits"
             )
     pipeline, regressions, found = _tuned(loop, recordings)
-    notes: list[str] = []
+    notes = [
+        f"estimator = {loop.monitor.estimator!r}: {why}; false alarms and wrong names are possible, with 'akf' less so"
+        for check, why in estimators.exceptions(loop.monitor.estimator).items()
+        if check in ("mean", "covariance")
+    ]
     if found.strength < WEAKEST_INSTRUMENT:
         notes.append(
             f"the instrument is too weak (strength {found.strength:.2g} of 1, at least {WEAKEST_INSTRUMENT:g} needed): "

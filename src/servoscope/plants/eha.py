@@ -12,7 +12,7 @@ from pydantic import Field
 from servoscope.errors import LoopError
 from servoscope.plants.base import Fault, FloatArray, Plant, StateSpace
 
-Positive = Annotated[float, Field(gt=0.0, ge=1e-30, le=1e30, allow_inf_nan=False)]  # SI values beyond are typos
+Positive = Annotated[float, Field(gt=1e-30, lt=1e30, allow_inf_nan=False)]  # SI values beyond are typos
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 FAULTS = (
