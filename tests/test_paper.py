@@ -5,12 +5,26 @@ from __future__ import annotations
 import functools
 import json
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from servoscope.paper import claims, measures, metrics, reproduction, sensitivity, table, tolerance, tracking, windup
+from servoscope.cli import app
+from servoscope.paper import (
+    claims,
+    drawings,
+    measures,
+    metrics,
+    reproduction,
+    sensitivity,
+    table,
+    tolerance,
+    tracking,
+    windup,
+)
 from servoscope.paper.conditions import FREQUENCIES, PAPER, TABLE_2, TRACKED, Case, default_loop, paper_loop, rig
 from servoscope.paper.measures import Job
 from servoscope.paper.method import Evaluator, FaultManager, Finding, ResidualGenerator, nominal_signatures
@@ -209,3 +223,32 @@ def test_the_reproduction_writes_every_figure_twice_and_the_claims(
 def test_jobs_are_shared_between_processes() -> None:
     work = [Job("physics", 1), Job("physics", 2)]
     assert dict(reproduction.results(work, 2)) == dict(reproduction.results(work, 1))
+
+
+class TestCommand:
+    """``servoscope reproduce``, with the measuring and drawing left out."""
+
+    @pytest.fixture(autouse=True)
+    def _quick(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def run(seeds: range, told: Callable[[str], None]) -> reproduction.Reproduction:
+            told(f"{len(seeds)} seeds")
+            return reduced()
+
+        monkeypatch.setattr(reproduction, "run", run)
+        monkeypatch.setattr(reproduction, "drawings", lambda found: iter([("figure-1", drawings.figure_1)]))
+
+    def test_writes_a_folder_and_prints_the_verdicts(self, tmp_path: Path) -> None:
+        said = CliRunner().invoke(app, ["reproduce", "-o", str(tmp_path / "new" / "folder")])
+        assert said.exit_code == 0, said.output
+        assert "does not hold: With the nominal system" in said.stdout
+        names = {path.name for path in (tmp_path / "new" / "folder").iterdir()}
+        assert names == {"figure-1.png", "figure-1.svg", "claims.json", "claims.md"}
+
+    def test_prints_json_and_nothing_else(self, tmp_path: Path) -> None:
+        said = CliRunner().invoke(app, ["reproduce", "-o", str(tmp_path), "--json"])
+        assert json.loads(said.stdout) == json.loads((tmp_path / "claims.json").read_text())
+
+    def test_a_folder_that_cannot_be_made_is_one_line(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("x")
+        said = CliRunner().invoke(app, ["reproduce", "-o", str(tmp_path / "file")])
+        assert said.exit_code == 1 and said.stderr.count("\n") == 1 and "cannot be made a folder" in said.stderr

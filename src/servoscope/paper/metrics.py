@@ -9,6 +9,8 @@ from servoscope.inverse import ComplexArray
 from servoscope.paper.sensitivity import angle
 from servoscope.plants import FloatArray
 
+LASTING = 1.0  # s
+
 
 def cv_theta(theta: FloatArray) -> float:
     """Return CV_theta = sqrt(mean of sigma/|mu|) over time; the paper prints mu without its magnitude.
@@ -27,7 +29,9 @@ def cv_H(H: ComplexArray) -> float:
 
 
 def rise(t: FloatArray, H: ComplexArray, at_s: float, before: complex, after: complex, share: float = 0.5) -> float:
-    """Return how long after `at_s` the iFRF first gets `share` of the way from `before` to `after` [s]; NaN: never.
+    """Return how long after `at_s` the iFRF gets `share` of the way from `before` to `after` [s]; NaN: never.
+
+    It has to stay there for a second: a noisy estimate crosses any level at once.
 
     Parameters
     ----------
@@ -35,7 +39,9 @@ def rise(t: FloatArray, H: ComplexArray, at_s: float, before: complex, after: co
         Times [s] and iFRF at one frequency, shape (K,).
     """
     way = np.real((H - before) * np.conj(after - before)) / abs(after - before) ** 2
-    reached = np.flatnonzero((t > at_s) & (way >= share))
+    last = np.searchsorted(t, t + LASTING + 1e-9)  # the sample after that second
+    misses = np.concatenate([[0], np.cumsum(way < share)])
+    reached = np.flatnonzero((t > at_s) & (misses[last] == misses[:-1]))
     return float(t[reached[0]] - at_s) if reached.size else float("nan")
 
 

@@ -65,11 +65,11 @@ def run(seeds: Sequence[int], told: Told = lambda _: None, processes: int | None
     work = measures.jobs(seeds)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = min(cores if processes is None else processes, len(work))
-    results: list[tuple[Job, dict[str, float]]] = []
+    done: list[tuple[Job, dict[str, float]]] = []
     for job, found in results(work, count):
-        results.append((job, found))
+        done.append((job, found))
         told(f"seed {job.seed}, {job.part}")
-    metrics = measures.gather(results)
+    metrics = measures.gather(done)
     return Reproduction(tuple(seeds), metrics, tuple(claims.claims(metrics)))
 
 
