@@ -152,7 +152,10 @@ def _bias(n: Numbers) -> Row:
         "There is a slight bias in the imaginary part, of small impact compared with the real part.",
         f"At 1 Hz: imaginary part {n.percent('akf.own_bias_imag')}, real part {n.percent('akf.own_bias_real')} of "
         f"itself. Without noise: {n.percent('noise_free.tustin.imag')}; where u runs in straight lines "
-        f"{n.percent('noise_free.tustin-straight.imag')}; state-variable filter {n.percent('noise_free.svf.imag')}.",
+        f"{n.percent('noise_free.tustin-straight.imag')}; state-variable filter {n.percent('noise_free.svf.imag')}. "
+        f"With filtered y in phi: {n.percent('akf-filtered.own_bias_imag')}, real part "
+        f"{n.percent('akf-filtered.own_bias_real')}, CV_theta {n.say('akf-filtered.cv_theta')} against "
+        f"{n.say('akf.cv_theta')} with raw y.",
         judge(imag < 0.1 and real < imag, imag < 0.1),
         (
             "The cause is the held input: Tustin takes u for straight lines, and where it is, the bias is gone. "

@@ -60,19 +60,40 @@ class ResidualGenerator:
         The recursion; its filter bank, stage 1 and estimator are settings of the loop.
     nominal
         H(f_d; kappa_o) from the plant's parameters, shape (3,).
+    output_stage
+        Stage 1 for y: then phi holds y_a, what the estimated map makes of r, in the place of the raw y; None: raw.
     """
 
     pipeline: Pipeline
     tuning: Tuning
     nominal: ComplexArray
+    output_stage: twostage.StageOne | None = None
 
     @classmethod
-    def of(cls, loop: Loop, healthy: Recording) -> Self:
-        """Tune on a healthy recording, P_d = (R/N) R_phi^-1; the nominal iFRF needs none."""
+    def of(cls, loop: Loop, healthy: Recording, *, filtered_y: bool = False) -> Self:
+        """Tune on a healthy recording, P_d = (R/N) R_phi^-1; the nominal iFRF needs none.
+
+        Parameters
+        ----------
+        loop
+            Of the paper's method; with `filtered_y` it has two stages.
+        healthy
+            The recording.
+        filtered_y
+            Whether phi holds y filtered by a stage 1 of its own, as eta holds u_a, or the raw y.
+        """
         pipeline = Pipeline.of(loop, twostage.tune(loop, [healthy]))
-        regression = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-        tuning = fit([regression], pipeline.memory, pipeline.bank.names).tuning
-        return cls(pipeline, tuning, pipeline.bank.E(FREQUENCIES) @ nominal_theta(loop))
+        output_stage = twostage.tune(loop, [replace(healthy, u=healthy.y)]) if filtered_y else None
+        generator = cls(pipeline, pipeline.blank(), pipeline.bank.E(FREQUENCIES) @ nominal_theta(loop), output_stage)
+        regression = pipeline.regression(healthy.r, healthy.u, generator.output(healthy), healthy.restart)
+        return replace(generator, tuning=fit([regression], pipeline.memory, pipeline.bank.names).tuning)
+
+    def output(self, recording: Recording) -> FloatArray:
+        """Return what phi is formed from, y or y_a, shape (N,)."""
+        if self.output_stage is None:
+            return recording.y
+        stage = twostage.Stage(self.pipeline.loop, self.output_stage)
+        return stage.run(stage.start(), recording.r, recording.y, recording.restart)
 
     def run(self, recording: Recording, *, from_zero: bool = False) -> Course:
         """Return the residuals of a recording.
@@ -95,7 +116,7 @@ class ResidualGenerator:
             state[:, layout.slices["P"]] *= IGNORANT
         out = np.empty((1, recording.samples // pipeline.every, layout.row))
         r, restart = recording.r, recording.restart
-        signals = (r, pipeline.input(r, recording.u, restart), recording.y, restart)
+        signals = (r, pipeline.input(r, recording.u, restart), self.output(recording), restart)
         block(pipeline.loop.monitor.estimator)(c, state, *(signal[None, :] for signal in signals), out)
         index = (np.arange(out.shape[1]) + 1) * pipeline.every - 1
         theta = pipeline.unpack(self.tuning, out[0], index).theta

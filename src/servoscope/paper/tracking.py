@@ -16,18 +16,19 @@ from servoscope.signatures import solve_scaled
 from servoscope.simulation import response
 
 COMMISSIONING = 1000  # added to a seed: the healthy recording that tunes is never one that is judged
-METHODS = ("akf", "dfrls", "default")
+FILTERED = "akf-filtered"  # the AKF with y_a, filtered by a stage 1 of its own, in phi
+METHODS = ("akf", "dfrls", "default", FILTERED)
 
 
 def loop_of(method: str) -> Loop:
     """Return the paper's settings with an estimator, or this project's ("default")."""
-    return default_loop() if method == "default" else paper_loop(method)
+    return default_loop() if method == "default" else paper_loop(method.removesuffix("-filtered"))
 
 
 def generator(method: str, seed: int) -> ResidualGenerator:
     """Return a residual generator that was tuned on another healthy recording."""
     loop = loop_of(method)
-    return ResidualGenerator.of(loop, PAPER.record(loop, seed + COMMISSIONING))
+    return ResidualGenerator.of(loop, PAPER.record(loop, seed + COMMISSIONING), filtered_y=method == FILTERED)
 
 
 @functools.lru_cache(maxsize=8)
