@@ -263,7 +263,7 @@ class TestInTheRecursion:
         pipeline, tuning, c, signals = chain(name)
         state, out = Layout(c).start(c, 1), np.empty((1, 1200, Layout(c).row))
         assert block(name)(c, state, *signals, out) == 1200
-        g = pipeline.regression(*(signal[0] for signal in signals), tuning)
+        g = pipeline.regression(*(signal[0] for signal in signals))
         run = Run(name, c.P_d, c.P_d, c.memory)
         run.theta[:], run.R = c.theta, c.R
         for k in np.flatnonzero(g.ok):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -216,20 +217,21 @@ class Pipeline:
         stage = Stage(self.loop, self.stage_one)
         return stage.run(stage.start(), r, u, restart)
 
-    def regression(
-        self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray, tuning: Tuning | None = None
-    ) -> Regression:
+    @cached_property
+    def _plain(self) -> Constants:
+        """Constants that only form regressors: asked for again and again while signatures are drawn."""
+        return self.constants(self.blank())
+
+    def regression(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
         """Form eta, phi and z of a block, each input of shape (N,); phi and z in physical units."""
         from servoscope.recursion import Layout, regressors
 
-        c = self.constants(self.blank() if tuning is None else tuning)
+        c, n = self._plain, self.bank.n
         state = Layout(c).start(c, 1)
         out = np.zeros((len(r), len(c.C)))  # a missing sample writes nothing
         ok = np.empty(len(r), dtype=np.int64)
         regressors(c, state[0], r, self.input(r, u, restart), y, restart, out, ok)
-        n = self.bank.n
-        scale = np.ones(n) if tuning is None else tuning.scale
-        return Regression(out[:, 0], out[:, 1 : 1 + n] * scale, out[:, -n:] * scale, ok == 1)
+        return Regression(out[:, 0], out[:, 1 : 1 + n].copy(), out[:, -n:].copy(), ok == 1)
 
     def estimate(self, tuning: Tuning, recording: Recording) -> Estimates:
         """Run the recursion over a recording, from the tuning's theta."""

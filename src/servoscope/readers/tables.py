@@ -143,7 +143,9 @@ def number_column(table: Table, name: str, what: str) -> FloatArray:
         numbers = pc.cast(column, pa.float64(), safe=False)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
         raise RecordingError(f"{table.name}: {what}: column {name!r} holds {kind}, not numbers") from None
-    return np.asarray(numbers.to_numpy(), dtype=np.float64)
+    # neither to_numpy nor a needless fill: both import pandas where they find it, a fifth of a second
+    chunks = (pc.fill_null(numbers, np.nan) if numbers.null_count else numbers).chunks
+    return np.concatenate([np.zeros(0), *(np.from_dlpack(chunk) for chunk in chunks if len(chunk))])
 
 
 def seconds(table: Table, name: str, unit: str) -> FloatArray:

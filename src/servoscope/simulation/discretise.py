@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from servoscope.plants import FloatArray, StateSpace
 
+Rows = tuple[tuple[float, ...], ...]
 _WHOLE = 1e-9  # a delay this close to a whole number of samples [samples] is one
 
 
@@ -53,7 +55,12 @@ def discretise(
     delay
         Time [s] from u to the plant; any fraction of a sample.
     """
-    A, B, C = system
+    return _discretise(*(tuple(map(tuple, each.tolist())) for each in system), sample_rate, hold, delay)
+
+
+@functools.lru_cache(maxsize=64)  # while signatures are drawn, the healthy plant comes back with every point
+def _discretise(a: Rows, b: Rows, c: Rows, sample_rate: float, hold: str, delay: float) -> Discrete:
+    A, B, C = (np.array(each, dtype=np.float64) for each in (a, b, c))
     T = 1.0 / sample_rate
     m, rest = split_delay(delay, sample_rate)
     Phi, level, slope = transition(A, B, (1.0 - rest) * T)
