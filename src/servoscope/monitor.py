@@ -125,6 +125,8 @@ class Monitor:
         RecordingError
             If the shapes do not fit together.
         """
+        from servoscope.recursion import SAMPLE
+
         signals = [np.atleast_2d(np.ascontiguousarray(signal, dtype=np.float64)) for signal in (r, u, y)]
         shape = (len(self.baselines), signals[0].shape[1])
         if any(signal.shape != shape for signal in signals) or state.shape != self._shape:
@@ -139,7 +141,7 @@ class Monitor:
             raise RecordingError("restart must have the shape of r")
         new = np.array(state, dtype=np.float64, copy=True)
         rows = new if self.fleet else new[None, :]
-        sample = int(rows[0, self._head + 2])
+        sample = int(rows[0, self._head + SAMPLE])
         every = self.pipeline.every
         count = (sample + shape[1]) // every - sample // every
         out = np.empty((shape[0], count, self._layout.row))
@@ -166,10 +168,14 @@ class Monitor:
 
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of this moment, one evaluation, from a state."""
+        from servoscope.recursion import POWER, SAMPLE, UPDATES
+
         rows = (state if self.fleet else state[None, :])[:, self._head :]
         at = self._layout.slices
-        out = np.concatenate([rows[:, 3:6], rows[:, at["theta"]], rows[:, at["S"]], rows[:, at["Psi"]]], axis=1)
-        return self._trace(out[:, None, :], np.array([int(rows[0, 2]) - 1]))
+        out = np.concatenate(
+            [rows[:, UPDATES : POWER + 1], rows[:, at["theta"]], rows[:, at["S"]], rows[:, at["Psi"]]], axis=1
+        )
+        return self._trace(out[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]))
 
     @property
     def _shape(self) -> tuple[int, ...]:

@@ -8,17 +8,14 @@ sample stands in that row.
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Callable
-from pathlib import Path
-from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from servoscope import estimators, propagation
-from servoscope.compiled import kernel
+from servoscope.compiled import around, kernel
 from servoscope.plants import FloatArray
 from servoscope.propagation import spread
 
@@ -287,15 +284,6 @@ def block(estimator: str) -> Callable[..., int]:
 
     The signature is ``block(c, state, r, u, y, restart, out) -> rows``; r, u, y, restart have shape
     (assets, samples), `state` is changed in place, and `out` (assets, rows, `Layout.row`) receives an evaluation
-    every ``c.every`` samples. Numba's cache sees only the file of the function itself, so the sources of all
-    kernels are part of its name: a change in any of them compiles anew.
+    every ``c.every`` samples.
     """
-    module = estimators.load(estimator)
-    sources = [Path(str(part.__file__)) for part in (propagation, module)] + [Path(__file__)]
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
-    function = FunctionType(
-        _block.__code__, {**globals(), "_update": module.update}, f"block_{module.NAME.replace('-', '_')}"
-    )
-    function.__qualname__ = f"{function.__name__}_{digest}"
-    function.__module__ = __name__
-    return kernel(function)
+    return around(estimators.load(estimator), _block, [propagation])

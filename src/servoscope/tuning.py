@@ -74,7 +74,7 @@ def least_squares(g: Regression) -> FloatArray:
     return solve_scaled(g.z[g.ok].T @ g.phi[g.ok], g.z[g.ok].T @ g.eta[g.ok])
 
 
-def coloured_covariance(g: Regression, a: FloatArray, gamma: FloatArray) -> FloatArray:
+def coloured_covariance(g: Regression, tuning: Tuning) -> FloatArray:
     """Return the covariance of `least_squares` under autoregressive noise, shape (n, n).
 
     sum z v has the covariance of z passed through the noise's shaping filter, summed: the spectrum of z decides how
@@ -84,9 +84,8 @@ def coloured_covariance(g: Regression, a: FloatArray, gamma: FloatArray) -> Floa
 
     phi, z = g.phi[g.ok], g.z[g.ok]
     size = np.sqrt((z**2).mean(axis=0))
-    innovation = max(float(gamma[0] - a[:-1] @ gamma[1:]), 1e-9 * float(gamma[0]))
-    shaped = lfilter([1.0], np.concatenate([[1.0], -a]), z / size, axis=0)
-    X = innovation * shaped.T @ shaped
+    shaped = lfilter([1.0], np.concatenate([[1.0], -tuning.noise_a]), z / size, axis=0)
+    X = tuning.innovation * shaped.T @ shaped
     G = np.linalg.inv((z / size).T @ (phi / size))
     return np.asarray(G @ X @ G.T / np.outer(size, size))
 
@@ -135,12 +134,13 @@ def fit(regressions: Sequence[Regression], memory: float, names: Sequence[str]) 
     R = float(gamma[0])
     P_d = R / memory * np.linalg.inv(scaled) / np.outer(scale, scale)
     strength = float(np.linalg.eigvals(np.linalg.solve(own, scaled)).real.min())
-    covariances = np.array([coloured_covariance(g, a, gamma) for g in regressions])
+    tuning = Tuning(theta, scale, P_d, R, a, gamma)
+    covariances = np.array([coloured_covariance(g, tuning) for g in regressions])
     joint = Regression(eta, phi, z, np.ones(len(eta), dtype=bool))
     correlation = gamma / gamma[0]
     return Fit(
-        tuning=Tuning(theta, scale, P_d, R, a, gamma),
-        covariance=coloured_covariance(joint, a, gamma),
+        tuning=tuning,
+        covariance=coloured_covariance(joint, tuning),
         each=np.array([least_squares(g) for g in regressions]),
         each_covariance=covariances,
         explained=1.0 - R / float(eta.var()),

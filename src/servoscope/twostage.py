@@ -9,11 +9,8 @@ inverse model's.
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from types import FunctionType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -200,7 +197,7 @@ def _update(*_: Any) -> int:  # the template's placeholder: `block` is built wit
     return 0
 
 
-def _block(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray, u_a: FloatArray) -> None:
+def _stage_one(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray, u_a: FloatArray) -> None:
     nx = c.A.shape[0]
     n = len(c.theta)
     x = s[HEAD : HEAD + nx]
@@ -241,16 +238,7 @@ def _block(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: B
 
 @functools.cache
 def block(estimator: str) -> Callable[..., None]:
-    """Compile stage 1 around one estimator: ``block(c, state, r, u, restart, u_a)``.
+    """Compile stage 1 around one estimator: ``block(c, state, r, u, restart, u_a)``."""
+    from servoscope.compiled import around
 
-    As in `servoscope.recursion.block`, the sources are part of its name.
-    """
-    from servoscope.compiled import kernel
-
-    module = estimators.load(estimator)
-    digest = hashlib.sha256(b"".join(Path(str(f)).read_bytes() for f in (module.__file__, __file__))).hexdigest()[:12]
-    name = f"stage_one_{module.NAME.replace('-', '_')}"
-    function = FunctionType(_block.__code__, {**globals(), "_update": module.update}, name)
-    function.__qualname__ = f"{name}_{digest}"
-    function.__module__ = __name__
-    return kernel(function)
+    return around(estimators.load(estimator), _stage_one)
