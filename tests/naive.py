@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import signal
+from scipy import linalg, signal
 
 Array = npt.NDArray[np.float64]
 Update = Callable[..., tuple[Array, Array, Array]]
@@ -158,12 +158,27 @@ UPDATES: dict[str, Update] = {
 
 
 class Spread:
-    """Joint covariance of the estimate's error and the last p noises, one explicit augmented matrix."""
+    """Joint covariance of [error of the estimate, last p values of v, last q of e], one explicit augmented matrix.
 
-    def __init__(self, n: int, a: Array, gamma: Array) -> None:
-        p = len(a)
-        self.n, self.a, self.gamma = n, a, gamma
-        self.joint = np.zeros((n + p, n + p))
+    The noise is v(k) = a' v_past + e(k) + b' e_past, e white.
+    """
+
+    def __init__(self, n: int, a: Array, b: Array, variance: float) -> None:
+        p, q = len(a), len(b)
+        self.n, self.variance = n, variance
+        self.weights = np.concatenate([a, b])
+        self.A = np.zeros((p + q, p + q))  # [v_past e_past] from one update to the next
+        self.A[0] = self.weights
+        for i in range(1, p + q):
+            if i != p:
+                self.A[i, i - 1] = 1.0
+        self.B = np.zeros(p + q)  # where e(k) enters
+        self.B[0] = 1.0
+        if q:
+            self.A[p] = 0.0
+            self.B[p] = 1.0
+        self.stationary = linalg.solve_discrete_lyapunov(self.A, variance * np.outer(self.B, self.B))
+        self.joint = np.zeros((n + p + q, n + p + q))
         self.Psi = np.eye(n)
         self.forget()
 
@@ -172,24 +187,18 @@ class Spread:
         n = self.n
         self.joint[:n, n:] = 0.0
         self.joint[n:, :n] = 0.0
-        self._stationary()
-
-    def _stationary(self) -> None:
-        p = len(self.a)
-        self.joint[self.n :, self.n :] = self.gamma[np.abs(np.subtract.outer(np.arange(p), np.arange(p)))]
+        self.joint[n:, n:] = self.stationary
 
     def update(self, K: Array, phi: Array) -> None:
-        """Advance by v(k) = a' v_past + w(k) and error(k+1) = (I - K phi') error + K v(k)."""
-        n, p = self.n, len(self.a)
+        """Advance by error(k+1) = (I - K phi') error + K v(k)."""
+        n = self.n
         keep = np.eye(n) - np.outer(K, phi)
-        F = np.zeros((n + p, n + p))
-        F[:n, :n], F[:n, n:] = keep, np.outer(K, self.a)
-        F[n, n:] = self.a
-        F[n + 1 :, n : n + p - 1] = np.eye(p - 1)
-        G = np.concatenate([K, [1.0], np.zeros(p - 1)])
-        innovation = self.gamma[0] - self.a @ self.joint[n:, n:] @ self.a
-        self.joint = F @ self.joint @ F.T + innovation * np.outer(G, G)
-        self._stationary()  # as it is already, but for rounding, which would grow
+        F = np.zeros_like(self.joint)
+        F[:n, :n], F[:n, n:] = keep, np.outer(K, self.weights)
+        F[n:, n:] = self.A
+        G = np.concatenate([K, self.B])
+        self.joint = F @ self.joint @ F.T + self.variance * np.outer(G, G)
+        self.joint[n:, n:] = self.stationary  # as it is already, but for rounding, which would grow
         self.Psi = keep @ self.Psi
 
 
@@ -245,13 +254,14 @@ def chain(
     P_d: Array,
     R: float,
     a: Array,
-    gamma: Array,
+    b: Array,
+    variance: float,
     memory: float,
 ) -> Chain:
     """Follow estimator, covariance and residual power over given regressors; the noise is new where nothing is used."""
     N, n = phi.shape
-    spread = Spread(n, a, gamma)
-    updates, power = 0, gamma[0]
+    spread = Spread(n, a, b, variance)
+    updates, power = 0, spread.stationary[0, 0]
     rows: list[tuple[Array, Array, Array, int, float]] = []
     past: list[Any] = []
     for k in range(N):
@@ -292,3 +302,31 @@ def inside(points: Array, polygon: Array) -> npt.NDArray[np.bool_]:
     to_point = points[:, None, :] - polygon[None, :-1, :]
     side = edge[None, :, 0] * to_point[:, :, 1] - edge[None, :, 1] * to_point[:, :, 0]
     return np.asarray(np.all(side >= 0.0, axis=1) | np.all(side <= 0.0, axis=1))
+
+
+def cusums(
+    e: Array, psi: Array, counts: npt.NDArray[np.bool_], changes: Array, limits: Array, every: int, steps: int
+) -> tuple[Array, Array]:
+    """Add up log-likelihood ratios of "shifted by psi' change" against "white"; return level and crossed row by row.
+
+    `e` (steps,) and `psi` (steps, m) are whitened, `counts` says where a sample speaks. `level` is the largest CUSUM
+    relative to its limit since the evaluation before, `crossed` the sample (from 1) at which one rose to its limit.
+    """
+    g = np.zeros(len(limits))
+    now, peak, since = 0.0, 0.0, 0
+    rows = []
+    for k in range(steps):
+        if k % every == 0:
+            peak = now
+            since = since if now >= 1.0 else 0
+        if counts[k]:
+            m = changes @ psi[k]
+            g = np.clip(g + m * (np.clip(e[k], -4.0, 4.0) - m / 2.0), 0.0, 2.0 * limits)
+            now = float((g / limits).max())
+            peak = max(peak, now)
+            if now >= 1.0 and not since:
+                since = k + 1
+        if (k + 1) % every == 0:
+            rows.append((peak, since))
+    level, crossed = np.array(rows, dtype=np.float64).T
+    return level, crossed

@@ -55,7 +55,7 @@ def test_ifrf_of_a_healthy_recording_is_true(rig: dict[str, Any], eha_cases: Pat
         pipeline = Pipeline.of(loop)
         healthy, other = (read(eha_cases / f"multisine_healthy_{i}.csv", loop) for i in (2, 3))
         g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-        tuning = fit([g], pipeline.memory, pipeline.bank.names).tuning
+        tuning = fit(pipeline, [g]).tuning
         estimates = pipeline.estimate(tuning, other)
         last = estimates.theta[other.t[estimates.index] >= 50.0].mean(axis=0)
         error[structure] = np.abs(pipeline.bank.E(FREQUENCIES) @ last / H - 1.0)

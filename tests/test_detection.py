@@ -107,7 +107,7 @@ def tuned(loop: Loop, kind: str, seconds: float = 60.0) -> tuple[Pipeline, Tunin
     pipeline = Pipeline.of(loop)
     healthy, _ = simulate(loop, reference(kind, seconds, 100.0), seed=99)
     g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-    return pipeline, fit([g], pipeline.memory, pipeline.bank.names).tuning
+    return pipeline, fit(pipeline, [g]).tuning
 
 
 def test_noncentrality_foretells_the_mean_of_the_statistic(rig: dict[str, Any]) -> None:
@@ -162,9 +162,10 @@ class TestOnset:
         assert sum(each.low_s <= 17.03 <= each.high_s for each in found) >= 5
 
     def test_a_change_at_rest_may_have_begun_any_time_since(self, rig: dict[str, Any]) -> None:
-        found = onset(*self.broken(rig, "profile", "b_p=20@18", 1))
-        assert found.low_s <= 18.0 <= found.high_s
-        assert found.low_s < 17.0 and 19.5 < found.high_s < 20.5  # it rests from 15 s to 20 s
+        """It rests from 15 s to 20 s; noise alone tells little of when friction grew in between."""
+        found = [onset(*self.broken(rig, "profile", "b_p=20@18", seed)) for seed in range(1, 7)]
+        assert all(each.low_s <= 18.0 and 19.5 < each.high_s < 20.5 for each in found)
+        assert np.median([each.low_s for each in found]) < 17.0
 
     def test_is_the_likelihood_of_every_sample(self, rig: dict[str, Any]) -> None:
         pipeline, tuning, recording, e, healthy, faulty, until, last = self.broken(rig, "multisine", "C_ie=1.1@3", 1)
@@ -177,11 +178,12 @@ class TestOnset:
         g = pipeline.regression(recording.r, recording.u, recording.y, cut)
         used = np.flatnonzero(g.ok[: last + 1])
         v, changed = (g.eta - g.phi @ healthy)[used], (g.phi @ (faulty - healthy))[used]
-        variance = tuning.innovation * max(1.0, float(e.power[-1]))
+        noise = tuning.noise.autoregression()
+        variance = noise.variance * max(1.0, float(e.power[-1]))
         step = np.zeros((pipeline.bank.wait + 1, 3))
         step[1:, 1] = 1.0
         ramp = pipeline.bank.system.simulate(step)[1:, 0]
-        of_used = naive.change_point(v, changed, tuning.noise_a, ramp / ramp[-1], variance)
+        of_used = naive.change_point(v, changed, noise.a, ramp / ramp[-1], variance)
         log_likelihood = np.array([of_used[min(np.searchsorted(used, k), len(used) - 1)] for k in range(until + 1)])
         weight = np.exp(log_likelihood - log_likelihood.max())
         share = np.cumsum(weight) / weight.sum()

@@ -251,7 +251,7 @@ def chain(name: str) -> tuple[Pipeline, Tuning, Constants, Signals]:
     recording, _ = simulate(loop, reference("multisine", 12.0, 100.0), seed=1)
     pipeline, restart = Pipeline.of(loop), recording.restart.copy()
     g = pipeline.regression(recording.r, recording.u, recording.y, restart)
-    tuning = fit([g], pipeline.memory, pipeline.bank.names).tuning
+    tuning = fit(pipeline, [g]).tuning
     r, u, y = recording.r.copy(), 0.9 * recording.u, recording.y.copy()
     u[300], y[301], r[500:510], restart[700] = np.nan, np.nan, np.nan, True
     return pipeline, tuning, pipeline.constants(tuning), tuple(signal[None, :] for signal in (r, u, y, restart))
@@ -268,7 +268,7 @@ class TestInTheRecursion:
         run.theta[:], run.R = c.theta, c.R
         for k in np.flatnonzero(g.ok):
             run.step(g.eta[k], g.phi[k] / tuning.scale, g.z[k] / tuning.scale)
-            assert out[0, k, 3 : 3 + n] == pytest.approx(run.theta, rel=1e-7, abs=1e-9)
+            assert out[0, k, 5 : 5 + n] == pytest.approx(run.theta, rel=1e-7, abs=1e-9)
         assert 900 < out[0, -1, 0] <= 1200
         assert len(state[0, Layout(c).slices["extra"]]) == estimators.extra(name, n, c.memory)
 

@@ -152,22 +152,22 @@ def check_contracts(name: str) -> None:
 
 def check_covariance(name: str) -> None:
     """Scatter of theta_hat over many realisations of coloured noise against S, when excitation comes and goes."""
-    memory, steps, a = 200.0, 1100, np.array([0.8])
-    rng, runs = np.random.default_rng(4), []
+    memory, steps, a, b = 200.0, 1100, 0.8, -0.3
+    variance = R * (1.0 - a**2) / (1.0 + 2.0 * a * b + b**2)  # of e in v(k) = a v(k-1) + e(k) + b e(k-1)
+    rng, runs, settled = np.random.default_rng(4), [], 100
     phi = rng.standard_normal((steps, n)) @ np.linalg.cholesky(spd(3, 100.0)).T
     phi[np.arange(steps) % 300 >= 150] *= 1e-3
     P_d = R / memory * np.linalg.inv(phi.T @ phi / steps)
-    S, M, Psi = np.zeros((n, n)), np.zeros((n, 1)), np.eye(n)
+    S, M, Psi = np.zeros((n, n)), np.zeros((n, 2)), np.eye(n)
     tracked = Run(name, P_d, P_d, memory)
     for k in range(steps):
         tracked.step(0.0, phi[k])
-        spread(a, np.array([R]), tracked.K, phi[k], S, M, Psi)
+        spread(np.array([a, b]), np.array([R, variance]), 1, tracked.K, phi[k], S, M, Psi)
     for _ in range(1500):
-        white = rng.standard_normal(steps) * np.sqrt(R * (1.0 - a[0] ** 2))
-        white[0] = rng.standard_normal() * np.sqrt(R)
+        white = rng.standard_normal(settled + steps) * np.sqrt(variance)
         run = Run(name, P_d, P_d, memory)
         run.theta[:] = 0.0
-        run.steps(lfilter([1.0], [1.0, -a[0]], white), phi, phi)
+        run.steps(lfilter([1.0, b], [1.0, -a], white)[settled:], phi, phi)
         runs.append(run.theta)
     L = np.linalg.inv(np.linalg.cholesky(S))
     ratios = np.linalg.eigvalsh(L @ np.cov(np.array(runs).T) @ L.T)

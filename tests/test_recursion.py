@@ -36,7 +36,7 @@ def recorded(loop: Loop, kind: str, seconds: float, seed: int) -> Recording:
 def tuned(loop: Loop, kind: str) -> Tuning:
     pipeline, healthy = Pipeline.of(loop), recorded(loop, kind, 20.0, 1)
     g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-    return fit([g], pipeline.memory, pipeline.bank.names).tuning
+    return fit(pipeline, [g]).tuning
 
 
 def estimate(pipeline: Pipeline, tuning: Tuning, signals: Signals) -> Estimates:
@@ -82,7 +82,7 @@ def slow(pipeline: Pipeline, tuning: Tuning, signals: Signals) -> naive.Chain:
     update = naive.UPDATES[loop.monitor.estimator]
     return naive.chain(
         update, eta, phi, z, usable & turn, usable & ~turn,
-        c.theta, c.P_d, c.P_d, tuning.R, tuning.noise_a, tuning.noise_gamma, c.memory,
+        c.theta, c.P_d, c.P_d, tuning.R, tuning.noise.a, tuning.noise.b, tuning.noise.variance, c.memory,
     )  # fmt: skip
 
 
@@ -113,7 +113,7 @@ def test_whole_chain_equals_its_slow_double(rig: dict[str, Any], case: str) -> N
     for mine, other in (
         (ours.S * np.outer(s, s), theirs.S),
         (ours.Psi * s[:, None] / s, theirs.Psi),
-        (ours.power * tuning.noise_gamma[0], theirs.power),
+        (ours.power * tuning.noise.gamma[0], theirs.power),
     ):
         assert np.abs(mine - other).max() < 1e-6 * np.abs(other).max()
 
@@ -187,6 +187,7 @@ def columns(trace: Trace) -> dict[str, npt.NDArray[Any]]:
     return {
         "t": trace.t, "theta": trace.theta, "covariance": trace.covariance, "expected": trace.expected,
         "statistic": trace.statistic, "H": trace.ifrf.H, "covariance of H": trace.ifrf.covariance,
+        "level": trace.level, "crossed": trace.crossed,
         "ready": trace.ready,
     }  # fmt: skip
 
@@ -195,9 +196,8 @@ def same(parts: list[Trace], whole: Trace, axis: int = 0) -> None:
     """Check that traces laid end to end are the other one to the last bit."""
     joined = [columns(part) for part in parts]
     for name, values in columns(whole).items():
-        assert np.array_equal(
-            np.concatenate([part[name] for part in joined], axis=axis if name != "t" else 0), values
-        ), name
+        together = np.concatenate([part[name] for part in joined], axis=axis if name != "t" else 0)
+        assert np.array_equal(together, values, equal_nan=True), name
 
 
 class TestMonitor:
@@ -245,7 +245,8 @@ class TestMonitor:
             alone_state, alone_trace = alone.run(alone.init(), *signals)
             assert np.array_equal(state[i], alone_state)
             for name, values in columns(alone_trace).items():
-                assert np.array_equal(columns(trace)[name] if name == "t" else columns(trace)[name][i], values), name
+                mine = columns(trace)[name] if name == "t" else columns(trace)[name][i]
+                assert np.array_equal(mine, values, equal_nan=True), name
 
     def test_the_old_state_and_the_inputs_stay_valid(self, baseline: Baseline) -> None:
         monitor, signals = Monitor(baseline), _signals(2)

@@ -64,8 +64,7 @@ def make_recording(N: int = 6000, seed: int = 0, name: str = "suspect.csv") -> R
     restart[0] = True
     if N > 100:
         t[N // 2 :] += 0.37
-        restart[N // 2] = True
-        restart[3 * N // 4] = True
+        restart[[N // 2, 3 * N // 4]] = True
     r = 0.03 * np.sin(t)
     u, noise = rng.normal(0.0, 0.1, N), rng.normal(0.0, 1e-3, N)
     return Recording(name, t, r, u, r + noise, 100.0, restart, np.zeros(N, dtype=np.int32))
@@ -92,6 +91,8 @@ def make_trace(K: int = 600, n: int = 4, F: int = 3, seed: int = 1, names: tuple
         expected=expected,
         statistic=rng.chisquare(n, K) + 400.0 * shifted[:, 0],
         threshold=46.2,
+        level=2.0 * shifted[:, 0],
+        crossed=np.where(shifted[:, 0], 30.1, np.nan),
         ifrf=of(theta),
         ifrf_expected=of(expected),
         ready=t > 0.55 if K > 10 else np.ones(K, dtype=bool),

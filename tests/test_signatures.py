@@ -40,7 +40,7 @@ def ensemble(loop: Loop, kind: str, faults: list[FaultEvent], louder: float = 1.
 
     healthy = recorded(300.0, 999, [])
     g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-    tuning = fit([g], pipeline.memory, pipeline.bank.names).tuning
+    tuning = fit(pipeline, [g]).tuning
     recordings = [recorded(60.0, seed, faults) for seed in range(seeds)]
     estimates = [pipeline.estimate(tuning, recording) for recording in recordings]
     expectation = Expectation(pipeline, tuning, noise, course(recordings[0]))
@@ -100,7 +100,7 @@ class TestExpectation:
         pipeline = Pipeline.of(loop)
         recording, _ = simulate(loop, reference("profile", 40.0, 100.0), seed=1)
         g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
-        tuning = fit([g], pipeline.memory, pipeline.bank.names).tuning
+        tuning = fit(pipeline, [g]).tuning
         return Expectation(pipeline, tuning, NOISE, course(recording)), g, tuning
 
     def test_batch_is_where_least_squares_ends(self, built: tuple[Expectation, Regression, Tuning]) -> None:

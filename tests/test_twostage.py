@@ -123,7 +123,8 @@ class TestMonitor:
             monitor.step(stepped, *(float(signal[k]) for signal in signals))
         assert np.array_equal(stepped, state)
         assert np.array_equal(monitor.latest(stepped).theta[0], trace.theta[-1])
-        assert np.array_equal(baseline.pipeline().estimate(baseline.tuning, recording).theta, trace.theta)
+        raw = baseline.pipeline().estimate(baseline.tuning, recording).theta
+        assert np.array_equal(raw - baseline.bias, trace.theta)
 
     def test_a_fleet_is_its_assets(self, baseline: Baseline) -> None:
         recordings = [recorded(baseline.loop, seed, 20.0) for seed in (2, 3)]

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from servoscope.baseline import Baseline
     from servoscope.diagnosis import Diagnosis, Trace
     from servoscope.inspection import inspect
-    from servoscope.learning import learn
     from servoscope.loop import Loop
     from servoscope.monitor import Monitor, diagnose
+    from servoscope.points import learn
     from servoscope.readers import read, read_parts
     from servoscope.recording import Recording
     from servoscope.simulation import simulate
@@ -51,7 +51,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "Trace": "diagnosis",
         "diagnose": "monitor",
         "inspect": "inspection",
-        "learn": "learning",
+        "learn": "points",
         "read": "readers",
         "read_parts": "readers",
         "simulate": "simulation",

@@ -7,21 +7,28 @@ import json
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from servoscope.detection import threshold
 from servoscope.errors import BaselineError, LoopError
 from servoscope.loop import Loop
+from servoscope.noise import Coloured, Noise
 from servoscope.output import atomic_write
 from servoscope.pipeline import Pipeline, Tuning
 from servoscope.plants import FloatArray, Plant
-from servoscope.signatures import Noise
+from servoscope.rehearsal import SEQUENTIAL, Rehearsed
+from servoscope.sequential import Member, rated, watch
+from servoscope.signatures import Expectation, true_theta
 from servoscope.twostage import StageOne
 
+if TYPE_CHECKING:
+    from servoscope.cusum import Watch
+
 FORMAT = "servoscope-baseline"
-VERSION = 1
+VERSION = 2
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
@@ -61,16 +68,17 @@ class Baseline(_Part):
     theta, covariance
         Healthy coefficients (n,) and the covariance of a further healthy recording's mean around them (n, n): noise
         of the baseline, scatter between recordings and model error.
-    scale, P_d, R, noise_a, noise_gamma
+    scale, P_d, R, noise_a, noise_b, noise_gamma, noise_variance
         The recursion's tuning (see `servoscope.pipeline.Tuning`).
     stage_one
         Stage 1 of a loop with two stages.
     noise
         n_u and n_y; None without a controller or physics.
-    ratios, ratios_std, model_theta
-        Healthy parameters relative to the loop file's nominal values, the standard deviations of their logarithms,
-        and the coefficients that they lead to under the references of the baseline; empty without a controller or
-        physics.
+    ratios, ratios_std, ratios_covariance
+        Healthy parameters relative to the loop file's nominal values, the standard deviations of their logarithms, and
+        their covariance (m, m); empty without a controller or physics.
+    model_theta
+        Coefficients that those lead to under the references of the baseline; empty likewise.
     dof
         Effective number of independent residuals.
     limit
@@ -81,10 +89,20 @@ class Baseline(_Part):
         Speed below which the axis stands still [output per s]; 0 where rest is part of what is expected.
     delay_s
         Delay that the recordings show [s]; None where they do not tell.
+    loudest
+        What the noises may be at most, as far as the recordings tell; None where white noises on u and y do not
+        explain the colour of the residual.
+    rehearsed
+        False alarms that were counted against those of theory.
+    members
+        Changes that the sequential test listens for; empty where there is none.
     promises
         Smallest changes that are seen with 90 % probability within the baseline's own excitation.
     notes
         What `learn` found worth saying.
+    point, others
+        Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
+        others is itself that of the first point.
     """
 
     loop_settings: dict[str, Any] = Field(alias="loop")
@@ -97,11 +115,14 @@ class Baseline(_Part):
     P_d: Matrix
     R: float
     noise_a: Vector
+    noise_b: Vector
     noise_gamma: Vector
+    noise_variance: float
     stage_one: StageOne | None = None
     noise: Noise | None
     ratios: dict[str, float]
     ratios_std: dict[str, float]
+    ratios_covariance: Matrix
     model_theta: Vector
     dof: float
     limit: float
@@ -110,8 +131,13 @@ class Baseline(_Part):
     delay_s: float | None
     suggested_model_error: float
     supported_false_alarms_per_year: float
+    loudest: Noise | None
+    rehearsed: Rehearsed
+    members: tuple[Member, ...]
     promises: tuple[Promise, ...]
     notes: tuple[str, ...]
+    point: str = ""
+    others: tuple[Baseline, ...] = ()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -123,7 +149,7 @@ class Baseline(_Part):
             rows = getattr(self, name)
             if len(rows) != n or any(len(row) != n for row in rows):
                 raise ValueError(f"{name} must be {n} by {n}")
-        if len(self.noise_gamma) != p or not p or not self.noise_gamma[0] > 0.0:
+        if len(self.noise_gamma) != p or not p or not (self.noise_gamma[0] > 0.0 and self.noise_variance > 0.0):
             raise ValueError("noise_a and noise_gamma must have the same length, and a positive variance")
         if len(self.model_theta) not in (0, n):
             raise ValueError(f"model_theta must be empty or have {n} values")
@@ -133,12 +159,40 @@ class Baseline(_Part):
         scaled = C / np.outer(size, size) if size.all() else C
         if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
             raise ValueError("covariance must be symmetric and positive")
+        if self.others and (not all(self.points) or len(set(self.points)) < len(self.points)):
+            raise ValueError("point must be a name of its own at every operating point")
+        if any(other.others for other in self.others):
+            raise ValueError("others must have no others")
         return self
 
     @cached_property
     def loop(self) -> Loop:
         """The loop."""
         return Loop.from_dict(self.loop_settings)
+
+    @property
+    def points(self) -> tuple[str, ...]:
+        """Names of the operating points; none where none was declared."""
+        return (self.point, *(other.point for other in self.others)) if self.point or self.others else ()
+
+    @property
+    def each(self) -> tuple[Baseline, ...]:
+        """One baseline per operating point; itself where none was declared."""
+        return (self.model_copy(update={"others": ()}), *self.others)
+
+    def at(self, point: str) -> Baseline:
+        """Return the baseline of one operating point.
+
+        Raises
+        ------
+        BaselineError
+            If there is no such point.
+        """
+        for one in self.each:
+            if point and one.point == point:
+                return one
+        known = f"choose from {', '.join(self.points)}" if self.points else "the baseline has none"
+        raise BaselineError(f"there is no operating point {point!r}: {known}")
 
     @property
     def plant(self) -> Plant:
@@ -150,11 +204,57 @@ class Baseline(_Part):
         """What the recursion takes."""
         arrays = (self.theta, self.scale, self.P_d)
         theta, scale, P_d = (np.array(value) for value in arrays)
-        return Tuning(theta, scale, P_d, self.R, np.array(self.noise_a), np.array(self.noise_gamma))
+        a, b, gamma = (np.array(value) for value in (self.noise_a, self.noise_b, self.noise_gamma))
+        return Tuning(theta, scale, P_d, self.R, Coloured(a, b, gamma, self.noise_variance))
 
     def pipeline(self) -> Pipeline:
         """Return the loop's chain of constant matrices."""
         return Pipeline.of(self.loop, self.stage_one, self.still_speed)
+
+    def watch(self, pipeline: Pipeline, under: Expectation | None = None, growth: float = 1.0) -> Watch | None:
+        """Return the sequential test beside a pipeline's recursion.
+
+        `under` is the expectation of a recording, to whose reference the limits are then fitted, instead of that of
+        the baseline; `growth` is that of the noise's variance.
+        """
+        if self.loudest is None or not self.members:
+            return None
+        noise = self.loudest.times(np.sqrt(growth))
+        budget = SEQUENTIAL * self.loop.monitor.false_alarms_per_year / self.rehearsed.cusum
+        heard = self.members
+        if under is not None:
+            heard = rated(under, self.plant, self.loudest, np.array(self.ratios_covariance), heard)
+        return watch(pipeline, self.plant, noise, np.array(self.scale), heard, budget)
+
+    @cached_property
+    def bias(self) -> FloatArray:
+        """What the biases of the regression add to the healthy coefficients, shape (n,)."""
+        if not self.model_theta or self.loop.monitor.structure != "svf":
+            return np.zeros(len(self.theta))
+        return np.array(self.model_theta) - true_theta(self.pipeline(), self.plant)
+
+    def shared(self, assets: int) -> Self:
+        """Return the baseline of one among many assets that share its budget of false alarms.
+
+        Each asset gets an equal part: whatever they have in common, all together raise at most the budget's alarms
+        (Bonferroni).
+
+        Raises
+        ------
+        BaselineError
+            If there is not at least one asset.
+        """
+        if assets < 1:
+            raise BaselineError(f"a budget cannot be shared by {assets} assets, give at least 1")
+        monitor = self.loop.monitor
+        budget = monitor.false_alarms_per_year / assets
+        share = budget * (1.0 - SEQUENTIAL if self.members else 1.0)
+        looks = monitor.evaluation_rate, monitor.memory
+        limit = threshold(len(self.names), *looks, share, self.dof, self.rehearsed.statistic)
+        loop = self.loop.model_copy(update={"monitor": monitor.model_copy(update={"false_alarms_per_year": budget})})
+        changed = self.model_copy(update={"loop_settings": loop.to_dict(), "limit": limit})
+        vars(changed).pop("loop", None)  # a copy takes along what was computed from the old settings
+        return changed
 
     def cov(self) -> FloatArray:
         """Return `covariance` as an array (n, n)."""
@@ -200,7 +300,7 @@ class Baseline(_Part):
         fields = {key: value for key, value in content.items() if key not in ("format", "version")}
         try:
             baseline = cls.model_validate(fields)
-            _ = baseline.loop
+            _ = [one.loop for one in baseline.each]
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])

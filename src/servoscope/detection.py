@@ -5,16 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope.pipeline import Estimates, Pipeline, Tuning
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 
+BoolArray = npt.NDArray[np.bool_]
+
 SECONDS_PER_YEAR = 365.25 * 86400.0
 POWER = 0.9  # probability with which a promised change is seen
 
 
-def threshold(n: int, evaluation_rate: float, memory: float, false_alarms_per_year: float, dof: float) -> float:
+def threshold(
+    n: int, evaluation_rate: float, memory: float, false_alarms_per_year: float, dof: float, counted: float = 1.0
+) -> float:
     """Return the limit of T^2 that a healthy loop crosses as often as the budget allows.
 
     theta_hat forgets within `memory`, so looks close together are one look; how close depends on the level: an
@@ -34,18 +39,37 @@ def threshold(n: int, evaluation_rate: float, memory: float, false_alarms_per_ye
         Budget.
     dof
         Effective number of independent values behind the noise's variance.
+    counted
+        Alarms that a rehearsal counted (see `servoscope.rehearsal`), divided by those that this rule expects.
     """
     from scipy import special  # not scipy.stats: half a second to import
 
-    dof = max(dof, n + 2.0)
+    dof = min(max(dof, n + 2.0), 1e9)
     rest = dof - n + 1.0
     limit = 10.0
     for _ in range(20):
-        looks = SECONDS_PER_YEAR * min(evaluation_rate, max(limit / (2.0 * memory), 1.0 / memory))
+        looks = counted * SECONDS_PER_YEAR * min(evaluation_rate, max(limit / (2.0 * memory), 1.0 / memory))
         tail = min(false_alarms_per_year / looks, 0.5)
         share = float(special.betaincinv(rest / 2.0, n / 2.0, tail))  # upper quantile of F(n, rest) through the beta's
         limit = dof * (1.0 - share) / share
     return limit
+
+
+def delayed(exceeded: BoolArray, on: int, off: int) -> BoolArray:
+    """Return an alarm with delays: raised when it has lasted for `on` evaluations, kept for `off` after it has gone.
+
+    Parameters
+    ----------
+    exceeded
+        Whether a limit is exceeded, shape (K,).
+    on, off
+        In evaluations (on-delay and off-delay of ISA-18.2).
+    """
+    k = np.arange(len(exceeded))
+    calm = np.maximum.accumulate(np.where(exceeded, -1, k))  # last evaluation below the limit
+    raised = exceeded & (k - calm > on)
+    last = np.maximum.accumulate(np.where(raised, k, -off - 1))
+    return np.asarray(k - last <= off)
 
 
 def required_noncentrality(n: int, limit: float) -> float:
@@ -122,7 +146,7 @@ def onset(
 ) -> Onset:
     """Find when the regression stopped following `healthy` and began to follow `faulty`.
 
-    Change point by maximum likelihood on the residual whitened by the noise's own autoregression, with a flat prior
+    Change point by maximum likelihood on the residual whitened by an autoregression of the noise, with a flat prior
     over the samples before the alarm (Basseville and Nikiforov, 1993, section 2.6). While the filters settle, the
     share of the change that they have let through counts.
 
@@ -141,8 +165,9 @@ def onset(
     used = np.flatnonzero(g.ok[: last + 1])
     phi = g.phi[used]
     changed = phi @ (faulty - healthy)
-    costs = _change_costs(g.eta[used] - phi @ healthy, changed, tuning.noise_a, _onset_of_filters(pipeline))
-    scale = 2.0 * tuning.innovation * max(1.0, float(estimates.power[-1]))
+    noise = tuning.noise.autoregression()  # a short memory: what surrounds each candidate is computed anew
+    costs = _change_costs(g.eta[used] - phi @ healthy, changed, noise.a, _onset_of_filters(pipeline))
+    scale = 2.0 * noise.variance * max(1.0, float(estimates.power[-1]))
     # a change between two updates shows at the later one
     at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
     log_likelihood = -costs[at_update] / scale

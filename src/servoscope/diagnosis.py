@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -104,6 +105,8 @@ class Diagnosis(_Said):
         At the end of the recording.
     warnings
         Defects and doubts.
+    point
+        Operating point that the recording was judged at; None where the baseline has none.
     """
 
     recording: str
@@ -119,6 +122,7 @@ class Diagnosis(_Said):
     parameters: dict[str, Parameter]
     ifrf: tuple[ResponsePoint, ...]
     warnings: tuple[Warning, ...] = ()
+    point: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,13 +136,19 @@ class Trace:
     names
         Of the n coefficients.
     theta, covariance
-        Estimate and its covariance, shapes (K, n) and (K, n, n).
+        Estimate and its covariance, shapes (K, n) and (K, n, n). Where the loop can be simulated, the biases of the
+        regression are taken out: intersample behaviour and noise in the regressors.
     expected
         What a healthy loop would show at the same time under the same reference, shape (K, n).
     statistic
         T^2, shape (K,).
     threshold
         Alarm limit of the statistic; for a fleet one per asset, shape (assets, 1).
+    level
+        The sequential test: its largest CUSUM since the evaluation before, as a multiple of its limit, shape (K,).
+        It alarms at 1; 0 throughout where there is no such test.
+    crossed
+        When a CUSUM passed its limit [s], NaN where none is above it, shape (K,).
     ifrf, ifrf_expected
         Responses at the monitored frequencies, of `theta` and of `expected`.
     ready
@@ -152,12 +162,48 @@ class Trace:
     expected: FloatArray
     statistic: FloatArray
     threshold: float | FloatArray
+    level: FloatArray
+    crossed: FloatArray
     ifrf: Response
     ifrf_expected: Response
     ready: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
+    @property
+    def exceeded(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """Whether one of the two tests is above its limit, without on-delay and off-delay, shape (K,)."""
+        return self.ready & ((self.statistic > self.threshold) | (self.level >= 1.0))
+
+    @classmethod
+    def stacked(cls, traces: Sequence[Trace]) -> Trace:
+        """Return the traces of a fleet as one, assets first; t, names and frequencies are shared."""
+        first = traces[0]
+
+        def together(name: str) -> Any:
+            return np.array([getattr(trace, name) for trace in traces])
+
+        def responses(name: str) -> Response:
+            each = [getattr(trace, name) for trace in traces]
+            return Response(each[0].frequencies, np.array([e.H for e in each]), np.array([e.covariance for e in each]))
+
+        return replace(
+            first,
+            threshold=together("threshold")[:, None],
+            ifrf=responses("ifrf"),
+            ifrf_expected=responses("ifrf_expected"),
+            theta=together("theta"),
+            covariance=together("covariance"),
+            expected=together("expected"),
+            statistic=together("statistic"),
+            level=together("level"),
+            crossed=together("crossed"),
+            ready=together("ready"),
+        )
+
     def table(self) -> dict[str, FloatArray]:
-        """Return the columns of ``diagnose --trace``: t, theta_0 ..., ifrf_1Hz_real ..., statistic, threshold."""
+        """Return the columns of ``diagnose --trace``: t, theta_0 ..., ifrf_1Hz_real ..., statistic, threshold, level.
+
+        The last is the sequential test's, which alarms at 1.
+        """
         columns = {"t": self.t}
         for i in range(self.theta.shape[1]):
             columns[f"theta_{i}"] = self.theta[:, i]
@@ -166,4 +212,5 @@ class Trace:
             columns[f"ifrf_{f:g}Hz_imag"] = self.ifrf.H[:, i].imag
         columns["statistic"] = self.statistic
         columns["threshold"] = np.full(len(self.t), self.threshold)
+        columns["level"] = self.level
         return columns

@@ -10,11 +10,12 @@ import numpy as np
 from servoscope.inverse import nominal_theta
 from servoscope.linear import Linear, autocovariances
 from servoscope.loop import Loop
+from servoscope.noise import Coloured, Noise, autocovariance
 from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
-from servoscope.signatures import Expectation, Noise, noise_system
-from servoscope.tuning import Fit, autocovariance
+from servoscope.signatures import Expectation, noise_system, solve_scaled, true_theta
+from servoscope.tuning import Fit
 
 PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
 
@@ -30,18 +31,30 @@ class HealthyPlant:
     ----------
     ratios
         Parameters relative to the loop file's.
-    std
-        Standard deviations of the ratios' logarithms.
-    theta
-        Coefficients that the plant leads to under the recordings' references, shape (n,).
+    covariance
+        Of the ratios' logarithms, shape (m, m).
+    theta, theta_covariance
+        Coefficients that the plant leads to under the recordings' references, shapes (n,) and (n, n).
     misfit
-        Chi-square with n degrees of freedom when the loop file is right.
+        Of these to the coefficients of least squares: chi-square with n degrees of freedom when the loop file is
+        right.
+    true
+        Coefficients of the plant itself, shape (n,).
+    residuals
+        What is left of v = eta - phi' true when a simulated loop's is taken off, one array per recording.
     """
 
     ratios: dict[str, float]
-    std: dict[str, float]
+    covariance: FloatArray
     theta: FloatArray
+    theta_covariance: FloatArray
     misfit: float
+    true: FloatArray
+    residuals: list[FloatArray]
+
+    def std(self, plant: Plant) -> dict[str, float]:
+        """Return the standard deviations of the ratios' logarithms by parameter."""
+        return dict(zip(plant.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
 def saturated(loop: Loop, recording: Recording) -> float:
@@ -58,8 +71,11 @@ def simulated(loop: Loop) -> bool:
 
 
 def noise_of(pipeline: Pipeline, found: Fit, regressions: Sequence[Regression]) -> Noise:
-    """Split the residual into n_u and n_y: its autocovariance is a non-negative mixture of theirs."""
+    """Split the residual into n_u and n_y; with two stages its autocovariance is a non-negative mixture of theirs."""
     from scipy.optimize import nnls
+
+    if found.noises is not None:
+        return found.noises.noise
 
     lags = 20
     n = pipeline.bank.n
@@ -76,37 +92,76 @@ def noise_of(pipeline: Pipeline, found: Fit, regressions: Sequence[Regression]) 
     return Noise(u_std=u_std, y_std=y_std)
 
 
-def healthy_parameters(expectations: Sequence[Expectation], found: Fit, covariance: FloatArray) -> HealthyPlant:
-    """Fit the plant's parameters to the healthy coefficients, held near the loop file's by a prior.
+def healthy_parameters(
+    expectations: Sequence[Expectation],
+    regressions: Sequence[Regression],
+    found: Fit,
+    theta: FloatArray,
+    noise: Coloured,
+    prior: float = PRIOR,
+) -> HealthyPlant:
+    """Fit the plant's parameters to the healthy recordings, held near the loop file's by a prior.
 
-    Maximum a posteriori by Gauss and Newton on the expected least squares estimate.
+    Maximum a posteriori by Gauss and Newton on the whitened residual: v = eta - phi' theta with theta fixed has the
+    mean that a simulated loop has under the same reference, and a colour that is known. Nothing of the intersample
+    behaviour and of the noise in phi is left in it (prediction errors; Ljung, 1999, section 7.4).
+
+    Parameters
+    ----------
+    expectations, regressions
+        One of each per recording.
+    found
+        Least squares over the same recordings.
+    theta
+        Coefficients that the residual is formed with, near the true ones, shape (n,).
+    noise
+        Colour of that residual.
+    prior
+        Standard deviation of the logarithms of the nominal parameters.
     """
     from scipy.optimize import least_squares as minimise
 
     plant = expectations[0].pipeline.loop.plant
-    size = np.sqrt(np.diag(covariance))
-    L = np.linalg.cholesky(covariance / np.outer(size, size) + 1e-9 * np.eye(len(size)))
-    weights = [len(e.course.kept) for e in expectations]
+    measured = [(g.eta - g.phi @ theta)[g.ok] for g in regressions]
 
     def ratios(x: FloatArray) -> dict[str, float]:
         return dict(zip(plant.parameters, np.exp(x).tolist(), strict=True))
 
-    def expected(x: FloatArray) -> FloatArray:
-        changed = plant.with_ratios(ratios(x))
-        return np.asarray(np.average([e.batch(changed) for e in expectations], axis=0, weights=weights))
-
     def misfit(x: FloatArray) -> FloatArray:
-        return np.concatenate([np.linalg.solve(L, (found.tuning.theta - expected(x)) / size), x / PRIOR])
+        changed = plant.with_ratios(ratios(x))
+        parts = [noise.whiten(v - e.residual(changed, theta)) for v, e in zip(measured, expectations, strict=True)]
+        return np.concatenate([*parts, x / prior])
 
     start = np.zeros(len(plant.parameters))
-    result = minimise(misfit, start, x_scale=PRIOR, diff_step=[1e-3], max_nfev=12, bounds=(-1.5, 1.5))
-    slope = np.asarray(result.jac)
-    std = np.sqrt(np.diag(np.linalg.inv(slope.T @ slope)))
+    found_x = minimise(misfit, start, x_scale=prior, diff_step=[1e-4], max_nfev=12, bounds=(-1.5, 1.5))
+    slope = np.asarray(found_x.jac)
+    C = np.linalg.inv(slope.T @ slope)
+
+    def expected(x: FloatArray) -> FloatArray:
+        changed = plant.with_ratios(ratios(x))
+        A, b = zip(*(e.normal(changed) for e in expectations), strict=True)
+        return solve_scaled(np.sum(A, axis=0), np.sum(b, axis=0))  # each reference weighs what it tells, as in the fit
+
+    step = 1e-3
+    J = np.array([expected(found_x.x + step * e) - expected(found_x.x - step * e) for e in np.eye(len(start))]).T
+    J /= 2.0 * step
+    limit = expected(found_x.x)
+    size = np.sqrt(np.diag(found.covariance))
+    off = (found.tuning.theta - limit) / size
+    covariance = found.covariance / np.outer(size, size) + 1e-9 * np.eye(len(size))
+    final = plant.with_ratios(ratios(found_x.x))
+    true = true_theta(expectations[0].pipeline, final)
     return HealthyPlant(
-        ratios(result.x),
-        dict(zip(plant.parameters, std.tolist(), strict=True)),
-        expected(result.x),
-        2.0 * float(result.cost),
+        ratios=ratios(found_x.x),
+        covariance=C,
+        theta=limit,
+        theta_covariance=J @ C @ J.T,
+        misfit=float(off @ np.linalg.solve(covariance, off)),
+        true=true,
+        residuals=[
+            (g.eta - g.phi @ true)[g.ok] - e.residual(final, true)
+            for g, e in zip(regressions, expectations, strict=True)
+        ],
     )
 
 

@@ -42,6 +42,8 @@ class FilterBank:
         Samples that the estimator waits after the filters are re-armed.
     sample_rate
         In Hz.
+    poles
+        Of the filters that u and y pass, per sample; none where they only delay.
     """
 
     system: Linear
@@ -54,6 +56,7 @@ class FilterBank:
     gain: float
     wait: int
     sample_rate: float
+    poles: FloatArray
 
     @property
     def n(self) -> int:
@@ -255,4 +258,7 @@ def build(loop: Loop, instrument: Linear | None = None) -> FilterBank:
         gain=plant.input_gain,
         wait=wait,
         sample_rate=loop.sample_rate,
+        poles=np.full(max((1, *plant.powers)) + 1, math.exp(-2.0 * math.pi * cutoff_of(loop) / loop.sample_rate))
+        if svf
+        else np.zeros(0),
     )

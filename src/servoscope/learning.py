@@ -12,6 +12,7 @@ from servoscope.baseline import Baseline, Source, digest
 from servoscope.delays import check_delay
 from servoscope.detection import threshold
 from servoscope.errors import LoopError, NotEnoughError
+from servoscope.homogeneity import odd_ones, scatter, told
 from servoscope.identification import (
     MOST_SATURATED,
     fault_directions,
@@ -21,13 +22,16 @@ from servoscope.identification import (
     simulated,
 )
 from servoscope.loop import Loop
+from servoscope.noise import AR_ORDER, autocovariance, white_noises, yule_walker
 from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray
-from servoscope.promises import WORTH_A_LOOK, misfit_of, promises, supported_budget
+from servoscope.promises import WORTH_A_LOOK, misfit_of, noise_notes, promises, supported_budget
 from servoscope.recording import Recording
-from servoscope.signatures import Expectation, course
+from servoscope.rehearsal import SEQUENTIAL, Rehearsed, prepare
+from servoscope.sequential import Member
+from servoscope.signatures import Expectation, colour_of, course, residual_system, true_theta
 from servoscope.simulation import reference, simulate
-from servoscope.tuning import Fit, fit
+from servoscope.tuning import Fit, fit, white_enough
 
 SHORTEST = 10.0  # memories; a shorter baseline is warned about
 SPEED_OVER = 0.05  # s over which a speed is measured here
@@ -35,6 +39,7 @@ STILL_SHARE = 0.02  # of the speed of motion, below which an axis stands still
 WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
 MOST_SIMULATED = 2e6  # samples behind a nominal baseline
 LEAST_EXPLAINED = 0.9  # share of u's variance
+UNLIKELY = 1e-3  # probability below which the physics are not believed to hold
 
 Progress = Callable[[str], None]
 
@@ -82,8 +87,8 @@ def learn(loop: Loop, recordings: Sequence[Recording], progress: Progress = lamb
         loop = loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"estimator": "akf"})})
         pipeline, regressions, found = _tuned(loop, recordings)
     progress("delay")
-    delay_s, told = check_delay(loop, recordings)
-    notes += told
+    delay_s, doubts = check_delay(loop, recordings)
+    notes += doubts
     return _assemble(loop, recordings, pipeline, regressions, found, delay_s, notes, progress)
 
 
@@ -112,7 +117,7 @@ def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
 def _tuned(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline, list[Regression], Fit]:
     pipeline = Pipeline.of(loop, twostage.tune(loop, recordings), still_speed(loop, recordings))
     regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
-    return pipeline, regressions, fit(regressions, pipeline.memory, pipeline.bank.names)
+    return pipeline, regressions, fit(pipeline, regressions)
 
 
 def nominal(loop: Loop, progress: Progress = lambda _: None, duration_s: float = 60.0) -> Baseline:
@@ -145,35 +150,63 @@ def _assemble(
     progress: Progress,
     exact: bool = False,
 ) -> Baseline:
-    covariance = found.covariance + _scatter(found)
-    error = loop.monitor.model_error * found.rms_eta / found.tuning.scale
-    covariance = covariance + np.diag(error**2)
-    theta, noise, model_theta = found.tuning.theta, None, np.zeros(0)
+    rehearsed = Rehearsed()
+    sure, apart = found.covariance, found.each
+    error = np.diag((loop.monitor.model_error * found.rms_eta / found.tuning.scale) ** 2)
+    theta, noise, model_theta, loudest = found.tuning.theta, None, np.zeros(0), None
     ratios: dict[str, float] = {}
     ratios_std: dict[str, float] = {}
+    ratios_covariance = np.zeros((0, 0))
+    listening: tuple[Member, ...] = ()
     if simulated(loop):
+        from scipy import special
+
         progress("healthy parameters")
         noise = noise_of(pipeline, found, regressions)
         expectations = [Expectation(pipeline, found.tuning, noise, course(rec)) for rec in recordings]
         if exact:
             theta = model_theta = expectations[0].batch(loop.plant)
         else:
-            healthy = healthy_parameters(expectations, found, covariance)
-            ratios, ratios_std, model_theta = healthy.ratios, healthy.std, healthy.theta
+            healthy = healthy_parameters(
+                expectations, regressions, found, true_theta(pipeline, loop.plant), found.tuning.noise
+            )
+            # what the plant leaves of the residual is noise alone: its colour is known better now
+            plant = loop.plant.with_ratios(healthy.ratios)
+            model = yule_walker(autocovariance(healthy.residuals, AR_ORDER))
+            if pipeline.stage_one is None:
+                noises = white_noises(residual_system(pipeline, plant), healthy.residuals, pipeline.stride)
+                noise = noises.noise
+                if white_enough(healthy.residuals, noises, model):
+                    model, loudest = colour_of(pipeline, plant, noise), noises.loudest
+                    found = replace(found, tuning=replace(found.tuning, noise=model))
+            expectations = [replace(e, tuning=found.tuning, noise=noise) for e in expectations]
+            healthy = healthy_parameters(expectations, regressions, found, healthy.true, model)
+            ratios, ratios_std, model_theta = healthy.ratios, healthy.std(loop.plant), healthy.theta
+            plant = loop.plant.with_ratios(ratios)
+            apart = found.each - np.array([e.batch(plant) for e in expectations])  # each reference has its own bias
+            ratios_covariance = healthy.covariance
+            if healthy.misfit <= special.chdtri(pipeline.bank.n, UNLIKELY):
+                # the physics hold: what they say is known better than the coefficients one by one
+                theta, sure = model_theta, healthy.theta_covariance
+                if loudest and not loop.monitor.model_error:
+                    progress("rehearsal")
+                    rehearsed, listening, doubts = prepare(
+                        recordings, expectations, plant, healthy.theta, healthy.covariance, loudest
+                    )
+                    notes += doubts
             if healthy.misfit > 10.0 * pipeline.bank.n:
                 notes.append(
                     f"[plant] and [controller] do not explain the healthy recordings (misfit {healthy.misfit:.0f}, "
                     f"about {pipeline.bank.n} expected): sizes of faults are uncertain, check the parameters"
                 )
+    covariance = sure + scatter(apart, found.each_covariance) + error
+    odd = odd_ones(apart, found.each_covariance + error)
+    notes += told(odd, [rec.name for rec in recordings], pipeline.bank.names)
     tuning = replace(found.tuning, theta=theta)
     plant = loop.plant.with_ratios(ratios) if ratios else loop.plant
-    limit = threshold(
-        pipeline.bank.n,
-        loop.monitor.evaluation_rate,
-        loop.monitor.memory,
-        loop.monitor.false_alarms_per_year,
-        found.dof,
-    )
+    share = loop.monitor.false_alarms_per_year * (1.0 - SEQUENTIAL if listening else 1.0)
+    looks = loop.monitor.evaluation_rate, loop.monitor.memory
+    limit = threshold(pipeline.bank.n, *looks, share, found.dof, rehearsed.statistic)
     progress("promises")
     estimates = [pipeline.estimate(tuning, rec) for rec in recordings]
     deviations = []
@@ -182,6 +215,7 @@ def _assemble(
         if noise is not None:
             expected = Expectation(pipeline, tuning, noise, course(rec)).healthy(plant, model_theta)
         deviations.append(e.theta - expected)
+    notes += noise_notes(pipeline, found, estimates, simulated(loop))
     excess, suggestion = misfit_of(estimates, deviations, covariance, found)
     if found.explained < LEAST_EXPLAINED:
         notes.append(
@@ -216,11 +250,14 @@ def _assemble(
         P_d=_rows(tuning.P_d),
         stage_one=pipeline.stage_one,
         R=tuning.R,
-        noise_a=tuple(tuning.noise_a),
-        noise_gamma=tuple(tuning.noise_gamma),
+        noise_a=tuple(tuning.noise.a),
+        noise_b=tuple(tuning.noise.b),
+        noise_gamma=tuple(tuning.noise.gamma),
+        noise_variance=tuning.noise.variance,
         noise=noise,
         ratios=ratios,
         ratios_std=ratios_std,
+        ratios_covariance=_rows(ratios_covariance),
         model_theta=tuple(model_theta),
         dof=found.dof,
         limit=limit,
@@ -229,6 +266,9 @@ def _assemble(
         delay_s=delay_s,
         suggested_model_error=suggestion,
         supported_false_alarms_per_year=supported,
+        loudest=loudest,
+        rehearsed=rehearsed,
+        members=listening,
         promises=promises(loop, directions, estimates, covariance, limit),
         notes=tuple(notes),
     )
@@ -236,18 +276,3 @@ def _assemble(
 
 def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(x) for x in row) for row in matrix)
-
-
-def _scatter(found: Fit) -> FloatArray:
-    """Return the covariance between recordings beyond their noise; it is diagonal, few recordings give no more.
-
-    A further recording scatters like Student's t around the mean of m, with the variance (m - 1)/(m - 3); fewer than
-    four recordings get the factor of four.
-    """
-    m, n = found.each.shape
-    if m < 2:
-        return np.zeros((n, n))
-    own = np.mean([np.diag(c) for c in found.each_covariance], axis=0)
-    beyond = np.maximum(found.each.var(axis=0, ddof=1) - own, 0.0)
-    students = (m - 1.0) / (m - 3.0) if m > 3 else 3.0
-    return np.diag(beyond * students * (1.0 + 1.0 / m))

@@ -105,7 +105,11 @@ class MonitorSettings(_Settings):
     frequencies
         Monitored frequencies [Hz].
     false_alarms_per_year
-        Budget that the threshold is set for.
+        Budget that the alarm is set for, after its delays.
+    on_delay
+        How long a limit must be exceeded before the alarm is raised [s].
+    off_delay
+        How long the alarm stays after the limit was exceeded last [s]; None: for the memory.
     """
 
     structure: Literal["svf", "tustin", "tustin-held"] = "svf"
@@ -122,6 +126,8 @@ class MonitorSettings(_Settings):
     evaluation_rate: Positive = 10.0
     frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
     false_alarms_per_year: Positive = 1.0
+    on_delay: NotNegative = 0.0
+    off_delay: NotNegative | None = None
 
 
 class Loop(_Settings):

@@ -11,11 +11,15 @@ import numpy as np
 from servoscope import inverse
 from servoscope.errors import LoopError
 from servoscope.inverse import FilterBank
+from servoscope.linear import Linear
+from servoscope.noise import Coloured
 from servoscope.plants import EXTRAS, FloatArray
 from servoscope.recording import Recording
 from servoscope.twostage import Stage, StageOne
+from servoscope.valve import Valve, held_back
 
 if TYPE_CHECKING:
+    from servoscope.cusum import Watch
     from servoscope.loop import Loop
     from servoscope.recursion import BoolArray, Constants, IntArray
 
@@ -34,22 +38,15 @@ class Tuning:
         Desired covariance of the AKF, shape (n, n).
     R
         Variance of the residual v.
-    noise_a, noise_gamma
-        Autoregression (p,) and autocovariance (p,) of v, gamma[0] its variance.
+    noise
+        Model of v.
     """
 
     theta: FloatArray
     scale: FloatArray
     P_d: FloatArray
     R: float
-    noise_a: FloatArray
-    noise_gamma: FloatArray
-
-    @property
-    def innovation(self) -> float:
-        """Variance of the white noise that drives the autoregression (Yule and Walker, with a floor)."""
-        gamma = self.noise_gamma
-        return max(float(gamma[0] - self.noise_a[:-1] @ gamma[1:]), 1e-9 * float(gamma[0]))
+    noise: Coloured
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +81,10 @@ class Estimates:
         Updates so far, and those that a guard refused, shape (K,).
     power
         Recent mean square of the residual relative to the baseline's, shape (K,).
+    level
+        Largest CUSUM since the evaluation before, as a multiple of its limit, shape (K,).
+    crossed
+        Sample at which one first passed its limit, counted from 1; 0 where none has, shape (K,).
     theta
         Estimate, shape (K, n).
     S
@@ -96,6 +97,8 @@ class Estimates:
     updates: FloatArray
     skipped: FloatArray
     power: FloatArray
+    level: FloatArray
+    crossed: FloatArray
     theta: FloatArray
     S: FloatArray
     Psi: FloatArray
@@ -128,13 +131,17 @@ class Pipeline:
         ------
         LoopError
             If the structure does not suit the plant, the estimator needs an instrument and the loop has neither a
-            controller nor nominal values to make one of, or stage 1 is demanded and not tuned.
+            controller nor nominal values to make one of, or stage 1 is demanded and not tuned or goes with a valve law.
         """
         from servoscope import estimators
 
         if loop.monitor.two_stage != "none" and stage_one is None:
             raise LoopError(f"{loop.name}: [monitor] two_stage = 'adaptive' needs a tuned stage 1: learn a baseline")
-
+        if loop.monitor.two_stage != "none" and Valve(loop).size:
+            raise LoopError(
+                f"{loop.name}: [monitor] two_stage = 'adaptive' simulates u from r as if the valve were linear: "
+                "set [plant] valve_law = 'linear' or two_stage = 'none'"
+            )
         needs = estimators.load(loop.monitor.estimator).NEEDS_INSTRUMENT
         bank = inverse.build(loop, inverse.instrument_of(loop) if needs else None)
         return cls(loop, bank, stage_one if loop.monitor.two_stage != "none" else None, still_speed)
@@ -143,6 +150,14 @@ class Pipeline:
     def every(self) -> int:
         """Samples between evaluations."""
         return max(1, round(self.loop.sample_rate / self.loop.monitor.evaluation_rate))
+
+    @property
+    def delays(self) -> tuple[int, int]:
+        """On-delay and off-delay of the alarm, in evaluations."""
+        monitor = self.loop.monitor
+        off = monitor.memory if monitor.off_delay is None else monitor.off_delay
+        rate = self.loop.sample_rate / self.every
+        return round(monitor.on_delay * rate), round(off * rate)
 
     @property
     def stride(self) -> int:
@@ -159,26 +174,32 @@ class Pipeline:
         """Memory N of the estimator in updates."""
         return self.loop.monitor.memory * self.loop.sample_rate / self.stride
 
-    def constants(self, tuning: Tuning) -> Constants:
-        """Turn loop and tuning into what the compiled recursion takes; phi is divided by the tuning's scale."""
+    def constants(self, tuning: Tuning, watch: Watch | None = None) -> Constants:
+        """Turn loop and tuning into what the compiled recursion takes; phi is divided by the tuning's scale.
+
+        `watch` is the sequential test, scaled alike; without it there is none.
+        """
         from servoscope import estimators
+        from servoscope.cusum import idle
         from servoscope.recursion import Constants
 
         loop, bank, n = self.loop, self.bank, self.bank.n
-        rows = np.ones(len(bank.system.C))
+        system = self._behind_valve
+        rows = np.ones(len(system.C))
         rows[1 : 1 + n] = 1.0 / tuning.scale
         if bank.has_instrument:
             rows[1 + n :] = 1.0 / tuning.scale
         pairs = np.outer(tuning.scale, tuning.scale)
         infinite = (-np.inf, np.inf)
         dead = loop.input_deadzone or (np.inf, -np.inf)
-        limits = (loop.input_limits or infinite) if loop.input_logged == "before_limiter" else infinite
+        unlimited = loop.input_logged == "after_limiter" or self.valve.size  # a valve law limits u itself
+        limits = infinite if unlimited else (loop.input_limits or infinite)
         arrays = {
-            "A": bank.system.A,
-            "B": bank.system.B,
-            "C": rows[:, None] * bank.system.C,
-            "D": rows[:, None] * bank.system.D,
-            "X0": bank.system.steady,
+            "A": system.A,
+            "B": system.B,
+            "C": rows[:, None] * system.C,
+            "D": rows[:, None] * system.D,
+            "X0": system.steady,
             "vA": bank.velocity.A,
             "vB": bank.velocity.B,
             "vC": bank.velocity.C,
@@ -188,8 +209,8 @@ class Pipeline:
             "deadzone": dead,
             "theta": tuning.theta * tuning.scale,
             "P_d": tuning.P_d * pairs,
-            "a": tuning.noise_a,
-            "gamma": tuning.noise_gamma,
+            "weights": np.concatenate([tuning.noise.a, tuning.noise.b]),
+            "heads": np.concatenate([tuning.noise.gamma, tuning.noise.c]),
         }
         return Constants(
             **{name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()},
@@ -200,22 +221,43 @@ class Pipeline:
             still_speed=self.still_speed,
             only_moving=loop.monitor.update_when == "moving",
             wait=bank.wait,
+            lags=len(tuning.noise.a),
             stride=self.stride,
             every=self.every,
             R=tuning.R,
             memory=self.memory,
             extra=estimators.extra(loop.monitor.estimator, n, self.memory),
+            watch=watch or idle(n),
         )
 
     def blank(self) -> Tuning:
         """Return a tuning that only serves to form regressors: scale 1, nothing known of noise."""
         n = self.bank.n
-        return Tuning(np.zeros(n), np.ones(n), np.eye(n), 1.0, np.zeros(1), np.ones(1))
+        noise = Coloured(np.zeros(1), np.zeros(0), np.ones(1), 1.0)
+        return Tuning(np.zeros(n), np.ones(n), np.eye(n), 1.0, noise)
 
     def input(self, r: FloatArray, u: FloatArray, restart: BoolArray) -> FloatArray:
         """Return what takes the place of u in eta, shape (N,): u_a of stage 1, or u itself without one."""
         stage = Stage(self.loop, self.stage_one)
         return stage.run(stage.start(), r, u, restart)
+
+    @cached_property
+    def valve(self) -> Valve:
+        """The law of the valve, in front of everything; it lets u pass where the law is linear."""
+        return Valve(self.loop)
+
+    @cached_property
+    def _behind_valve(self) -> Linear:
+        """The bank without the delay that the valve law takes over."""
+        if not held_back(self.loop):
+            return self.bank.system
+        instrument = inverse.instrument_of(self.loop) if self.bank.has_instrument else None
+        rest = self.loop.model_copy(update={"delay": self.loop.delay - held_back(self.loop)})
+        return inverse.build(rest, instrument).system
+
+    def flow(self, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
+        """Return what the valve makes of u, shape (N,); u itself where its law is linear."""
+        return self.valve.run(self.valve.start(), u, y, restart)
 
     @cached_property
     def _plain(self) -> Constants:
@@ -230,19 +272,20 @@ class Pipeline:
         state = Layout(c).start(c, 1)
         out = np.zeros((len(r), len(c.C)))  # a missing sample writes nothing
         ok = np.empty(len(r), dtype=np.int64)
-        regressors(c, state[0], r, self.input(r, u, restart), y, restart, out, ok)
+        u = self.input(r, self.flow(u, y, restart), restart)
+        regressors(c, state[0], r, u, y, restart, out, ok)
         return Regression(out[:, 0], out[:, 1 : 1 + n].copy(), out[:, -n:].copy(), ok == 1)
 
-    def estimate(self, tuning: Tuning, recording: Recording) -> Estimates:
-        """Run the recursion over a recording, from the tuning's theta."""
+    def estimate(self, tuning: Tuning, recording: Recording, watch: Watch | None = None) -> Estimates:
+        """Run the recursion over a recording, from the tuning's theta, with or without the sequential test."""
         from servoscope.recursion import Layout, block
 
-        c = self.constants(tuning)
+        c = self.constants(tuning, watch)
         layout = Layout(c)
         state = layout.start(c, 1)
         out = np.empty((1, recording.samples // self.every, layout.row))
-        r, restart = recording.r, recording.restart
-        signals = (r, self.input(r, recording.u, restart), recording.y, restart)
+        r, y, restart = recording.r, recording.y, recording.restart
+        signals = (r, self.input(r, self.flow(recording.u, y, restart), restart), y, restart)
         block(self.loop.monitor.estimator)(c, state, *(signal[None, :] for signal in signals), out)
         index = (np.arange(out.shape[1]) + 1) * self.every - 1
         return self.unpack(tuning, out[0], index)
@@ -251,12 +294,14 @@ class Pipeline:
         """Turn rows of the recursion, shape (K, row), into estimates in physical units."""
         n, s = self.bank.n, tuning.scale
         pairs = np.outer(s, s)
-        theta, S, Psi = np.split(rows[:, 3:], [n, n + n * n], axis=1)
+        theta, S, Psi = np.split(rows[:, 5:], [n, n + n * n], axis=1)
         return Estimates(
             index=index,
             updates=rows[:, 0],
             skipped=rows[:, 1],
-            power=rows[:, 2] / tuning.noise_gamma[0],
+            power=rows[:, 2] / tuning.noise.gamma[0],
+            level=rows[:, 3],
+            crossed=rows[:, 4],
             theta=theta / s,
             S=S.reshape(-1, n, n) / pairs,
             Psi=Psi.reshape(-1, n, n) * (s[None, :] / s[:, None]),

@@ -8,11 +8,15 @@ import numpy as np
 
 from servoscope.baseline import Promise
 from servoscope.detection import SECONDS_PER_YEAR, noncentrality, required_noncentrality, statistic, threshold
+from servoscope.inverse import cutoff_of
+from servoscope.linear import Linear, autocovariances
 from servoscope.loop import Loop
-from servoscope.pipeline import Estimates
+from servoscope.pipeline import Estimates, Pipeline
 from servoscope.plants import FloatArray
+from servoscope.signatures import solve_scaled
 from servoscope.tuning import Fit
 
+WORTH_TELLING = 1.0 / 3.0  # standard deviations that noise in phi may move the iFRF in silence
 WORTH_A_LOOK = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
 
 
@@ -54,6 +58,48 @@ def supported_budget(n: int, loop: Loop, dof: float, excess: float) -> float:
         if threshold(n, *looks, budget, dof) <= 1.5 * threshold(n, *looks, budget, 1e9):
             return budget
     return SECONDS_PER_YEAR * looks[0]
+
+
+def noise_bias(pipeline: Pipeline, found: Fit, estimates: Sequence[Estimates]) -> tuple[FloatArray, FloatArray]:
+    """Return what noise in phi does to the iFRF, and the standard deviation of one estimate, both relative to |H|.
+
+    Least squares are off by -(R_phi + S)^-1 S theta, S the covariance that the sensor's white noise has behind the
+    filters (errors in variables; Soderstrom, 2007). Shapes (F,), (F,); zeros with an instrument and where the noise is
+    not known.
+    """
+    loop, bank, n = pipeline.loop, pipeline.bank, pipeline.bank.n
+    nothing = np.zeros(len(loop.monitor.frequencies))
+    last = [e.S[-1] for e in estimates if len(e.S) and e.updates[-1] > 0]
+    if bank.has_instrument or found.noises is None or not last:
+        return nothing, nothing
+    system = Linear(bank.system.A, bank.system.B[:, 2:3], bank.system.C[1 : 1 + n], bank.system.D[1 : 1 + n, 2:3])
+    S = found.noises.noise.y_std**2 * autocovariances(system, 0)[0]
+    R_phi = np.asarray(found.tuning.R / pipeline.memory * np.linalg.inv(found.tuning.P_d), dtype=np.float64)
+    E = bank.E(loop.monitor.frequencies)
+    H = np.abs(E @ found.tuning.theta)
+    bias = np.abs(E @ solve_scaled(R_phi, S @ found.tuning.theta))
+    spread = np.mean(last, axis=0)
+    std = np.sqrt(np.einsum("fi,ij,fj->f", E, spread, E.conj()).real)
+    return bias / H, std / H
+
+
+def noise_notes(pipeline: Pipeline, found: Fit, estimates: Sequence[Estimates], simulated: bool) -> list[str]:
+    """Say where noise in phi moves the iFRF by more than a third of its standard deviation, and what helps."""
+    loop = pipeline.loop
+    bias, std = noise_bias(pipeline, found, estimates)
+    if not np.any(bias > WORTH_TELLING * std):
+        return []
+    at = int(np.argmax(bias / np.maximum(std, 1e-12)))
+    told = (
+        f"noise in y moves the estimated iFRF by {bias[at]:.2g} of its size at {loop.monitor.frequencies[at]:g} Hz, "
+        f"where one estimate scatters by {std[at]:.2g}"
+    )
+    if simulated:
+        return [f"{told}: diagnose takes it out, as the loop can be simulated"]
+    if loop.controller is not None:
+        return [f"{told}: estimator = 'iv-akf' removes it"]
+    slower = cutoff_of(loop) / 2.0
+    return [f"{told}: try [monitor] cutoff = {slower:g}, or give [controller] and the plant's nominal values"]
 
 
 def promises(

@@ -14,8 +14,9 @@ BoolArray = npt.NDArray[np.bool_]
 
 @kernel
 def spread(
-    a: FloatArray,
-    gamma: FloatArray,
+    weights: FloatArray,
+    heads: FloatArray,
+    lags: int,
     K: FloatArray,
     phi: FloatArray,
     S: FloatArray,
@@ -24,11 +25,13 @@ def spread(
 ) -> None:
     """Carry the covariance of theta_hat through one update of gain K, for coloured noise v.
 
-    With theta_err(k+1) = (I - K phi') theta_err(k) + K v(k) and v autoregressive (a, gamma), the joint covariance of
-    theta_err and the last p noises obeys a recursion of its own: S = Cov(theta_err), M = E[theta_err v_past']. It is
-    exact for given phi, whatever the excitation and the gating. Psi is the share of the starting value that is left.
+    With theta_err(k+1) = (I - K phi') theta_err(k) + K v(k) and v(k) = sum a_j v(k-j) + e(k) + sum b_j e(k-j), the
+    joint covariance of theta_err, the last p values of v and the last q of e obeys a recursion of its own:
+    S = Cov(theta_err), M = E[theta_err [v_past e_past]']. It is exact for given phi, whatever the excitation and the
+    gating. `weights` are [a b], `heads` are E[v(k) v(k-j)] and E[v(k) e(k-j)], `lags` is p. Psi is the share of the
+    starting value that is left.
     """
-    n, p = M.shape
+    n, past = M.shape
     m = np.empty(n)  # E[theta_err(k) v(k)]
     q = np.empty(n)  # S phi
     h = np.empty(n)  # phi' Psi
@@ -36,8 +39,8 @@ def spread(
     phi_q = 0.0
     for i in range(n):
         m[i] = 0.0
-        for j in range(p):
-            m[i] += M[i, j] * a[j]
+        for j in range(past):
+            m[i] += M[i, j] * weights[j]
         q[i] = 0.0
         h[i] = 0.0
         for j in range(n):
@@ -50,18 +53,22 @@ def spread(
         for j in range(i + 1):
             am_i = m[i] - K[i] * phi_m
             am_j = m[j] - K[j] * phi_m
-            S[i, j] += (phi_q + gamma[0]) * K[i] * K[j] - K[i] * q[j] - q[i] * K[j] + am_i * K[j] + K[i] * am_j
+            S[i, j] += (phi_q + heads[0]) * K[i] * K[j] - K[i] * q[j] - q[i] * K[j] + am_i * K[j] + K[i] * am_j
             S[j, i] = S[i, j]
         for j in range(n):
             Psi[i, j] -= K[i] * h[j]
-    for lag in range(p - 1, 0, -1):
-        phi_M = 0.0
-        for i in range(n):
-            phi_M += phi[i] * M[i, lag - 1]
-        for i in range(n):
-            M[i, lag] = M[i, lag - 1] - K[i] * phi_M + K[i] * gamma[lag]
+    for j in range(past - 1, 0, -1):
+        if j == lags:  # e(k) is new: nothing before knew it
+            for i in range(n):
+                M[i, j] = K[i] * heads[j]
+        else:
+            phi_M = 0.0
+            for i in range(n):
+                phi_M += phi[i] * M[i, j - 1]
+            for i in range(n):
+                M[i, j] = M[i, j - 1] - K[i] * phi_M + K[i] * heads[j]
     for i in range(n):
-        M[i, 0] = m[i] - K[i] * phi_m + K[i] * gamma[0]
+        M[i, 0] = m[i] - K[i] * phi_m + K[i] * heads[0]
 
 
 @kernel

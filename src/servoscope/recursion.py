@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servoscope import estimators, propagation
+from servoscope import cusum, estimators, propagation
 from servoscope.compiled import around, kernel
+from servoscope.cusum import LAGS, Watch, accumulate, follow
 from servoscope.plants import FloatArray
 from servoscope.propagation import spread
 
@@ -23,8 +24,8 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 # counters at the head of the state row
-ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, POWER, STILL, DRIFT = range(8)
-HEAD = 8
+ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, POWER, STILL, DRIFT, USED_UP, LEVEL, PEAK, CROSSED = range(12)
+HEAD = 12
 ABSURD = 1e100  # no physical signal; its square would overflow and stay in the state for ever
 # what `sense` says of a sample
 MISSING, HELD, USED, BETWEEN = -1, 0, 1, 2
@@ -34,9 +35,10 @@ class Constants(NamedTuple):
     """Everything that a loop and a baseline say, as arrays (scaled: phi / scale, theta * scale).
 
     ``A, B, C, D, X0`` are the filter bank and its steady state per unit input, ``vA ... vX0`` the velocity filter,
-    `codes` the non-linear inputs, `limits` and `deadzone` of u, `a` and `gamma` the noise's autoregression and
-    autocovariance (gamma[0] its variance), in updates: of every `stride`-th sample; `extra` is the size of the
-    estimator's private state.
+    `codes` the non-linear inputs, `limits` and `deadzone` of u; `weights` and `heads` are the noise's model as
+    `servoscope.propagation.spread` takes it, `lags` of them the autoregression's (heads[0] is its variance), in
+    updates: of every `stride`-th sample; `extra` is the size of the
+    estimator's private state, and `watch` is the sequential test.
     """
 
     A: FloatArray
@@ -63,10 +65,12 @@ class Constants(NamedTuple):
     theta: FloatArray
     P_d: FloatArray
     R: float
-    a: FloatArray
-    gamma: FloatArray
+    weights: FloatArray
+    heads: FloatArray
+    lags: int
     memory: float
     extra: int
+    watch: Watch
 
 
 class Layout:
@@ -79,7 +83,7 @@ class Layout:
     """
 
     def __init__(self, c: Constants) -> None:
-        nx, nv, n, p = len(c.A), len(c.vA), len(c.theta), len(c.a)
+        nx, nv, n, p = len(c.A), len(c.vA), len(c.theta), len(c.weights)
         self.n = n
         sizes = {
             "head": HEAD,
@@ -91,13 +95,14 @@ class Layout:
             "M": n * p,
             "Psi": n * n,
             "extra": c.extra,
+            "watch": c.watch.size,
         }
         ends = np.cumsum(list(sizes.values()))
         self.slices = {
             name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)
         }
         self.size = int(ends[-1])
-        self.row = 3 + n + 2 * n * n  # counters, theta, S, Psi
+        self.row = 5 + n + 2 * n * n  # counters, sequential test, theta, S, Psi
 
     def start(self, c: Constants, assets: int) -> FloatArray:
         """Return the state before the first sample, shape (assets, size): theta at the baseline, P = P_d."""
@@ -105,7 +110,7 @@ class Layout:
         state[:, self.slices["theta"]] = c.theta
         state[:, self.slices["P"]] = c.P_d.ravel()
         state[:, self.slices["Psi"]] = np.eye(self.n).ravel()
-        state[:, POWER] = c.gamma[0]
+        state[:, POWER] = c.heads[0]
         return state
 
 
@@ -211,11 +216,14 @@ def _block(
     nx = c.A.shape[0]
     nv = c.vA.shape[0]
     n = len(c.theta)
-    p = len(c.a)
+    p = len(c.weights)
     assets, samples = r.shape
     w = np.empty(c.B.shape[1])
     v_out = np.empty(c.C.shape[0])
     K = np.empty(n)
+    watched = len(c.watch.limits) > 0
+    nxs = c.watch.A.shape[0]
+    shadow = np.empty(1 + n)
     row = 0
     for asset in range(assets):
         s = state[asset]
@@ -228,12 +236,29 @@ def _block(
         o += n * n + n * p
         Psi = s[o : o + n * n].reshape((n, n))
         extra = s[o + n * n : o + n * n + c.extra]
+        xs = s[o + n * n + c.extra : o + n * n + c.extra + nxs]
+        o += n * n + c.extra + nxs
+        filters = (n + 1) * (len(c.watch.numerator) - 1) + n + LAGS
+        test = s[o : o + filters + len(c.watch.limits)]
         phi = v_out[1 : 1 + n]
         z = v_out[len(v_out) - n :]
         row = 0
         for k in range(samples):
+            arm = restart[asset, k] or s[ARMED] == 0.0
+            if s[SAMPLE] % c.every == 0.0:  # a new evaluation begins
+                s[PEAK] = s[LEVEL]
+                if s[LEVEL] < 1.0:
+                    s[CROSSED] = 0.0
             ok = sense(c, s, w, v_out, r[asset, k], u[asset, k], y[asset, k], restart[asset, k])
+            if watched and ok != MISSING:
+                follow(c.watch, xs, r[asset, k], arm, shadow)
             if ok == USED:
+                if watched:
+                    s[USED_UP] += 1.0
+                    s[LEVEL] = accumulate(c.watch, test, v_out[0], phi, shadow, s[USED_UP])
+                    s[PEAK] = max(s[PEAK], s[LEVEL])
+                    if s[LEVEL] >= 1.0 and s[CROSSED] == 0.0:
+                        s[CROSSED] = s[SAMPLE]
                 e = v_out[0]
                 for i in range(n):
                     e -= phi[i] * theta[i]
@@ -242,21 +267,27 @@ def _block(
                     s[POWER] += (e * e - s[POWER]) / c.memory
                 else:
                     s[SKIPPED] += 1.0
-                spread(c.a, c.gamma, K, phi, S, M, Psi)
+                spread(c.weights, c.heads, c.lags, K, phi, S, M, Psi)
             elif ok != BETWEEN:
                 for i in range(n):  # after a gap or a rest the noise is new
                     for j in range(p):
                         M[i, j] = 0.0
+                if watched:
+                    s[USED_UP] = 0.0
+                    for i in range(filters):
+                        test[i] = 0.0
             if s[SAMPLE] % c.every == 0.0:
                 q = out[asset, row]
                 q[0] = s[UPDATES]
                 q[1] = s[SKIPPED]
                 q[2] = s[POWER]
+                q[3] = s[PEAK]
+                q[4] = s[CROSSED]
                 for i in range(n):
-                    q[3 + i] = theta[i]
+                    q[5 + i] = theta[i]
                     for j in range(n):
-                        q[3 + n + i * n + j] = S[i, j]
-                        q[3 + n + n * n + i * n + j] = Psi[i, j]
+                        q[5 + n + i * n + j] = S[i, j]
+                        q[5 + n + n * n + i * n + j] = Psi[i, j]
                 row += 1
     return row
 
@@ -286,4 +317,4 @@ def block(estimator: str) -> Callable[..., int]:
     (assets, samples), `state` is changed in place, and `out` (assets, rows, `Layout.row`) receives an evaluation
     every ``c.every`` samples.
     """
-    return around(estimators.load(estimator), _block, [propagation])
+    return around(estimators.load(estimator), _block, [propagation, cusum])

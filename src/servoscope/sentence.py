@@ -14,6 +14,7 @@ def summary(
     since: str,
     seen: dict[str, tuple[float, float]],
     warnings: Sequence[Warning],
+    point: str = "",
 ) -> str:
     """Say it.
 
@@ -25,27 +26,30 @@ def summary(
         "since ...", or nothing.
     seen
         By parameter, the smallest change that would have shown, and what the baseline promises.
+    point
+        Operating point that the recording was judged at, or nothing.
     """
+    here = f" at {point}" if point else ""
     if verdict == "healthy":
         smallest = sorted((size, parameter) for parameter, (size, _) in seen.items())
         told = ", ".join(f"{parameter} {100.0 * size:.3g} %" for size, parameter in smallest)
-        return f"Healthy: no change that would have shown here (from {told} on)."
+        return f"Healthy{here}: no change that would have shown here (from {told} on)."
     if verdict == "undetermined":
         reason = next(warning.message for warning in warnings if warning.kind == "power")
-        return f"Undetermined: {reason}."
+        return f"Undetermined{here}: {reason}."
     if faults:
         (fault,) = faults
         low, high = fault.interval
         what = "It" if fault.parameter == fault.name else fault.parameter
         return (
-            f"Fault: {fault.name}. {what} is {fault.ratio:.4g} times its healthy value ({low:.4g} to "
+            f"Fault{here}: {fault.name}. {what} is {fault.ratio:.4g} times its healthy value ({low:.4g} to "
             f"{high:.4g}) {since}."
         )
     likely = [c for c in candidates if c.probability >= 0.05]
     if likely[0].name == UNKNOWN and likely[0].probability >= 0.5:
-        return f"Fault, unknown: a change {since} that no single known fault explains."
+        return f"Fault{here}, unknown: a change {since} that no single known fault explains."
     listed = " or ".join(f"{c.name} ({_share(c.probability)})" for c in likely)
-    return f"Fault {since}, not to be told apart here: {listed}."
+    return f"Fault{here} {since}, not to be told apart here: {listed}."
 
 
 def _share(probability: float) -> str:

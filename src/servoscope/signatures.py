@@ -14,24 +14,20 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope.errors import LoopError, SimulationError
-from servoscope.inverse import closed_loop
+from servoscope.inverse import closed_loop, nominal_theta
 from servoscope.linear import Linear, autocovariances
-from servoscope.pipeline import Pipeline, Tuning
+from servoscope.noise import Coloured, Noise, coloured
+from servoscope.pipeline import Pipeline, Regression, Tuning
 from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
 from servoscope.simulation import response
 
+IntArray = npt.NDArray[np.int64]
+
 LONGEST_FILL = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
-
-
-@dataclass(frozen=True)
-class Noise:
-    """White noise of the loop: standard deviations of n_u (enters with u) and n_y (part of the measured y)."""
-
-    u_std: float
-    y_std: float
 
 
 class Moments(NamedTuple):
@@ -78,6 +74,25 @@ def noise_system(pipeline: Pipeline, plant: Plant) -> Linear:
     return noisy.then(Linear(bank.A, bank.B[:, 1:3], bank.C, bank.D[:, 1:3]))
 
 
+def residual_system(pipeline: Pipeline, plant: Plant) -> Linear:
+    """Return [n_u, n_y] -> v = eta - phi' theta through the closed loop, with the plant's own coefficients."""
+    system, n = noise_system(pipeline, plant), pipeline.bank.n
+    row = np.concatenate([[1.0], -true_theta(pipeline, plant)])[None, :]
+    return Linear(system.A, system.B, row @ system.C[: 1 + n], row @ system.D[: 1 + n])
+
+
+def colour_of(pipeline: Pipeline, plant: Plant, noise: Noise) -> Coloured:
+    """Return the model of v for white noise in the closed loop with a plant.
+
+    The colour is that of the filters; the power is exact: between samples the output that answers to the noise does
+    not run in straight lines either, which takes a few per cent from it.
+    """
+    model = coloured(pipeline.bank, true_theta(pipeline, plant), noise, pipeline.stride)
+    system, std = residual_system(pipeline, plant), np.array([noise.u_std, noise.y_std])
+    power = autocovariances(Linear(system.A, system.B * std, system.C, system.D * std), 0)[0, 0, 0]
+    return model.times(float(power) / float(model.gamma[0]))
+
+
 def noise_moments(pipeline: Pipeline, plant: Plant, noise: Noise) -> Moments:
     """Return the moments of the noise in the regressors; zero with an instrument, for E[z v] = 0 is its point."""
     n = pipeline.bank.n
@@ -119,8 +134,8 @@ class Expectation:
             self._moments[key] = noise_moments(self.pipeline, plant, self.noise)
         return self._moments[key]
 
-    def path(self, plants: Sequence[Plant], onsets: Sequence[int], start: FloatArray) -> FloatArray:
-        """Return the mean of theta_hat at every evaluation, shape (K, n).
+    def regression(self, plants: Sequence[Plant], onsets: Sequence[int]) -> tuple[Regression, IntArray]:
+        """Return the noise-free regression of the loop with plants that follow each other, and which of them holds.
 
         Parameters
         ----------
@@ -128,21 +143,26 @@ class Expectation:
             Plants that follow each other.
         onsets
             Sample of the recording from which each holds; the first is 0.
-        start
-            theta_hat before the first sample, shape (n,).
 
         Raises
         ------
         SimulationError
             If the loop is unstable with one of the plants.
         """
-        from servoscope.propagation import mean_path
-
         r, kept, restart = self.course
         u, y = response(self.pipeline.loop, r, plants=plants, switch=[int(kept[k]) for k in onsets])
-        g = self.pipeline.regression(r[kept], u[kept], y[kept], restart)
-        moments = [self.moments(plant) for plant in plants]
         which = np.searchsorted(np.asarray(onsets), np.arange(len(kept)), side="right") - 1
+        return self.pipeline.regression(r[kept], u[kept], y[kept], restart), which
+
+    def path(self, plants: Sequence[Plant], onsets: Sequence[int], start: FloatArray) -> FloatArray:
+        """Return the mean of theta_hat at every evaluation, shape (K, n), from `start` (n,) before the first sample.
+
+        The other arguments and errors are those of `regression`.
+        """
+        from servoscope.propagation import mean_path
+
+        g, which = self.regression(plants, onsets)
+        moments = [self.moments(plant) for plant in plants]
         return mean_path(
             g.eta,
             g.phi,
@@ -156,6 +176,10 @@ class Expectation:
             np.asarray(start, dtype=np.float64),
             self.pipeline.every,
         )
+
+    def first(self, seconds: float) -> Expectation:
+        """Return the expectation for the recording's first seconds only."""
+        return self.until(min(round(seconds * self.pipeline.loop.sample_rate), len(self.course.kept)))
 
     def until(self, samples: int) -> Expectation:
         """Return the expectation for the recording's first samples only."""
@@ -173,12 +197,27 @@ class Expectation:
 
     def batch(self, plant: Plant) -> FloatArray:
         """Return what least squares over the whole reference converges to, shape (n,)."""
-        r, kept, restart = self.course
-        u, y = response(self.pipeline.loop, r, plants=[plant])
-        g = self.pipeline.regression(r[kept], u[kept], y[kept], restart)
+        return solve_scaled(*self.normal(plant))
+
+    def normal(self, plant: Plant) -> tuple[FloatArray, FloatArray]:
+        """Return the mean normal equations of least squares over the reference, shapes (n, n) and (n,)."""
+        g, _ = self.regression([plant], [0])
         phi, z, eta = g.phi[g.ok], g.z[g.ok], g.eta[g.ok]
         c, S = self.moments(plant)
-        return solve_scaled(z.T @ phi + len(eta) * S, z.T @ eta + len(eta) * c)
+        return z.T @ phi + len(eta) * S, z.T @ eta + len(eta) * c
+
+    def residual(self, plant: Plant, theta: FloatArray) -> FloatArray:
+        """Return the mean of v = eta - phi' theta for fixed coefficients at every usable sample, shape (M,).
+
+        It is exact: with theta fixed, v is linear in u and y, and the noise has no mean.
+        """
+        g, _ = self.regression([plant], [0])
+        return (g.eta - g.phi @ theta)[g.ok]
+
+
+def true_theta(pipeline: Pipeline, plant: Plant) -> FloatArray:
+    """Return the coefficients of a plant in the pipeline's own structure, shape (n,)."""
+    return nominal_theta(pipeline.loop.model_copy(update={"plant": plant}))
 
 
 def solve_scaled(A: FloatArray, b: FloatArray) -> FloatArray:

@@ -8,11 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoscope.errors import NotEnoughError
-from servoscope.pipeline import Regression, Tuning
+from servoscope.noise import (
+    AR_ORDER,
+    Coloured,
+    WhiteNoises,
+    autocovariance,
+    coloured,
+    misfit,
+    residual_of,
+    white_noises,
+    yule_walker,
+)
+from servoscope.pipeline import Pipeline, Regression, Tuning
 from servoscope.plants import FloatArray
 from servoscope.signatures import solve_scaled
 
-AR_ORDER = 10
 WEAKEST = 1e-14  # smallest eigenvalue of the scaled R_phi, relative to the largest, that still counts as excited
 
 
@@ -37,6 +47,8 @@ class Fit:
         recursion diverges where it is negative (THEORY section 5).
     rms_eta
         Root mean square of eta.
+    noises
+        White noises of u and y that fit the residual best; None with two stages, where u does not enter.
     """
 
     tuning: Tuning
@@ -47,26 +59,7 @@ class Fit:
     dof: float
     strength: float
     rms_eta: float
-
-
-def autocovariance(runs: Sequence[FloatArray], lags: int) -> FloatArray:
-    """Return the autocovariance of a zero-mean signal at lags 0 ... lags, over several runs, shape (lags + 1,)."""
-    total = sum(len(run) for run in runs)
-    products = [sum(float(run[lag:] @ run[: len(run) - lag]) for run in runs) for lag in range(lags + 1)]
-    return np.array(products) / total
-
-
-def autoregression(runs: Sequence[FloatArray], order: int = AR_ORDER) -> tuple[FloatArray, FloatArray]:
-    """Fit v(k) = sum a_j v(k-j) + w(k) by Yule and Walker; return a (p,) and the autocovariance (p,).
-
-    A small white floor keeps strongly oversampled noise solvable.
-    """
-    from scipy.linalg import solve_toeplitz
-
-    gamma = autocovariance(runs, order)
-    row = gamma[:order].copy()
-    row[0] *= 1.0 + 1e-9
-    return np.asarray(solve_toeplitz(row, gamma[1:])), gamma[:order]
+    noises: WhiteNoises | None
 
 
 def least_squares(g: Regression) -> FloatArray:
@@ -80,33 +73,39 @@ def coloured_covariance(g: Regression, tuning: Tuning) -> FloatArray:
     sum z v has the covariance of z passed through the noise's shaping filter, summed: the spectrum of z decides how
     much of the noise's spectrum reaches theta.
     """
-    from scipy.signal import lfilter
-
     phi, z = g.phi[g.ok], g.z[g.ok]
     size = np.sqrt((z**2).mean(axis=0))
-    shaped = lfilter([1.0], np.concatenate([[1.0], -tuning.noise_a]), z / size, axis=0)
-    X = tuning.innovation * shaped.T @ shaped
+    shaped = tuning.noise.shape(z / size)
+    X = shaped.T @ shaped
     G = np.linalg.inv((z / size).T @ (phi / size))
     return np.asarray(G @ X @ G.T / np.outer(size, size))
 
 
-def fit(regressions: Sequence[Regression], memory: float, names: Sequence[str]) -> Fit:
+def white_enough(runs: Sequence[FloatArray], noises: WhiteNoises, free: Coloured) -> bool:
+    """Return whether white noises explain residuals better than an autoregression, by Schwarz' criterion (1978).
+
+    Two white noises have two numbers, an autoregression has one for each lag and its variance.
+    """
+    price = 0.5 * float(np.log(sum(len(run) for run in runs)))
+    return noises.cost + 2.0 * price <= misfit(free, runs) + (len(free.a) + 1.0) * price
+
+
+def fit(pipeline: Pipeline, regressions: Sequence[Regression]) -> Fit:
     """Tune the recursion on healthy recordings: P_d = (R/N) R_phi^-1, so that all directions forget alike.
 
     Parameters
     ----------
+    pipeline
+        Gives the memory and, for error messages, the names of the coefficients.
     regressions
         One per recording.
-    memory
-        N in samples.
-    names
-        Of the coefficients, for error messages.
 
     Raises
     ------
     NotEnoughError
         If too few samples are usable or a column is not excited at all.
     """
+    names = pipeline.bank.names
     n = len(names)
     usable = sum(int(g.ok.sum()) for g in regressions)
     if usable < 20 * n:
@@ -130,14 +129,18 @@ def fit(regressions: Sequence[Regression], memory: float, names: Sequence[str]) 
         raise NotEnoughError(f"the healthy recordings do not tell {weakest} from the other coefficients: move more")
     theta = solve_scaled(R_phi, z.T @ eta / len(eta))
     residuals = [(g.eta - g.phi @ theta)[g.ok] for g in regressions]
-    a, gamma = autoregression(residuals)
-    R = float(gamma[0])
-    P_d = R / memory * np.linalg.inv(scaled) / np.outer(scale, scale)
+    R = float(autocovariance(residuals, 0)[0])
+    model, noises = yule_walker(autocovariance(residuals, AR_ORDER)), None
+    if pipeline.stage_one is None:
+        noises = white_noises(residual_of(pipeline.bank, theta), residuals, pipeline.stride)
+        if white_enough(residuals, noises, model):
+            model = coloured(pipeline.bank, theta, noises.noise, pipeline.stride)
+    P_d = R / pipeline.memory * np.linalg.inv(scaled) / np.outer(scale, scale)
     strength = float(np.linalg.eigvals(np.linalg.solve(own, scaled)).real.min())
-    tuning = Tuning(theta, scale, P_d, R, a, gamma)
+    tuning = Tuning(theta, scale, P_d, R, model)
     covariances = np.array([coloured_covariance(g, tuning) for g in regressions])
     joint = Regression(eta, phi, z, np.ones(len(eta), dtype=bool))
-    correlation = gamma / gamma[0]
+    correlation = model.autocovariance(AR_ORDER) / model.gamma[0]
     return Fit(
         tuning=tuning,
         covariance=coloured_covariance(joint, tuning),
@@ -147,4 +150,5 @@ def fit(regressions: Sequence[Regression], memory: float, names: Sequence[str]) 
         dof=len(eta) / float(1.0 + 2.0 * (correlation[1:] ** 2).sum()),
         strength=strength,
         rms_eta=float(np.sqrt((eta**2).mean())),
+        noises=noises,
     )

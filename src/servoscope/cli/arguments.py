@@ -1,17 +1,18 @@
-"""What the words on the command line mean: row conditions, column mappings, faults, names of output files."""
+"""What the words on the command line mean: operating points, row conditions, column mappings, faults."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from servoscope.errors import OutputError, RecordingError, ServoscopeError
+from servoscope.errors import RecordingError, ServoscopeError
 
 if TYPE_CHECKING:
     from servoscope.baseline import Baseline
@@ -21,20 +22,48 @@ if TYPE_CHECKING:
     from servoscope.simulation import FaultEvent
 
 __all__ = [
-    "Outputs",
+    "Rigs",
     "Source",
     "check_length",
-    "check_output",
     "check_reference",
     "columns_from",
     "conditions",
     "fault_events",
+    "healthy",
     "no_mapping",
     "provenance",
-    "stem_of",
 ]
 
 MOST_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
+
+
+class Rigs(StrEnum):
+    """What ``simulate`` can simulate."""
+
+    linear = "linear"
+    nonlinear = "nonlinear"
+
+
+def healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
+    """Read recordings to learn from: ``warm=c.csv`` is c.csv at the operating point warm, ``c.csv`` is at none.
+
+    A file whose whole name exists is taken as it is.
+
+    Raises
+    ------
+    typer.BadParameter
+        If some have an operating point and others have none.
+    """
+    found = []
+    for text in texts:
+        named = re.fullmatch(r"(\w[\w-]*)=(.+)", text)
+        found.append((named[1], Path(named[2])) if named and not Path(text).exists() else ("", Path(text)))
+    without = [path for point, path in found if not point]
+    if 0 < len(without) < len(found):
+        raise typer.BadParameter(
+            f"{without[0]}: name the operating point of each recording, as in cold=a.csv, or of none"
+        )
+    return found
 
 
 def conditions(texts: Sequence[str]) -> dict[str, str]:
@@ -186,116 +215,6 @@ def check_length(duration_s: float, sample_rate: float) -> None:
         raise typer.BadParameter(f"--duration {duration_s:g}: give more than 0 s and at most {most:g} s")
 
 
-def check_output(
-    path: Path | None, option: str, suffixes: Sequence[str], inputs: Iterable[Path], *, folder: bool = False
-) -> None:
-    """Refuse an output that would overwrite an input or cannot be written, before any work is done.
-
-    Parameters
-    ----------
-    path
-        What the option says; None: it was not given.
-    option
-        The option, for messages.
-    suffixes
-        Endings that the file may have; empty: any.
-    inputs
-        Files that the command reads.
-    folder
-        Whether a folder will do as well.
-
-    Raises
-    ------
-    typer.BadParameter
-        If it has another suffix, or is one of the inputs.
-    OutputError
-        If its folder does not exist.
-    """
-    if path is None:
-        return
-    if any(_same(path, each) for each in inputs):
-        raise typer.BadParameter(f"{option} {path}: is an input and would be overwritten, give another name")
-    try:
-        is_folder = path.is_dir()
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
-    if folder and (is_folder or not path.suffix):
-        return
-    if suffixes and path.suffix.lower() not in suffixes:
-        raise typer.BadParameter(f"{option} {path}: end the name in {' or '.join(suffixes)}")
-    if not path.parent.is_dir():
-        raise OutputError(f"{path}: cannot be written, there is no folder {path.parent}; make it first")
-
-
-def _same(one: Path, other: Path) -> bool:
-    try:
-        return one.samefile(other)
-    except OSError:
-        return False
-
-
-def stem_of(path: Path, recording: str) -> str:
-    """Return what a recording's files are called: ``x`` for x.csv, ``x-run-6`` for its part x.csv[run=6]."""
-    part = re.sub(r"[^\w.+]+", "-", recording.removeprefix(path.name)).strip("-")
-    return f"{path.stem}-{part}" if part else path.stem
-
-
-class Outputs:
-    """Where the results on one or several recordings go; no two of them get one name.
-
-    Parameters
-    ----------
-    wanted
-        What the user asked for: a file, which is kept for a single recording and gets each one's name before
-        its suffix for several (``report-x.html``); a folder, or a name without suffix, which gets one file
-        per recording.
-    suffix
-        Of the files in a folder, for example ``.html``.
-    many
-        Whether several recordings are to be expected.
-    inputs
-        Files that must not be overwritten.
-    """
-
-    def __init__(self, wanted: Path, suffix: str, many: bool, inputs: Sequence[Path]) -> None:
-        self.wanted, self.suffix, self.many, self.inputs = wanted, suffix, many, tuple(inputs)
-        self._in_folder = wanted.is_dir() or not wanted.suffix
-        self._used: set[str] = set()
-
-    @classmethod
-    def of(cls, wanted: Path | None, suffix: str, many: bool, inputs: Sequence[Path]) -> Outputs | None:
-        """Return where results go; None if none are wanted."""
-        return None if wanted is None else cls(wanted, suffix, many, inputs)
-
-    def path(self, stem: str) -> Path:
-        """Return the file for the next recording; makes the folder if there is to be one.
-
-        Raises
-        ------
-        OutputError
-            If the folder cannot be made, or the file is an input.
-        """
-        if not self._in_folder and not self.many:
-            return self.wanted
-        name = free = stem if self._in_folder else f"{self.wanted.stem}-{stem}"
-        number = 1
-        while free.casefold() in self._used:  # some file systems do not tell upper from lower case
-            number += 1
-            free = f"{name}-{number}"
-        self._used.add(free.casefold())
-        if self._in_folder:
-            try:
-                self.wanted.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise OutputError(f"{self.wanted}: cannot be made a folder ({error.strerror or error})") from None
-            found = self.wanted / f"{free}{self.suffix}"
-        else:
-            found = self.wanted.with_name(free + self.wanted.suffix)
-        if any(_same(found, each) for each in self.inputs):
-            raise OutputError(f"{found}: is an input and would be overwritten, name another folder")
-        return found
-
-
 def no_mapping(path: Path) -> RecordingError:
     """Return the error that asks for a mapping."""
     example = "--columns 't=..., r=..., u=..., y=...'"
@@ -313,6 +232,7 @@ def provenance(baseline: Baseline, file: Path, recording: Path) -> dict[str, str
     return {
         "recording": str(recording),
         "baseline": f"{file} ({baseline.hash})",
+        **({"operating point": baseline.point} if baseline.point else {}),
         "learned from": ", ".join(sources if not more else sources[:5]) + more,
         "threshold": f"{baseline.limit:.4g}",
         "made with": f"servoscope {__version__}",

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servoscope.cli import arguments
-from servoscope.cli.arguments import Outputs, Source
+from servoscope.cli.arguments import Source
+from servoscope.cli.outputs import Outputs, check_output, stem_of
 from servoscope.cli.shell import FAULT, Commands, Failures, print_json
 
 if TYPE_CHECKING:
@@ -90,10 +91,14 @@ def simulate(
     noise_u: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on u, std. dev.")] = 1e-4,
     noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on y, std. dev.")] = 3.162e-4,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the noise.")] = 0,
+    rig: Annotated[
+        arguments.Rigs,
+        typer.Option(help="nonlinear: an EHA with friction, valve, sensor, limits and warming oil."),
+    ] = arguments.Rigs.linear,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a loop, with faults if wanted, and write what a machine would log."""
-    arguments.check_output(output, "-o", RECORDINGS, [loop, Path(reference)])
+    check_output(output, "-o", RECORDINGS, [loop, Path(reference)])
     arguments.check_reference(reference)
     events = arguments.fault_events(fault or [])
 
@@ -107,13 +112,12 @@ def simulate(
     with progress(1, 1) as steps:
         steps.begin("simulating")
         r = simulation.reference(reference, duration, settings.sample_rate, amplitude=amplitude)
-        recording, truth = simulation.simulate(
-            settings, r, faults=events, noise_u_std=noise_u, noise_y_std=noise_y, seed=seed
-        )
+        run = simulation.simulate if rig is arguments.Rigs.linear else simulation.simulate_rig
+        recording, truth = run(settings, r, faults=events, noise_u_std=noise_u, noise_y_std=noise_y, seed=seed)
         steps.tell("writing")
         used = writers.write(output, recording, settings.columns)
     if as_json:
-        how = {"reference": reference, "amplitude": amplitude, "seed": seed}
+        how = {"reference": reference, "amplitude": amplitude, "seed": seed, "rig": rig.value}
         noise = {"noise_u_std": noise_u, "noise_y_std": noise_y}
         facts = summaries.simulated(recording, truth, used)
         print_json({"recording": str(output), **facts, **how, **noise}, lines=False)
@@ -136,7 +140,7 @@ def inspect(
     report: Report = None,
 ) -> None:
     """Say whether a log is usable, and if not, why; without a mapping, say which columns it has."""
-    arguments.check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
+    check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
 
     from servoscope import inspection
     from servoscope.cli import summaries, terminal
@@ -170,7 +174,7 @@ def inspect(
                             terminal.inspection(out, said)
                     if pages is not None:
                         with failures.noted():
-                            target = pages.path(arguments.stem_of(path, recording.name))
+                            target = pages.path(stem_of(path, recording.name))
                             inspection_figures.write(target, said, recording)
                             terminal.written(terminal.console(stderr=as_json), target)
     failures.leave()
@@ -181,9 +185,17 @@ def learn(
     loop: LoopFile,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="BASELINE", help="Baseline to write (JSON).")],
     healthy: Annotated[
-        list[Path] | None, typer.Argument(metavar="HEALTHY", help="Healthy recordings.", show_default=False)
+        list[str] | None,
+        typer.Argument(metavar="[POINT=]HEALTHY", help="Healthy recordings, at operating points.", show_default=False),
     ] = None,
     nominal: Annotated[bool, typer.Option("--nominal", help="From the plant's nominal parameters instead.")] = False,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="BASELINE", help="Refuse recordings that are a fault to this earlier baseline."),
+    ] = None,
+    accept_change: Annotated[
+        bool, typer.Option("--accept-change", help="Learn them all the same, and note the change.")
+    ] = False,
     columns: ColumnsText = None,
     where: Where = None,
     by: By = None,
@@ -192,12 +204,15 @@ def learn(
     as_json: AsJson = False,
 ) -> None:
     """Learn from healthy recordings what healthy looks like."""
-    paths = healthy or []
-    if nominal == bool(paths):
+    named = arguments.healthy(healthy or [])
+    if nominal == bool(named):
         raise typer.BadParameter("give healthy recordings or --nominal, and not both")
-    arguments.check_output(output, "-o", (), [loop, *paths])
+    if (accept_change and compare is None) or (nominal and compare is not None):
+        raise typer.BadParameter("--accept-change goes with --compare, and that with recordings")
+    check_output(output, "-o", (), [loop, *(path for _, path in named), *filter(None, [compare])])
 
-    from servoscope import learning
+    from servoscope import learning, points
+    from servoscope.baseline import Baseline
     from servoscope.cli import summaries, terminal
     from servoscope.cli.progress import progress
     from servoscope.loop import Loop
@@ -206,18 +221,22 @@ def learn(
     source = Source.of(settings, columns, where, by, (from_s, to_s))
     if source.columns is not None:  # into the baseline with it: whoever diagnoses need not say it again
         settings = settings.model_copy(update={"columns": source.columns})
+    earlier = Baseline.load(compare) if compare is not None else None
     failures = Failures()
-    recordings: list[Recording] = []
-    with progress(len(paths) + 1, 4) as steps:
-        for path in paths:
+    recordings: dict[str, list[Recording]] = {point: [] for point, _ in named}
+    with progress(len(named) + 1, 6 * max(1, len(recordings))) as steps:
+        for point, path in named:
             steps.begin(path.name)
             with failures.noted():
-                recordings += source.read(path)
-        if failures.count and not recordings:
+                recordings[point] += source.read(path)
+        if failures.count and not any(recordings.values()):
             failures.leave()
         steps.begin("learning")
-        tell = steps.tell
-        found = learning.nominal(settings, tell) if nominal else learning.learn(settings, recordings, tell)
+        if nominal:
+            found = learning.nominal(settings, steps.tell)
+        else:
+            chosen = recordings.get("", recordings)
+            found = points.learn(settings, chosen, steps.tell, compare=earlier, accept_change=accept_change)
         found.save(output)
     if as_json:
         print_json({"baseline": str(output), **summaries.baseline(found)}, lines=False)
@@ -231,6 +250,9 @@ def learn(
 def diagnose(
     baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="What learn wrote.")],
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING", help="Recordings to judge.")],
+    point: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Operating point that they were taken at; else any.")
+    ] = None,
     columns: ColumnsText = None,
     where: Where = None,
     by: By = None,
@@ -243,8 +265,8 @@ def diagnose(
 ) -> None:
     """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure."""
     inputs = [baseline, *recordings]
-    arguments.check_output(report, "--report", REPORTS, inputs, folder=True)
-    arguments.check_output(trace, "--trace", TRACES, inputs, folder=True)
+    check_output(report, "--report", REPORTS, inputs, folder=True)
+    check_output(trace, "--trace", TRACES, inputs, folder=True)
 
     from servoscope import monitor, writers
     from servoscope.baseline import Baseline
@@ -252,6 +274,8 @@ def diagnose(
     from servoscope.cli.progress import progress
 
     healthy = Baseline.load(baseline)
+    if point is not None:
+        healthy = healthy.at(point)
     source = Source.of(healthy.loop, columns, where, by, (from_s, to_s))
     many = source.many(recordings)
     pages, traces = Outputs.of(report, ".html", many, inputs), Outputs.of(trace, ".parquet", many, inputs)
@@ -270,7 +294,7 @@ def diagnose(
                                 print_json(summaries.plain(said), lines=many)
                             else:
                                 terminal.diagnosis(out, said)
-                        stem = arguments.stem_of(path, recording.name)
+                        stem = stem_of(path, recording.name)
                         if traces is not None:
                             target = traces.path(stem)
                             writers.write_table(target, course.table())
@@ -279,8 +303,9 @@ def diagnose(
                             from servoscope import report as reports
 
                             target = pages.path(stem)
-                            origin = arguments.provenance(healthy, baseline, path)
-                            reports.write(target, said, course, recording, healthy.loop, origin)
+                            judged = healthy.at(said.point) if said.point else healthy
+                            origin = arguments.provenance(judged, baseline, path)
+                            reports.write(target, said, course, recording, judged.loop, origin)
                             terminal.written(terminal.console(stderr=as_json), target)
     if fail_on_fault and faulty:
         raise typer.Exit(FAULT)

@@ -51,7 +51,13 @@ def channels(name: str, found: Sequence[ChannelInfo]) -> dict[str, object]:
 
 
 def baseline(b: Baseline) -> dict[str, object]:
-    """Return what was learned."""
+    """Return what was learned; by operating point where these have names."""
+    if b.points:
+        return {"loop": b.loop.name, "points": {one.point: _one(one) for one in b.each}}
+    return _one(b)
+
+
+def _one(b: Baseline) -> dict[str, object]:
     said = b.model_dump(mode="json", by_alias=True)
     std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
     return {

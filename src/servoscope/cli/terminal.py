@@ -93,11 +93,17 @@ def notes(out: Console, texts: Sequence[str], colour: str = "yellow", mark: str 
 
 
 def baseline(out: Console, b: Baseline) -> None:
-    """Print what was learned."""
+    """Print what was learned, operating point by operating point."""
+    for one in b.each:
+        _baseline(out, one)
+
+
+def _baseline(out: Console, b: Baseline) -> None:
+    at = f" at {b.point}" if b.point else ""
     if b.loop.name == type(b.loop).model_fields["name"].default:
-        out.print(Text.assemble(("Baseline", "bold"), f" from {_sources(b)}"))
+        out.print(Text.assemble(("Baseline", "bold"), f"{at} from {_sources(b)}"))
     else:
-        out.print(Text.assemble((b.loop.name, "bold"), f": baseline from {_sources(b)}"))
+        out.print(Text.assemble((b.loop.name, "bold"), f": baseline{at} from {_sources(b)}"))
     std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
     rows = [
         (name, f"{value:.5g}", f"{s:.2g}", f"{100.0 * abs(s / value):.2g} %" if value else "-")
@@ -120,10 +126,11 @@ def baseline(out: Console, b: Baseline) -> None:
             table(out, ("fault", "parameter", "seen from a change of"), seen, words=2)
         out.print()
     monitor = b.loop.monitor
+    listening = f" and {len(b.members)} CUSUMs" if b.members else ""
     told = [
         ("explained", f"{percent(b.explained)} of u's variance (R = {b.R:.3g})"),
         ("delay", f"{1e3 * b.delay_s:.3g} ms" if b.delay_s is not None else "the recordings do not tell"),
-        ("false alarms", f"T² = {b.limit:.4g}, for a budget of {monitor.false_alarms_per_year:g} per year"),
+        ("false alarms", f"T² = {b.limit:.4g}{listening}, for a budget of {monitor.false_alarms_per_year:g} per year"),
         ("data support", f"budgets of {b.supported_false_alarms_per_year:.3g} per year or more"),
         ("model_error", f"{monitor.model_error:g} set, {b.suggested_model_error:.2g} suggested"),
     ]

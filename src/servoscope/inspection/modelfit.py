@@ -115,7 +115,8 @@ def regressors(recording: Recording, loop: Loop, delay: float | None = None) -> 
     rows = np.empty((recording.samples, len(constants.C)))
     said = np.empty(recording.samples, dtype=np.int64)
     state = Layout(constants).start(constants, 1)[0]
-    form(constants, state, recording.r, recording.u, recording.y, recording.restart, rows, said)
+    u = pipeline.flow(recording.u, recording.y, recording.restart)
+    form(constants, state, recording.r, u, recording.y, recording.restart, rows, said)
     return Regressors(loop, bank, rows[:, 0], rows[:, 1 : 1 + bank.n], said == USED)
 
 

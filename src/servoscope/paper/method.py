@@ -86,7 +86,7 @@ class ResidualGenerator:
         output_stage = twostage.tune(loop, [replace(healthy, u=healthy.y)]) if filtered_y else None
         generator = cls(pipeline, pipeline.blank(), pipeline.bank.E(FREQUENCIES) @ nominal_theta(loop), output_stage)
         regression = pipeline.regression(healthy.r, healthy.u, generator.output(healthy), healthy.restart)
-        return replace(generator, tuning=fit([regression], pipeline.memory, pipeline.bank.names).tuning)
+        return replace(generator, tuning=fit(pipeline, [regression]).tuning)
 
     def output(self, recording: Recording) -> FloatArray:
         """Return what phi is formed from, y or y_a, shape (N,)."""

@@ -1,4 +1,4 @@
-"""Linear electrohydraulic actuator: voice-coil current [A] to load displacement [m], THEORY section 1."""
+"""Electrohydraulic actuator: voice-coil current [A] to load displacement [m], THEORY section 1."""
 
 from __future__ import annotations
 
@@ -58,6 +58,12 @@ class EHA(Plant):
         Area gradient of the valve [m].
     K_m
         Spool displacement per current [m/A].
+    valve_law
+        ``square-root``: the flow is K_q u sqrt(1 - sign(u) p_L/p_s), with the coefficients as they are; ``linear``: it
+        is K_q u.
+    coulomb
+        Coulomb friction [N] beside b_p y'. Simulations know it, and with them expectations and signatures; the
+        coefficients do not.
     """
 
     kind: Literal["eha"] = "eha"
@@ -73,6 +79,13 @@ class EHA(Plant):
     C_d: Positive
     W: Positive
     K_m: Positive
+    valve_law: Literal["linear", "square-root"] = "linear"
+    coulomb: NotNegative = 0.0
+
+    @property
+    def linear(self) -> bool:
+        """Whether `state_space` says all: no square root, no Coulomb friction."""
+        return self.valve_law == "linear" and self.coulomb == 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -121,7 +134,10 @@ class EHA(Plant):
         return self.model_copy(update={name: getattr(self, name) * float(ratio) for name, ratio in ratios.items()})
 
     def state_space(self) -> StateSpace:
-        """Return A (3, 3), B (3, 1), C (1, 3), states y [m], y' [m/s], p_L [Pa]; integrates if k_p = 0."""
+        """Return A (3, 3), B (3, 1), C (1, 3), states y [m], y' [m/s], p_L [Pa]; integrates if k_p = 0.
+
+        Where the actuator is not `linear` this is the linear part: flow at p_L = 0, no Coulomb friction.
+        """
         m_p, capacity = self.m_p, self.capacity
         A = np.array(
             [

@@ -200,8 +200,9 @@ def _pictures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Lo
     drawn = (
         (
             "Change over time",
-            "One number for the distance from healthy. Above the dashed line, chance is no longer an"
-            f" explanation: a healthy loop gets there by design {budget}, if the noise stays as learned.",
+            "Distance from healthy: T², which sees any change, and the sequential test, which is faster for changes"
+            " that it was told to expect. Above the dashed line, chance is no longer an explanation: a healthy loop"
+            f" gets there by design {budget}, if the noise stays as learned.",
             figures.statistic(trace, diagnosis),
         ),
         (

@@ -71,7 +71,10 @@ def signals(recording: Recording, diagnosis: Diagnosis | None = None, *, units: 
 
 @styled()
 def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
-    """Draw T^2 over time on a logarithmic axis, with its threshold, the onset and the detection."""
+    """Draw both tests over time on a logarithmic axis, with their common limit, the onset and the detection.
+
+    The sequential test is scaled to the threshold of T^2, so that one line is the limit of both.
+    """
     figure = Figure(figsize=(WIDTH, 2.7), layout="constrained")
     ax = figure.subplots()
     usable = trace.ready & np.isfinite(trace.statistic) & (trace.statistic > 0.0)
@@ -88,9 +91,14 @@ def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     ax.yaxis.set_major_formatter("{x:g}")
     ax.plot(*envelope(t, value), color=MEASURED, marker="o" if usable.sum() < 20 else "", markersize=3)
     ax.axhline(limit, color=ALARM, linewidth=1.0, linestyle=(0, (5, 2.5)))
-    over = np.where(usable, np.maximum(trace.statistic, limit), np.nan)
+    level = np.where(usable & (trace.level > 0.0), np.maximum(limit * trace.level, lowest), np.nan)
+    sequential = bool(np.isfinite(level).any())
+    if sequential:
+        ax.plot(*envelope(t, level), color=HEALTHY, linewidth=1.0)
+    highest = np.fmax(value, level)
+    over = np.where(usable, np.maximum(highest, limit), np.nan)
     ax.fill_between(*envelope(t, over), limit, color=ALARM, alpha=0.16, linewidth=0)
-    ax.set_ylim(lowest, 3.0 * max(float(np.nanmax(value)), limit))
+    ax.set_ylim(lowest, 3.0 * max(float(np.nanmax(highest)), limit))
     ax.margins(x=0.0)
     if usable.sum() == 1:
         ax.set_xlim(t[usable][0] - 1.0, t[usable][0] + 1.0)
@@ -99,6 +107,8 @@ def statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
         Line2D([], [], color=MEASURED, label="statistic T²"),
         Line2D([], [], color=ALARM, linestyle=(0, (5, 2.5)), label=f"threshold {limit:.3g}"),
     ]
+    if sequential:
+        lines.insert(1, Line2D([], [], color=HEALTHY, linewidth=1.0, label="sequential test, to the same limit"))
     _legend_above(figure, diagnosis, lines)
     return figure
 

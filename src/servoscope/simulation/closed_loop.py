@@ -12,7 +12,7 @@ import numpy.typing as npt
 from servoscope.errors import SimulationError
 from servoscope.plants import FloatArray, Plant
 from servoscope.simulation.discretise import discretise, split_delay
-from servoscope.simulation.faults import FaultEvent, resolve, schedule
+from servoscope.simulation.faults import FaultEvent, resolve, schedule, words
 from servoscope.simulation.stability import check_stable, gains
 
 if TYPE_CHECKING:
@@ -97,38 +97,15 @@ def simulate(
     LoopError
         If the plant has no nominal values.
     """
-    from servoscope.recording import Recording
-
-    r = _checked(r)
-    if not (noise_u_std >= 0.0 and noise_y_std >= 0.0):
-        raise SimulationError("standard deviations of the noise must not be negative")
+    r = checked(r)
+    n_u, n_y = noises(r.size, noise_u_std, noise_y_std, seed)
     events = resolve(loop.plant, faults)
     plan = schedule(loop.plant, events, r.size, loop.sample_rate)
-    rng = np.random.default_rng(seed)
-    n_u = noise_u_std * rng.standard_normal(r.size)
-    n_y = noise_y_std * rng.standard_normal(r.size)
-    words = [
-        ", ".join(f"{name} x {values[i]:g}" for name, values in plan.ratios.items()) or "its nominal plant"
-        for i in range(len(plan.plants))
-    ]
-    u, acting, y = _run(loop, plan.plants, words, plan.which, r, n_u, n_y)
-    t = np.arange(r.size) / loop.sample_rate
-    first = np.zeros(r.size, dtype=bool)
-    first[0] = True
-    recording = Recording(
-        name=f"{loop.name} simulated",
-        t=t,
-        r=r,
-        u=u,
-        y=y + n_y,
-        sample_rate=loop.sample_rate,
-        restart=first,
-        run=np.zeros(r.size, dtype=np.int32),
-        defects=(),
-    )
+    u, acting, y = _run(loop, plan.plants, words(plan), plan.which, r, n_u, n_y)
+    recording = recorded(loop, r, u, y + n_y)
     ratios = {name: values[plan.which] for name, values in plan.ratios.items()}
     theta = np.array([plant.theta() for plant in plan.plants])[plan.which]
-    return recording, Truth(t, y, acting, ratios, theta, events, loop.plant)
+    return recording, Truth(recording.t, y, acting, ratios, theta, events, loop.plant)
 
 
 def response(
@@ -154,41 +131,74 @@ def response(
         If the loop has no controller or is unstable with one of the plants, or the arguments do not fit
         together.
     """
-    r = _checked(r)
+    r = checked(r)
     plants = (loop.plant,) if plants is None else tuple(plants)
     edges = np.asarray(switch, dtype=np.int64)
     if edges.shape != (len(plants),) or edges.size == 0 or edges[0] != 0 or np.any(np.diff(edges) <= 0):
         raise SimulationError("switch needs one sample per plant, increasing, the first of them 0")
     which = np.searchsorted(edges, np.arange(r.size), side="right") - 1
-    words = [f"plant {i + 1} of {len(plants)}" for i in range(len(plants))]
-    u, _, y = _run(loop, plants, words, which, r, np.zeros(r.size), np.zeros(r.size))
+    numbered = [f"plant {i + 1} of {len(plants)}" for i in range(len(plants))]
+    u, _, y = _run(loop, plants, numbered, which, r, np.zeros(r.size), np.zeros(r.size))
     return u, y
 
 
-def _checked(r: npt.ArrayLike) -> FloatArray:
+def checked(r: npt.ArrayLike) -> FloatArray:
+    """Return a reference as a row of numbers, or refuse it."""
     reference = np.ascontiguousarray(r, dtype=np.float64)
     if reference.ndim != 1 or reference.size == 0 or not np.all(np.isfinite(reference)):
         raise SimulationError("the reference must be one row of finite numbers")
     return reference
 
 
+def noises(samples: int, noise_u_std: float, noise_y_std: float, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Draw n_u and n_y, each (samples,)."""
+    if not (noise_u_std >= 0.0 and noise_y_std >= 0.0):
+        raise SimulationError("standard deviations of the noise must not be negative")
+    rng = np.random.default_rng(seed)
+    n_u = noise_u_std * rng.standard_normal(samples)
+    return n_u, noise_y_std * rng.standard_normal(samples)
+
+
+def recorded(loop: Loop, r: FloatArray, u: FloatArray, y: FloatArray) -> Recording:
+    """Return signals that begin at time 0 as a recording without defects."""
+    from servoscope.recording import Recording
+
+    first = np.zeros(r.size, dtype=bool)
+    first[0] = True
+    return Recording(
+        name=f"{loop.name} simulated",
+        t=np.arange(r.size) / loop.sample_rate,
+        r=r,
+        u=u,
+        y=y,
+        sample_rate=loop.sample_rate,
+        restart=first,
+        run=np.zeros(r.size, dtype=np.int32),
+        defects=(),
+    )
+
+
 def _run(
     loop: Loop,
     plants: Sequence[Plant],
-    words: Sequence[str],
+    called: Sequence[str],
     which: npt.NDArray[np.int64],
     r: FloatArray,
     n_u: FloatArray,
     n_y: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return u as logged, what acts on the plant, and y without noise; words say which plant is unstable."""
-    settings = _settings(loop)
+    """Return u as logged, what acts on the plant, and y without noise; `called` says which plant is unstable."""
+    settings = settings_of(loop)
     from servoscope.simulation import axis, kernels
 
     discrete = [discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants]
-    for each, what in zip(discrete, words, strict=True):
+    for each, what in zip(discrete, called, strict=True):
         check_stable(loop, each, what)
-    if loop.plant.extras:
+    if not getattr(loop.plant, "linear", True):
+        from servoscope.simulation.rig import run_nonlinear
+
+        u, limited, acting, y = run_nonlinear(loop, plants, which, settings, r, n_u, n_y)
+    elif loop.plant.extras:
         motion = axis.motion(plants, loop)
         u, limited, acting, y = kernels.run_axis(motion, which, settings, r, n_u, n_y)
     else:
@@ -197,7 +207,8 @@ def _run(
     return (limited if loop.input_logged == "after_limiter" else u), acting, y
 
 
-def _settings(loop: Loop) -> Settings:
+def settings_of(loop: Loop) -> Settings:
+    """Return controller, limits, dead zone and delay of a loop as plain numbers."""
     from servoscope.simulation.kernels import Settings
 
     k_p, integrating = gains(loop)

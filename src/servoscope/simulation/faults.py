@@ -150,6 +150,14 @@ def schedule(plant: Plant, events: Sequence[FaultEvent], samples: int, sample_ra
     return Schedule(plants, ratios, which)
 
 
+def words(plan: Schedule) -> list[str]:
+    """Say of each plant of a schedule how it differs from the nominal one."""
+    return [
+        ", ".join(f"{name} x {values[i]:g}" for name, values in plan.ratios.items()) or "its nominal plant"
+        for i in range(len(plan.plants))
+    ]
+
+
 def _first_sample(time: float, sample_rate: float) -> int:
     return int(np.ceil(time * sample_rate - 1e-6))
 

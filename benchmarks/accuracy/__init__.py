@@ -1,0 +1,1 @@
+"""How accurate servoscope is: bias, coverage, false alarms and delays, by repeated simulation."""

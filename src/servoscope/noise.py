@@ -1,0 +1,255 @@
+"""The noise of the residual v = eta - phi' theta as one ARMA model: white noises of u and y, or an autoregression.
+
+White noise that enters the plant with u and white noise of the sensor reach v through filters that are known: those
+of the regression itself. Two variances then say all about its colour, down to the deep notch at low frequencies,
+where 1/G is small, that no short autoregression can draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servoscope.inverse import FilterBank
+from servoscope.linear import Linear, autocovariances
+from servoscope.plants import FloatArray
+
+AR_ORDER = 10
+FLOOR = 1e-9  # of the variance of v: no innovation is smaller
+DOUBT = 1.5  # fall of the log-likelihood that a louder noise may cost
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White noise of the loop: standard deviations of n_u (enters with u) and n_y (part of the measured y)."""
+
+    u_std: float
+    y_std: float
+
+    def times(self, factor: float) -> Noise:
+        """Return the same noise, louder by a factor."""
+        return Noise(u_std=factor * self.u_std, y_std=factor * self.y_std)
+
+
+@dataclass(frozen=True, eq=False)
+class Coloured:
+    """Stationary noise v(k) = sum a_j v(k-j) + e(k) + sum b_j e(k-j), e white.
+
+    Parameters
+    ----------
+    a, b
+        Shapes (p,), p > 0, and (q,).
+    gamma
+        Autocovariance of v at lags 0 to p - 1, shape (p,).
+    variance
+        Of e.
+    """
+
+    a: FloatArray
+    b: FloatArray
+    gamma: FloatArray
+    variance: float
+
+    @property
+    def c(self) -> FloatArray:
+        """E[v(k) e(k-j)] for j = 0 to q - 1, shape (q,)."""
+        psi = np.zeros(len(self.b))
+        for j in range(len(psi)):
+            psi[j] = (1.0 if j == 0 else self.b[j - 1]) + sum(
+                self.a[i] * psi[j - 1 - i] for i in range(min(j, len(self.a)))
+            )
+        return self.variance * psi
+
+    def times(self, factor: float) -> Coloured:
+        """Return the same colour with `factor` times the power."""
+        return replace(self, gamma=factor * self.gamma, variance=factor * self.variance)
+
+    def whiten(self, x: FloatArray) -> FloatArray:
+        """Return innovations of unit variance for a column or columns of v, shape (N,) or (N, m)."""
+        from scipy.signal import lfilter
+
+        numerator, denominator = np.concatenate([[1.0], -self.a]), np.concatenate([[1.0], self.b])
+        white: FloatArray = lfilter(numerator, denominator, x, axis=0) / np.sqrt(self.variance)
+        return white
+
+    def shape(self, x: FloatArray) -> FloatArray:
+        """Return x passed through the filter that turns white noise of unit variance into v, shape as x."""
+        from scipy.signal import lfilter
+
+        numerator, denominator = np.concatenate([[1.0], self.b]), np.concatenate([[1.0], -self.a])
+        shaped: FloatArray = lfilter(numerator, denominator, x, axis=0) * np.sqrt(self.variance)
+        return shaped
+
+    def autocovariance(self, lags: int) -> FloatArray:
+        """Return the autocovariance of v at lags 0 to `lags`, shape (lags + 1,)."""
+        gamma, c, b = list(self.gamma), self.c, np.concatenate([[1.0], self.b])
+        psi = np.append(c, 0.0)
+        for j in range(len(gamma), lags + 1):
+            moving = sum(b[i] * psi[i - j] for i in range(j, len(b)))
+            gamma.append(float(sum(self.a[i] * gamma[j - 1 - i] for i in range(len(self.a))) + moving))
+        return np.array(gamma[: lags + 1])
+
+    def autoregression(self, order: int = AR_ORDER) -> Coloured:
+        """Return the autoregression that is nearest to it."""
+        return yule_walker(self.autocovariance(order)) if len(self.b) else self
+
+
+def autocovariance(runs: Sequence[FloatArray], lags: int) -> FloatArray:
+    """Return the autocovariance of a zero-mean signal at lags 0 ... lags, over several runs, shape (lags + 1,)."""
+    total = sum(len(run) for run in runs)
+    products = [sum(float(run[lag:] @ run[: len(run) - lag]) for run in runs) for lag in range(lags + 1)]
+    return np.array(products) / total
+
+
+def yule_walker(gamma: FloatArray) -> Coloured:
+    """Return the autoregression with an autocovariance (p + 1,) at lags 0 ... p.
+
+    A small white floor keeps strongly oversampled noise solvable.
+    """
+    from scipy.linalg import solve_toeplitz
+
+    row = gamma[:-1].copy()
+    row[0] *= 1.0 + 1e-9
+    a = np.asarray(solve_toeplitz(row, gamma[1:]))
+    variance = max(float(gamma[0] - a @ gamma[1:]), FLOOR * float(gamma[0]))
+    return Coloured(a, np.zeros(0), gamma[:-1].copy(), variance)
+
+
+def residual_of(bank: FilterBank, theta: FloatArray) -> Linear:
+    """Return [u, y] -> v = eta - phi' theta; columns of friction and offset do not pass noise on."""
+    row = np.concatenate([[1.0], -theta])
+    system, used = bank.system, 1 + bank.n
+    return Linear(system.A, system.B[:, 1:3], row[None, :] @ system.C[:used], row[None, :] @ system.D[:used, 1:3])
+
+
+def coloured(bank: FilterBank, theta: FloatArray, noise: Noise, stride: int) -> Coloured:
+    """Return the model of v for white noise on u and y, by spectral factorisation.
+
+    The poles are those of the regression's filters; the zeros are the roots inside the unit circle of what is left of
+    the autocovariance when the poles are taken out of it (Kailath, Sayed and Hassibi, 2000, chapter 6).
+
+    Parameters
+    ----------
+    bank
+        The regression.
+    theta
+        Coefficients of the plant, shape (n,).
+    noise
+        Not both zero.
+    stride
+        Samples per update.
+    """
+    system = residual_of(bank, theta)
+    std = np.array([noise.u_std, noise.y_std])
+    poles = bank.poles**stride
+    a = -np.atleast_1d(np.poly(poles))[1:] if len(poles) else np.zeros(1)
+    p = len(a)
+    q = p + 1 if len(poles) else len(system.A)
+    gamma = autocovariances(Linear(system.A, system.B * std, system.C, system.D * std), 2 * p + q, stride)[:, 0, 0]
+    A = np.concatenate([[1.0], -a])
+    both = np.convolve(A, A[::-1])  # of A(q) A(1/q), lags -p ... p
+    moving = np.array([both @ gamma[np.abs(j + np.arange(-p, p + 1))] for j in range(q + 1)])
+    zeros = np.roots(np.concatenate([moving[::-1], moving[1:]]))
+    b = np.real(np.poly(zeros[np.argsort(np.abs(zeros))][:q]))
+    variance = float(moving[0] / (b**2).sum())
+    return Coloured(a, b[1:], gamma[:p].copy(), max(variance, FLOOR * float(gamma[0])))
+
+
+def _spectra(system: Linear, stride: int, samples: int) -> FloatArray:
+    """Return the power spectra of v under unit noise on each input, at rfft's frequencies of a run, shape (M, m)."""
+    lags = min(64, max(samples // 2, 1))
+    columns = []
+    for i in range(system.B.shape[1]):
+        gamma = autocovariances(Linear(system.A, system.B[:, [i]], system.C, system.D[:, [i]]), lags, stride)[:, 0, 0]
+        whole = np.zeros(samples)
+        whole[: lags + 1] += gamma
+        whole[samples - lags :] += gamma[:0:-1]
+        columns.append(np.maximum(np.fft.rfft(whole).real, 0.0))
+    return np.stack(columns, axis=1)
+
+
+def _periodogram(v: FloatArray) -> FloatArray:
+    """Return |V(f)|^2 of a run under a Hann window, which keeps loud frequencies out of quiet ones."""
+    window = np.hanning(len(v))
+    return np.asarray(np.abs(np.fft.rfft(v * window)) ** 2 / (window**2).sum())
+
+
+@dataclass(frozen=True)
+class WhiteNoises:
+    """White noises that explain residuals.
+
+    Parameters
+    ----------
+    noise
+        Most likely.
+    loudest
+        What each may be at most: Whittle's likelihood falls by the factor exp(-`DOUBT`) there.
+    cost
+        Minus the logarithm of the likelihood.
+    """
+
+    noise: Noise
+    loudest: Noise
+    cost: float
+
+
+def white_noises(system: Linear, runs: Sequence[FloatArray], stride: int) -> WhiteNoises:
+    """Fit n_u and n_y to residuals by Whittle's likelihood (1953).
+
+    Parameters
+    ----------
+    system
+        From noise on u and on y to v, for example `residual_of`.
+    runs
+        Residuals v, one array per recording.
+    stride
+        Samples per update.
+    """
+    from scipy.optimize import minimize
+
+    I = np.concatenate([_periodogram(v)[1:-1] for v in runs])
+    S = np.concatenate([_spectra(system, stride, len(v))[1:-1] for v in runs])
+    size, level = S.mean(axis=0), float(I.mean())
+    S = S / size + FLOOR
+    I = I / level
+
+    def cost(x: FloatArray) -> tuple[float, FloatArray]:
+        parts = S * np.exp(x)
+        model = parts.sum(axis=1)
+        return float((np.log(model) + I / model).sum()), ((1.0 / model - I / model**2) @ parts)
+
+    found = minimize(cost, np.full(2, np.log(0.5)), jac=True, method="L-BFGS-B", bounds=[(-25.0, 3.0)] * 2)
+    best = float(found.fun)
+
+    def std(x: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.exp(x) * level / size))
+
+    most = np.array(found.x)
+    for i in (0, 1):
+        low, high = float(found.x[i]), 5.0
+        for _ in range(30):
+            middle = 0.5 * (low + high)
+            raised = np.where(np.arange(2) == i, middle, found.x)
+            low, high = (middle, high) if cost(raised)[0] < best + DOUBT else (low, middle)
+        most[i] = high
+    likely, loudest = std(found.x), std(most)
+    return WhiteNoises(
+        Noise(float(likely[0]), float(likely[1])),
+        Noise(float(loudest[0]), float(loudest[1])),
+        best + len(I) * float(np.log(level)),
+    )
+
+
+def misfit(model: Coloured, runs: Sequence[FloatArray]) -> float:
+    """Return minus the logarithm of Whittle's likelihood of a model."""
+    from scipy.signal import freqz
+
+    total = 0.0
+    numerator, denominator = np.concatenate([[1.0], model.b]), np.concatenate([[1.0], -model.a])
+    for v in runs:
+        w = 2.0 * np.pi * np.arange(len(v) // 2 + 1)[1:-1] / len(v)
+        S = model.variance * np.abs(freqz(numerator, denominator, w)[1]) ** 2
+        total += float((np.log(S) + _periodogram(v)[1:-1] / S).sum())
+    return total

@@ -1,0 +1,169 @@
+"""From an examination to the verdict: since when, which fault, how large, and what the estimates mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from servoscope.candidates import candidates_of
+from servoscope.correction import explain, spread_of
+from servoscope.detection import Onset, onset
+from servoscope.diagnosis import (
+    UNKNOWN,
+    Candidate,
+    Diagnosis,
+    FoundFault,
+    Parameter,
+    ResponsePoint,
+    Trace,
+    Verdict,
+    Warning,
+)
+from servoscope.doubts import blind_to, doubts, seen_by
+from servoscope.examination import Examination, Watched, trace_of
+from servoscope.isolation import isolate
+from servoscope.sentence import summary
+from servoscope.signatures import true_theta
+
+SURE = 0.95  # probability from which a fault is named
+
+
+def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> tuple[Diagnosis, Trace]:
+    """Return the verdict on an examination and its trace; `progress` is told what is being done."""
+    recording = x.recording
+    warnings = [Warning.of(defect) for defect in recording.defects] + doubts(x)
+    alarms = np.flatnonzero(x.alarm)
+    seen: dict[str, tuple[float, float]] = {}
+    candidates: tuple[Candidate, ...] = ()
+    faults: tuple[FoundFault, ...] = ()
+    since: Onset | None = None
+    at, detected_at = len(x.t) - 1, None
+    if alarms.size:
+        first = int(alarms[0])
+        announced = _announced(x, first)
+        detected_at = float(recording.t[announced])
+        # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
+        at = at if x.alarm[-1] else first + int(np.argmax(x.statistic[first:]))
+        progress("onset")
+        since = _onset(x, announced, at)
+        candidates = isolate(
+            candidates_of(x.baseline, recording, x.expectation, since.sample, int(x.estimates.index[at])),
+            x.estimates.theta[at] - x.expected[at],
+            x.estimates.S[at] * max(1.0, float(x.estimates.power[at])) + x.baseline.cov(),
+            lambda: progress("isolation"),
+        )
+        if candidates[0].probability >= SURE and candidates[0].name != UNKNOWN:
+            faults = candidates[0].faults
+    else:
+        seen = seen_by(x)
+        blind = blind_to(x, seen)
+        span = float(recording.t[0]), float(recording.t[-1])
+        warnings += [Warning(kind="power", from_s=span[0], to_s=span[1], count=1, message=text) for text in blind]
+    verdict: Verdict = "fault" if alarms.size else "undetermined" if blind else "healthy"
+    trace = trace_of(x.baseline, x.pipeline, x.estimates, x.t, watched(x, candidates, since, at))
+    found = Diagnosis(
+        recording=recording.name,
+        samples=recording.samples,
+        duration_s=recording.duration_s,
+        verdict=verdict,
+        summary=summary(verdict, faults, candidates, _since(x, since), seen, warnings, x.baseline.point),
+        detected_at_s=detected_at,
+        onset_s=(since.low_s, since.likely_s, since.high_s) if since is not None else None,
+        probability=candidates[0].probability if candidates else None,
+        faults=faults,
+        candidates=candidates,
+        parameters=_parameters(trace),
+        ifrf=_ifrf(trace),
+        warnings=tuple(sorted(warnings, key=lambda warning: warning.from_s)),
+        point=x.baseline.point or None,
+    )
+    return found, trace
+
+
+def _announced(x: Examination, first: int) -> int:
+    """Return the sample of the alarm: the sequential test speaks at once, T^2 at its evaluations."""
+    crossed = int(x.estimates.crossed[first]) - 1
+    return crossed if crossed >= 0 and not x.baseline.loop.monitor.on_delay else int(x.estimates.index[first])
+
+
+def _onset(x: Examination, announced: int, at: int) -> Onset:
+    return onset(
+        x.pipeline,
+        x.tuning,
+        x.recording,
+        x.estimates,
+        x.expected[at],
+        x.estimates.theta[at],
+        announced,
+        max(int(x.estimates.index[at]), announced),
+    )
+
+
+def _since(x: Examination, found: Onset | None) -> str:
+    if found is None:
+        return ""
+    start = float(x.recording.t[0])
+    if found.likely_s - start <= 3.0 * x.pipeline.bank.wait / x.recording.sample_rate:
+        return "since the start of the recording or before"
+    return f"since {found.likely_s:.1f} s"
+
+
+def watched(x: Examination, candidates: tuple[Candidate, ...], since: Onset | None, at: int) -> Watched:
+    """Take the biases out of estimates and expectation, as far as the loop can be simulated.
+
+    After a change the past that theta_hat has not forgotten yet counts as a bias too. The covariance becomes that of
+    the estimate alone: the noise in the coefficients under the actuator that was found, and what is left of the start.
+    """
+    e, C = x.estimates, x.baseline.cov()
+    if x.expectation is None or not len(x.t) or not x.ready[at] or x.baseline.loop.monitor.structure != "svf":
+        return Watched(e.theta, x.covariance, x.expected, C, x.statistic)
+    plant, start = x.baseline.plant, np.array(x.baseline.model_theta)
+    healthy = true_theta(x.pipeline, plant)
+    bias = shift = x.expectation.path([plant], [0], start) - healthy
+    S, gain = x.growth * e.S, np.eye(x.pipeline.bank.n)
+    if since is not None:
+        likely = next((c for c in candidates if c.name != UNKNOWN), None)
+        guess = {fault.parameter: fault.ratio for fault in likely.faults} if likely else {}
+        until = x.expectation.until(int(e.index[at]) + 1)
+        found = explain(until, plant, start, e.theta[at], S[at] + C, since.sample, guess)
+        gain, ill = found.gain, found.plant
+        plants, onsets = ([plant, ill], [0, since.sample]) if since.sample else ([ill], [0])
+        late = e.index >= since.sample
+        true = np.where(late[:, None], true_theta(x.pipeline, ill), healthy)
+        bias = x.expectation.path(plants, onsets, start) - true
+        if x.baseline.loudest is not None:
+            spread = spread_of(x.pipeline, x.tuning, x.recording, x.expectation.noise, ill)
+            S = np.where(late[:, None, None], spread, S)
+    covariance = gain @ (S + e.Psi @ C @ np.swapaxes(e.Psi, -1, -2)) @ gain.T
+    return Watched(e.theta - bias, covariance, x.expected - shift, C, x.statistic)
+
+
+def _parameters(trace: Trace) -> dict[str, Parameter]:
+    if not len(trace.t):
+        return {}
+    theta, expected = trace.theta[-1], trace.expected[-1]
+    std = np.sqrt(np.diag(trace.covariance[-1]))
+    return {
+        name: Parameter(value=float(value), std=float(s), nominal=float(nominal))
+        for name, value, s, nominal in zip(trace.names, theta, std, expected, strict=True)
+    }
+
+
+def _ifrf(trace: Trace) -> tuple[ResponsePoint, ...]:
+    if not len(trace.t):
+        return ()
+    now, healthy = trace.ifrf, trace.ifrf_expected
+    std = np.sqrt(np.diagonal(now.covariance[-1], axis1=-2, axis2=-1))
+    return tuple(
+        ResponsePoint(
+            frequency_hz=float(f),
+            real=float(H.real),
+            imag=float(H.imag),
+            real_std=float(s[0]),
+            imag_std=float(s[1]),
+            nominal_real=float(H0.real),
+            nominal_imag=float(H0.imag),
+        )
+        for f, H, s, H0 in zip(now.frequencies, now.H[-1], std, healthy.H[-1], strict=True)
+    )
