@@ -14,6 +14,7 @@ from servoscope.plants import Fault, FloatArray
 
 GRID = 17  # points along a signature before the minimum is refined
 MISFIT = 1e-3  # probability with which the true fault may fit worse than the limit
+FAR = 1e12  # stands for an infinite misfit
 HOPELESS = 200.0  # excess misfit from which a signature is not refined
 SYSTEMATIC = 2e-3  # share of a signature that nominal parameters and intersample models may be off by
 
@@ -177,7 +178,9 @@ class _Search:
         i = int(np.argmin([self.J(float(x)) for x in grid]))
         bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
         fine = 1e-4 * (bracket[1] - bracket[0])
-        optimize.minimize_scalar(self.J, bounds=bracket, method="bounded", options={"xatol": fine, "maxiter": steps})
+        options = {"xatol": fine, "maxiter": steps}
+        # a loop that cannot run is infinitely far, which a parabola cannot be drawn through
+        optimize.minimize_scalar(lambda x: min(self.J(x), FAR), bounds=bracket, method="bounded", options=options)
 
     def fit(self, fine: bool) -> _Fitted:
         """Refine the minimum and integrate over the prior."""
