@@ -178,9 +178,11 @@ class _Search:
         i = int(np.argmin([self.J(float(x)) for x in grid]))
         bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
         fine = 1e-4 * (bracket[1] - bracket[0])
-        options = {"xatol": fine, "maxiter": steps}
-        # a loop that cannot run is infinitely far, which a parabola cannot be drawn through
-        optimize.minimize_scalar(lambda x: min(self.J(x), FAR), bounds=bracket, method="bounded", options=options)
+
+        def misfit(x: float) -> float:  # a parabola through infinity is none: a loop that cannot run is far away
+            return min(self.J(x), FAR)
+
+        optimize.minimize_scalar(misfit, bounds=bracket, method="bounded", options={"xatol": fine, "maxiter": steps})
 
     def fit(self, fine: bool) -> _Fitted:
         """Refine the minimum and integrate over the prior."""
