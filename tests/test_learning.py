@@ -202,3 +202,50 @@ class TestFile:
         path.write_text(saved.read_text()[:500])
         with pytest.raises(BaselineError, match="no JSON"):
             Baseline.load(path)
+
+
+@pytest.mark.parametrize("seconds", [0.02, 0.1, 0.2])
+def test_a_blink_of_a_recording_is_undetermined(
+    rig: dict[str, Any], record: Callable[..., Recording], seconds: float
+) -> None:
+    loop = Loop.from_dict(rig)
+    assert diagnose(learn(loop, [record(loop)]), record(loop, seconds=seconds, seed=2)).verdict == "undetermined"
+
+
+def test_a_slowly_ringing_loop_keeps_its_noise_apart(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    """The closed loop's poles, not the filters', say how long the noise is remembered."""
+    loop = Loop.from_dict(rig | {"delay": 0.013})
+    baseline = learn(loop, [record(loop)])
+    assert baseline.noise is not None and baseline.members
+    assert baseline.noise.u_std == pytest.approx(1e-4, rel=0.6)
+    assert baseline.noise.y_std == pytest.approx(np.sqrt(1e-7), rel=0.05)
+    assert diagnose(baseline, record(loop, seed=3)).verdict == "healthy"
+
+
+def test_a_loop_that_is_held_at_rest_can_be_simulated_too(
+    rig: dict[str, Any], record: Callable[..., Recording]
+) -> None:
+    loop = Loop.from_dict(rig | {"monitor": {"update_when": "moving", "rest_speed": 0.005}})
+    baseline = learn(loop, [record(loop, kind="profile")])
+    assert diagnose(baseline, record(loop, kind="profile", seed=4)).verdict == "healthy"
+
+
+def test_silence_is_no_obstacle(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    quiet = {"noise_u_std": 0.0, "noise_y_std": 0.0}
+    assert diagnose(learn(loop, [record(loop, **quiet)]), record(loop, seed=5, **quiet)).verdict == "healthy"
+
+
+def test_one_recording_too_short_among_others_is_refused(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    loop = Loop.from_dict(rig)
+    with pytest.raises(NotEnoughError, match="one of the recordings"):
+        learn(loop, [record(loop), record(loop, seconds=0.3, seed=2)])
+
+
+def test_a_rehearsal_is_as_long_as_the_memory_asks(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
+    """On a short one alarms run into each other, and the few that are counted would lower the limit."""
+    shares = []
+    for memory in (5.0, 20.0):
+        loop = Loop.from_dict(rig | {"monitor": {"memory": memory}})
+        shares.append(learn(loop, [record(loop, seconds=240.0)]).rehearsed.statistic)
+    assert shares[1] == pytest.approx(shares[0], rel=0.5)

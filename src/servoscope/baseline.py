@@ -252,7 +252,8 @@ class Baseline(_Part):
         looks = monitor.evaluation_rate, monitor.memory
         limit = threshold(len(self.names), *looks, share, self.dof, self.rehearsed.statistic)
         loop = self.loop.model_copy(update={"monitor": monitor.model_copy(update={"false_alarms_per_year": budget})})
-        changed = self.model_copy(update={"loop_settings": loop.to_dict(), "limit": limit})
+        others = tuple(other.shared(assets) for other in self.others)
+        changed = self.model_copy(update={"loop_settings": loop.to_dict(), "limit": limit, "others": others})
         vars(changed).pop("loop", None)  # a copy takes along what was computed from the old settings
         return changed
 

@@ -77,7 +77,7 @@ def whitening(noise: Coloured) -> tuple[FloatArray, FloatArray, float, int]:
 
 def columns(phi: FloatArray) -> FloatArray:
     """Return whitened columns (N, n) with `LAGS` delayed copies of the last beside them, shape (N, n + LAGS)."""
-    late = [np.concatenate([np.zeros(lag), phi[:-lag, -1]]) for lag in range(1, LAGS + 1)]
+    late = [np.concatenate([np.zeros(lag), phi[:, -1]])[: len(phi)] for lag in range(1, LAGS + 1)]
     return np.column_stack([phi, *late])
 
 

@@ -45,7 +45,7 @@ def blind_to(x: Examination, seen: dict[str, tuple[float, float]]) -> list[str]:
 
 
 def doubts(x: Examination) -> list[Warning]:
-    """Return warnings about the estimate itx."""
+    """Return warnings about the estimate itself."""
     told = []
     e, t = x.estimates, x.recording.t
     if x.refused > WORTH_TELLING:

@@ -23,7 +23,7 @@ LOUDER = 1.5  # growth of the noise's variance from which it is believed
 
 
 @dataclass(frozen=True, eq=False)
-class Watched:
+class Compared:
     """What is compared at every evaluation.
 
     Parameters
@@ -45,7 +45,9 @@ class Watched:
     statistic: FloatArray
 
 
-def trace_of(baseline: Baseline, pipeline: Pipeline, e: Estimates, t: FloatArray, seen: Watched) -> Trace:
+def trace_of(
+    baseline: Baseline, pipeline: Pipeline, e: Estimates, t: FloatArray, seen: Compared, clock: FloatArray | None = None
+) -> Trace:
     """Put a trace together: responses from coefficients, alarms from both tests.
 
     Parameters
@@ -58,10 +60,13 @@ def trace_of(baseline: Baseline, pipeline: Pipeline, e: Estimates, t: FloatArray
         Times of the evaluations [s], shape (K,).
     seen
         What was compared.
+    clock
+        Times of all samples [s]; None: uniform from 0.
     """
     ready = e.updates > 0
     respond = pipeline.bank, baseline.loop.monitor.frequencies
-    period = 1.0 / baseline.loop.sample_rate
+    crossed = np.maximum(e.crossed.astype(np.int64) - 1, 0)
+    at = crossed / baseline.loop.sample_rate if clock is None else clock[crossed]
     return Trace(
         t=t,
         names=pipeline.bank.names,
@@ -71,7 +76,7 @@ def trace_of(baseline: Baseline, pipeline: Pipeline, e: Estimates, t: FloatArray
         statistic=np.where(ready, seen.statistic, 0.0),
         threshold=baseline.limit,
         level=e.level,
-        crossed=np.where(e.crossed > 0, t - (e.index + 1 - e.crossed) * period, np.nan),
+        crossed=np.where(e.crossed > 0, at, np.nan),
         ifrf=ifrf.response(*respond, seen.theta, seen.covariance),
         ifrf_expected=ifrf.response(
             *respond, seen.expected, np.broadcast_to(seen.expected_covariance, seen.covariance.shape)

@@ -129,7 +129,10 @@ def healthy_parameters(
 
     def misfit(x: FloatArray) -> FloatArray:
         changed = plant.with_ratios(ratios(x))
-        parts = [noise.whiten(v - e.residual(changed, theta)) for v, e in zip(measured, expectations, strict=True)]
+        parts = [
+            noise.whiten(v - e.residual(changed, theta, g.ok))
+            for v, e, g in zip(measured, expectations, regressions, strict=True)
+        ]
         return np.concatenate([*parts, x / prior])
 
     start = np.zeros(len(plant.parameters))
@@ -159,7 +162,7 @@ def healthy_parameters(
         misfit=float(off @ np.linalg.solve(covariance, off)),
         true=true,
         residuals=[
-            (g.eta - g.phi @ true)[g.ok] - e.residual(final, true)
+            (g.eta - g.phi @ true)[g.ok] - e.residual(final, true, g.ok)
             for g, e in zip(regressions, expectations, strict=True)
         ],
     )

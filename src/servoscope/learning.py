@@ -39,6 +39,7 @@ STILL_SHARE = 0.02  # of the speed of motion, below which an axis stands still
 WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
 MOST_SIMULATED = 2e6  # samples behind a nominal baseline
 LEAST_EXPLAINED = 0.9  # share of u's variance
+NOTHING = 1e-9  # of the residual's variance: what is left below is rounding
 UNLIKELY = 1e-3  # probability below which the physics are not believed to hold
 
 Progress = Callable[[str], None]
@@ -172,12 +173,14 @@ def _assemble(
             )
             # what the plant leaves of the residual is noise alone: its colour is known better now
             plant = loop.plant.with_ratios(healthy.ratios)
-            model = yule_walker(autocovariance(healthy.residuals, AR_ORDER))
-            if pipeline.stage_one is None:
+            gamma = autocovariance(healthy.residuals, AR_ORDER)
+            silent = not gamma[0] > NOTHING * found.tuning.R  # simulated without noise, for example
+            model = found.tuning.noise if silent else yule_walker(gamma)
+            if pipeline.stage_one is None and not silent:
                 noises = white_noises(residual_system(pipeline, plant), healthy.residuals, pipeline.stride)
-                noise = noises.noise
                 if white_enough(healthy.residuals, noises, model):
-                    model, loudest = colour_of(pipeline, plant, noise), noises.loudest
+                    noise, loudest = noises.noise, noises.loudest
+                    model = colour_of(pipeline, plant, noise)
                     found = replace(found, tuning=replace(found.tuning, noise=model))
             expectations = [replace(e, tuning=found.tuning, noise=noise) for e in expectations]
             healthy = healthy_parameters(expectations, regressions, found, healthy.true, model)

@@ -12,7 +12,7 @@ from servoscope.baseline import Baseline
 from servoscope.detection import statistic
 from servoscope.diagnosis import UNKNOWN, Diagnosis, Trace, Warning
 from servoscope.errors import BaselineError, RecordingError
-from servoscope.examination import Examination, Watched, trace_of
+from servoscope.examination import Compared, Examination, trace_of
 from servoscope.pipeline import Estimates, Pipeline
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
@@ -135,10 +135,12 @@ class Monitor:
         if len({each.loop.hash() for each in self.baselines}) > 1:
             raise BaselineError("the baselines of one monitor must share one loop: make one monitor per loop")
         self.loop = self.baselines[0].loop
-        self.pipeline = self.baselines[0].pipeline()
+        self._pipelines = tuple(each.pipeline() for each in self.baselines)
+        self.pipeline = self._pipelines[0]
         self.tunings = tuple(each.tuning for each in self.baselines)
         self._constants: tuple[Constants, ...] = tuple(
-            self.pipeline.constants(each.tuning, each.watch(self.pipeline)) for each in self.baselines
+            pipeline.constants(each.tuning, each.watch(pipeline))
+            for pipeline, each in zip(self._pipelines, self.baselines, strict=True)
         )
         self._layouts: tuple[Layout, ...] = tuple(Layout(c) for c in self._constants)
         self._size = max(layout.size for layout in self._layouts)  # models of the noise differ in length
@@ -256,17 +258,17 @@ class Monitor:
     def _trace(self, out: FloatArray, index: npt.NDArray[np.int64]) -> Trace:
         t = index / self.loop.sample_rate
         traces = [
-            _watch(baseline, self.pipeline, self.pipeline.unpack(tuning, rows, index), t)
-            for baseline, tuning, rows in zip(self.baselines, self.tunings, out, strict=True)
+            _compared(baseline, pipeline, pipeline.unpack(tuning, rows, index), t)
+            for baseline, pipeline, tuning, rows in zip(self.baselines, self._pipelines, self.tunings, out, strict=True)
         ]
         return Trace.stacked(traces) if self.fleet else traces[0]
 
 
-def _watch(baseline: Baseline, pipeline: Pipeline, e: Estimates, t: FloatArray) -> Trace:
+def _compared(baseline: Baseline, pipeline: Pipeline, e: Estimates, t: FloatArray) -> Trace:
     """Compare with the healthy coefficients of the baseline; their bias under its references is taken out of both."""
     covariance = e.S + baseline.cov()
     theta = np.array(baseline.theta)
     expected = np.broadcast_to(theta, e.theta.shape)
     T2 = statistic(e.theta, expected, covariance)
     bias = baseline.bias
-    return trace_of(baseline, pipeline, e, t, Watched(e.theta - bias, covariance, expected - bias, baseline.cov(), T2))
+    return trace_of(baseline, pipeline, e, t, Compared(e.theta - bias, covariance, expected - bias, baseline.cov(), T2))

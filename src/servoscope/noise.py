@@ -18,6 +18,7 @@ from servoscope.plants import FloatArray
 
 AR_ORDER = 10
 FLOOR = 1e-9  # of the variance of v: no innovation is smaller
+FORGOTTEN = 1e-4  # of a closed loop's answer that an autocovariance may leave out
 DOUBT = 1.5  # fall of the log-likelihood that a louder noise may cost
 
 
@@ -159,7 +160,9 @@ def coloured(bank: FilterBank, theta: FloatArray, noise: Noise, stride: int) -> 
 
 def _spectra(system: Linear, stride: int, samples: int) -> FloatArray:
     """Return the power spectra of v under unit noise on each input, at rfft's frequencies of a run, shape (M, m)."""
-    lags = min(64, max(samples // 2, 1))
+    slowest = float(np.abs(np.linalg.eigvals(system.A)).max(initial=0.0)) ** stride
+    remembered = np.log(FORGOTTEN) / np.log(slowest) if 0.0 < slowest < 1.0 else 1.0
+    lags = int(min(max(64, remembered), max(samples // 2, 1)))
     columns = []
     for i in range(system.B.shape[1]):
         gamma = autocovariances(Linear(system.A, system.B[:, [i]], system.C, system.D[:, [i]]), lags, stride)[:, 0, 0]

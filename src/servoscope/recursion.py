@@ -37,8 +37,8 @@ class Constants(NamedTuple):
     ``A, B, C, D, X0`` are the filter bank and its steady state per unit input, ``vA ... vX0`` the velocity filter,
     `codes` the non-linear inputs, `limits` and `deadzone` of u; `weights` and `heads` are the noise's model as
     `servoscope.propagation.spread` takes it, `lags` of them the autoregression's (heads[0] is its variance), in
-    updates: of every `stride`-th sample; `extra` is the size of the
-    estimator's private state, and `watch` is the sequential test.
+    updates: of every `stride`-th sample; `extra` is the size of the estimator's private state, and `watch` is the
+    sequential test.
     """
 
     A: FloatArray

@@ -22,6 +22,9 @@ from servoscope.signatures import Course, Expectation
 from servoscope.simulation import simulate
 
 SAMPLES = 120_000  # as many as a third of a second simulates
+MOST_SAMPLES = 1_200_000
+MEMORIES = 240.0  # or delays of the alarm, that a rehearsal lasts if it can
+FEW = 10.0  # alarms: fewer are not believed where they would lower a limit
 COUNTED = 30.0  # alarms that theory expects among them
 SEED = 20
 UNLIKELY = 1e-3  # chance of an alarm during the healthy recordings from which noise is not believed to raise it
@@ -52,13 +55,17 @@ def rehearse(expectation: Expectation, plant: Plant, noise: Noise, chosen: Seque
     """
     pipeline, tuning = expectation.pipeline, expectation.tuning
     loop = pipeline.loop.model_copy(update={"plant": plant})
-    budget = COUNTED * SECONDS_PER_YEAR * loop.sample_rate / SAMPLES
-    r = np.resize(expectation.course.r, SAMPLES)
+    off = pipeline.delays[1] * pipeline.every / loop.sample_rate
+    wanted = max(SAMPLES, round(MEMORIES * max(loop.monitor.memory, off) * loop.sample_rate))
+    samples = min(wanted, MOST_SAMPLES)
+    counted = COUNTED * samples / wanted
+    budget = counted * SECONDS_PER_YEAR * loop.sample_rate / samples
+    r = np.resize(expectation.course.r, samples)
     recording, _ = simulate(loop, r, noise_u_std=noise.u_std, noise_y_std=noise.y_std, seed=SEED)
     certain = [replace(member, drift=0.0) for member in chosen]
     test = watch(pipeline, plant, noise, tuning.scale, certain, budget) if certain else None
     e = pipeline.estimate(tuning, recording, test)
-    whole = replace(expectation, noise=noise, course=Course(r, np.arange(SAMPLES), recording.restart))
+    whole = replace(expectation, noise=noise, course=Course(r, np.arange(samples), recording.restart))
     expected = whole.path([plant], [0], tuning.theta)
     ready = e.updates > pipeline.memory
     T2 = np.where(
@@ -67,7 +74,7 @@ def rehearse(expectation: Expectation, plant: Plant, noise: Noise, chosen: Seque
     monitor = loop.monitor
     limit = threshold(len(tuning.theta), monitor.evaluation_rate, monitor.memory, budget, np.inf)
     delays = pipeline.delays
-    return Rehearsed(_share(delayed(limit < T2, *delays)), _share(delayed(e.level >= 1.0, *delays)))
+    return Rehearsed(_share(delayed(limit < T2, *delays), counted), _share(delayed(e.level >= 1.0, *delays), counted))
 
 
 def prepare(
@@ -95,10 +102,12 @@ def prepare(
     """
     tuning = expectations[0].tuning
     first = replace(expectations[0], tuning=replace(tuning, theta=theta))
+    if not plant.linear:  # what runs beside the loop is a linear one
+        return Rehearsed(), (), ["there is no sequential test: the plant is not linear"]
     chosen = members(first, plant, loudest, covariance)
     rehearsed = rehearse(first, plant, loudest, chosen)
     if not chosen:
-        return rehearsed, (), []
+        return rehearsed, (), ["there is no sequential test: the healthy recordings are too short or too still for it"]
     pipeline = first.pipeline
     # the recordings are short: they speak where an alarm during them would have a chance of one in a thousand
     years = sum(rec.duration_s for rec in recordings) / SECONDS_PER_YEAR
@@ -111,7 +120,8 @@ def prepare(
     return rehearsed, chosen, []
 
 
-def _share(alarm: npt.NDArray[np.bool_]) -> float:
-    """Return events against `COUNTED`, none counting as a half."""
+def _share(alarm: npt.NDArray[np.bool_], expected: float) -> float:
+    """Return events against those expected, none counting as a half."""
     events = int((np.diff(alarm.astype(np.int8)) == 1).sum())
-    return float((events + 0.5) / (COUNTED + 0.5))
+    share = float((events + 0.5) / (expected + 0.5))
+    return share if expected >= FEW else max(share, 1.0)

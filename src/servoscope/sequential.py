@@ -81,7 +81,7 @@ def members(expectation: Expectation, plant: Plant, noise: Noise, covariance: Fl
     covariance
         Of the logarithms of the plant's parameters, shape (m, m).
     """
-    bench = _Bench(expectation.first(LONGEST), plant, noise)
+    bench = _Bench(_first(expectation), plant, noise)
     if len(bench.phi) < FEWEST:
         return ()
     size = np.sqrt((bench.phi**2).mean(axis=0))
@@ -102,7 +102,13 @@ def rated(
     expectation: Expectation, plant: Plant, noise: Noise, covariance: FloatArray, chosen: Sequence[Member]
 ) -> tuple[Member, ...]:
     """Return the same changes with rate and drift under another reference where those are worse; see `members`."""
-    return _Bench(expectation.first(LONGEST), plant, noise).rated(chosen, covariance)
+    return _Bench(_first(expectation), plant, noise).rated(chosen, covariance)
+
+
+def _first(expectation: Expectation) -> Expectation:
+    """Return as much of a reference as the design needs."""
+    pipeline = expectation.pipeline
+    return expectation.first(max(LONGEST, 10.0 * FEWEST * pipeline.stride / pipeline.loop.sample_rate))
 
 
 class _Bench:

@@ -25,6 +25,7 @@ from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
 from servoscope.simulation import response
 
+BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 LONGEST_FILL = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
@@ -206,13 +207,14 @@ class Expectation:
         c, S = self.moments(plant)
         return z.T @ phi + len(eta) * S, z.T @ eta + len(eta) * c
 
-    def residual(self, plant: Plant, theta: FloatArray) -> FloatArray:
+    def residual(self, plant: Plant, theta: FloatArray, ok: BoolArray | None = None) -> FloatArray:
         """Return the mean of v = eta - phi' theta for fixed coefficients at every usable sample, shape (M,).
 
-        It is exact: with theta fixed, v is linear in u and y, and the noise has no mean.
+        `ok` (N,) are the usable samples of the measured loop, where they are others. The mean is exact: with theta
+        fixed, v is linear in u and y, and the noise has none.
         """
         g, _ = self.regression([plant], [0])
-        return (g.eta - g.phi @ theta)[g.ok]
+        return (g.eta - g.phi @ theta)[g.ok if ok is None else ok]
 
 
 def true_theta(pipeline: Pipeline, plant: Plant) -> FloatArray:

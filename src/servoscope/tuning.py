@@ -113,6 +113,10 @@ def fit(pipeline: Pipeline, regressions: Sequence[Regression]) -> Fit:
             f"only {usable} usable samples when filters have settled and rest is left out: record longer, or lower "
             "rest_speed"
         )
+    if min(int(g.ok.sum()) for g in regressions) < 20 * n:
+        raise NotEnoughError(
+            f"one of the recordings has fewer than {20 * n} usable samples: leave it out, or record longer"
+        )
     phi = np.vstack([g.phi[g.ok] for g in regressions])
     z = np.vstack([g.z[g.ok] for g in regressions])
     eta = np.concatenate([g.eta[g.ok] for g in regressions])

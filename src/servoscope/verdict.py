@@ -21,7 +21,7 @@ from servoscope.diagnosis import (
     Warning,
 )
 from servoscope.doubts import blind_to, doubts, seen_by
-from servoscope.examination import Examination, Watched, trace_of
+from servoscope.examination import Compared, Examination, trace_of
 from servoscope.isolation import isolate
 from servoscope.sentence import summary
 from servoscope.signatures import true_theta
@@ -61,7 +61,7 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         span = float(recording.t[0]), float(recording.t[-1])
         warnings += [Warning(kind="power", from_s=span[0], to_s=span[1], count=1, message=text) for text in blind]
     verdict: Verdict = "fault" if alarms.size else "undetermined" if blind else "healthy"
-    trace = trace_of(x.baseline, x.pipeline, x.estimates, x.t, watched(x, candidates, since, at))
+    trace = trace_of(x.baseline, x.pipeline, x.estimates, x.t, unbiased(x, candidates, since, at), recording.t)
     found = Diagnosis(
         recording=recording.name,
         samples=recording.samples,
@@ -109,7 +109,7 @@ def _since(x: Examination, found: Onset | None) -> str:
     return f"since {found.likely_s:.1f} s"
 
 
-def watched(x: Examination, candidates: tuple[Candidate, ...], since: Onset | None, at: int) -> Watched:
+def unbiased(x: Examination, candidates: tuple[Candidate, ...], since: Onset | None, at: int) -> Compared:
     """Take the biases out of estimates and expectation, as far as the loop can be simulated.
 
     After a change the past that theta_hat has not forgotten yet counts as a bias too. The covariance becomes that of
@@ -117,7 +117,7 @@ def watched(x: Examination, candidates: tuple[Candidate, ...], since: Onset | No
     """
     e, C = x.estimates, x.baseline.cov()
     if x.expectation is None or not len(x.t) or not x.ready[at] or x.baseline.loop.monitor.structure != "svf":
-        return Watched(e.theta, x.covariance, x.expected, C, x.statistic)
+        return Compared(e.theta, x.covariance, x.expected, C, x.statistic)
     plant, start = x.baseline.plant, np.array(x.baseline.model_theta)
     healthy = true_theta(x.pipeline, plant)
     bias = shift = x.expectation.path([plant], [0], start) - healthy
@@ -136,7 +136,7 @@ def watched(x: Examination, candidates: tuple[Candidate, ...], since: Onset | No
             spread = spread_of(x.pipeline, x.tuning, x.recording, x.expectation.noise, ill)
             S = np.where(late[:, None, None], spread, S)
     covariance = gain @ (S + e.Psi @ C @ np.swapaxes(e.Psi, -1, -2)) @ gain.T
-    return Watched(e.theta - bias, covariance, x.expected - shift, C, x.statistic)
+    return Compared(e.theta - bias, covariance, x.expected - shift, C, x.statistic)
 
 
 def _parameters(trace: Trace) -> dict[str, Parameter]:

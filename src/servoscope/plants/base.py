@@ -83,6 +83,11 @@ class Plant(BaseModel, abc.ABC):
         return ()
 
     @property
+    def linear(self) -> bool:
+        """Whether the plant is a linear one, to which superposition applies."""
+        return not self.extras
+
+    @property
     @abc.abstractmethod
     def has_physics(self) -> bool:
         """Whether nominal values are known, so that `theta`, `state_space` and simulation work."""
