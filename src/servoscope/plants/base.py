@@ -84,8 +84,8 @@ class Plant(BaseModel, abc.ABC):
 
     @property
     def linear(self) -> bool:
-        """Whether the plant is a linear one, to which superposition applies."""
-        return not self.extras
+        """Whether it is linear but for `extras`, which are simulated and regressed as what they are."""
+        return True
 
     @property
     @abc.abstractmethod
