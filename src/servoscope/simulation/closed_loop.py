@@ -194,7 +194,7 @@ def _run(
     discrete = [discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants]
     for each, what in zip(discrete, called, strict=True):
         check_stable(loop, each, what)
-    if not getattr(loop.plant, "linear", True):
+    if not loop.plant.linear:
         from servoscope.simulation.rig import run_nonlinear
 
         u, limited, acting, y = run_nonlinear(loop, plants, which, settings, r, n_u, n_y)
