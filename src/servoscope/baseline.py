@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from servoscope.detection import threshold
 from servoscope.errors import BaselineError, LoopError
 from servoscope.loop import Loop
 from servoscope.noise import Coloured, Noise
 from servoscope.output import atomic_write
 from servoscope.pipeline import Pipeline, Tuning
 from servoscope.plants import FloatArray, Plant
-from servoscope.rehearsal import SEQUENTIAL, Rehearsed
+from servoscope.rehearsal import SEQUENTIAL, Rehearsed, limit_of
 from servoscope.sequential import Member, rated, watch
 from servoscope.signatures import Expectation, true_theta
 from servoscope.twostage import StageOne
@@ -248,10 +247,8 @@ class Baseline(_Part):
             raise BaselineError(f"a budget cannot be shared by {assets} assets, give at least 1")
         monitor = self.loop.monitor
         budget = monitor.false_alarms_per_year / assets
-        share = budget * (1.0 - SEQUENTIAL if self.members else 1.0)
-        looks = monitor.evaluation_rate, monitor.memory
-        limit = threshold(len(self.names), *looks, share, self.dof, self.rehearsed.statistic)
         loop = self.loop.model_copy(update={"monitor": monitor.model_copy(update={"false_alarms_per_year": budget})})
+        limit = limit_of(loop, len(self.names), self.dof, self.rehearsed, bool(self.members))
         others = tuple(other.shared(assets) for other in self.others)
         changed = self.model_copy(update={"loop_settings": loop.to_dict(), "limit": limit, "others": others})
         vars(changed).pop("loop", None)  # a copy takes along what was computed from the old settings

@@ -10,7 +10,6 @@ import numpy as np
 from servoscope import estimators, twostage
 from servoscope.baseline import Baseline, Source, digest
 from servoscope.delays import check_delay
-from servoscope.detection import threshold
 from servoscope.errors import LoopError, NotEnoughError
 from servoscope.homogeneity import odd_ones, scatter, told
 from servoscope.identification import (
@@ -27,7 +26,7 @@ from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray
 from servoscope.promises import WORTH_A_LOOK, misfit_of, noise_notes, promises, supported_budget
 from servoscope.recording import Recording
-from servoscope.rehearsal import SEQUENTIAL, Rehearsed, prepare
+from servoscope.rehearsal import Rehearsed, limit_of, prepare
 from servoscope.sequential import Member
 from servoscope.signatures import Expectation, colour_of, course, residual_system, true_theta
 from servoscope.simulation import reference, simulate
@@ -207,9 +206,7 @@ def _assemble(
     notes += told(odd, [rec.name for rec in recordings], pipeline.bank.names)
     tuning = replace(found.tuning, theta=theta)
     plant = loop.plant.with_ratios(ratios) if ratios else loop.plant
-    share = loop.monitor.false_alarms_per_year * (1.0 - SEQUENTIAL if listening else 1.0)
-    looks = loop.monitor.evaluation_rate, loop.monitor.memory
-    limit = threshold(pipeline.bank.n, *looks, share, found.dof, rehearsed.statistic)
+    limit = limit_of(loop, pipeline.bank.n, found.dof, rehearsed, bool(listening))
     progress("promises")
     estimates = [pipeline.estimate(tuning, rec) for rec in recordings]
     deviations = []

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.detection import SECONDS_PER_YEAR, delayed, statistic, threshold
+from servoscope.loop import Loop
 from servoscope.noise import Noise
 from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
@@ -37,6 +38,13 @@ class Rehearsed:
 
     statistic: float = 1.0
     cusum: float = 1.0
+
+
+def limit_of(loop: Loop, n: int, dof: float, rehearsed: Rehearsed, sequential: bool) -> float:
+    """Return the threshold of T^2 for its share of the loop's budget; without a sequential test that is all of it."""
+    monitor = loop.monitor
+    budget = monitor.false_alarms_per_year * (1.0 - SEQUENTIAL if sequential else 1.0)
+    return threshold(n, monitor.evaluation_rate, monitor.memory, budget, dof, rehearsed.statistic)
 
 
 def rehearse(expectation: Expectation, plant: Plant, noise: Noise, chosen: Sequence[Member]) -> Rehearsed:
