@@ -238,8 +238,9 @@ def test_silence_is_no_obstacle(rig: dict[str, Any], record: Callable[..., Recor
 
 def test_one_recording_too_short_among_others_is_refused(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
-    with pytest.raises(NotEnoughError, match="one of the recordings"):
-        learn(loop, [record(loop), record(loop, seconds=0.3, seed=2)])
+    short = replace(record(loop, seconds=0.3, seed=2), name="short.csv")
+    with pytest.raises(NotEnoughError, match=r"^short\.csv: only \d+ usable samples of at least 80 "):
+        learn(loop, [record(loop), short])
 
 
 def test_a_rehearsal_is_as_long_as_the_memory_asks(rig: dict[str, Any], record: Callable[..., Recording]) -> None:

@@ -54,6 +54,13 @@ class TestAlgebra:
         both = stack([first, second]).simulate(w)
         assert both == pytest.approx(np.hstack([first.simulate(w[:, :1]), second.simulate(w[:, 1:])]), abs=1e-12)
 
+    def test_inputs_and_outputs_are_mixed_before_and_after(self) -> None:
+        both = stack(self.systems())
+        before, after = np.array([[1.0, -2.0, 0.5], [0.0, 3.0, 1.0]]), np.array([[2.0, 0.1]])
+        w = np.column_stack([noise(80, seed) for seed in range(3)])
+        mixed = both.input(before).output(after).simulate(w)
+        assert mixed == pytest.approx(both.simulate(w @ before.T) @ after.T, abs=1e-12)
+
     def test_steady_state_stands_still(self) -> None:
         first, second = self.systems()
         both = stack([first, second, taps(np.ones(4))])
@@ -79,7 +86,7 @@ class TestAutocovariances:
         first = sampled(state_variable_filter(5.0, 2), RATE, "zoh")
         system = stack([first, sampled(state_variable_filter(20.0, 2), RATE, "foh")])
         mix = np.array([[1.0, 0.02, 0.0, 0.0], [0.3, 0.0, 1.0, 1e-3]])
-        system = Linear(system.A, system.B, mix @ system.C, mix @ system.D)
+        system = system.output(mix)
         pulse = np.zeros((2000, 2, 2))
         for i in range(2):
             w = np.zeros((2001, 2))

@@ -25,15 +25,12 @@ AXIS = {"kind": "polynomial", "order": 2, "coefficients": {"viscous_friction": 2
 def built(rig: dict[str, Any], ratios: dict[str, float], **monitor: Any) -> tuple[FilterBank, naive.Array]:
     """Return the regression of a rig and the coefficients of its plant with other parameters."""
     loop = Loop.from_dict(rig | {"monitor": monitor})
-    if ratios:
-        loop = loop.model_copy(update={"plant": loop.plant.with_ratios(ratios)})
-    return Pipeline.of(loop).bank, nominal_theta(loop)
+    return Pipeline.of(loop).bank, nominal_theta(loop, loop.plant.with_ratios(ratios))
 
 
 def loud(bank: FilterBank, theta: naive.Array, noise: Noise) -> Linear:
     """Return unit white noises -> v."""
-    system, std = residual_of(bank, theta), np.array([noise.u_std, noise.y_std])
-    return Linear(system.A, system.B * std, system.C, system.D * std)
+    return residual_of(bank, theta).input(np.diag([noise.u_std, noise.y_std]))
 
 
 def drawn(bank: FilterBank, theta: naive.Array, noise: Noise, samples: int, seed: int, stride: int = 1) -> naive.Array:

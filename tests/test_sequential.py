@@ -14,6 +14,7 @@ import naive
 from servoscope.baseline import Baseline
 from servoscope.cusum import LAGS, whitening
 from servoscope.detection import SECONDS_PER_YEAR, delayed
+from servoscope.inverse import nominal_theta
 from servoscope.learning import learn
 from servoscope.loop import Loop
 from servoscope.monitor import Monitor, examine
@@ -22,7 +23,7 @@ from servoscope.pipeline import Estimates, Pipeline
 from servoscope.recording import Recording
 from servoscope.rehearsal import rehearse
 from servoscope.sequential import Member, members, watch
-from servoscope.signatures import Expectation, colour_of, course, true_theta
+from servoscope.signatures import Expectation, colour_of, course
 from servoscope.simulation import FaultEvent, reference, response, simulate
 from servoscope.tuning import fit
 
@@ -56,7 +57,7 @@ class TestKernel:
     def shadow(self, pipeline: Pipeline, recording: Recording) -> tuple[naive.Array, naive.Array]:
         """Simulate the healthy loop without noise, in each stretch from its steady state at the first r."""
         loop, (r, u, y) = pipeline.loop, (recording.r, recording.u.copy(), recording.y.copy())
-        hold = true_theta(pipeline, loop.plant)[0]
+        hold = nominal_theta(loop, loop.plant)[0]
         for begin, end in naive.stretches(r, u, y, recording.restart):
             part, first = slice(begin, end), recording.r[begin]
             moved = response(loop, r[part] - first)
@@ -77,8 +78,8 @@ class TestKernel:
         k = round(rate)
         recording.y[2 * k], recording.u[5 * k : 5 * k + 3], recording.restart[10 * k] = np.nan, np.nan, True
         rng = np.random.default_rng(0)
-        step = np.array([true_theta(pipeline, loop.plant.with_ratios({"C_ie": x})) for x in (1.05, 1.5, 0.8)])
-        step -= true_theta(pipeline, loop.plant)
+        step = np.array([nominal_theta(loop, loop.plant.with_ratios({"C_ie": x})) for x in (1.05, 1.5, 0.8)])
+        step -= nominal_theta(loop, loop.plant)
         late = 1e-3 * step[:, -1:] * rng.standard_normal((3, LAGS))
         changes, limits = np.hstack([step, late]), np.array([20.0, 35.0, 15.0])
         chosen = [Member("C_ie", 1.0, tuple(change), 1.0, 0.0) for change in changes.tolist()]
@@ -89,7 +90,7 @@ class TestKernel:
         r, u, y, restart = recording.r, recording.u, recording.y, recording.restart
         g = pipeline.regression(r, u, y, restart)
         eta, phi = self.shadow(pipeline, recording)
-        v = g.eta - eta - (g.phi - phi) @ true_theta(pipeline, loop.plant)
+        v = g.eta - eta - (g.phi - phi) @ nominal_theta(loop, loop.plant)
         model = colour_of(pipeline, loop.plant, NOISE)
         numerator, denominator = np.concatenate([[1.0], -model.a]), np.concatenate([[1.0], model.b])
         slowest = np.abs(np.roots(denominator)).max()

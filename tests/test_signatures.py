@@ -47,12 +47,12 @@ def ensemble(loop: Loop, kind: str, faults: list[FaultEvent], louder: float = 1.
     return Ensemble(np.array([e.theta for e in estimates]), np.array([e.S for e in estimates]), expectation)
 
 
-def expected(run: Ensemble, faults: list[FaultEvent]) -> naive.Array:
-    plant = run.expectation.pipeline.loop.plant
-    plants = [plant, *(plant.with_ratios({fault.parameter: fault.ratio}) for fault in faults)]
-    return run.expectation.path(
-        plants, [0, *(round(100 * fault.at_s) for fault in faults)], run.expectation.tuning.theta
-    )
+def expected(run: Ensemble, fault: FaultEvent | None) -> naive.Array:
+    plant, start = run.expectation.pipeline.loop.plant, run.expectation.tuning.theta
+    if fault is None:
+        return run.expectation.path(start, plant)
+    ill = plant.with_ratios({fault.parameter: fault.ratio})
+    return run.expectation.path(start, plant, ill, round(100 * fault.at_s))
 
 
 @pytest.mark.parametrize(
@@ -68,9 +68,8 @@ def expected(run: Ensemble, faults: list[FaultEvent]) -> naive.Array:
 def test_path_is_the_mean_of_noisy_runs(
     rig: dict[str, Any], kind: str, fault: FaultEvent | None, louder: float
 ) -> None:
-    faults = [] if fault is None else [fault]
-    run = ensemble(Loop.from_dict(rig), kind, faults, louder)
-    path = expected(run, faults)
+    run = ensemble(Loop.from_dict(rig), kind, [] if fault is None else [fault], louder)
+    path = expected(run, fault)
     assert path.shape == run.theta.shape[1:]
     error = run.theta.std(axis=0, ddof=1) / np.sqrt(SEEDS)
     z = ((run.theta.mean(axis=0) - path) / error)[LATE]
@@ -121,15 +120,15 @@ class TestExpectation:
         expectation, _, tuning = built
         plant = expectation.pipeline.loop.plant
         model = expectation.batch(plant)
-        path = expectation.path([plant], [0], model)
+        path = expectation.path(model, plant)
         assert expectation.healthy(plant, model) == pytest.approx(path + (tuning.theta - model), rel=1e-12)
 
     def test_a_shorter_look_is_the_beginning(self, built: tuple[Expectation, Regression, Tuning]) -> None:
         expectation, _, tuning = built
         plant = expectation.pipeline.loop.plant
         ill = plant.with_ratios({"C_ie": 1.2})
-        whole = expectation.path([plant, ill], [0, 1000], tuning.theta)
-        part = expectation.until(1500).path([plant, ill], [0, 1000], tuning.theta)
+        whole = expectation.path(tuning.theta, plant, ill, 1000)
+        part = expectation.until(1500).path(tuning.theta, plant, ill, 1000)
         assert np.array_equal(part, whole[:150])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from servoscope.errors import BaselineError, LoopError
+from servoscope.inverse import nominal_theta
 from servoscope.loop import Loop
 from servoscope.noise import Coloured, Noise
 from servoscope.output import atomic_write
@@ -20,7 +21,7 @@ from servoscope.pipeline import Pipeline, Tuning
 from servoscope.plants import FloatArray, Plant
 from servoscope.rehearsal import SEQUENTIAL, Rehearsed, limit_of
 from servoscope.sequential import Member, rated, watch
-from servoscope.signatures import Expectation, true_theta
+from servoscope.signatures import Expectation
 from servoscope.twostage import StageOne
 
 if TYPE_CHECKING:
@@ -230,7 +231,7 @@ class Baseline(_Part):
         """What the biases of the regression add to the healthy coefficients, shape (n,)."""
         if not self.model_theta or self.loop.monitor.structure != "svf":
             return np.zeros(len(self.theta))
-        return np.array(self.model_theta) - true_theta(self.pipeline(), self.plant)
+        return np.array(self.model_theta) - nominal_theta(self.loop, self.plant)
 
     def shared(self, assets: int) -> Self:
         """Return the baseline of one among many assets that share its budget of false alarms.

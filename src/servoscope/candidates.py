@@ -49,13 +49,12 @@ def candidates_of(
 def _simulated(baseline: Baseline, expectation: Expectation, since: int) -> Callable[[Fault], Shift]:
     """Let the fault step in at the onset, and ask what the recursion would say at the end."""
     plant, start = baseline.plant, np.array(baseline.model_theta)
-    healthy = expectation.path([plant], [0], start)[-1]
+    healthy = expectation.path(start, plant)[-1]
 
     def of(fault: Fault) -> Shift:
         def shift(ratio: float) -> FloatArray:
             ill = plant.with_ratios({fault.parameter: ratio})
-            plants, onsets = ([plant, ill], [0, since]) if since > 0 else ([ill], [0])
-            moved: FloatArray = expectation.path(plants, onsets, start)[-1] - healthy
+            moved: FloatArray = expectation.path(start, plant, ill, since)[-1] - healthy
             return moved
 
         return shift
@@ -66,12 +65,12 @@ def _simulated(baseline: Baseline, expectation: Expectation, since: int) -> Call
 def _physical(baseline: Baseline, learned: FloatArray) -> Callable[[Fault], Shift]:
     """Take the coefficients of the changed plant, as far as the recursion has taken them up."""
     loop, plant = baseline.loop, baseline.plant
-    healthy = nominal_theta(loop.model_copy(update={"plant": plant}))
+    healthy = nominal_theta(loop, plant)
 
     def of(fault: Fault) -> Shift:
         def shift(ratio: float) -> FloatArray:
-            ill = loop.model_copy(update={"plant": plant.with_ratios({fault.parameter: ratio})})
-            return np.asarray(learned @ (nominal_theta(ill) - healthy))
+            ill = plant.with_ratios({fault.parameter: ratio})
+            return np.asarray(learned @ (nominal_theta(loop, ill) - healthy))
 
         return shift
 

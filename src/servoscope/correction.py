@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servoscope.errors import SimulationError
+from servoscope.inverse import nominal_theta
 from servoscope.noise import Noise
 from servoscope.pipeline import Pipeline, Tuning
 from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
-from servoscope.signatures import Expectation, colour_of, true_theta
+from servoscope.signatures import Expectation, colour_of
 
 FREE = 3.0  # standard deviation of the logarithm of a parameter that nothing tells
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
@@ -72,12 +73,11 @@ def explain(
     size = np.sqrt(np.diag(S))
     L = np.linalg.cholesky(S / np.outer(size, size) + 1e-9 * np.eye(len(size)))
 
-    def plants(x: FloatArray) -> tuple[list[Plant], list[int]]:
-        now = healthy.with_ratios(dict(zip(names, np.exp(x).tolist(), strict=True)))
-        return ([healthy, now], [0, since]) if since else ([now], [0])
+    def ill(x: FloatArray) -> Plant:
+        return healthy.with_ratios(dict(zip(names, np.exp(x).tolist(), strict=True)))
 
     def expected(x: FloatArray) -> FloatArray:
-        last: FloatArray = expectation.path(*plants(x), start)[-1]
+        last: FloatArray = expectation.path(start, healthy, ill(x), since)[-1]
         return last
 
     def misfit(x: FloatArray) -> FloatArray:
@@ -90,14 +90,15 @@ def explain(
     x = _search(misfit, np.log([guess.get(name, 1.0) for name in names]))
     here = expected(x)
     J, T = np.empty((len(theta), len(names))), np.empty((len(theta), len(names)))
-    true = true_theta(expectation.pipeline, plants(x)[0][-1])
+    loop = expectation.pipeline.loop
+    true = nominal_theta(loop, ill(x))
     for i, e in enumerate(np.eye(len(names))):
         moved = x + STEP * e
         J[:, i] = (expected(moved) - here) / STEP
-        T[:, i] = (true_theta(expectation.pipeline, plants(moved)[0][-1]) - true) / STEP
+        T[:, i] = (nominal_theta(loop, ill(moved)) - true) / STEP
     white = np.linalg.solve(L, J / size[:, None])
     fitted = np.linalg.solve(white.T @ white + np.eye(len(names)) / FREE**2, white.T @ np.linalg.inv(L) / size)
-    return Correction(plants(x)[0][-1], np.eye(len(theta)) + (T - J) @ fitted)
+    return Correction(ill(x), np.eye(len(theta)) + (T - J) @ fitted)
 
 
 def _search(misfit: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:

@@ -64,10 +64,7 @@ def idle(n: int) -> Watch:
 def whitening(noise: Coloured) -> tuple[FloatArray, FloatArray, float, int]:
     """Return numerator, denominator, gain and warm-up of the filter that whitens a noise."""
     length = max(len(noise.a), len(noise.b)) + 1
-    numerator, denominator = np.zeros(length), np.zeros(length)
-    numerator[0] = denominator[0] = 1.0
-    numerator[1 : len(noise.a) + 1] = -noise.a
-    denominator[1 : len(noise.b) + 1] = noise.b
+    numerator, denominator = (np.pad(each, (0, length - len(each))) for each in noise.polynomials)
     slowest = float(np.abs(np.roots(denominator)).max(initial=0.0)) if len(noise.b) else 0.0
     warm = LONGEST_WARMUP
     if slowest < 1.0:

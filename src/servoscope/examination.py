@@ -142,12 +142,12 @@ class Examination:
             estimates = pipeline.estimate(tuning, recording, baseline.watch(pipeline, own))
         expectation, growth = None, 1.0
         expected = np.broadcast_to(tuning.theta, estimates.theta.shape)
-        if baseline.noise is not None:
+        if own is not None:
             growth = _noise_growth(pipeline, estimates)
             if growth > 1.0:  # the sequential test takes louder noise for steps of a change
                 deafer = pipeline.estimate(tuning, recording, baseline.watch(pipeline, own, growth))
                 estimates = replace(estimates, level=deafer.level, crossed=deafer.crossed)
-            expectation = Expectation(pipeline, tuning, baseline.noise.times(np.sqrt(growth)), course(recording))
+            expectation = replace(own, pipeline=pipeline, noise=own.noise.times(np.sqrt(growth)))
             expected = expectation.healthy(baseline.plant, np.array(baseline.model_theta))
         covariance = growth * estimates.S + baseline.cov()
         T2 = np.where(estimates.updates > 0, statistic(estimates.theta, expected, covariance), 0.0)

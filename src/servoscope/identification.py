@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoscope.inverse import nominal_theta
-from servoscope.linear import Linear, autocovariances
+from servoscope.linear import autocovariances
 from servoscope.loop import Loop
 from servoscope.noise import Coloured, Noise, autocovariance
 from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
-from servoscope.signatures import Expectation, noise_system, solve_scaled, true_theta
+from servoscope.signatures import Expectation, residual_system, solve_scaled
 from servoscope.tuning import Fit
 
 PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
@@ -78,13 +78,8 @@ def noise_of(pipeline: Pipeline, found: Fit, regressions: Sequence[Regression]) 
         return found.noises.noise
 
     lags = 20
-    n = pipeline.bank.n
-    residual = np.concatenate([[1.0], -nominal_theta(pipeline.loop)])  # v = eta - phi' theta
-    system = noise_system(pipeline, pipeline.loop.plant)
-    v = Linear(system.A, system.B, residual @ system.C[None, : 1 + n], residual @ system.D[None, : 1 + n])
-    columns = [
-        autocovariances(Linear(v.A, v.B[:, [i]], v.C, v.D[:, [i]]), lags, pipeline.stride)[:, 0, 0] for i in (0, 1)
-    ]
+    system = residual_system(pipeline, pipeline.loop.plant)
+    columns = [autocovariances(system.input(one[:, None]), lags, pipeline.stride)[:, 0, 0] for one in np.eye(2)]
     measured = autocovariance([(g.eta - g.phi @ found.tuning.theta)[g.ok] for g in regressions], lags)
     size = np.array([column[0] for column in columns])
     shares, _ = nnls(np.column_stack(columns) / size, measured)
@@ -153,7 +148,7 @@ def healthy_parameters(
     off = (found.tuning.theta - limit) / size
     covariance = found.covariance / np.outer(size, size) + 1e-9 * np.eye(len(size))
     final = plant.with_ratios(ratios(found_x.x))
-    true = true_theta(expectations[0].pipeline, final)
+    true = nominal_theta(expectations[0].pipeline.loop, final)
     return HealthyPlant(
         ratios=ratios(found_x.x),
         covariance=C,
@@ -174,7 +169,7 @@ def fault_directions(loop: Loop, plant: Plant, theta: FloatArray) -> dict[str, F
         step = 1e-4
 
         def at(ratio: float, parameter: str) -> FloatArray:
-            return nominal_theta(loop.model_copy(update={"plant": plant.with_ratios({parameter: ratio})}))
+            return nominal_theta(loop, plant.with_ratios({parameter: ratio}))
 
         return {p: (at(np.exp(step), p) - at(np.exp(-step), p)) / (2.0 * step) for p in plant.parameters}
     names = plant.names

@@ -64,6 +64,11 @@ class FilterBank:
         return len(self.names)
 
     @property
+    def linear(self) -> Linear:
+        """From [u, y] alone to [eta, phi (n)]; nothing reaches the columns of friction and offset."""
+        return self.system.input(np.eye(3 + len(self.extras), 2, -1)).output(np.eye(1 + self.n, len(self.system.C)))
+
+    @property
     def has_instrument(self) -> bool:
         """Whether z stands beside phi."""
         return len(self.system.C) == 1 + 2 * self.n
@@ -119,9 +124,12 @@ def tustin_coefficients(theta: FloatArray, sample_rate: float) -> FloatArray:
     return c
 
 
-def nominal_theta(loop: Loop) -> FloatArray:
-    """Return the coefficients that the plant's parameters give in the loop's own structure, shape (n,)."""
-    theta = loop.plant.theta()
+def nominal_theta(loop: Loop, plant: Plant | None = None) -> FloatArray:
+    """Return the coefficients that a plant's parameters give in the loop's own structure, shape (n,).
+
+    `plant` stands in the place of the loop's own, of the same kind and with the same columns.
+    """
+    theta = (loop.plant if plant is None else plant).theta()
     return theta if loop.monitor.structure == "svf" else tustin_coefficients(theta, loop.sample_rate)
 
 
@@ -168,7 +176,7 @@ def instrument_of(loop: Loop) -> Linear:
         As `closed_loop`.
     """
     whole = closed_loop(loop, loop.plant)
-    return Linear(whole.A, whole.B[:, :1], whole.C[1:], whole.D[1:, :1])
+    return whole.input(np.eye(3, 1)).output(np.eye(1, 2, 1))
 
 
 def cutoff_of(loop: Loop) -> float:

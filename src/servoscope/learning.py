@@ -20,6 +20,7 @@ from servoscope.identification import (
     saturated,
     simulated,
 )
+from servoscope.inverse import nominal_theta
 from servoscope.loop import Loop
 from servoscope.noise import AR_ORDER, autocovariance, white_noises, yule_walker
 from servoscope.pipeline import Pipeline, Regression
@@ -28,11 +29,12 @@ from servoscope.promises import WORTH_A_LOOK, misfit_of, noise_notes, promises, 
 from servoscope.recording import Recording
 from servoscope.rehearsal import Rehearsed, limit_of, prepare
 from servoscope.sequential import Member
-from servoscope.signatures import Expectation, colour_of, course, residual_system, true_theta
+from servoscope.signatures import Expectation, colour_of, course, residual_system
 from servoscope.simulation import reference, simulate
 from servoscope.tuning import Fit, fit, white_enough
 
 SHORTEST = 10.0  # memories; a shorter baseline is warned about
+FEWEST_PER_COEFFICIENT = 20  # usable samples of every recording
 SPEED_OVER = 0.05  # s over which a speed is measured here
 STILL_SHARE = 0.02  # of the speed of motion, below which an axis stands still
 WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
@@ -117,6 +119,13 @@ def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
 def _tuned(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline, list[Regression], Fit]:
     pipeline = Pipeline.of(loop, twostage.tune(loop, recordings), still_speed(loop, recordings))
     regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
+    fewest = FEWEST_PER_COEFFICIENT * pipeline.bank.n
+    for rec, g in zip(recordings, regressions, strict=True):
+        if (usable := int(g.ok.sum())) < fewest:
+            raise NotEnoughError(
+                f"{rec.name}: only {usable} usable samples of at least {fewest} when filters have settled and rest is "
+                "left out: record longer, lower rest_speed, or learn without it"
+            )
     return pipeline, regressions, fit(pipeline, regressions)
 
 
@@ -158,6 +167,7 @@ def _assemble(
     ratios_std: dict[str, float] = {}
     ratios_covariance = np.zeros((0, 0))
     listening: tuple[Member, ...] = ()
+    expectations: list[Expectation] = []
     if simulated(loop):
         from scipy import special
 
@@ -167,9 +177,7 @@ def _assemble(
         if exact:
             theta = model_theta = expectations[0].batch(loop.plant)
         else:
-            healthy = healthy_parameters(
-                expectations, regressions, found, true_theta(pipeline, loop.plant), found.tuning.noise
-            )
+            healthy = healthy_parameters(expectations, regressions, found, nominal_theta(loop), found.tuning.noise)
             # what the plant leaves of the residual is noise alone: its colour is known better now
             plant = loop.plant.with_ratios(healthy.ratios)
             gamma = autocovariance(healthy.residuals, AR_ORDER)
@@ -209,12 +217,8 @@ def _assemble(
     limit = limit_of(loop, pipeline.bank.n, found.dof, rehearsed, bool(listening))
     progress("promises")
     estimates = [pipeline.estimate(tuning, rec) for rec in recordings]
-    deviations = []
-    for rec, e in zip(recordings, estimates, strict=True):
-        expected = theta
-        if noise is not None:
-            expected = Expectation(pipeline, tuning, noise, course(rec)).healthy(plant, model_theta)
-        deviations.append(e.theta - expected)
+    expected = [replace(e, tuning=tuning).healthy(plant, model_theta) for e in expectations] or [theta] * len(estimates)
+    deviations = [e.theta - mean for e, mean in zip(estimates, expected, strict=True)]
     notes += noise_notes(pipeline, found, estimates, simulated(loop))
     excess, suggestion = misfit_of(estimates, deviations, covariance, found)
     if found.explained < LEAST_EXPLAINED:

@@ -41,6 +41,10 @@ class Linear:
         C = np.hstack([after.D @ self.C, after.C])
         return Linear(A, B, C, after.D @ self.D)
 
+    def input(self, matrix: FloatArray) -> Linear:
+        """Return the same system with inputs of its own before it, ``w = matrix @ inputs``."""
+        return Linear(self.A, self.B @ matrix, self.C, self.D @ matrix)
+
     def output(self, matrix: FloatArray) -> Linear:
         """Return the same system with outputs ``matrix @ v``."""
         return Linear(self.A, self.B, matrix @ self.C, matrix @ self.D)

@@ -54,6 +54,11 @@ class Coloured:
     variance: float
 
     @property
+    def polynomials(self) -> tuple[FloatArray, FloatArray]:
+        """``A = [1, -a]`` and ``B = [1, b]`` of A(q) v = B(q) e, q the delay, shapes (p + 1,) and (q + 1,)."""
+        return np.concatenate([[1.0], -self.a]), np.concatenate([[1.0], self.b])
+
+    @property
     def c(self) -> FloatArray:
         """E[v(k) e(k-j)] for j = 0 to q - 1, shape (q,)."""
         psi = np.zeros(len(self.b))
@@ -71,21 +76,21 @@ class Coloured:
         """Return innovations of unit variance for a column or columns of v, shape (N,) or (N, m)."""
         from scipy.signal import lfilter
 
-        numerator, denominator = np.concatenate([[1.0], -self.a]), np.concatenate([[1.0], self.b])
-        white: FloatArray = lfilter(numerator, denominator, x, axis=0) / np.sqrt(self.variance)
+        A, B = self.polynomials
+        white: FloatArray = lfilter(A, B, x, axis=0) / np.sqrt(self.variance)
         return white
 
     def shape(self, x: FloatArray) -> FloatArray:
         """Return x passed through the filter that turns white noise of unit variance into v, shape as x."""
         from scipy.signal import lfilter
 
-        numerator, denominator = np.concatenate([[1.0], self.b]), np.concatenate([[1.0], -self.a])
-        shaped: FloatArray = lfilter(numerator, denominator, x, axis=0) * np.sqrt(self.variance)
+        A, B = self.polynomials
+        shaped: FloatArray = lfilter(B, A, x, axis=0) * np.sqrt(self.variance)
         return shaped
 
     def autocovariance(self, lags: int) -> FloatArray:
         """Return the autocovariance of v at lags 0 to `lags`, shape (lags + 1,)."""
-        gamma, c, b = list(self.gamma), self.c, np.concatenate([[1.0], self.b])
+        gamma, c, b = list(self.gamma), self.c, self.polynomials[1]
         psi = np.append(c, 0.0)
         for j in range(len(gamma), lags + 1):
             moving = sum(b[i] * psi[i - j] for i in range(j, len(b)))
@@ -120,9 +125,7 @@ def yule_walker(gamma: FloatArray) -> Coloured:
 
 def residual_of(bank: FilterBank, theta: FloatArray) -> Linear:
     """Return [u, y] -> v = eta - phi' theta; columns of friction and offset do not pass noise on."""
-    row = np.concatenate([[1.0], -theta])
-    system, used = bank.system, 1 + bank.n
-    return Linear(system.A, system.B[:, 1:3], row[None, :] @ system.C[:used], row[None, :] @ system.D[:used, 1:3])
+    return bank.linear.output(np.concatenate([[1.0], -theta])[None, :])
 
 
 def coloured(bank: FilterBank, theta: FloatArray, noise: Noise, stride: int) -> Coloured:
@@ -143,12 +146,11 @@ def coloured(bank: FilterBank, theta: FloatArray, noise: Noise, stride: int) -> 
         Samples per update.
     """
     system = residual_of(bank, theta)
-    std = np.array([noise.u_std, noise.y_std])
     poles = bank.poles**stride
     a = -np.atleast_1d(np.poly(poles))[1:] if len(poles) else np.zeros(1)
     p = len(a)
     q = p + 1 if len(poles) else len(system.A)
-    gamma = autocovariances(Linear(system.A, system.B * std, system.C, system.D * std), 2 * p + q, stride)[:, 0, 0]
+    gamma = autocovariances(system.input(np.diag([noise.u_std, noise.y_std])), 2 * p + q, stride)[:, 0, 0]
     A = np.concatenate([[1.0], -a])
     both = np.convolve(A, A[::-1])  # of A(q) A(1/q), lags -p ... p
     moving = np.array([both @ gamma[np.abs(j + np.arange(-p, p + 1))] for j in range(q + 1)])
@@ -164,8 +166,8 @@ def _spectra(system: Linear, stride: int, samples: int) -> FloatArray:
     remembered = np.log(FORGOTTEN) / np.log(slowest) if 0.0 < slowest < 1.0 else 1.0
     lags = int(min(max(64, remembered), max(samples // 2, 1)))
     columns = []
-    for i in range(system.B.shape[1]):
-        gamma = autocovariances(Linear(system.A, system.B[:, [i]], system.C, system.D[:, [i]]), lags, stride)[:, 0, 0]
+    for one in np.eye(system.B.shape[1]):
+        gamma = autocovariances(system.input(one[:, None]), lags, stride)[:, 0, 0]
         whole = np.zeros(samples)
         whole[: lags + 1] += gamma
         whole[samples - lags :] += gamma[:0:-1]
@@ -250,9 +252,9 @@ def misfit(model: Coloured, runs: Sequence[FloatArray]) -> float:
     from scipy.signal import freqz
 
     total = 0.0
-    numerator, denominator = np.concatenate([[1.0], model.b]), np.concatenate([[1.0], -model.a])
+    A, B = model.polynomials
     for v in runs:
         w = 2.0 * np.pi * np.arange(len(v) // 2 + 1)[1:-1] / len(v)
-        S = model.variance * np.abs(freqz(numerator, denominator, w)[1]) ** 2
+        S = model.variance * np.abs(freqz(B, A, w)[1]) ** 2
         total += float((np.log(S) + _periodogram(v)[1:-1] / S).sum())
     return total

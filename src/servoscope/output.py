@@ -8,7 +8,7 @@ from pathlib import Path
 
 from servoscope.errors import OutputError
 
-__all__ = ["atomic_write"]
+__all__ = ["atomic_write", "make_folder"]
 
 
 def atomic_write(path: str | Path, content: bytes) -> None:
@@ -46,6 +46,20 @@ def atomic_write(path: str | Path, content: bytes) -> None:
     ) as error:  # the last two: a loop of links, a zero byte in the name
         reason = getattr(error, "strerror", None) or error
         raise OutputError(f"{path!s}: cannot be written ({reason})".replace("\0", "?")) from None
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those that it stands in, where there is none yet.
+
+    Raises
+    ------
+    OutputError
+        If that is not possible.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made a folder ({error.strerror or error})") from None
 
 
 def _replace(target: Path, content: bytes) -> None:

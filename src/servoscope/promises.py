@@ -9,7 +9,7 @@ import numpy as np
 from servoscope.baseline import Promise
 from servoscope.detection import SECONDS_PER_YEAR, noncentrality, required_noncentrality, statistic, threshold
 from servoscope.inverse import cutoff_of
-from servoscope.linear import Linear, autocovariances
+from servoscope.linear import autocovariances
 from servoscope.loop import Loop
 from servoscope.pipeline import Estimates, Pipeline
 from servoscope.plants import FloatArray
@@ -72,8 +72,8 @@ def noise_bias(pipeline: Pipeline, found: Fit, estimates: Sequence[Estimates]) -
     last = [e.S[-1] for e in estimates if len(e.S) and e.updates[-1] > 0]
     if bank.has_instrument or found.noises is None or not last:
         return nothing, nothing
-    system = Linear(bank.system.A, bank.system.B[:, 2:3], bank.system.C[1 : 1 + n], bank.system.D[1 : 1 + n, 2:3])
-    S = found.noises.noise.y_std**2 * autocovariances(system, 0)[0]
+    of_y = bank.linear.input(np.eye(2, 1, -1)).output(np.eye(n, 1 + n, 1))
+    S = found.noises.noise.y_std**2 * autocovariances(of_y, 0)[0]
     R_phi = np.asarray(found.tuning.R / pipeline.memory * np.linalg.inv(found.tuning.P_d), dtype=np.float64)
     E = bank.E(loop.monitor.frequencies)
     H = np.abs(E @ found.tuning.theta)

@@ -74,7 +74,7 @@ def rehearse(expectation: Expectation, plant: Plant, noise: Noise, chosen: Seque
     test = watch(pipeline, plant, noise, tuning.scale, certain, budget) if certain else None
     e = pipeline.estimate(tuning, recording, test)
     whole = replace(expectation, noise=noise, course=Course(r, np.arange(samples), recording.restart))
-    expected = whole.path([plant], [0], tuning.theta)
+    expected = whole.path(tuning.theta, plant)
     ready = e.updates > pipeline.memory
     T2 = np.where(
         ready, statistic(e.theta, expected, np.where(ready[:, None, None], e.S, np.eye(len(tuning.theta)))), 0.0

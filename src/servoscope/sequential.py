@@ -11,12 +11,11 @@ import numpy as np
 from servoscope.cusum import LAGS, Watch, columns, whitening
 from servoscope.detection import SECONDS_PER_YEAR
 from servoscope.errors import LoopError, SimulationError
-from servoscope.inverse import closed_loop
-from servoscope.linear import Linear
+from servoscope.inverse import closed_loop, nominal_theta
 from servoscope.noise import Noise
 from servoscope.pipeline import Pipeline
 from servoscope.plants import FloatArray, Plant
-from servoscope.signatures import Expectation, colour_of, true_theta
+from servoscope.signatures import Expectation, colour_of
 
 FACTOR = 4.0  # in information from one size to the next: in between, a CUSUM is at most a fifth slower than the best
 FASTEST = 2000.0  # 1/s; a change with more information shows within a few samples anyway
@@ -119,8 +118,8 @@ class _Bench:
         self.expectation, self.plant = expectation, plant
         self.rate = pipeline.loop.sample_rate / pipeline.stride
         self.white = colour_of(pipeline, plant, noise)
-        self.theta, self.warm = true_theta(pipeline, plant), whitening(self.white)[3]
-        g, _ = expectation.regression([plant], [0])
+        self.theta, self.warm = nominal_theta(pipeline.loop, plant), whitening(self.white)[3]
+        g = expectation.regression(plant)
         self.phi = columns(self.white.whiten(g.phi[g.ok]))[self.warm :]
         self.healthy = self.white.whiten((g.eta - g.phi @ self.theta)[g.ok])
 
@@ -199,14 +198,10 @@ def watch(
         return None
     limits = np.array([member.limit(false_alarms_per_year / len(heard)) for member in heard])
     try:
-        loop = closed_loop(pipeline.loop, plant)
+        quiet = closed_loop(pipeline.loop, plant).input(np.eye(3, 1))
     except LoopError as error:
         raise SimulationError(str(error)) from None
-    bank, n = pipeline.bank, pipeline.bank.n
-    quiet = Linear(loop.A, loop.B[:, :1], loop.C, loop.D[:, :1])
-    system = bank.system
-    shadow = quiet.then(Linear(system.A, system.B[:, 1:3], system.C[: 1 + n], system.D[: 1 + n, 1:3]))
-    theta = true_theta(pipeline, plant)
+    shadow = quiet.then(pipeline.bank.linear)
     numerator, denominator, gain, warm = whitening(colour_of(pipeline, plant, noise))
     rows = np.concatenate([[1.0], 1.0 / scale])[:, None]
     return Watch(
@@ -215,7 +210,7 @@ def watch(
         C=np.ascontiguousarray(rows * shadow.C),
         D=np.ascontiguousarray(rows * shadow.D),
         X0=shadow.steady,
-        theta=theta * scale,
+        theta=nominal_theta(pipeline.loop, plant) * scale,
         numerator=numerator,
         denominator=denominator,
         gain=gain,

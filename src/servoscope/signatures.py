@@ -8,7 +8,6 @@ moments. So the biases of the regression are in the expectation, and cancel from
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -26,7 +25,6 @@ from servoscope.recording import Recording
 from servoscope.simulation import response
 
 BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 
 LONGEST_FILL = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
 
@@ -56,7 +54,7 @@ def course(recording: Recording) -> Course:
 
 
 def noise_system(pipeline: Pipeline, plant: Plant) -> Linear:
-    """Return [n_u, n_y] -> [eta, phi, z] through the closed loop with a plant.
+    """Return [n_u, n_y] -> [eta, phi] through the closed loop with a plant.
 
     Raises
     ------
@@ -64,22 +62,18 @@ def noise_system(pipeline: Pipeline, plant: Plant) -> Linear:
         If the loop is unstable with the plant.
     """
     try:
-        loop = closed_loop(pipeline.loop, plant)
+        noisy = closed_loop(pipeline.loop, plant).input(np.eye(3, 2, -1))
     except LoopError as error:
         raise SimulationError(str(error)) from None
-    bank = pipeline.bank.system
-    C, D = loop.C.copy(), loop.D.copy()
     if pipeline.stage_one is not None:
-        C[0], D[0] = 0.0, 0.0  # u_a is simulated from r: the noise does not reach eta
-    noisy = Linear(loop.A, loop.B[:, 1:], C, D[:, 1:])
-    return noisy.then(Linear(bank.A, bank.B[:, 1:3], bank.C, bank.D[:, 1:3]))
+        noisy = noisy.output(np.diag([0.0, 1.0]))  # u_a is simulated from r: the noise does not reach eta
+    return noisy.then(pipeline.bank.linear)
 
 
 def residual_system(pipeline: Pipeline, plant: Plant) -> Linear:
     """Return [n_u, n_y] -> v = eta - phi' theta through the closed loop, with the plant's own coefficients."""
-    system, n = noise_system(pipeline, plant), pipeline.bank.n
-    row = np.concatenate([[1.0], -true_theta(pipeline, plant)])[None, :]
-    return Linear(system.A, system.B, row @ system.C[: 1 + n], row @ system.D[: 1 + n])
+    row = np.concatenate([[1.0], -nominal_theta(pipeline.loop, plant)])[None, :]
+    return noise_system(pipeline, plant).output(row)
 
 
 def colour_of(pipeline: Pipeline, plant: Plant, noise: Noise) -> Coloured:
@@ -88,9 +82,9 @@ def colour_of(pipeline: Pipeline, plant: Plant, noise: Noise) -> Coloured:
     The colour is that of the filters; the power is exact: between samples the output that answers to the noise does
     not run in straight lines either, which takes a few per cent from it.
     """
-    model = coloured(pipeline.bank, true_theta(pipeline, plant), noise, pipeline.stride)
-    system, std = residual_system(pipeline, plant), np.array([noise.u_std, noise.y_std])
-    power = autocovariances(Linear(system.A, system.B * std, system.C, system.D * std), 0)[0, 0, 0]
+    model = coloured(pipeline.bank, nominal_theta(pipeline.loop, plant), noise, pipeline.stride)
+    system = residual_system(pipeline, plant).input(np.diag([noise.u_std, noise.y_std]))
+    power = autocovariances(system, 0)[0, 0, 0]
     return model.times(float(power) / float(model.gamma[0]))
 
 
@@ -99,10 +93,9 @@ def noise_moments(pipeline: Pipeline, plant: Plant, noise: Noise) -> Moments:
     n = pipeline.bank.n
     if pipeline.bank.has_instrument or not (noise.u_std or noise.y_std):
         return Moments(np.zeros(n), np.zeros((n, n)))
-    system = noise_system(pipeline, plant)
-    std = np.array([noise.u_std, noise.y_std])
-    (covariance,) = autocovariances(Linear(system.A, system.B * std, system.C, system.D * std), 0)
-    return Moments(covariance[1 : 1 + n, 0].copy(), covariance[1 : 1 + n, 1 : 1 + n].copy())
+    system = noise_system(pipeline, plant).input(np.diag([noise.u_std, noise.y_std]))
+    (covariance,) = autocovariances(system, 0)
+    return Moments(covariance[1:, 0].copy(), covariance[1:, 1:].copy())
 
 
 @dataclass(frozen=True)
@@ -135,15 +128,17 @@ class Expectation:
             self._moments[key] = noise_moments(self.pipeline, plant, self.noise)
         return self._moments[key]
 
-    def regression(self, plants: Sequence[Plant], onsets: Sequence[int]) -> tuple[Regression, IntArray]:
-        """Return the noise-free regression of the loop with plants that follow each other, and which of them holds.
+    def regression(self, plant: Plant, ill: Plant | None = None, since: int = 0) -> Regression:
+        """Return the noise-free regression of the loop with a plant that may turn ill.
 
         Parameters
         ----------
-        plants
-            Plants that follow each other.
-        onsets
-            Sample of the recording from which each holds; the first is 0.
+        plant
+            The plant, up to then.
+        ill
+            What it turns into; None: it stays as it is.
+        since
+            Sample of the recording from which it is ill; 0: it has always been.
 
         Raises
         ------
@@ -151,19 +146,21 @@ class Expectation:
             If the loop is unstable with one of the plants.
         """
         r, kept, restart = self.course
+        plants, onsets = in_turn(plant, ill, since)
         u, y = response(self.pipeline.loop, r, plants=plants, switch=[int(kept[k]) for k in onsets])
-        which = np.searchsorted(np.asarray(onsets), np.arange(len(kept)), side="right") - 1
-        return self.pipeline.regression(r[kept], u[kept], y[kept], restart), which
+        return self.pipeline.regression(r[kept], u[kept], y[kept], restart)
 
-    def path(self, plants: Sequence[Plant], onsets: Sequence[int], start: FloatArray) -> FloatArray:
+    def path(self, start: FloatArray, plant: Plant, ill: Plant | None = None, since: int = 0) -> FloatArray:
         """Return the mean of theta_hat at every evaluation, shape (K, n), from `start` (n,) before the first sample.
 
         The other arguments and errors are those of `regression`.
         """
         from servoscope.propagation import mean_path
 
-        g, which = self.regression(plants, onsets)
-        moments = [self.moments(plant) for plant in plants]
+        g = self.regression(plant, ill, since)
+        plants, onsets = in_turn(plant, ill, since)
+        which = np.searchsorted(np.asarray(onsets), np.arange(len(g.ok)), side="right") - 1
+        moments = [self.moments(each) for each in plants]
         return mean_path(
             g.eta,
             g.phi,
@@ -194,7 +191,7 @@ class Expectation:
         `model_theta` is what `plant` gives under the baseline's own references; what it leaves unexplained of the
         baseline's theta is kept as a constant difference.
         """
-        return self.path([plant], [0], model_theta) + (self.tuning.theta - model_theta)
+        return self.path(model_theta, plant) + (self.tuning.theta - model_theta)
 
     def batch(self, plant: Plant) -> FloatArray:
         """Return what least squares over the whole reference converges to, shape (n,)."""
@@ -202,7 +199,7 @@ class Expectation:
 
     def normal(self, plant: Plant) -> tuple[FloatArray, FloatArray]:
         """Return the mean normal equations of least squares over the reference, shapes (n, n) and (n,)."""
-        g, _ = self.regression([plant], [0])
+        g = self.regression(plant)
         phi, z, eta = g.phi[g.ok], g.z[g.ok], g.eta[g.ok]
         c, S = self.moments(plant)
         return z.T @ phi + len(eta) * S, z.T @ eta + len(eta) * c
@@ -213,13 +210,15 @@ class Expectation:
         `ok` (N,) are the usable samples of the measured loop, where they are others. The mean is exact: with theta
         fixed, v is linear in u and y, and the noise has none.
         """
-        g, _ = self.regression([plant], [0])
+        g = self.regression(plant)
         return (g.eta - g.phi @ theta)[g.ok if ok is None else ok]
 
 
-def true_theta(pipeline: Pipeline, plant: Plant) -> FloatArray:
-    """Return the coefficients of a plant in the pipeline's own structure, shape (n,)."""
-    return nominal_theta(pipeline.loop.model_copy(update={"plant": plant}))
+def in_turn(plant: Plant, ill: Plant | None, since: int) -> tuple[list[Plant], list[int]]:
+    """Return the plants that follow each other when one turns ill, and the sample from which each holds."""
+    if ill is None:
+        return [plant], [0]
+    return ([plant, ill], [0, since]) if since else ([ill], [0])
 
 
 def solve_scaled(A: FloatArray, b: FloatArray) -> FloatArray:

@@ -98,25 +98,14 @@ def fit(pipeline: Pipeline, regressions: Sequence[Regression]) -> Fit:
     pipeline
         Gives the memory and, for error messages, the names of the coefficients.
     regressions
-        One per recording.
+        One per recording, each with many more usable samples than coefficients.
 
     Raises
     ------
     NotEnoughError
-        If too few samples are usable or a column is not excited at all.
+        If a column is not excited at all, or not told from the others.
     """
     names = pipeline.bank.names
-    n = len(names)
-    usable = sum(int(g.ok.sum()) for g in regressions)
-    if usable < 20 * n:
-        raise NotEnoughError(
-            f"only {usable} usable samples when filters have settled and rest is left out: record longer, or lower "
-            "rest_speed"
-        )
-    if min(int(g.ok.sum()) for g in regressions) < 20 * n:
-        raise NotEnoughError(
-            f"one of the recordings has fewer than {20 * n} usable samples: leave it out, or record longer"
-        )
     phi = np.vstack([g.phi[g.ok] for g in regressions])
     z = np.vstack([g.z[g.ok] for g in regressions])
     eta = np.concatenate([g.eta[g.ok] for g in regressions])

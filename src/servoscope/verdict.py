@@ -22,9 +22,9 @@ from servoscope.diagnosis import (
 )
 from servoscope.doubts import blind_to, doubts, seen_by
 from servoscope.examination import Compared, Examination, trace_of
+from servoscope.inverse import nominal_theta
 from servoscope.isolation import isolate
 from servoscope.sentence import summary
-from servoscope.signatures import true_theta
 
 SURE = 0.95  # probability from which a fault is named
 
@@ -119,8 +119,9 @@ def unbiased(x: Examination, candidates: tuple[Candidate, ...], since: Onset | N
     if x.expectation is None or not len(x.t) or not x.ready[at] or x.baseline.loop.monitor.structure != "svf":
         return Compared(e.theta, x.covariance, x.expected, C, x.statistic)
     plant, start = x.baseline.plant, np.array(x.baseline.model_theta)
-    healthy = true_theta(x.pipeline, plant)
-    bias = shift = x.expectation.path([plant], [0], start) - healthy
+    healthy = nominal_theta(x.pipeline.loop, plant)
+    # the healthy path: what was expected, without what the model leaves unexplained
+    bias = shift = x.expected - (x.tuning.theta - start) - healthy
     S, gain = x.growth * e.S, np.eye(x.pipeline.bank.n)
     if since is not None:
         likely = next((c for c in candidates if c.name != UNKNOWN), None)
@@ -128,10 +129,9 @@ def unbiased(x: Examination, candidates: tuple[Candidate, ...], since: Onset | N
         until = x.expectation.until(int(e.index[at]) + 1)
         found = explain(until, plant, start, e.theta[at], S[at] + C, since.sample, guess)
         gain, ill = found.gain, found.plant
-        plants, onsets = ([plant, ill], [0, since.sample]) if since.sample else ([ill], [0])
         late = e.index >= since.sample
-        true = np.where(late[:, None], true_theta(x.pipeline, ill), healthy)
-        bias = x.expectation.path(plants, onsets, start) - true
+        true = np.where(late[:, None], nominal_theta(x.pipeline.loop, ill), healthy)
+        bias = x.expectation.path(start, plant, ill, since.sample) - true
         if x.baseline.loudest is not None:
             spread = spread_of(x.pipeline, x.tuning, x.recording, x.expectation.noise, ill)
             S = np.where(late[:, None, None], spread, S)

@@ -323,9 +323,10 @@ def reproduce(
     """Reproduce the source paper: its figures, and every claim of it beside the measured number."""
     from servoscope.cli import terminal
     from servoscope.cli.progress import progress
+    from servoscope.output import make_folder
     from servoscope.paper import measures, reproduction
 
-    reproduction.prepare(output)
+    make_folder(output)
     numbers = range(1, seeds + 1)
     with progress(len(measures.jobs(numbers)) + reproduction.DRAWINGS + 1, 1) as steps:
         steps.begin("measuring")

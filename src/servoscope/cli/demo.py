@@ -14,8 +14,7 @@ import typer
 from rich.text import Text
 
 from servoscope.cli.progress import on_compiling
-from servoscope.errors import OutputError
-from servoscope.output import atomic_write
+from servoscope.output import atomic_write, make_folder
 
 __all__ = ["Step", "prepare", "show", "steps"]
 
@@ -56,10 +55,7 @@ def prepare(folder: Path) -> None:
     OutputError
         If that is not possible.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be made a folder ({error.strerror or error})") from None
+    make_folder(folder)
     rig = files("servoscope").joinpath("examples", "reference-rig.toml").read_bytes()
     atomic_write(folder / "loop.toml", rig)
 

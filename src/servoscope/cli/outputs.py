@@ -9,6 +9,7 @@ from pathlib import Path
 import typer
 
 from servoscope.errors import OutputError
+from servoscope.output import make_folder
 
 __all__ = ["Outputs", "check_output", "stem_of"]
 
@@ -111,10 +112,7 @@ class Outputs:
             free = f"{name}-{number}"
         self._used.add(free.casefold())
         if self._in_folder:
-            try:
-                self.wanted.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise OutputError(f"{self.wanted}: cannot be made a folder ({error.strerror or error})") from None
+            make_folder(self.wanted)
             found = self.wanted / f"{free}{self.suffix}"
         else:
             found = self.wanted.with_name(free + self.wanted.suffix)

@@ -184,7 +184,7 @@ def nominal_signatures(loop: Loop) -> dict[str, tuple[FloatArray, ComplexArray]]
         low, high = np.log(REACH[fault.parameter])
         sizes = np.exp(np.linspace(low, high, GRID))
         ill = [loop.plant.with_ratios({fault.parameter: float(size)}) for size in sizes]
-        theta = np.array([nominal_theta(loop.model_copy(update={"plant": plant})) for plant in ill])
+        theta = np.array([nominal_theta(loop, plant) for plant in ill])
         found[fault.name] = (sizes, (theta - healthy) @ E.T)
     return found
 

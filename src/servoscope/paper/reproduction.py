@@ -11,8 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from servoscope.errors import OutputError
-from servoscope.output import atomic_write
+from servoscope.output import atomic_write, make_folder
 from servoscope.paper import claims, measures
 from servoscope.paper.claims import Claim
 from servoscope.paper.measures import Job
@@ -140,7 +139,7 @@ def write(found: Reproduction, folder: Path, told: Told = lambda _: None) -> lis
     """
     from servoscope.report.canvas import save
 
-    prepare(folder)
+    make_folder(folder)
     written = []
     for name, draw in drawings(found):
         figure = draw()
@@ -152,17 +151,3 @@ def write(found: Reproduction, folder: Path, told: Told = lambda _: None) -> lis
     atomic_write(folder / "claims.json", content.encode())
     atomic_write(folder / "claims.md", claims.markdown(found.claims, len(found.seeds)).encode())
     return [*written, folder / "claims.json", folder / "claims.md"]
-
-
-def prepare(folder: Path) -> None:
-    """Make the folder.
-
-    Raises
-    ------
-    OutputError
-        If that is not possible.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be made a folder ({error.strerror or error})") from None

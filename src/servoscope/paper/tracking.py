@@ -47,7 +47,7 @@ def targets(method: str) -> tuple[ComplexArray, ComplexArray]:
     loop = loop_of(method)
     plant = loop.plant.with_ratios({TRACKED.parameter: TRACKED.ratio})
     E = Pipeline.of(rig(structure=loop.monitor.structure)).bank.E(FREQUENCIES)
-    return E @ nominal_theta(loop), E @ nominal_theta(loop.model_copy(update={"plant": plant}))
+    return E @ nominal_theta(loop), E @ nominal_theta(loop, plant)
 
 
 def measure(seed: int) -> dict[str, float]:

@@ -73,7 +73,7 @@ def ratio(flat: dict[str, float], conditions: Conditions, name: str, one: str = 
 def _rise(made: ResidualGenerator, faulty: Course) -> float:
     loop = made.pipeline.loop
     ill = loop.plant.with_ratios({TRACKED.parameter: TRACKED.ratio})
-    turn = made.pipeline.bank.E(FREQUENCIES[:1]) @ nominal_theta(loop.model_copy(update={"plant": ill}))
+    turn = made.pipeline.bank.E(FREQUENCIES[:1]) @ nominal_theta(loop, ill)
     level = complex(faulty.between(20.0, FAULT_AT).H[:, 0].mean())
     return metrics.rise(faulty.t, faulty.H[:, 0], FAULT_AT, level, level * complex(turn[0] / made.nominal[0]))
 
