@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -112,7 +112,11 @@ class Plant(BaseModel, abc.ABC):
         """Names of the parameters that `with_ratios` takes."""
         return tuple(fault.parameter for fault in self.faults)
 
-    @abc.abstractmethod
+    @property
+    def causes(self) -> Mapping[str, str]:
+        """Further names that `scaled` takes, changes that are no fault of the list, each with what it would mean."""
+        return {}
+
     def with_ratios(self, ratios: Mapping[str, float]) -> Self:
         """Return the same plant with some parameters multiplied, ``{"C_ie": 1.2}``.
 
@@ -120,6 +124,20 @@ class Plant(BaseModel, abc.ABC):
         ------
         LoopError
             If a parameter is not one of `parameters`, a ratio is not positive, or no nominal value is known.
+        """
+        self._check_ratios(ratios)
+        return self.scaled({name: float(ratio) for name, ratio in ratios.items()})
+
+    @abc.abstractmethod
+    def scaled(self, factors: Mapping[str, Any]) -> Self:
+        """Return the same plant with `parameters` and `causes` multiplied by factors that nobody checks.
+
+        They may be complex, as complex-step derivatives of `state_space` need them (Squire and Trapp, 1998).
+
+        Raises
+        ------
+        LoopError
+            If no nominal value is known.
         """
 
     @abc.abstractmethod

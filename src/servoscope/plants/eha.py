@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,8 @@ FAULTS = (
     Fault("friction", "b_p", (0.2, 100.0), "friction"),
     Fault("contamination", "beta", (0.001, 30.0), "oil contamination (bulk modulus)"),
 )
+
+CAUSES = {"m_p": "another mass", "k_p": "another stiffness of the load", "A_p": "another piston area"}
 
 
 class EHA(Plant):
@@ -110,7 +112,8 @@ class EHA(Plant):
     @property
     def flow_gain(self) -> float:
         """K_q = K_m C_d W sqrt(p_s/rho) [m^3/(s A)]."""
-        return float(self.K_m * self.C_d * self.W * np.sqrt(self.p_s / self.rho))
+        flow_gain: float = self.K_m * self.C_d * self.W * np.sqrt(self.p_s / self.rho)  # complex where `scaled` was
+        return flow_gain
 
     @property
     def capacity(self) -> float:
@@ -128,10 +131,14 @@ class EHA(Plant):
         ]
         return np.array(coefficients) / (self.A_p * self.flow_gain)
 
-    def with_ratios(self, ratios: Mapping[str, float]) -> Self:
-        """Return the same plant with p_s, C_ie, b_p, beta multiplied by the ratios."""
-        self._check_ratios(ratios)
-        return self.model_copy(update={name: getattr(self, name) * float(ratio) for name, ratio in ratios.items()})
+    @property
+    def causes(self) -> Mapping[str, str]:
+        """Mass, spring and piston: what else may change."""
+        return CAUSES
+
+    def scaled(self, factors: Mapping[str, Any]) -> Self:
+        """Return the same plant with any of the twelve parameters multiplied."""
+        return self.model_copy(update={name: getattr(self, name) * factor for name, factor in factors.items()})
 
     def state_space(self) -> StateSpace:
         """Return A (3, 3), B (3, 1), C (1, 3), states y [m], y' [m/s], p_L [Pa]; integrates if k_p = 0.

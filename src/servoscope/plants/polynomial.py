@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -126,14 +126,13 @@ class Polynomial(Plant):
         nominal = self._nominal()
         return np.array([nominal[name] for name in self.names], dtype=np.float64)
 
-    def with_ratios(self, ratios: Mapping[str, float]) -> Self:
+    def scaled(self, factors: Mapping[str, Any]) -> Self:
         """Return the same plant with coefficients multiplied; ``input_gain`` multiplies all of them.
 
-        A ratio of the input gain above 1 means that the same motion asks for more u.
+        A factor of the input gain above 1 means that the same motion asks for more u.
         """
-        self._check_ratios(ratios)
-        common = ratios.get("input_gain", 1.0)
-        scaled = {name: value * common * ratios.get(name, 1.0) for name, value in self._nominal().items()}
+        common = factors.get("input_gain", 1.0)
+        scaled = {name: value * common * factors.get(name, 1.0) for name, value in self._nominal().items()}
         return self.model_copy(update={"coefficients": scaled})
 
     def state_space(self) -> StateSpace:
@@ -147,8 +146,7 @@ class Polynomial(Plant):
                 nominal["viscous_friction_forward"] + nominal["viscous_friction_backward"]
             )
         polynomial = [nominal.get(POWER_NAMES[power], 0.0) for power in range(self.order + 1)]
-        A = np.eye(self.order, k=1)
-        A[-1, :] = -np.array(polynomial[:-1]) / polynomial[-1]
-        B = np.zeros((self.order, 1))
-        B[-1, 0] = self.input_gain / polynomial[-1]
+        last = -np.array(polynomial[:-1]) / polynomial[-1]
+        A = np.vstack([np.eye(self.order, k=1)[:-1], last])
+        B = np.append(np.zeros(self.order - 1), self.input_gain / polynomial[-1])[:, None]
         return A, B, np.eye(1, self.order)

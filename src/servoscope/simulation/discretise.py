@@ -60,7 +60,7 @@ def discretise(
 
 @functools.lru_cache(maxsize=64)  # while signatures are drawn, the healthy plant comes back with every point
 def _discretise(a: Rows, b: Rows, c: Rows, sample_rate: float, hold: str, delay: float) -> Discrete:
-    A, B, C = (np.array(each, dtype=np.float64) for each in (a, b, c))
+    A, B, C = (np.array(each) for each in (a, b, c))
     T = 1.0 / sample_rate
     m, rest = split_delay(delay, sample_rate)
     Phi, level, slope = transition(A, B, (1.0 - rest) * T)
@@ -85,20 +85,21 @@ def transition(A: FloatArray, B: FloatArray, duration: float) -> tuple[FloatArra
     """Return exp(A t) (n, n) and the responses (n,) to a unit step and a unit ramp of the input over t [s].
 
     The matrix is balanced first: pressures beside displacements spread its entries over 13 decades, and the
-    exponential of the unbalanced one would lose half of its digits (Van Loan 1978 for the augmented form).
+    exponential of the unbalanced one would lose half of its digits (Van Loan 1978 for the augmented form). Complex
+    matrices of complex-step derivatives are taken as they are.
     """
     from scipy.linalg import expm, matrix_balance
 
     n = A.shape[0]
-    _, (scale, _) = matrix_balance(A, permute=False, separate=True)
-    block = np.zeros((n + 2, n + 2))
+    _, (scale, _) = matrix_balance(A.real, permute=False, separate=True)
+    block = np.zeros((n + 2, n + 2), dtype=np.result_type(A, B))
     block[:n, :n] = A * scale / scale[:, None]
     unit = max(float(np.max(np.abs(B[:, 0] / scale))), np.finfo(np.float64).tiny)
     block[:n, n] = B[:, 0] / scale / unit
     # In units of the duration the chain of integrators is of order one whatever the sample rate.
     block[:n] *= duration
     block[n, n + 1] = 1.0
-    result = np.asarray(expm(block), dtype=np.float64)
+    result = np.asarray(expm(block))
     Phi = result[:n, :n] * scale[:, None] / scale
     level, slope = (result[:n, n + i] * scale * unit for i in (0, 1))
     return Phi, level, slope * duration

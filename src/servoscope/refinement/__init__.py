@@ -1,0 +1,5 @@
+"""After an alarm: the refit of the seconds around the onset by maximum likelihood on the exact sampled plant."""
+
+from servoscope.refinement.refining import Hypothesis, Refined, refine
+
+__all__ = ["Hypothesis", "Refined", "refine"]

@@ -1,0 +1,101 @@
+"""Whether a hypothesis explains everything: what is left of the innovations against what a wrong model would leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope.plants import FloatArray
+from servoscope.refinement.kernels import BoolArray
+from servoscope.refinement.predictor import Predictor
+from servoscope.refinement.window import Growth, Window
+
+LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
+MISFIT = 1e-3  # probability with which a true hypothesis may fit worse than the limit
+SYSTEMATIC = 2e-3  # share of a change that nominal parameters may be off by
+RANK = 1e-7  # of a column's length, below which it says nothing new
+
+
+@dataclass(frozen=True)
+class Goodness:
+    """A test of what is left.
+
+    Parameters
+    ----------
+    statistic
+        Sum of squares that the columns of `traces` take out, chi-square with `dof` degrees of freedom if nothing but
+        noise is left.
+    dof
+        Number of columns that say something of their own.
+    limit
+        What a true hypothesis passes in one of a thousand cases.
+    """
+
+    statistic: float
+    dof: int
+    limit: float
+
+
+def traces(window: Window, predictor: Predictor, growth: Growth, where: BoolArray) -> FloatArray:
+    """Return what wrong models leave in the innovations, shape (N, q).
+
+    Missed dynamics: u and y of the last samples, as additions to y; backlash: the sign of y', added to y; Coulomb
+    friction: the same, added to u; offsets of both. `where` (N,) are the samples from which they count.
+    """
+    u, y = window.u, window.y
+    moving = np.sign(_speed(y))
+    nothing = np.zeros(window.samples)
+    to_y = [_later(x, lag) for x in (u, y) for lag in range(1, LAGS + 1)] + [_later(moving, 1), np.ones(window.samples)]
+    to_u = [_later(moving, 1), np.ones(window.samples)]
+    columns = [window.disturbed(predictor, growth, nothing, column * where) for column in to_y]
+    columns += [window.disturbed(predictor, growth, column * where, nothing) for column in to_u]
+    return np.array(columns).T
+
+
+def goodness(Z: FloatArray, jacobian: FloatArray, residual: FloatArray, louder: float, shift: float) -> Goodness:
+    """Test whether columns Z (N, q) explain part of a residual that the unknowns of the fit do not.
+
+    Score test (Rao, 1948): both are projected off the Jacobian (N + m, k) first.
+
+    Parameters
+    ----------
+    Z, jacobian, residual
+        Columns, and the least-squares problem at its end; the last rows of the latter are the prior's.
+    louder
+        Variance of the innovations.
+    shift
+        Root of the sum of squares that the change adds to healthy innovations: a share of it may be left.
+    """
+    from scipy import special
+
+    Z = np.vstack([Z, np.zeros((len(residual) - len(Z), Z.shape[1]))])
+    Q = _basis(jacobian)
+    Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
+    own = _basis(Z - Q @ (Q.T @ Z))
+    dof = own.shape[1]
+    left = residual - Q @ (Q.T @ residual)
+    statistic = float(((own.T @ left) ** 2).sum()) / louder
+    limit = float(special.chdtri(max(dof, 1), MISFIT)) + (SYSTEMATIC * shift) ** 2 / louder
+    return Goodness(statistic, dof, limit)
+
+
+def _basis(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of columns, those left out that say nothing new."""
+    from scipy.linalg import qr
+
+    if not columns.shape[1]:
+        return columns
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    keep = size > RANK
+    Q, R, _ = qr(columns[:, keep] / size[keep], mode="economic", pivoting=True)
+    return np.asarray(Q[:, np.abs(np.diag(R)) > RANK])
+
+
+def _later(x: FloatArray, samples: int) -> FloatArray:
+    return np.concatenate([np.full(samples, x[0]), x[:-samples]])
+
+
+def _speed(y: FloatArray, over: int = 5) -> FloatArray:
+    """Return the difference over a few samples, so that noise does not decide its sign as long as there is motion."""
+    return np.concatenate([np.zeros(over), y[over:] - y[:-over]])

@@ -1,0 +1,238 @@
+"""The compiled loops of the exact predictor: Kalman gains after a restart, and innovations through changing plants."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.compiled import kernel
+
+Array = npt.NDArray[Any]  # float64, or complex128 for complex-step derivatives
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+SETTLED = 1e-8  # relative change of the gain from which it stays as it is
+
+
+@kernel
+def gains(A: Array, Q: Array, c: Array, r: float, P: Array, K: Array, S: Array) -> None:
+    """Fill Kalman gains K (L, n) and innovation variances S (L,) for the samples after a restart.
+
+    ``S = c P c' + r,  K = A P c'/S,  P <- A P A' + Q - K S K'`` from the covariance P (n, n) of the first state, which
+    is overwritten (Anderson and Moore, 1979, chapter 4). The last gain stands for all later samples.
+    """
+    n, L = len(c), len(S)
+    zero = 0.0 * A[0, 0]
+    Pc, AP = np.zeros_like(c), np.zeros_like(A)
+    for j in range(L):
+        s = zero + r
+        for i in range(n):
+            total = zero
+            for k in range(n):
+                total += P[i, k] * c[k]
+            Pc[i] = total
+            s += c[i] * total
+        S[j] = s
+        moved = 0.0
+        for i in range(n):
+            total = zero
+            for k in range(n):
+                total += A[i, k] * Pc[k]
+            K[j, i] = total / s
+            if j > 0:
+                moved = max(moved, abs(K[j, i] - K[j - 1, i]) / (abs(K[j, i]) + 1e-300))
+        if j > n and moved < SETTLED:
+            for later in range(j + 1, L):
+                S[later] = s
+                for i in range(n):
+                    K[later, i] = K[j, i]
+            return
+        for i in range(n):
+            for k in range(n):
+                total = zero
+                for q in range(n):
+                    total += A[i, q] * P[q, k]
+                AP[i, k] = total
+        for i in range(n):
+            for k in range(n):
+                total = Q[i, k] - K[j, i] * s * K[j, k]
+                for q in range(n):
+                    total += AP[i, q] * A[k, q]
+                P[i, k] = total
+
+
+@kernel
+def innovations(
+    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, edges: IntArray,
+    u: Array, y: Array, restart: BoolArray,
+) -> Array:  # fmt: skip
+    """Return e(k) = y(k) - y_hat(k | k-1) in standard deviations, shape (N,), through plants that follow each other.
+
+    Plant p holds from sample edges[p] on; A (p, n, n), b, late and c (p, n), gains K (p, L, n) and variances S (p, L)
+    are its own, the state goes on. All are multiplied by one factor, the geometric mean of the standard deviations
+    relative to the first plant's, so that the sum of squares ranks hypotheses as the likelihood does whose noise is
+    known but for a common factor.
+    """
+    N, n, L = len(y), A.shape[1], S.shape[1]
+    zero = 0.0 * A[0, 0, 0]
+    e = np.empty(N, A.dtype)
+    x, following = np.zeros(n, A.dtype), np.zeros(n, A.dtype)
+    p, j, volume, last = 0, L - 1, zero, 0.0 * u[0]
+    for k in range(N):
+        while p + 1 < len(A) and edges[p + 1] <= k:
+            p += 1
+        if restart[k]:
+            j, last = 0, u[k]
+            reach = zero
+            for i in range(n):
+                reach += c[p, i] * c[p, i]
+            for i in range(n):  # what y says at once; the first covariance knows that the rest is open
+                x[i] = c[p, i] * y[k] / reach
+        predicted = zero
+        for i in range(n):
+            predicted += c[p, i] * x[i]
+        error = y[k] - predicted
+        e[k] = error / np.sqrt(S[p, j])
+        volume += np.log(S[p, j] / S[0, j])
+        for i in range(n):
+            total = K[p, j, i] * error + b[p, i] * u[k] + late[p, i] * last
+            for q in range(n):
+                total += A[p, i, q] * x[q]
+            following[i] = total
+        for i in range(n):
+            x[i] = following[i]
+        last = u[k]
+        if j < L - 1:
+            j += 1
+    scaled: Array = e * np.exp(0.5 * volume / N)
+    return scaled
+
+
+@kernel
+def sweep(
+    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, step: float,
+    onsets: IntArray, overs: IntArray, settle: int, u: Array, y: Array, restart: BoolArray, Q: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Sum up innovations for changes that come at many times, and for their derivatives by the sizes.
+
+    Before a change they are those of the healthy plant, and once the predictor has forgotten when it came, those of the
+    changed one: only what lies in between is computed for each.
+
+    Parameters
+    ----------
+    A, b, late, c, K, S
+        As for `innovations`, with two more axes in front: variants v (0: as it is; i: size i moved by `step`), and
+        plants (0 healthy, the pieces of a drift, last the changed one).
+    onsets, overs
+        First changed sample and duration of each change, shapes (M,).
+    settle
+        Samples after which the predictor has forgotten.
+    Q
+        Orthonormal columns, shape (N, m).
+
+    Returns
+    -------
+    sums
+        Shape (M, v + m, v + m): products of all pairs of the columns [e, its derivatives by the sizes, Q]; those of Q
+        with itself are not filled.
+    volume
+        Sum of log S relative to the healthy plant's, shape (M,).
+    """
+    V, P, n, L = A.shape[0], A.shape[1], A.shape[2], K.shape[2]
+    N, m, M = len(y), Q.shape[1], len(onsets)
+    W = V + m
+    states = np.zeros((N, V, n))
+    row = np.zeros(W)
+    x, following = np.zeros((V, n)), np.zeros(n)
+    before, after = np.zeros((N + 1, W, W)), np.zeros((N + 1, W, W))
+    volume_after = np.zeros(N + 1)
+    changed = np.zeros((N, V))
+    age = np.zeros(N, np.int64)
+    j = L - 1
+    for k in range(N):
+        if restart[k]:
+            j = 0
+        age[k] = j
+        j = min(j + 1, L - 1)
+    for final in range(2):  # the healthy plant all the way, and the changed one
+        p = (P - 1) * final
+        x[:] = 0.0
+        for k in range(N):
+            if not final:
+                states[k] = x
+            for v in range(V):
+                row[v] = _advance(A, b, late, c, K, S, v, p, age[k], k, u, y, restart, x, following)
+            if final:
+                changed[k] = row[:V]
+            else:
+                for v in range(1, V):
+                    row[v] = 0.0
+                row[V:] = Q[k]
+                before[k + 1] = before[k]
+                _add(before[k + 1], row, V)
+    for k in range(N - 1, -1, -1):
+        row[0] = changed[k, 0]
+        for v in range(1, V):
+            row[v] = (changed[k, v] - changed[k, 0]) / step
+        row[V:] = Q[k]
+        after[k] = after[k + 1]
+        _add(after[k], row, V)
+        volume_after[k] = volume_after[k + 1] + np.log(S[0, P - 1, age[k]] / S[0, 0, age[k]])
+    sums, volume = np.zeros((M, W, W)), np.zeros(M)
+    for i in range(M):
+        onset, over = onsets[i], overs[i]
+        stop = min(onset + over + settle, N)
+        total = before[onset] + after[stop]
+        volume[i] = volume_after[stop]
+        x[:] = states[min(onset, N - 1)]
+        for k in range(onset, stop):
+            p = P - 1
+            if k < onset + over:
+                p = 1 + (k - onset) * (P - 2) // over
+            for v in range(V):
+                row[v] = _advance(A, b, late, c, K, S, v, p, age[k], k, u, y, restart, x, following)
+            for v in range(1, V):
+                row[v] = (row[v] - row[0]) / step
+            row[V:] = Q[k]
+            _add(total, row, V)
+            volume[i] += np.log(S[0, p, age[k]] / S[0, 0, age[k]])
+        sums[i] = total
+    return sums, volume
+
+
+@kernel
+def _advance(
+    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, p: int, j: int, k: int,
+    u: Array, y: Array, restart: BoolArray, x: Array, following: Array,
+) -> float:  # fmt: skip
+    """Take variant v of plant p through sample k; returns its innovation in standard deviations."""
+    n = x.shape[1]
+    if restart[k]:
+        reach = 0.0
+        for i in range(n):
+            reach += c[v, p, i] ** 2
+        for i in range(n):
+            x[v, i] = c[v, p, i] * y[k] / reach
+    error = y[k]
+    for i in range(n):
+        error -= c[v, p, i] * x[v, i]
+    before = u[k] if restart[k] else u[max(k - 1, 0)]
+    for i in range(n):
+        total = K[v, p, j, i] * error + b[v, p, i] * u[k] + late[v, p, i] * before
+        for q in range(n):
+            total += A[v, p, i, q] * x[v, q]
+        following[i] = total
+    for i in range(n):
+        x[v, i] = following[i]
+    standardised: float = error / np.sqrt(S[v, p, j])
+    return standardised
+
+
+@kernel
+def _add(total: Array, row: Array, V: int) -> None:
+    """Add the products of a row's first V entries with all of it."""
+    for a in range(V):
+        for other in range(len(row)):
+            total[a, other] += row[a] * row[other]

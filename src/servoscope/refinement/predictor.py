@@ -1,0 +1,117 @@
+"""The exact one-step predictor of y from u as logged: one plant, sampled, with the gains of its Kalman filter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.loop import Loop
+from servoscope.noise import Noise
+from servoscope.plants import FloatArray, Plant
+from servoscope.refinement.kernels import Array, BoolArray, IntArray
+from servoscope.simulation.discretise import discretise
+
+LONGEST = 1024  # samples after a restart until the gain stays as it is
+LOUD = 3.0  # standard deviations of u that the unknown first state may come from
+DOUBLINGS = 8  # 2^8 samples before a restart that it may come from
+
+
+class Predictor(NamedTuple):
+    """One plant or several in a row; the arrays are those of `servoscope.refinement.kernels.innovations`."""
+
+    A: Array
+    b: Array
+    late: Array
+    c: Array
+    K: Array
+    S: Array
+
+    @classmethod
+    def of(cls, each: Sequence[Predictor]) -> Predictor:
+        """Put plants in a row."""
+        return cls(*(np.ascontiguousarray(np.concatenate(parts)) for parts in zip(*each, strict=True)))
+
+    def innovations(self, edges: IntArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Array:
+        """Return the innovations of a recording in standard deviations, shape (N,)."""
+        from servoscope.refinement.kernels import innovations
+
+        return innovations(*self, edges, u, y, restart)
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """Where predictors are made.
+
+    Parameters
+    ----------
+    loop
+        Sampling and delay; `Loop.hold` is ``zoh``, or u would know of the noise that it meets.
+    noise
+        Of the loop.
+    scale
+        Units of the plant's states, shape (n,), the same for all plants: pressures beside displacements would spoil
+        the covariance.
+    u_std
+        Standard deviation of u as recorded, which says how far the state may be from rest at a restart.
+    """
+
+    loop: Loop
+    noise: Noise
+    scale: FloatArray
+    u_std: float
+
+    @classmethod
+    def of(cls, loop: Loop, noise: Noise, u: FloatArray) -> Bench:
+        """Prepare for a recording's u (N,)."""
+        from scipy.linalg import matrix_balance
+
+        _, (scale, _) = matrix_balance(loop.plant.state_space()[0], permute=False, separate=True)
+        return cls(loop, noise, np.asarray(scale, dtype=np.float64), float(np.sqrt((u**2).mean())))
+
+    def predictor(self, plant: Plant, output_gain: float = 1.0, later_s: float = 0.0) -> Predictor:
+        """Return the predictor of a plant.
+
+        ``x(k+1) = A x + b (u + n_u),  y = c x + n_y`` with the input held between samples. u as logged is known, so
+        the loop being closed changes nothing, and no controller is needed (Ljung, 1999, section 13.4).
+
+        Parameters
+        ----------
+        plant
+            The plant; its parameters may be complex.
+        output_gain
+            Factor on y as measured.
+        later_s
+            Delay beyond the loop file's [s], below one sample together with its fraction.
+        """
+        from servoscope.refinement.kernels import gains
+
+        d = discretise(plant.state_space(), self.loop.sample_rate, hold="zoh", delay=self.rest_s + later_s)
+        A, b, late = d.A * self.scale / self.scale[:, None], d.b_now / self.scale, d.b_late / self.scale
+        c = d.c * self.scale * output_gain + 0.0 * b
+        if d.m:  # one sample later than the loop file says
+            b, late = late, b
+        Q = self.noise.u_std**2 * (np.outer(b, b) + np.outer(late, late))
+        K, S = np.zeros((LONGEST, len(b)), A.dtype), np.zeros(LONGEST, A.dtype)
+        gains(np.ascontiguousarray(A), Q, c, self.noise.y_std**2, self._open(A, b + late, c), K, S)
+        return Predictor(A[None], b[None], late[None], c[None], K[None], S[None])
+
+    @property
+    def rest_s(self) -> float:
+        """Part of the loop file's delay that is no whole sample [s]."""
+        samples = self.loop.delay * self.loop.sample_rate
+        return float(samples - np.floor(samples + 1e-9)) / self.loop.sample_rate
+
+    @property
+    def whole(self) -> int:
+        """Whole samples of the loop file's delay."""
+        return int(np.floor(self.loop.delay * self.loop.sample_rate + 1e-9))
+
+    def _open(self, A: Array, b: Array, c: Array) -> Array:
+        """Return the covariance of the first state: what a loud and white u would have left."""
+        P, power = (LOUD * self.u_std) ** 2 * np.outer(b, b), A
+        for _ in range(DOUBLINGS):
+            P, power = P + power @ P @ power.T, power @ power
+        return np.ascontiguousarray(P + (self.noise.y_std**2 / (c @ c) ** 2) * np.outer(c, c))

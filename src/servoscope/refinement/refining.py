@@ -1,0 +1,210 @@
+"""The refit of the seconds around an onset: every fault and every pair, when, how large, how probable, what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from servoscope.baseline import Baseline
+from servoscope.diagnosis import UNKNOWN
+from servoscope.plants import Fault, FloatArray
+from servoscope.recording import Recording
+from servoscope.refinement.goodness import Goodness, goodness, traces
+from servoscope.refinement.hypotheses import Evidence, Fitted, Scale, evidence, fit, start
+from servoscope.refinement.since import Since, since
+from servoscope.refinement.window import Growth, Window
+
+BEFORE_S = 60.0  # of healthy motion before the onset
+AFTER_S = 240.0  # of motion with the change
+MOST = 40_000  # samples in a window
+PAIRS = 0.02  # probability that two faults come at once, before anything is known
+IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth computing
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One explanation: its fit, its evidence and its probability."""
+
+    fitted: Fitted
+    evidence: Evidence
+    probability: float
+
+    @property
+    def name(self) -> str:
+        """Names of its faults, joined by plus signs."""
+        return " + ".join(fault.name for fault in self.fitted.faults)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """What the refit says.
+
+    Parameters
+    ----------
+    window
+        What it looked at.
+    hypotheses
+        Most probable first.
+    unknown
+        Probability that it is none of them.
+    goodness
+        Of the most probable one.
+    since
+        Onset, in samples of the window.
+    louder
+        Variance of the innovations under it, 1 for the baseline's noise.
+    """
+
+    window: Window
+    hypotheses: tuple[Hypothesis, ...]
+    unknown: float
+    goodness: Goodness
+    since: Since
+    louder: float
+
+    @property
+    def best(self) -> Hypothesis:
+        """The most probable hypothesis."""
+        return self.hypotheses[0]
+
+    @property
+    def name(self) -> str:
+        """What is most probable, ``unknown`` among it."""
+        return UNKNOWN if self.unknown > self.best.probability else self.best.name
+
+
+def window_of(baseline: Baseline, recording: Recording, onset: int, last: int) -> Window:
+    """Return the stretch around an onset, to the sample `last` at most."""
+    rate = recording.sample_rate
+    first = max(onset - min(round(BEFORE_S * rate), MOST // 4), 0)
+    end = min(last + 1, onset + round(AFTER_S * rate), first + MOST)
+    return Window.of(baseline, recording, first, end)
+
+
+def refine(
+    baseline: Baseline,
+    recording: Recording,
+    onset: int,
+    announced: int,
+    last: int,
+    progress: Callable[[], None] = lambda: None,
+) -> Refined:
+    """Fit every fault and every pair of faults to the seconds around an onset.
+
+    Maximum likelihood on the innovations of the exact sampled plant (Ljung, 1999, chapter 7), so that sizes scatter as
+    little as the Cramer-Rao bound allows; the healthy parameters are free as far as the baseline does not know them.
+
+    Parameters
+    ----------
+    baseline, recording
+        What is compared with what.
+    onset
+        Sample from which the search for the onset starts.
+    announced
+        Sample of the alarm: the onset is not later.
+    last
+        Last sample that counts.
+    progress
+        Called now and then.
+    """
+    search = _Search(window_of(baseline, recording, onset, last), baseline.plant.faults, onset, announced, progress)
+    return search.run()
+
+
+class _Search:
+    def __init__(
+        self, window: Window, faults: Sequence[Fault], onset: int, announced: int, progress: Callable[[], None]
+    ) -> None:
+        self.window, self.faults, self.progress = window, faults, progress
+        self.latest = min(announced - window.first, window.samples - 1)
+        self.growth = Growth(min(onset - window.first, self.latest))
+        self.louder = 1.0
+
+    def run(self) -> Refined:
+        nothing = np.zeros(self.window.nuisances)
+        singles = [
+            self._fit([fault], nothing, [np.array([start(self.window, fault, self.growth, nothing)])])
+            for fault in self.faults
+        ]
+        found = self._since(self._best(singles))
+        singles = [self._again(f, found.growth) for f in singles]
+        self.growth = found.growth
+        pairs = [
+            self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
+            for one, other in combinations(singles, 2)
+        ]
+        best = self._best([*singles, *pairs])
+        if len(best.faults) > 1:
+            found = self._since(best)
+        everything = [self._again(f, found.growth) for f in (*singles, *pairs)]
+        best = self._best(everything)
+        everything = [self._free(f) if self._within(f, best) else f for f in everything]
+        best = self._best(everything)
+        return self._weighed([self._own(f, best) for f in everything], found)
+
+    def _fit(self, faults: Sequence[Fault], d: FloatArray, starts: Sequence[FloatArray]) -> Fitted:
+        self.progress()
+        return fit(self.window, faults, self.growth, d, starts, free=False)
+
+    def _free(self, fitted: Fitted) -> Fitted:
+        self.progress()
+        return fit(self.window, fitted.faults, fitted.growth, fitted.d, [fitted.x], free=True)
+
+    def _again(self, fitted: Fitted, growth: Growth) -> Fitted:
+        if fitted.growth == growth:
+            return fitted
+        return fit(self.window, fitted.faults, growth, fitted.d, [fitted.x], free=False)
+
+    def _own(self, fitted: Fitted, best: Fitted) -> Fitted:
+        """Let another single fault that is within reach have its own onset."""
+        if fitted is best or len(fitted.names) > 1 or not self._within(fitted, best):
+            return fitted
+        growth = self._since(fitted).growth
+        return fitted if growth == fitted.growth else self._free(self._again(fitted, growth))
+
+    def _within(self, fitted: Fitted, best: Fitted) -> bool:
+        return IN_REACH * self.louder >= fitted.J - best.J
+
+    def _best(self, fitted: Sequence[Fitted]) -> Fitted:
+        """Return the closest hypothesis; a second fault must be worth its freedom."""
+        best = min(fitted, key=lambda f: f.J + 2.0 * np.log(1.0 / PAIRS) * (len(f.names) - 1) * self.louder)
+        self.louder = best.J / self.window.samples
+        return best
+
+    def _since(self, fitted: Fitted) -> Since:
+        freed = fitted if fitted.jacobian.shape[1] > len(fitted.x) or not self.window.nuisances else self._free(fitted)
+        return since(self.window, freed, self.latest, self.louder)
+
+    def _weighed(self, fitted: Sequence[Fitted], found: Since) -> Refined:
+        window, n = self.window, len(self.faults)
+        scales = {fault: Scale.of(window, fault, found.growth) for fault in self.faults}
+        several = PAIRS if n > 1 else 0.0
+        prior = {1: (1.0 - several) / n, 2: several / max(n * (n - 1) / 2, 1)}
+        best = self._best(fitted)
+        told = [
+            evidence(window, f, [scales[fault] for fault in f.faults], self.louder)
+            if self._within(f, best)
+            else Evidence(-0.5 * f.J / self.louder, f.intervals(self.louder))
+            for f in fitted
+        ]
+        logs = np.array([e.log + np.log(prior[len(f.names)]) for e, f in zip(told, fitted, strict=True)])
+        top = int(np.argmax(logs))
+        good = self._goodness(fitted[top])
+        logs = np.append(logs, logs[top] + 0.5 * (good.statistic - good.limit))
+        probability = np.exp(logs - logs.max())
+        probability /= probability.sum()
+        hypotheses = [Hypothesis(f, e, float(p)) for f, e, p in zip(fitted, told, probability[:-1], strict=True)]
+        hypotheses.sort(key=lambda h: -h.probability)
+        return Refined(window, tuple(hypotheses), float(probability[-1]), good, found, self.louder)
+
+    def _goodness(self, fitted: Fitted) -> Goodness:
+        window, growth = self.window, fitted.growth
+        predictor = window.predictor(fitted.d, fitted.names, fitted.x, growth)
+        healthy = window.predictor(fitted.d, (), np.zeros(0), growth)
+        where = np.arange(window.samples) >= growth.since
+        e = fitted.residual[: window.samples]
+        shift = float(np.linalg.norm(window.innovations(healthy, growth) - e))
+        return goodness(traces(window, predictor, growth, where), fitted.jacobian, fitted.residual, self.louder, shift)

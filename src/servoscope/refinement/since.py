@@ -1,0 +1,191 @@
+"""Since when, exactly: the posterior of onset and duration of a change, its sizes following."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope.plants import FloatArray
+from servoscope.refinement.hypotheses import Fitted
+from servoscope.refinement.kernels import IntArray
+from servoscope.refinement.predictor import Predictor
+from servoscope.refinement.window import Growth, Window
+
+STEP = 1e-3  # of the logarithm of a parameter, for derivatives
+FORGOTTEN = 1e-4  # share of its state from before a change that a predictor may still hold
+SHORTEST_S = 0.2  # of a drift that is not called a step
+STEPLIKE = 0.5  # probability of a step, before anything is known
+STEPS = 2000  # onsets of a step that are tried at first, at most
+RATIO = 1.5  # of one duration to the next, at first
+PER_DURATION = 6  # onsets that are tried within the duration of a drift
+CLOSER = 3  # times closer together they are in each further look
+LOOKS = 5
+NEGLIGIBLE = 1e-4  # of the largest posterior, that a further look may leave out
+INTERVAL = 0.025, 0.975
+
+
+@dataclass(frozen=True)
+class Since:
+    """Onset of a change within a window.
+
+    Parameters
+    ----------
+    growth
+        The most likely one.
+    low, high
+        95 % interval of the first changed sample, whatever the duration.
+    """
+
+    growth: Growth
+    low: int
+    high: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """Changes that were tried: onsets and durations [samples], their cost and their share of the prior, (M,)."""
+
+    onsets: IntArray
+    overs: IntArray
+    cost: FloatArray
+    prior: FloatArray
+
+
+def since(window: Window, found: Fitted, latest: int, louder: float) -> Since:
+    """Find when a change began, as a step or as a drift.
+
+    The likelihood of each onset and duration has the sizes and the healthy parameters at their best, by one step of
+    Gauss and Newton from where they are.
+
+    Parameters
+    ----------
+    window, found
+        The hypothesis, its sizes and healthy parameters free.
+    latest
+        Sample of the window by which it had begun.
+    louder
+        Variance of the innovations.
+    """
+    table = _Table(window, found, louder)
+    tried = [_steps(table, latest, louder)]
+    drifts = _drifts(table, latest, louder)
+    if drifts is not None:
+        tried.append(drifts)
+    onsets, overs, cost, prior = (np.concatenate([getattr(t, name) for t in tried]) for name in vars(tried[0]))
+    likelihood = np.exp(-0.5 * (cost - cost.min()) / louder)
+    order = np.argsort(onsets, kind="stable")
+    share = np.cumsum((likelihood * prior)[order])
+    low, high = (int(onsets[order][np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
+    best = int(np.argmax(likelihood * np.where(overs == 0, 1.0, NEGLIGIBLE**0.1)))
+    return Since(Growth(int(onsets[best]), int(overs[best])), low, high)
+
+
+def _steps(table: _Table, latest: int, louder: float) -> _Tried:
+    """Try steps everywhere, and at every sample where they are likely."""
+    apart = max(1, latest // STEPS)
+    onsets = np.arange(0, latest + 1, apart)
+    cost = table.costs(onsets, np.zeros_like(onsets))
+    if apart > 1:
+        beside = np.abs(np.diff(cost)).max(initial=0.0) if len(cost) > 1 else 0.0
+        near = onsets[cost <= cost.min() + max(_unlikely(louder), min(beside, 1e3 * louder))]
+        onsets = np.unique((near[:, None] + np.arange(1 - apart, apart)).ravel())
+        onsets = onsets[(onsets >= 0) & (onsets <= latest)]
+        cost = table.costs(onsets, np.zeros_like(onsets))
+    return _Tried(onsets, np.zeros_like(onsets), cost, np.full(len(onsets), STEPLIKE))
+
+
+def _drifts(table: _Table, latest: int, louder: float) -> _Tried | None:
+    """Try drifts of all durations, then ever closer to what is likely; None where the window is too short for one.
+
+    The middle of a drift is known better than its ends, so looks are laid out by middle and duration.
+    """
+    shortest, longest = SHORTEST_S * table.window.bench.loop.sample_rate, table.window.samples - 1
+    if longest <= 2.0 * shortest:
+        return None
+    count = int(np.ceil(np.log(longest / shortest) / np.log(RATIO))) + 1
+    durations = np.geomspace(shortest, longest, count)
+    ratio, share = float(durations[1] / durations[0]), 1.0 / PER_DURATION
+    points = np.concatenate([_row(d, latest, share) for d in durations])
+    for look in range(LOOKS):
+        onsets, overs = _rounded(points)
+        inside = (onsets >= 0) & (onsets <= latest) & (overs > 0) & (overs <= longest)
+        points, onsets, overs = points[inside], onsets[inside], overs[inside]
+        if not len(points):
+            return None
+        cost = table.costs(onsets, overs)
+        width = np.maximum(points[:, 1] * share, 1.0) * np.log(ratio)
+        prior = (1.0 - STEPLIKE) * width / np.log(longest / shortest)
+        tried = _Tried(onsets, overs, cost, prior)
+        worth = cost <= cost.min() + _unlikely(louder)
+        if look == LOOKS - 1 or worth.sum() > 40 or points[worth, 1].max() * share <= 1.0:
+            break
+        ranked = np.argsort(cost)[: max(int(worth.sum()), 12)]
+        points = np.unique(np.concatenate([_closer(points[i], ratio, share) for i in ranked]), axis=0)
+        ratio, share = ratio ** (1.0 / CLOSER), share / CLOSER
+    return tried
+
+
+def _row(duration: float, latest: int, share: float) -> FloatArray:
+    """Return drifts of one duration, as middle and duration [samples], shape (M, 2)."""
+    onsets = np.arange(0.0, latest + 1.0, max(duration * share, 1.0))
+    return np.column_stack([onsets + duration / 2.0, np.full(len(onsets), duration)])
+
+
+def _closer(point: FloatArray, ratio: float, share: float) -> FloatArray:
+    """Return drifts around one, in the cell that it stands for and those beside it; the grid is common to all."""
+    k = np.arange(-CLOSER + 1, CLOSER)
+    middles = point[0] + point[1] * share * k / CLOSER
+    durations = point[1] * ratio ** (k / CLOSER)
+    both = np.stack(np.meshgrid(middles, durations), axis=-1).reshape(-1, 2)
+    return np.asarray(np.round(both, 3))
+
+
+def _rounded(points: FloatArray) -> tuple[IntArray, IntArray]:
+    onsets = np.round(points[:, 0] - points[:, 1] / 2.0).astype(np.int64)
+    return onsets, np.round(points[:, 1]).astype(np.int64)
+
+
+def _unlikely(louder: float) -> float:
+    """Return the cost above the smallest from which a change is negligible."""
+    return 2.0 * float(np.log(1.0 / NEGLIGIBLE)) * louder
+
+
+class _Table:
+    """Smallest sums of squares by onset and duration."""
+
+    def __init__(self, window: Window, found: Fitted, louder: float) -> None:
+        self.window, self.louder = window, louder
+        # the healthy parameters' share of everything, prior included, is taken out once and for all
+        Q, _ = np.linalg.qr(found.jacobian[:, : window.nuisances])
+        prior = window.prior @ found.d
+        self.Q, self.outside, self.inside = (
+            np.ascontiguousarray(Q[: window.samples]),
+            prior @ prior,
+            prior @ Q[window.samples :],
+        )
+        sizes = [found.x, *(found.x + STEP * e for e in np.eye(len(found.x)))]
+        drifting = [window.predictor(found.d, found.names, x, Growth(0, 1)) for x in sizes]
+        self.drifting = Predictor(*(np.stack(parts) for parts in zip(*drifting, strict=True)))
+        self.stepping = Predictor(*(np.ascontiguousarray(part[:, [0, -1]]) for part in self.drifting))
+        A, K, c = self.stepping.A[0], self.stepping.K[0, :, -1], self.stepping.c[0]
+        slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
+        self.settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), window.samples)
+
+    def costs(self, onsets: IntArray, overs: IntArray) -> FloatArray:
+        """Return the smallest cost of each change, shape (M,): all steps or all drifts."""
+        from servoscope.refinement.kernels import sweep
+
+        window = self.window
+        parts = self.drifting if overs.any() else self.stepping
+        sums, volume = sweep(*parts, STEP, onsets, overs, self.settle, window.u, window.y, window.restart, self.Q)
+        V = len(parts.A)
+        in_e = sums[:, 0, V:] + self.inside
+        in_J = sums[:, 1:V, V:]
+        g = sums[:, 0, 1:V] - np.einsum("ikm,im->ik", in_J, in_e)
+        H = sums[:, 1:V, 1:V] - np.einsum("ikm,ilm->ikl", in_J, in_J)
+        # regularised as lightly as rounding asks: an onset at the very end leaves sizes open
+        ridge = 1e-9 * np.einsum("ikk->ik", H) + 1e-12
+        step = np.linalg.solve(H + ridge[:, :, None] * np.eye(V - 1), g[..., None])[..., 0]
+        gained = (in_e**2).sum(axis=1) + (step * g).sum(axis=1)
+        return np.asarray(sums[:, 0, 0] + self.outside - gained + self.louder * volume)
