@@ -98,6 +98,8 @@ class Baseline(_Part):
         Changes that the sequential test listens for; empty where there is none.
     promises
         Smallest changes that are seen with 90 % probability within the baseline's own excitation.
+    predictor_misfit
+        How badly the exact predictor explains the healthy recordings, at most 1 if well; None where there is none.
     notes
         What `learn` found worth saying.
     point, others
@@ -136,6 +138,7 @@ class Baseline(_Part):
     members: tuple[Member, ...]
     promises: tuple[Promise, ...]
     notes: tuple[str, ...]
+    predictor_misfit: float | None = None
     point: str = ""
     others: tuple[Baseline, ...] = ()
 

@@ -31,11 +31,53 @@ class FoundFault(_Said):
 
 
 class Candidate(_Said):
-    """One explanation of a detected change; ``unknown`` carries no faults."""
+    """One explanation of a detected change; ``unknown`` carries no faults.
+
+    `covariance` is that of the logarithms of its ratios, shape (k, k), where two faults were estimated together.
+    """
 
     name: str
     probability: float
     faults: tuple[FoundFault, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] | None = None
+
+
+class Mimic(_Said):
+    """A cause outside the list of faults that explains the recording as well, or better where the answer is unknown.
+
+    `value` is a ratio to the healthy value, or a size in `unit`.
+    """
+
+    name: str
+    words: str
+    value: float
+    unit: str
+
+
+class Refit(_Said):
+    """The refit of the seconds around the onset, from which the diagnosis's onset and candidates are.
+
+    Parameters
+    ----------
+    from_s, to_s
+        What it looked at.
+    noise
+        Standard deviation of the innovations, as a multiple of the baseline's.
+    misfit, limit
+        What the best candidate leaves unexplained, and the limit that a true one passes in one of a thousand cases.
+    recursive
+        What the recursion alone, with its memory, says at its last evaluation.
+    mimics
+        What else it could be.
+    """
+
+    from_s: float
+    to_s: float
+    noise: float
+    misfit: float
+    limit: float
+    recursive: tuple[Candidate, ...]
+    mimics: tuple[Mimic, ...]
 
 
 class Parameter(_Said):
@@ -101,6 +143,10 @@ class Diagnosis(_Said):
         Named faults; empty when healthy and when no candidate reaches probability 0.95.
     candidates
         Explanations, the most probable first.
+    explanation
+        Why, in sentences: what moved, what was rejected.
+    refit
+        What the candidates rest on; None where the recursion alone speaks.
     parameters, ifrf
         At the end of the recording.
     warnings
@@ -119,6 +165,8 @@ class Diagnosis(_Said):
     probability: float | None = None
     faults: tuple[FoundFault, ...] = ()
     candidates: tuple[Candidate, ...] = ()
+    explanation: tuple[str, ...] = ()
+    refit: Refit | None = None
     parameters: dict[str, Parameter]
     ifrf: tuple[ResponsePoint, ...]
     warnings: tuple[Warning, ...] = ()

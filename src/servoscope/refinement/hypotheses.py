@@ -12,7 +12,7 @@ from servoscope.plants import Fault, FloatArray
 from servoscope.refinement.window import Growth, Window
 
 GRID = 17  # sizes at which a search begins
-STEPS = 40  # of the search, at most
+STEPS = 12  # of the search, at most
 UNSEEN = 3.0  # standard deviations below which a size is as good as none
 REACH = 5.0  # standard deviations of the size over which its likelihood is integrated
 POINTS = 31
@@ -67,7 +67,7 @@ class Fitted:
 
 def bounds(faults: Sequence[Fault]) -> tuple[FloatArray, FloatArray]:
     """Return the smallest and largest logarithms of the ratios that are searched, shapes (k,)."""
-    low, high = np.log([fault.ratio_range for fault in faults]).T
+    low, high = np.log(np.array([fault.ratio_range for fault in faults]).reshape(-1, 2)).T
     return low, high
 
 
@@ -117,7 +117,7 @@ def fit(
         return window.residual(whole(z), names, growth)
 
     def jacobian(z: FloatArray) -> FloatArray:
-        return window.jacobian(whole(z), names, growth, held)
+        return window.jacobian(whole(z), names, growth, slice(held, None))
 
     ends = []
     for x in starts:
@@ -139,8 +139,8 @@ def fit(
     H = J.T @ J
     size = np.sqrt(np.maximum(np.diag(H), 1e-300))
     C = np.linalg.pinv(H / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
-    k = len(names)
-    return Fitted(tuple(faults), growth, z[:m], z[m:], 2.0 * float(best.cost), C[-k:, -k:], J, best.fun)
+    k = m - held  # rows of d, where it is free
+    return Fitted(tuple(faults), growth, z[:m], z[m:], 2.0 * float(best.cost), C[k:, k:], J, best.fun)
 
 
 @dataclass(frozen=True)

@@ -90,12 +90,14 @@ class Bench:
 
         d = discretise(plant.state_space(), self.loop.sample_rate, hold="zoh", delay=self.rest_s + later_s)
         A, b, late = d.A * self.scale / self.scale[:, None], d.b_now / self.scale, d.b_late / self.scale
-        c = d.c * self.scale * output_gain + 0.0 * b
+        c = d.c * self.scale * output_gain
+        kind = np.result_type(A, b, c)  # one for all: each further mixture would be compiled anew
+        A, b, late, c = (np.ascontiguousarray(part, dtype=kind) for part in (A, b, late, c))
         if d.m:  # one sample later than the loop file says
             b, late = late, b
         Q = self.noise.u_std**2 * (np.outer(b, b) + np.outer(late, late))
         K, S = np.zeros((LONGEST, len(b)), A.dtype), np.zeros(LONGEST, A.dtype)
-        gains(np.ascontiguousarray(A), Q, c, self.noise.y_std**2, self._open(A, b + late, c), K, S)
+        gains(A, Q, c, self.noise.y_std**2, self._open(A, b + late, c), K, S)
         return Predictor(A[None], b[None], late[None], c[None], K[None], S[None])
 
     @property

@@ -9,7 +9,6 @@ from itertools import combinations
 import numpy as np
 
 from servoscope.baseline import Baseline
-from servoscope.diagnosis import UNKNOWN
 from servoscope.plants import Fault, FloatArray
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import Goodness, goodness, traces
@@ -56,6 +55,8 @@ class Refined:
         Onset, in samples of the window.
     louder
         Variance of the innovations under it, 1 for the baseline's noise.
+    rough
+        Sample of the window from which the search for the onset started.
     """
 
     window: Window
@@ -64,16 +65,17 @@ class Refined:
     goodness: Goodness
     since: Since
     louder: float
+    rough: int
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether none of the hypotheses is the most probable answer."""
+        return self.unknown > self.best.probability
 
     @property
     def best(self) -> Hypothesis:
         """The most probable hypothesis."""
         return self.hypotheses[0]
-
-    @property
-    def name(self) -> str:
-        """What is most probable, ``unknown`` among it."""
-        return UNKNOWN if self.unknown > self.best.probability else self.best.name
 
 
 def window_of(baseline: Baseline, recording: Recording, onset: int, last: int) -> Window:
@@ -120,7 +122,8 @@ class _Search:
     ) -> None:
         self.window, self.faults, self.progress = window, faults, progress
         self.latest = min(announced - window.first, window.samples - 1)
-        self.growth = Growth(min(onset - window.first, self.latest))
+        self.rough = max(min(onset - window.first, self.latest), 0)
+        self.growth = Growth(self.rough)
         self.louder = 1.0
 
     def run(self) -> Refined:
@@ -175,8 +178,7 @@ class _Search:
         return best
 
     def _since(self, fitted: Fitted) -> Since:
-        freed = fitted if fitted.jacobian.shape[1] > len(fitted.x) or not self.window.nuisances else self._free(fitted)
-        return since(self.window, freed, self.latest, self.louder)
+        return since(self.window, fitted, self.latest, self.louder)
 
     def _weighed(self, fitted: Sequence[Fitted], found: Since) -> Refined:
         window, n = self.window, len(self.faults)
@@ -198,7 +200,7 @@ class _Search:
         probability /= probability.sum()
         hypotheses = [Hypothesis(f, e, float(p)) for f, e, p in zip(fitted, told, probability[:-1], strict=True)]
         hypotheses.sort(key=lambda h: -h.probability)
-        return Refined(window, tuple(hypotheses), float(probability[-1]), good, found, self.louder)
+        return Refined(window, tuple(hypotheses), float(probability[-1]), good, found, self.louder, self.rough)
 
     def _goodness(self, fitted: Fitted) -> Goodness:
         window, growth = self.window, fitted.growth

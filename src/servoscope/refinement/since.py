@@ -13,10 +13,10 @@ from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.window import Growth, Window
 
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
-FORGOTTEN = 1e-4  # share of its state from before a change that a predictor may still hold
+FORGOTTEN = 1e-3  # share of its state from before a change that a predictor may still hold
 SHORTEST_S = 0.2  # of a drift that is not called a step
 STEPLIKE = 0.5  # probability of a step, before anything is known
-STEPS = 2000  # onsets of a step that are tried at first, at most
+STEPS = 400  # onsets of a step that are tried at first, at most
 RATIO = 1.5  # of one duration to the next, at first
 PER_DURATION = 6  # onsets that are tried within the duration of a drift
 CLOSER = 3  # times closer together they are in each further look
@@ -61,7 +61,7 @@ def since(window: Window, found: Fitted, latest: int, louder: float) -> Since:
     Parameters
     ----------
     window, found
-        The hypothesis, its sizes and healthy parameters free.
+        The hypothesis and its sizes.
     latest
         Sample of the window by which it had begun.
     louder
@@ -87,8 +87,9 @@ def _steps(table: _Table, latest: int, louder: float) -> _Tried:
     onsets = np.arange(0, latest + 1, apart)
     cost = table.costs(onsets, np.zeros_like(onsets))
     if apart > 1:
-        beside = np.abs(np.diff(cost)).max(initial=0.0) if len(cost) > 1 else 0.0
-        near = onsets[cost <= cost.min() + max(_unlikely(louder), min(beside, 1e3 * louder))]
+        best = int(np.argmin(cost))  # between two tries it may fall as deep as it rises beside the best one
+        beside = float(cost[max(best - 1, 0) : best + 2].max() - cost[best])
+        near = onsets[cost <= cost[best] + max(_unlikely(louder), beside)]
         onsets = np.unique((near[:, None] + np.arange(1 - apart, apart)).ravel())
         onsets = onsets[(onsets >= 0) & (onsets <= latest)]
         cost = table.costs(onsets, np.zeros_like(onsets))
@@ -157,7 +158,8 @@ class _Table:
     def __init__(self, window: Window, found: Fitted, louder: float) -> None:
         self.window, self.louder = window, louder
         # the healthy parameters' share of everything, prior included, is taken out once and for all
-        Q, _ = np.linalg.qr(found.jacobian[:, : window.nuisances])
+        z = np.concatenate([found.d, found.x])
+        Q, _ = np.linalg.qr(window.jacobian(z, found.names, found.growth, slice(window.nuisances)))
         prior = window.prior @ found.d
         self.Q, self.outside, self.inside = (
             np.ascontiguousarray(Q[: window.samples]),

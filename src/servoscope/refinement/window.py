@@ -15,8 +15,10 @@ from servoscope.recording import Recording
 from servoscope.refinement.kernels import Array, BoolArray
 from servoscope.refinement.predictor import Bench, Predictor
 
-PIECES = 16  # plants that stand for a drift
+PIECES = 8  # plants that stand for a drift
 TINY = 1e-30  # complex step
+SENSOR_GAIN = "sensor_gain"
+"""What stands among the parameters for a factor on y as measured."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Window:
         d
             Error of the logarithms of the healthy parameters, shape (m,).
         names, x
-            Parameters that change, and by how much their logarithms do, shape (len(names),).
+            Parameters that change, or `SENSOR_GAIN`, and by how much their logarithms do, shape (len(names),).
         growth
             When.
         """
@@ -118,7 +120,8 @@ class Window:
             ill = dict(healthy)
             for name, value in zip(names, np.exp(share * x), strict=True):
                 ill[name] = ill.get(name, 1.0) * value
-            each.append(self.bench.predictor(self.plant.scaled(ill)))
+            output_gain = ill.pop(SENSOR_GAIN, 1.0)
+            each.append(self.bench.predictor(self.plant.scaled(ill), output_gain))
         return Predictor.of([_as(one, np.result_type(*(e.A for e in each))) for one in each])
 
     def innovations(self, predictor: Predictor, growth: Growth) -> Array:
@@ -131,17 +134,17 @@ class Window:
         e = self.innovations(self.predictor(d, names, x, growth), growth)
         return np.concatenate([e, self.prior @ d])
 
-    def jacobian(self, z: FloatArray, names: Sequence[str], growth: Growth, first: int = 0) -> FloatArray:
-        """Return the derivatives of `residual` by the unknowns from `first` on, shape (N + m, m + len(names) - first).
+    def jacobian(self, z: FloatArray, names: Sequence[str], growth: Growth, by: slice = slice(None)) -> FloatArray:
+        """Return the derivatives of `residual` by the unknowns that `by` selects, shape (N + m, k).
 
         By complex steps: no difference is taken, so nothing is lost by rounding (Squire and Trapp, 1998).
         """
-        J = np.empty((self.samples + self.nuisances, len(z) - first))
-        for i in range(first, len(z)):
+        columns = []
+        for i in np.arange(len(z))[by]:
             moved = z.astype(np.complex128)
             moved[i] += 1j * TINY
-            J[:, i - first] = self.residual(moved, names, growth).imag / TINY
-        return J
+            columns.append(self.residual(moved, names, growth).imag / TINY)
+        return np.array(columns).reshape(-1, self.samples + self.nuisances).T
 
     def disturbed(self, predictor: Predictor, growth: Growth, u: FloatArray, y: FloatArray) -> FloatArray:
         """Return what disturbances of u and of y, shape (N,), add to the innovations: they are linear in both."""

@@ -1,0 +1,117 @@
+"""What else it could be: causes outside the list of faults that explain a window as well as the best of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope.plants import Fault, FloatArray
+from servoscope.refinement.goodness import LAGS, traces
+from servoscope.refinement.hypotheses import Fitted, fit, start
+from servoscope.refinement.predictor import Predictor
+from servoscope.refinement.refining import Refined
+from servoscope.refinement.window import SENSOR_GAIN, Growth, Window
+
+AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
+RANGE = (0.3, 3.0)  # of the ratios that are tried
+NEARLY_ALL = 0.95
+TRIED = 9  # delays up to one further sample, before the best is refined
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Something that would explain the window.
+
+    Parameters
+    ----------
+    name, words
+        What it is.
+    value, unit
+        A ratio to the healthy value (unit ``ratio``), or a size.
+    J
+        Sum of squares with it.
+    """
+
+    name: str
+    words: str
+    value: float
+    unit: str
+    J: float
+
+
+def causes(refined: Refined) -> list[Cause]:
+    """Return the causes that explain the window, the likeliest first.
+
+    Where a fault or a pair is the best explanation, those that are as good. Where none is, the best of the others and
+    those as good as it, if they explain nearly all that the healthy plant does not.
+    """
+    window, best = refined.window, refined.best.fitted
+    # the onset of an explanation that is none means nothing
+    growth = Growth(refined.rough) if refined.is_unknown else best.growth
+    healthy = fit(window, [], growth, best.d, [np.zeros(0)], free=True)
+    found = [*_parametric(window, growth, best), *_added(window, growth, healthy)]
+    limit = best.J
+    if refined.is_unknown:
+        most = window.samples + (1.0 - NEARLY_ALL) * (healthy.J - window.samples)
+        limit = min([cause.J for cause in found if most >= cause.J], default=-np.inf)
+    return sorted((c for c in found if limit + AS_WELL * refined.louder >= c.J), key=lambda cause: cause.J)
+
+
+def _parametric(window: Window, growth: Growth, best: Fitted) -> Iterator[Cause]:
+    """Try other parameters of the plant and the gain of the sensor."""
+    known = {**window.plant.causes, SENSOR_GAIN: "a gain error of the sensor of y"}
+    for name, words in known.items():
+        fault = Fault(name, name, RANGE, words)
+        held = fit(window, [fault], growth, best.d, [np.array([start(window, fault, growth, best.d)])], free=False)
+        free = fit(window, [fault], growth, best.d, [held.x], free=True)
+        yield Cause(name, words, float(np.exp(free.x[0])), "ratio", free.J)
+
+
+def _added(window: Window, growth: Growth, healthy: Fitted) -> Iterator[Cause]:
+    """Try what is no parameter: a later input, backlash, Coulomb friction, offsets."""
+    yield _later(window, growth, healthy)
+    predictor = window.predictor(healthy.d, (), np.zeros(0), growth)
+    where = np.arange(window.samples) >= growth.since
+    columns = traces(window, predictor, growth, where)[:, 2 * LAGS :]
+    # a disturbance is taken off y to explain it, so its size has the other sign
+    names = (
+        ("backlash", "backlash between actuator and sensor", "of y", -2.0),
+        ("sensor_offset", "an offset of the sensor of y", "of y", 1.0),
+        ("coulomb_friction", "Coulomb friction", "of u", -1.0),
+        ("input_offset", "an offset of the input", "of u", 1.0),
+    )
+    for (name, words, unit, factor), column in zip(names, columns.T, strict=True):
+        J = np.column_stack([healthy.jacobian, np.append(column, np.zeros(window.nuisances))])
+        step, left = _step(J, healthy.residual)
+        yield Cause(name, words, float(factor * step[-1]), unit, left)
+
+
+def _later(window: Window, growth: Growth, healthy: Fitted) -> Cause:
+    """Try an input that acts up to a sample later than the loop file says."""
+    from scipy.optimize import minimize_scalar
+
+    rate, bench = window.bench.loop.sample_rate, window.bench
+    nothing = np.zeros(window.nuisances)
+
+    def cost(samples: float) -> float:
+        last = bench.predictor(window.plant, later_s=samples / rate)
+        both = Predictor.of([window.healthy, *(last for _ in growth.shares)])
+        e = np.asarray(window.innovations(both, growth), dtype=np.float64)
+        return _step(healthy.jacobian, np.concatenate([e, nothing]))[1]
+
+    latest = 1.0 - bench.rest_s * rate
+    tried = np.linspace(0.0, latest, TRIED)
+    at = int(np.argmin([cost(float(samples)) for samples in tried]))
+    bracket = float(tried[max(at - 1, 0)]), float(tried[min(at + 1, TRIED - 1)])
+    found = minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": 1e-4})
+    best = min((float(tried[at]), float(found.x)), key=cost)
+    return Cause("delay", "an input that acts later", best / rate, "s", cost(best))
+
+
+def _step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, float]:
+    """Return the unknowns that make ``residual + J step`` smallest, and the sum of squares that is left."""
+    size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    step = -np.linalg.lstsq(J / size, residual, rcond=None)[0] / size
+    return step, float(((residual + J @ step) ** 2).sum())

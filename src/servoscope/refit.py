@@ -1,0 +1,97 @@
+"""The refit's answer in the words of a diagnosis, and whether it agrees with the recursion's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from servoscope.detection import Onset
+from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault, Mimic, Refit, Warning
+from servoscope.examination import Examination
+from servoscope.refinement import Hypothesis, Refined, causes, refine
+from servoscope.refinement.gate import exact
+
+WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
+APART = 3.0  # standard deviations between two sizes that are called different
+
+
+def refit(x: Examination, since: Onset, announced: int, last: int, progress: Callable[[], None]) -> Refined | None:
+    """Refit the seconds around an onset; None where the exact predictor does not explain even healthy recordings."""
+    misfit = x.baseline.predictor_misfit
+    if misfit is None or misfit > 1.0 or not exact(x.baseline):
+        return None
+    return refine(x.baseline, x.recording, since.sample, announced, last, progress)
+
+
+def candidates_of(refined: Refined) -> tuple[Candidate, ...]:
+    """Return every single fault, the pairs that are worth it, and ``unknown``, the most probable first."""
+    told = [
+        _candidate(each)
+        for each in refined.hypotheses
+        if len(each.fitted.faults) == 1 or each.probability >= WORTH_LISTING
+    ]
+    told.append(Candidate(name=UNKNOWN, probability=refined.unknown))
+    return tuple(sorted(told, key=lambda candidate: -candidate.probability))
+
+
+def onset_of(refined: Refined, x: Examination) -> Onset:
+    """Return since when, in the recording's time."""
+    t, first, since = x.recording.t, refined.window.first, refined.since
+    last = len(t) - 1
+    low, likely, high = (min(first + k, last) for k in (since.low, since.growth.since, since.high))
+    # the first changed sample ends the interval in which the change came
+    return Onset(float(t[max(low - 1, 0)]), float(t[likely]), float(t[high]), likely)
+
+
+def said(refined: Refined, x: Examination, recursive: tuple[Candidate, ...]) -> Refit:
+    """Return what a diagnosis keeps of a refit."""
+    t, window = x.recording.t, refined.window
+    return Refit(
+        from_s=float(t[window.first]),
+        to_s=float(t[window.first + window.samples - 1]),
+        noise=float(np.sqrt(refined.louder)),
+        misfit=refined.goodness.statistic,
+        limit=refined.goodness.limit,
+        recursive=recursive,
+        mimics=tuple(
+            Mimic(name=cause.name, words=cause.words, value=cause.value, unit=cause.unit) for cause in causes(refined)
+        ),
+    )
+
+
+def disagreement(said: tuple[Candidate, ...], recursive: tuple[Candidate, ...], sure: float) -> str | None:
+    """Say where the refit and the recursion contradict each other, each being sure; None where they do not."""
+    one, other = said[0], recursive[0]
+    if min(one.probability, other.probability) < sure:
+        return None
+    if one.name != other.name:
+        return (
+            f"the refit says {one.name}, the recursion's last estimate {other.name}: the refit weighs every sample "
+            "since the onset, the recursion those within its memory; look whether the change went on"
+        )
+    for a, b in zip(one.faults, other.faults, strict=True):
+        spread = np.hypot(*(np.log(f.interval[1] / f.interval[0]) / 3.92 for f in (a, b)))
+        if abs(np.log(a.ratio / b.ratio)) > APART * spread:
+            return (
+                f"{a.parameter} is {a.ratio:.4g} times its healthy value by the refit and {b.ratio:.4g} by the "
+                "recursion's last estimate: look whether the change went on"
+            )
+    return None
+
+
+def warning_of(text: str, x: Examination) -> Warning:
+    """Return a disagreement as a warning about the whole recording."""
+    t = x.recording.t
+    return Warning(kind="disagreement", from_s=float(t[0]), to_s=float(t[-1]), count=1, message=text)
+
+
+def _candidate(each: Hypothesis) -> Candidate:
+    fitted = each.fitted
+    ratios, intervals = np.exp(fitted.x), np.exp(np.array(each.evidence.intervals))
+    faults = tuple(
+        FoundFault(name=fault.name, parameter=fault.parameter, ratio=float(ratio), interval=(float(low), float(high)))
+        for fault, ratio, (low, high) in zip(fitted.faults, ratios, intervals, strict=True)
+    )
+    covariance = tuple(tuple(row) for row in fitted.covariance.tolist()) if len(faults) > 1 else None
+    return Candidate(name=each.name, probability=each.probability, faults=faults, covariance=covariance)
