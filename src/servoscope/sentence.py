@@ -40,6 +40,11 @@ def summary(
     if faults:
         (fault,) = faults
         low, high = fault.interval
+        if fault.learned:
+            return (
+                f"Fault{here}: {fault.name}, as labelled recordings show it, at {fault.ratio:.3g} times the labelled "
+                f"severity ({low:.3g} to {high:.3g}) {since}."
+            )
         what = "It" if fault.parameter == fault.name else fault.parameter
         return (
             f"Fault{here}: {fault.name}. {what} is {fault.ratio:.4g} times its healthy value ({low:.4g} to "

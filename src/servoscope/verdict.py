@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from servoscope.candidates import candidates_of
 from servoscope.correction import explain, spread_of
 from servoscope.detection import Onset, onset
 from servoscope.diagnosis import (
@@ -25,6 +24,7 @@ from servoscope.examination import Compared, Examination, trace_of
 from servoscope.isolation import isolate
 from servoscope.sentence import summary
 from servoscope.signatures import true_theta
+from servoscope.steady import evidence
 
 SURE = 0.95  # probability from which a fault is named
 
@@ -47,12 +47,7 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         at = at if x.alarm[-1] else first + int(np.argmax(x.statistic[first:]))
         progress("onset")
         since = _onset(x, announced, at)
-        candidates = isolate(
-            candidates_of(x.baseline, recording, x.expectation, since.sample, int(x.estimates.index[at])),
-            x.estimates.theta[at] - x.expected[at],
-            x.estimates.S[at] * max(1.0, float(x.estimates.power[at])) + x.baseline.cov(),
-            lambda: progress("isolation"),
-        )
+        candidates = isolate(*evidence(x, since, at), lambda: progress("isolation"))
         if candidates[0].probability >= SURE and candidates[0].name != UNKNOWN:
             faults = candidates[0].faults
     else:
