@@ -64,6 +64,13 @@ def line(fault: Fault, direction: FloatArray) -> Signature:
     return Signature(fault, lambda x: x * direction, lambda x: 1.0 + x, -reach, reach)
 
 
+def worst_misfit(n: int) -> float:
+    """Return the misfit that a true fault passes in one of a thousand cases, with n coefficients."""
+    from scipy import special
+
+    return float(special.chdtri(max(n - 1, 1), MISFIT))
+
+
 @dataclass(frozen=True)
 class _Fitted:
     signature: Signature
@@ -104,10 +111,8 @@ def isolate(
     tuple of Candidate
         Most probable first, ``unknown`` among them; probabilities sum to 1.
     """
-    from scipy import special
-
     n = len(deviation)
-    limit = float(special.chdtri(max(n - 1, 1), MISFIT))
+    limit = worst_misfit(n)
     searches = [_Search(signature, deviation, covariance) for signature in signatures]
     coarse = [search.coarse() for search in searches]
     fitted = []

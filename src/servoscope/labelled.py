@@ -50,8 +50,8 @@ class LearnedFault(BaseModel):
         if len(C) != n or any(len(row) != n for row in C):
             raise ValueError(f"{self.name}: covariance must be {n} by {n}")
         size = np.sqrt(np.abs(np.diag(C)))
-        scaled = np.array(C) / np.outer(size, size) if size.all() else np.array(C)
-        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
+        scaled = np.array(C) / np.outer(size, size) if size.all() else -np.eye(n)
+        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] <= 0.0:
             raise ValueError(f"{self.name}: covariance must be symmetric and positive")
         if not self.recordings or len(self.shares) != len(self.recordings):
             raise ValueError(f"{self.name}: shares must have one value per recording")
@@ -99,16 +99,20 @@ class LearnedFault(BaseModel):
         )
 
     @property
-    def vague(self) -> float:
-        """Standard deviation of the mean severity that a share refers to, relative; 0 with one recording."""
-        m = len(self.shares)
-        return float(np.std(self.shares, ddof=1) / np.sqrt(m)) if m > 1 else 0.0
+    def distinct(self) -> float:
+        """Squared distance of the deviation from healthy in units of its own covariance: how clear the direction is.
+
+        A direction is told from another at an angle phi where ``distinct * tan(phi)**2`` exceeds the limit of a misfit.
+        """
+        size = np.sqrt(np.diag(self.covariance))
+        s = np.array(self.deviation) / size
+        return float(s @ np.linalg.solve(np.array(self.covariance) / np.outer(size, size), s))
 
     def signature(self, taken_up: FloatArray) -> Signature:
         """Return the ray along which theta_hat moves as the share of the labelled severity grows.
 
-        The scatter of a direction grows with the share; not beyond the labelled severity, though, or a large enough
-        share would be near everything.
+        The scatter of the direction grows with the share. Along the ray the misfit of a deviation that points elsewhere
+        then tends to `distinct`, however large it is.
 
         Parameters
         ----------
@@ -118,5 +122,5 @@ class LearnedFault(BaseModel):
         moved = taken_up @ np.array(self.deviation)
         C = taken_up @ np.array(self.covariance) @ taken_up.T
         words = Fault(self.name, SEVERITY, SHARES, self.name)
-        ray = curve(words, lambda share: share * moved, self.vague)
-        return replace(ray, scatter=lambda x: min(float(np.exp(2.0 * x)), 1.0) * C)
+        ray = curve(words, lambda share: share * moved)
+        return replace(ray, scatter=lambda x: float(np.exp(2.0 * x)) * C)

@@ -12,12 +12,14 @@ from servoscope.baseline import Baseline
 from servoscope.diagnosis import UNKNOWN
 from servoscope.errors import BaselineError, NotEnoughError
 from servoscope.examination import Examination
+from servoscope.isolation import worst_misfit
 from servoscope.labelled import LearnedFault
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 from servoscope.steady import Steady, steady
 from servoscope.verdict import judge
 
+DISTINCT = 2.0  # times the limit of a misfit: a label that says less of its direction is refused (35 degrees)
 LIKELY = 0.05  # probability from which another explanation of a labelled recording is told
 
 Labelled = Mapping[str, Sequence[Recording]]
@@ -42,7 +44,7 @@ def label(baseline: Baseline, faults: Labelled, progress: Callable[[str], None] 
     BaselineError
         If a name is one of the plant's own faults.
     NotEnoughError
-        If no recording of a fault differs from healthy, one is too short, or two of one name move theta opposite ways.
+        If no recording of a fault differs from healthy, one is too short, or those of one name do not agree.
     """
     own = {UNKNOWN, *(fault.name for fault in baseline.loop.plant.faults)}
     learned, examined, notes = [], {}, list(baseline.notes)
@@ -81,6 +83,11 @@ def _learn(name: str, shown: Sequence[Examination], healthy: FloatArray) -> Lear
     if min(found.shares) <= 0.0:
         odd = found.recordings[int(np.argmin(found.shares))]
         raise NotEnoughError(f"{odd} moves theta the other way than the other recordings of {name}: two labels?")
+    if found.distinct < DISTINCT * worst_misfit(len(healthy)):
+        raise NotEnoughError(
+            f"the {len(shown)} recordings of {name} differ from each other as much as from healthy, and nearly any "
+            "change would look like it: label them apart, or record more"
+        )
     return found
 
 
