@@ -49,9 +49,9 @@ class LearnedFault(BaseModel):
             raise ValueError(f"{self.name}: deviation must not be zero")
         if len(C) != n or any(len(row) != n for row in C):
             raise ValueError(f"{self.name}: covariance must be {n} by {n}")
-        size = np.sqrt(np.abs(np.diag(C)))
+        size = np.sqrt(np.maximum(np.diag(C), 0.0))
         scaled = np.array(C) / np.outer(size, size) if size.all() else -np.eye(n)
-        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] <= 0.0:
+        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
             raise ValueError(f"{self.name}: covariance must be symmetric and positive")
         if not self.recordings or len(self.shares) != len(self.recordings):
             raise ValueError(f"{self.name}: shares must have one value per recording")

@@ -45,7 +45,7 @@ def steady(x: Examination, from_s: float, to_s: float = np.inf) -> Steady:
     return Steady(found.each[0] - expected, found.each_covariance[0])
 
 
-def evidence(x: Examination, since: Onset, at: int) -> tuple[list[Signature], FloatArray, FloatArray]:
+def isolation_inputs(x: Examination, since: Onset, at: int) -> tuple[list[Signature], FloatArray, FloatArray]:
     """Return what isolation compares after an alarm: signatures, the deviation (n,) and its covariance (n, n).
 
     Labels that point nearly the same way are told apart by the whole stretch since the onset better than by the last

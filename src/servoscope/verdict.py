@@ -24,7 +24,7 @@ from servoscope.examination import Compared, Examination, trace_of
 from servoscope.isolation import isolate
 from servoscope.sentence import summary
 from servoscope.signatures import true_theta
-from servoscope.steady import evidence
+from servoscope.steady import isolation_inputs
 
 SURE = 0.95  # probability from which a fault is named
 
@@ -47,7 +47,7 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         at = at if x.alarm[-1] else first + int(np.argmax(x.statistic[first:]))
         progress("onset")
         since = _onset(x, announced, at)
-        candidates = isolate(*evidence(x, since, at), lambda: progress("isolation"))
+        candidates = isolate(*isolation_inputs(x, since, at), lambda: progress("isolation"))
         if candidates[0].probability >= SURE and candidates[0].name != UNKNOWN:
             faults = candidates[0].faults
     else:

@@ -191,7 +191,7 @@ def meaning(name: str, words: Mapping[str, str], ratio: float = 1.0) -> str:
     """
     if name == UNKNOWN:
         return "none of the known faults"
-    text = " and ".join(words.get(part, part).partition(" (")[0] for part in name.split("+"))
+    text = " and ".join(words.get(part, part.replace("_", " ")).partition(" (")[0] for part in name.split("+"))
     return re.sub("^more ", "less ", text) if ratio < 1.0 else text
 
 
