@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from servoscope.errors import BaselineError, LoopError
 from servoscope.inverse import nominal_theta
+from servoscope.labelled import LearnedFault
 from servoscope.loop import Loop
 from servoscope.noise import Coloured, Noise
 from servoscope.output import atomic_write
@@ -102,6 +103,8 @@ class Baseline(_Part):
         How badly the exact predictor explains the healthy recordings, at most 1 if well; None where there is none.
     notes
         What `learn` found worth saying.
+    learned
+        Faults known from labelled recordings; empty where none were given.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -139,6 +142,7 @@ class Baseline(_Part):
     promises: tuple[Promise, ...]
     notes: tuple[str, ...]
     predictor_misfit: float | None = None
+    learned: tuple[LearnedFault, ...] = ()
     point: str = ""
     others: tuple[Baseline, ...] = ()
 
@@ -162,6 +166,10 @@ class Baseline(_Part):
         scaled = C / np.outer(size, size) if size.all() else C
         if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
             raise ValueError("covariance must be symmetric and positive")
+        if any(len(fault.deviation) != n for fault in self.learned):
+            raise ValueError(f"learned must have deviations of {n} values, one per coefficient")
+        if len({fault.name for fault in self.learned}) < len(self.learned):
+            raise ValueError("learned must have names of their own")
         if self.others and (not all(self.points) or len(set(self.points)) < len(self.points)):
             raise ValueError("point must be a name of its own at every operating point")
         if any(other.others for other in self.others):

@@ -18,9 +18,14 @@ Shift = Callable[[float], FloatArray]
 
 
 def candidates_of(
-    baseline: Baseline, recording: Recording, expectation: Expectation | None, since: int, last: int
+    baseline: Baseline,
+    recording: Recording,
+    expectation: Expectation | None,
+    since: int,
+    last: int,
+    settled: bool = False,
 ) -> list[Signature]:
-    """Return one signature per fault of the loop's plant.
+    """Return one signature per fault of the loop's plant, and one per fault learned from labelled recordings.
 
     Parameters
     ----------
@@ -32,12 +37,22 @@ def candidates_of(
         Sample of the onset.
     last
         Sample of the evaluation that is explained.
+    settled
+        Whether the estimate to be explained has taken up all of a change: no recursion, or one that has forgotten.
     """
+    needed = not settled and (expectation is None or bool(baseline.learned))
+    taken_up = _learned(baseline, recording, since, last) if needed else np.eye(len(baseline.theta))
+    known = _of_plant(baseline, expectation, since, last, taken_up)
+    return known + [fault.signature(taken_up) for fault in baseline.learned]
+
+
+def _of_plant(
+    baseline: Baseline, expectation: Expectation | None, since: int, last: int, learned: FloatArray
+) -> list[Signature]:
     faults, plant = baseline.loop.plant.faults, baseline.plant
     if expectation is not None:
         shift = _simulated(baseline, expectation.until(last + 1), since)
         return [curve(fault, shift(fault), baseline.ratios_std.get(fault.parameter, 0.0)) for fault in faults]
-    learned = _learned(baseline, recording, since, last)
     if plant.has_physics and plant.kind != "polynomial":
         shift = _physical(baseline, learned)
         return [curve(fault, shift(fault)) for fault in faults]

@@ -15,6 +15,7 @@ from servoscope.recording import Defect
 
 Verdict = Literal["healthy", "fault", "undetermined"]
 UNKNOWN = "unknown"
+SEVERITY = "severity"  # the parameter of a fault that was learned from labelled recordings
 
 
 class _Said(BaseModel):
@@ -22,24 +23,47 @@ class _Said(BaseModel):
 
 
 class FoundFault(_Said):
-    """A fault with its size: `ratio` of `parameter` to its healthy value, and the 95 % interval of it."""
+    """A fault with its size: `ratio` of `parameter` to its healthy value, and the 95 % interval of it.
+
+    The parameter of a fault learned from labelled recordings is ``severity``: there `ratio` is to the labelled one.
+    """
 
     name: str
     parameter: str
     ratio: float
     interval: tuple[float, float]
 
+    @property
+    def learned(self) -> bool:
+        """Whether it is known from labelled recordings, so that `ratio` is a share of their severity."""
+        return self.parameter == SEVERITY
+
+    @property
+    def change(self) -> float:
+        """How far from healthy it is: of the parameter's healthy value, or of the labelled severity."""
+        return self.ratio if self.learned else abs(self.ratio - 1.0)
+
 
 class Candidate(_Said):
     """One explanation of a detected change; ``unknown`` carries no faults.
 
+    `misfit` is the sum of squared standard deviations by which it fits worse than the best one; None for ``unknown``.
     `covariance` is that of the logarithms of its ratios, shape (k, k), where two faults were estimated together.
+    `cosine` is that of the angle between the deviation and the direction of a fault learned from labelled recordings,
+    in units of the misfit's covariance: 1 the same way, 0 elsewhere, -1 the opposite way; None for other faults.
     """
 
     name: str
     probability: float
     faults: tuple[FoundFault, ...] = ()
+    misfit: float | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
+    cosine: float | None = None
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether it is a fault learned from labelled recordings."""
+        return any(fault.learned for fault in self.faults)
 
 
 class Mimic(_Said):

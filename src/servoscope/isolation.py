@@ -35,6 +35,8 @@ class Signature:
         Range of the coordinate; the prior is uniform on it.
     vague
         Standard deviation of the healthy value on the coordinate's scale: the size is relative to it.
+    scatter
+        Coordinate -> covariance of the shift, shape (n, n), where the direction itself was learned from recordings.
     """
 
     fault: Fault
@@ -43,6 +45,7 @@ class Signature:
     low: float
     high: float
     vague: float = 0.0
+    scatter: Callable[[float], FloatArray] | None = None
 
 
 def curve(fault: Fault, shift_of_ratio: Callable[[float], FloatArray], vague: float = 0.0) -> Signature:
@@ -61,6 +64,13 @@ def line(fault: Fault, direction: FloatArray) -> Signature:
     return Signature(fault, lambda x: x * direction, lambda x: 1.0 + x, -reach, reach)
 
 
+def worst_misfit(n: int) -> float:
+    """Return the misfit that a true fault passes in one of a thousand cases, with n coefficients."""
+    from scipy import special
+
+    return float(special.chdtri(max(n - 1, 1), MISFIT))
+
+
 @dataclass(frozen=True)
 class _Fitted:
     signature: Signature
@@ -69,6 +79,7 @@ class _Fitted:
     best: float
     low: float
     high: float
+    cosine: float | None
 
 
 def isolate(
@@ -81,7 +92,8 @@ def isolate(
 
     Along each curve J(x) = (d - s(x))' Sigma(x)^-1 (d - s(x)); the probability of a fault is proportional to the
     integral of exp(-(J + log det Sigma)/2) over its range. "unknown" stands for a change that would fit exactly as
-    badly as the limit that a true fault passes in one of a thousand cases.
+    badly as the limit that a true fault passes in one of a thousand cases. Sigma(x) holds the scatter of a learned
+    direction too, so a label that is known only roughly has to fit better to be as probable.
 
     Parameters
     ----------
@@ -99,10 +111,8 @@ def isolate(
     tuple of Candidate
         Most probable first, ``unknown`` among them; probabilities sum to 1.
     """
-    from scipy import special
-
     n = len(deviation)
-    limit = float(special.chdtri(max(n - 1, 1), MISFIT))
+    limit = worst_misfit(n)
     searches = [_Search(signature, deviation, covariance) for signature in signatures]
     coarse = [search.coarse() for search in searches]
     fitted = []
@@ -130,6 +140,8 @@ def isolate(
                     interval=(found.signature.ratio(found.low), found.signature.ratio(found.high)),
                 ),
             ),
+            misfit=found.misfit - closest.misfit,
+            cosine=found.cosine,
         )
         for found, share in zip(fitted, probability[:-1], strict=True)
     ]
@@ -158,9 +170,23 @@ class _Search:
             s = self.signature.shift(x) / self.size
         except SimulationError:  # nobody could have recorded it
             return np.inf, 0.0
-        Sigma = self.correlation + np.diag((SYSTEMATIC * s) ** 2 + 1e-12)
+        Sigma = self._covariance(x, s)
         J = float((self.scaled - s) @ np.linalg.solve(Sigma, self.scaled - s))
         return J, float(np.linalg.slogdet(Sigma)[1])
+
+    def _covariance(self, x: float, s: FloatArray) -> FloatArray:
+        Sigma = self.correlation + np.diag((SYSTEMATIC * s) ** 2 + 1e-12)
+        if self.signature.scatter is not None:
+            Sigma = Sigma + self.signature.scatter(x) / np.outer(self.size, self.size)
+        return np.asarray(Sigma)
+
+    def cosine(self, x: float) -> float | None:
+        """Return the cosine between deviation and shift in the metric of J; None where no direction was learned."""
+        if self.signature.scatter is None:
+            return None
+        s = self.signature.shift(x) / self.size
+        white = np.linalg.solve(np.linalg.cholesky(self._covariance(x, s)), np.column_stack([self.scaled, s]))
+        return float(white[:, 0] @ white[:, 1] / np.prod(np.linalg.norm(white, axis=0)))
 
     def coarse(self) -> float:
         """Return the smallest misfit on the grid and a few steps towards the minimum beside its best point."""
@@ -214,4 +240,4 @@ class _Search:
             best + np.hypot(high - best, 1.96 * signature.vague),
         )
         evidence = top + float(np.log(area[-1] / (signature.high - signature.low)))
-        return _Fitted(signature, self.known[best][0], evidence, best, float(low), float(high))
+        return _Fitted(signature, self.known[best][0], evidence, best, float(low), float(high), self.cosine(best))

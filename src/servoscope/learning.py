@@ -27,6 +27,7 @@ from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray
 from servoscope.promises import WORTH_A_LOOK, misfit_of, noise_notes, promises, supported_budget
 from servoscope.recording import Recording
+from servoscope.refinement.gate import healthy_misfit
 from servoscope.rehearsal import Rehearsed, limit_of, prepare
 from servoscope.sequential import Member
 from servoscope.signatures import Expectation, colour_of, course, residual_system
@@ -243,7 +244,7 @@ def _assemble(
             f"{loop.monitor.false_alarms_per_year:g}: record longer, or give a model_error"
         )
     directions = fault_directions(loop, plant, theta)
-    return Baseline(
+    baseline = Baseline(
         loop=loop.to_dict(),
         sources=tuple(Source(name=r.name, samples=r.samples, duration_s=r.duration_s) for r in recordings),
         hash=digest(loop, [a for rec in recordings for a in (rec.t, rec.r, rec.u, rec.y)]),
@@ -276,6 +277,14 @@ def _assemble(
         promises=promises(loop, directions, estimates, covariance, limit),
         notes=tuple(notes),
     )
+    progress("predictor")
+    misfit = healthy_misfit(baseline, recordings)
+    if misfit is not None and misfit > 1.0:
+        notes.append(
+            f"the sampled plant does not explain the healthy recordings to the last digit ({misfit:.2g} times what "
+            "noise would leave): faults are named by the recursion alone, without a refit; check [plant] and delay"
+        )
+    return baseline.model_copy(update={"predictor_misfit": misfit, "notes": tuple(notes)})
 
 
 def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:

@@ -88,7 +88,7 @@ def _size(said: Diagnosis) -> float:
     """Return how large the change is, relative; infinite where no known fault explains it."""
     if not _explained(said):
         return np.inf
-    return max(abs(fault.ratio - 1.0) for fault in said.candidates[0].faults)
+    return max(fault.change for fault in said.candidates[0].faults)
 
 
 def _explained(said: Diagnosis) -> bool:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from servoscope import learning
+from servoscope import labelling, learning
 from servoscope.baseline import Baseline
 from servoscope.errors import BaselineError, NotEnoughError
+from servoscope.labelling import Labelled
 from servoscope.learning import Progress
 from servoscope.loop import Loop
 from servoscope.monitor import diagnose
@@ -22,6 +23,7 @@ def learn(
     *,
     compare: Baseline | None = None,
     accept_change: bool = False,
+    faults: Labelled | Mapping[str, Labelled] | None = None,
 ) -> Baseline:
     """Learn what healthy looks like, at one operating point or at several.
 
@@ -41,6 +43,9 @@ def learn(
         if that baseline has it.
     accept_change
         Learn although a recording is a fault to the earlier baseline; the notes then say so.
+    faults
+        Recordings of known faults by name, ``{"backlash": [...]}``; `diagnose` then knows these faults too. Where
+        operating points are named, by point first, ``{"cold": {"backlash": [...]}}``.
 
     Returns
     -------
@@ -50,13 +55,15 @@ def learn(
     Raises
     ------
     NotEnoughError
-        If the recordings are too short or excite too little, or if a point has none.
+        If the recordings are too short or excite too little, if a point has none, or if those of a fault do not
+        differ from healthy.
     RecordingError
         If u and y are out of step by more than the loop file says.
     LoopError
         If the settings do not go together.
     BaselineError
-        If a recording is a fault to the earlier baseline and the change is not accepted, or if a point has no name.
+        If a recording is a fault to the earlier baseline and the change is not accepted, if a point has no name, or if
+        a fault has the name of one that the plant knows, or a point that has no healthy recordings.
     """
     named = recordings if isinstance(recordings, Mapping) else {"": recordings}
     for name, some in named.items():
@@ -66,6 +73,7 @@ def learn(
             raise NotEnoughError(f"operating point {name}: no recording to learn from, give at least one")
     if not named:
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
+    labels = _by_point(faults or {}, recordings)
     notes = {name: _changes(compare, name, some, progress, accept_change) for name, some in named.items()}
     learned: list[Baseline] = []
     for name, some in named.items():
@@ -73,8 +81,34 @@ def learn(
         longest = max(some, key=lambda rec: rec.samples)
         progress("operating points")
         told = [text for other in learned if (text := _resembles(other, name, longest))]
-        learned.append(one.model_copy(update={"point": name, "notes": (*one.notes, *notes[name], *told)}))
+        one = one.model_copy(update={"point": name, "notes": (*one.notes, *notes[name], *told)})
+        learned.append(labelling.label(one, labels[name], progress) if name in labels else one)
     return learned[0].model_copy(update={"others": tuple(learned[1:])})
+
+
+def _by_point(
+    faults: Labelled | Mapping[str, Labelled], recordings: Sequence[Recording] | Mapping[str, Sequence[Recording]]
+) -> dict[str, Labelled]:
+    """Return the labelled recordings of each operating point; the point of a baseline without points is "".
+
+    Raises
+    ------
+    BaselineError
+        If points and faults do not go together.
+    """
+    found: dict[str, dict[str, Sequence[Recording]]] = {}
+    for key, value in faults.items():
+        if isinstance(recordings, Mapping) != isinstance(value, Mapping):
+            how = "{'cold': {'backlash': [...]}}" if isinstance(recordings, Mapping) else "{'backlash': [...]}"
+            raise BaselineError(f"faults, {key}: give them by operating point where healthy ones are, as in {how}")
+        if isinstance(value, Mapping):
+            found[key] = dict(value)
+        else:
+            found.setdefault("", {})[key] = value
+    for point in found:
+        if point and point not in recordings:
+            raise BaselineError(f"faults at {point}: there are no healthy recordings at that operating point")
+    return {point: labels for point, labels in found.items() if labels}
 
 
 def _changes(

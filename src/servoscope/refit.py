@@ -26,8 +26,9 @@ def refit(x: Examination, since: Onset, announced: int, last: int, progress: Cal
 
 def candidates_of(refined: Refined) -> tuple[Candidate, ...]:
     """Return every single fault, the pairs that are worth it, and ``unknown``, the most probable first."""
+    least = min(each.fitted.J for each in refined.hypotheses)
     told = [
-        _candidate(each)
+        _candidate(each, least, refined.louder)
         for each in refined.hypotheses
         if len(each.fitted.faults) == 1 or each.probability >= WORTH_LISTING
     ]
@@ -60,38 +61,42 @@ def said(refined: Refined, x: Examination, recursive: tuple[Candidate, ...]) -> 
     )
 
 
-def disagreement(said: tuple[Candidate, ...], recursive: tuple[Candidate, ...], sure: float) -> str | None:
-    """Say where the refit and the recursion contradict each other, each being sure; None where they do not."""
-    one, other = said[0], recursive[0]
-    if min(one.probability, other.probability) < sure:
-        return None
+def disagreements(
+    x: Examination, said: tuple[Candidate, ...], recursive: tuple[Candidate, ...], sure: float
+) -> list[Warning]:
+    """Return a warning where the refit and the recursion contradict each other, both with probability `sure`."""
+    one, other, t = said[0], recursive[0], x.recording.t
+    message = ""
+    if min(one.probability, other.probability) < sure or (len(one.faults) > 1 and other.name == UNKNOWN):
+        return []  # the recursion knows no pairs
     if one.name != other.name:
-        return (
-            f"the refit says {one.name}, the recursion's last estimate {other.name}: the refit weighs every sample "
-            "since the onset, the recursion those within its memory; look whether the change went on"
-        )
-    for a, b in zip(one.faults, other.faults, strict=True):
-        spread = np.hypot(*(np.log(f.interval[1] / f.interval[0]) / 3.92 for f in (a, b)))
-        if abs(np.log(a.ratio / b.ratio)) > APART * spread:
-            return (
-                f"{a.parameter} is {a.ratio:.4g} times its healthy value by the refit and {b.ratio:.4g} by the "
-                "recursion's last estimate: look whether the change went on"
-            )
-    return None
+        message = f"the refit says {one.name}, the recursion's last estimate {other.name}"
+    else:
+        for a, b in zip(one.faults, other.faults, strict=True):
+            spread = np.hypot(*(np.log(f.interval[1] / f.interval[0]) / 3.92 for f in (a, b)))
+            if abs(np.log(a.ratio / b.ratio)) > APART * spread:
+                message = (
+                    f"{a.parameter} is {a.ratio:.4g} times its healthy value by the refit, {b.ratio:.4g} by the "
+                    "recursion's last estimate"
+                )
+    if not message:
+        return []
+    why = "the refit weighs every second since the onset, the recursion the last ones: look whether the change went on"
+    return [Warning(kind="disagreement", from_s=float(t[0]), to_s=float(t[-1]), count=1, message=f"{message}; {why}")]
 
 
-def warning_of(text: str, x: Examination) -> Warning:
-    """Return a disagreement as a warning about the whole recording."""
-    t = x.recording.t
-    return Warning(kind="disagreement", from_s=float(t[0]), to_s=float(t[-1]), count=1, message=text)
-
-
-def _candidate(each: Hypothesis) -> Candidate:
+def _candidate(each: Hypothesis, least: float, louder: float) -> Candidate:
     fitted = each.fitted
     ratios, intervals = np.exp(fitted.x), np.exp(np.array(each.evidence.intervals))
     faults = tuple(
         FoundFault(name=fault.name, parameter=fault.parameter, ratio=float(ratio), interval=(float(low), float(high)))
         for fault, ratio, (low, high) in zip(fitted.faults, ratios, intervals, strict=True)
     )
-    covariance = tuple(tuple(row) for row in fitted.covariance.tolist()) if len(faults) > 1 else None
-    return Candidate(name=each.name, probability=each.probability, faults=faults, covariance=covariance)
+    covariance = tuple(tuple(row) for row in (louder * fitted.covariance).tolist()) if len(faults) > 1 else None
+    return Candidate(
+        name=each.name,
+        probability=each.probability,
+        faults=faults,
+        misfit=max(fitted.J - least, 0.0) / louder,
+        covariance=covariance,
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault, Verdict, Warning
+from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault, Refit, Verdict, Warning
 
 
 def summary(
@@ -14,6 +14,7 @@ def summary(
     since: str,
     seen: dict[str, tuple[float, float]],
     warnings: Sequence[Warning],
+    refit: Refit | None = None,
     point: str = "",
 ) -> str:
     """Say it.
@@ -26,6 +27,8 @@ def summary(
         "since ...", or nothing.
     seen
         By parameter, the smallest change that would have shown, and what the baseline promises.
+    refit
+        Of the diagnosis.
     point
         Operating point that the recording was judged at, or nothing.
     """
@@ -37,19 +40,40 @@ def summary(
     if verdict == "undetermined":
         reason = next(warning.message for warning in warnings if warning.kind == "power")
         return f"Undetermined{here}: {reason}."
+    same = _same(refit)
     if faults:
-        (fault,) = faults
-        low, high = fault.interval
-        what = "It" if fault.parameter == fault.name else fault.parameter
-        return (
-            f"Fault{here}: {fault.name}. {what} is {fault.ratio:.4g} times its healthy value ({low:.4g} to "
-            f"{high:.4g}) {since}."
-        )
+        each = ", ".join(_size(fault) for fault in faults)
+        return f"Fault{here}: {' and '.join(fault.name for fault in faults)}. {each} {since}.{same}"
     likely = [c for c in candidates if c.probability >= 0.05]
     if likely[0].name == UNKNOWN and likely[0].probability >= 0.5:
-        return f"Fault{here}, unknown: a change {since} that no single known fault explains."
+        known = "no known fault and no pair of them explains" if refit else "no single known fault explains"
+        return f"Fault{here}, unknown: a change {since} that {known}.{same}"
     listed = " or ".join(f"{c.name} ({_share(c.probability)})" for c in likely)
+    several = [[fault.parameter for fault in c.faults] for c in likely if len(c.faults) > 1]
+    if len(several) == len(likely) > 1:
+        every = [name for names in several for name in names]
+        confused = sorted(name for name in set(every) if every.count(name) < len(several))
+        return (
+            f"Fault{here} {since}: two at once, not to be resolved here, because {' and '.join(confused)} are "
+            f"confused: {listed}."
+        )
     return f"Fault{here} {since}, not to be told apart here: {listed}."
+
+
+def _size(fault: FoundFault) -> str:
+    low, high = fault.interval
+    if fault.learned:
+        interval = f"({low:.3g} to {high:.3g})"
+        return f"As labelled recordings show it, at {fault.ratio:.3g} times the labelled severity {interval}"
+    what = "It" if fault.parameter == fault.name else fault.parameter
+    return f"{what} is {fault.ratio:.4g} times its healthy value ({low:.4g} to {high:.4g})"
+
+
+def _same(refit: Refit | None) -> str:
+    """Name the likeliest cause outside the list."""
+    if refit is None or not refit.mimics:
+        return ""
+    return f" It looks the same as {refit.mimics[0].words}."
 
 
 def _share(probability: float) -> str:

@@ -112,14 +112,14 @@ def fit(pipeline: Pipeline, regressions: Sequence[Regression]) -> Fit:
     scale = np.sqrt((phi**2).mean(axis=0))
     for name, size in zip(names, scale, strict=True):
         if not size > 0.0:
-            raise NotEnoughError(f"nothing excites {name}: its column is zero throughout the healthy recordings")
+            raise NotEnoughError(f"nothing excites {name}: its column is zero throughout")
     R_phi = z.T @ phi / len(eta)
     scaled = R_phi / np.outer(scale, scale)
     own = phi.T @ phi / len(eta) / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(own)
     if values[0] < WEAKEST * values[-1]:
         weakest = names[int(np.argmax(np.abs(vectors[:, 0])))]
-        raise NotEnoughError(f"the healthy recordings do not tell {weakest} from the other coefficients: move more")
+        raise NotEnoughError(f"the recordings do not tell {weakest} from the other coefficients: move more")
     theta = solve_scaled(R_phi, z.T @ eta / len(eta))
     residuals = [(g.eta - g.phi @ theta)[g.ok] for g in regressions]
     R = float(autocovariance(residuals, 0)[0])

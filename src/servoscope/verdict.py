@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from servoscope.candidates import candidates_of
 from servoscope.correction import explain, spread_of
 from servoscope.detection import Onset, onset
 from servoscope.diagnosis import (
@@ -15,6 +14,7 @@ from servoscope.diagnosis import (
     Diagnosis,
     FoundFault,
     Parameter,
+    Refit,
     ResponsePoint,
     Trace,
     Verdict,
@@ -24,7 +24,10 @@ from servoscope.doubts import blind_to, doubts, seen_by
 from servoscope.examination import Compared, Examination, trace_of
 from servoscope.inverse import nominal_theta
 from servoscope.isolation import isolate
+from servoscope.reasons import reasons
+from servoscope.refit import candidates_of, disagreements, onset_of, refit, said
 from servoscope.sentence import summary
+from servoscope.steady import isolation_inputs
 
 SURE = 0.95  # probability from which a fault is named
 
@@ -38,6 +41,7 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
     candidates: tuple[Candidate, ...] = ()
     faults: tuple[FoundFault, ...] = ()
     since: Onset | None = None
+    told: Refit | None = None
     at, detected_at = len(x.t) - 1, None
     if alarms.size:
         first = int(alarms[0])
@@ -47,12 +51,13 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         at = at if x.alarm[-1] else first + int(np.argmax(x.statistic[first:]))
         progress("onset")
         since = _onset(x, announced, at)
-        candidates = isolate(
-            candidates_of(x.baseline, recording, x.expectation, since.sample, int(x.estimates.index[at])),
-            x.estimates.theta[at] - x.expected[at],
-            x.estimates.S[at] * max(1.0, float(x.estimates.power[at])) + x.baseline.cov(),
-            lambda: progress("isolation"),
-        )
+        recursive = candidates = isolate(*isolation_inputs(x, since, at), lambda: progress("isolation"))
+        progress("refit")
+        refined = refit(x, since, announced, int(x.estimates.index[at]), lambda: progress("refit"))
+        if refined is not None and not (refined.is_unknown and recursive[0].is_learned):
+            candidates, told = candidates_of(refined), said(refined, x, recursive)
+            since = since if refined.is_unknown else onset_of(refined, x)
+            warnings += disagreements(x, candidates, recursive, SURE)
         if candidates[0].probability >= SURE and candidates[0].name != UNKNOWN:
             faults = candidates[0].faults
     else:
@@ -61,18 +66,21 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         span = float(recording.t[0]), float(recording.t[-1])
         warnings += [Warning(kind="power", from_s=span[0], to_s=span[1], count=1, message=text) for text in blind]
     verdict: Verdict = "fault" if alarms.size else "undetermined" if blind else "healthy"
-    trace = trace_of(x.baseline, x.pipeline, x.estimates, x.t, unbiased(x, candidates, since, at), recording.t)
+    compared = unbiased(x, candidates, since, at)
+    trace = trace_of(x.baseline, x.pipeline, x.estimates, x.t, compared, recording.t)
     found = Diagnosis(
         recording=recording.name,
         samples=recording.samples,
         duration_s=recording.duration_s,
         verdict=verdict,
-        summary=summary(verdict, faults, candidates, _since(x, since), seen, warnings, x.baseline.point),
+        summary=summary(verdict, faults, candidates, _since(x, since), seen, warnings, told, x.baseline.point),
         detected_at_s=detected_at,
         onset_s=(since.low_s, since.likely_s, since.high_s) if since is not None else None,
         probability=candidates[0].probability if candidates else None,
         faults=faults,
         candidates=candidates,
+        explanation=reasons(x, trace, at, candidates, told) if alarms.size else (),
+        refit=told,
         parameters=_parameters(trace),
         ifrf=_ifrf(trace),
         warnings=tuple(sorted(warnings, key=lambda warning: warning.from_s)),

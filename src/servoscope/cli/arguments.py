@@ -30,6 +30,7 @@ __all__ = [
     "conditions",
     "fault_events",
     "healthy",
+    "labelled",
     "no_mapping",
     "provenance",
 ]
@@ -63,6 +64,27 @@ def healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
         raise typer.BadParameter(
             f"{without[0]}: name the operating point of each recording, as in cold=a.csv, or of none"
         )
+    return found
+
+
+def labelled(texts: Sequence[str], points: Sequence[str]) -> list[tuple[str, str, Path]]:
+    """Read ``--fault`` of ``learn``: operating point, name and file; ``backlash@warm=a.csv`` is one at the point warm.
+
+    Raises
+    ------
+    typer.BadParameter
+        If a text cannot be read, or its point is none of `points`.
+    """
+    found = []
+    for text in texts:
+        named = re.fullmatch(r"(\w[\w-]*)(?:@(\w[\w-]*))?=(.+)", text)
+        if named is None:
+            raise typer.BadParameter(f"--fault {text!r}: write NAME=FILE, as in backlash=worn.csv")
+        name, point, file = named[1], named[2] or "", Path(named[3])
+        if point not in points:
+            where = f"at one of {', '.join(points)}, as in {name}@{points[0]}={file}" if any(points) else "at no point"
+            raise typer.BadParameter(f"--fault {text!r}: the healthy recordings are {where}")
+        found.append((point, name, file))
     return found
 
 

@@ -196,6 +196,10 @@ def learn(
     accept_change: Annotated[
         bool, typer.Option("--accept-change", help="Learn them all the same, and note the change.")
     ] = False,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=FILE", help="Recording of a known fault to learn too, NAME@POINT=FILE; repeatable."),
+    ] = None,
     columns: ColumnsText = None,
     where: Where = None,
     by: By = None,
@@ -203,13 +207,17 @@ def learn(
     to_s: To = None,
     as_json: AsJson = False,
 ) -> None:
-    """Learn from healthy recordings what healthy looks like."""
+    """Learn from healthy recordings what healthy looks like, and from labelled ones what faults look like."""
     named = arguments.healthy(healthy or [])
     if nominal == bool(named):
         raise typer.BadParameter("give healthy recordings or --nominal, and not both")
     if (accept_change and compare is None) or (nominal and compare is not None):
         raise typer.BadParameter("--accept-change goes with --compare, and that with recordings")
-    check_output(output, "-o", (), [loop, *(path for _, path in named), *filter(None, [compare])])
+    if nominal and fault:
+        raise typer.BadParameter("--fault goes with healthy recordings, not with --nominal")
+    faults = arguments.labelled(fault or [], list(dict.fromkeys(point for point, _ in named)))
+    files = [path for _, path in named] + [path for *_, path in faults]
+    check_output(output, "-o", (), [loop, *files, *filter(None, [compare])])
 
     from servoscope import learning, points
     from servoscope.baseline import Baseline
@@ -224,19 +232,26 @@ def learn(
     earlier = Baseline.load(compare) if compare is not None else None
     failures = Failures()
     recordings: dict[str, list[Recording]] = {point: [] for point, _ in named}
-    with progress(len(named) + 1, 6 * max(1, len(recordings))) as steps:
+    labels: dict[str, dict[str, list[Recording]]] = {point: {} for point in recordings}
+    with progress(len(files) + 1, 6 * max(1, len(recordings))) as steps:
         for point, path in named:
             steps.begin(path.name)
             with failures.noted():
                 recordings[point] += source.read(path)
         if failures.count and not any(recordings.values()):
             failures.leave()
+        for point, name, path in faults:
+            steps.begin(path.name)
+            with failures.noted():
+                labels[point][name] = labels[point].get(name, []) + source.read(path)
         steps.begin("learning")
         if nominal:
             found = learning.nominal(settings, steps.tell)
         else:
-            chosen = recordings.get("", recordings)
-            found = points.learn(settings, chosen, steps.tell, compare=earlier, accept_change=accept_change)
+            chosen, known = recordings.get("", recordings), labels.get("", labels)
+            found = points.learn(
+                settings, chosen, steps.tell, compare=earlier, accept_change=accept_change, faults=known
+            )
         found.save(output)
     if as_json:
         print_json({"baseline": str(output), **summaries.baseline(found)}, lines=False)
@@ -280,7 +295,7 @@ def diagnose(
     many = source.many(recordings)
     pages, traces = Outputs.of(report, ".html", many, inputs), Outputs.of(trace, ".parquet", many, inputs)
     out, failures, faulty = terminal.console(), Failures(), False
-    with progress(len(recordings), 3 + len(healthy.loop.plant.faults)) as steps:
+    with progress(len(recordings), 3 + len(healthy.loop.plant.faults) + len(healthy.learned)) as steps:
         for path in recordings:
             steps.begin(path.name)
             with failures.noted():

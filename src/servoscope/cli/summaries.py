@@ -75,6 +75,7 @@ def _one(b: Baseline) -> dict[str, object]:
         "model_error": b.loop.monitor.model_error,
         "suggested_model_error": b.suggested_model_error,
         "promises": said["promises"],
+        "learned": [{key: fault[key] for key in ("name", "recordings", "shares")} for fault in said["learned"]],
         "notes": said["notes"],
     }
 

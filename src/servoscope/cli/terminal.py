@@ -125,6 +125,10 @@ def _baseline(out: Console, b: Baseline) -> None:
         else:
             table(out, ("fault", "parameter", "seen from a change of"), seen, words=2)
         out.print()
+    if b.learned:
+        severity = [(f.name, f"{len(f.shares)}", f"{min(f.shares):.2f} to {max(f.shares):.2f}") for f in b.learned]
+        table(out, ("labelled fault", "recordings", "severity"), severity)
+        out.print()
     monitor = b.loop.monitor
     listening = f" and {len(b.members)} CUSUMs" if b.members else ""
     told = [
@@ -163,10 +167,13 @@ def diagnosis(out: Console, d: Diagnosis) -> None:
             if fault
             else ("", "", "")
         )
-        rows.append((c.name, probability(c.probability), *size))
+        cosine = f"{c.cosine:.3f}" if c.cosine is not None else ""
+        rows.append((c.name, probability(c.probability), *size, cosine))
     twice = all(row[2] in ("", row[0]) for row in rows)  # the fault is called as its parameter
-    columns = [i for i in range(5) if i != 2 or not twice]
-    header = ("candidate", "probability", "parameter", "ratio", "95 % interval")
+    empty = {2} if twice else set()
+    empty |= {5} if not any(row[5] for row in rows) else set()
+    columns = [i for i in range(6) if i not in empty]
+    header = ("candidate", "probability", "parameter", "ratio", "95 % interval", "cosine")
     if rows:
         table(out, [header[i] for i in columns], [[row[i] for i in columns] for row in rows])
     _warnings(out, d.warnings)

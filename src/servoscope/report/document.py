@@ -18,6 +18,7 @@ from servoscope.report.sheets import candidates, coefficient_units, numbers, sec
 from servoscope.report.wording import (
     clock_time,
     count,
+    factors,
     meaning,
     number,
     probability,
@@ -168,7 +169,8 @@ def _fault_facts(diagnosis: Diagnosis) -> Iterator[Fact]:
     elif seen:
         yield "Since when", "not known", seen
     for fault in diagnosis.faults:
-        size, low, high = size_of(fault.ratio, *fault.interval)
+        told = factors if fault.learned else size_of
+        size, low, high = told(fault.ratio, *fault.interval)
         yield "How large", f"{symbol(fault.parameter)} {size.replace(' ', '&nbsp;')}", f"95 %: {low} to {high}"
     if diagnosis.faults:
         yield "How sure", probability(diagnosis.probability), "among the faults that this plant knows"

@@ -59,6 +59,7 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
     if not diagnosis.candidates:
         return ""
     rows = []
+    labelled = any(candidate.cosine is not None for candidate in diagnosis.candidates)
     for i, candidate in enumerate(diagnosis.candidates):
         width = 100.0 * min(max(candidate.probability, 0.0), 1.0)
         bar = f'<span class="bar"><i style="width:{width:.1f}%"></i></span>'
@@ -80,7 +81,12 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         )
         mark = ' class="first"' if i == 0 else ""
         rows.append(f"<tr{mark}>{''.join(cells)}</tr>")
-    head = ("Explanation", "*Size, relative to healthy", "*95 % interval", ".Probability")
+    head = (
+        "Explanation",
+        f"*Size, relative to {'healthy or labelled' if labelled else 'healthy'}",
+        "*95 % interval",
+        ".Probability",
+    )
     why = "What could explain the change, how large each explanation would have to be, how probable it is."
     return section("Candidates", why, _table(head, rows), "whole candidates")
 

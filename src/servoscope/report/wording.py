@@ -16,6 +16,7 @@ __all__ = [
     "axis_scale",
     "clock_time",
     "count",
+    "factors",
     "meaning",
     "number",
     "plain_symbol",
@@ -135,7 +136,12 @@ def size_of(ratio: float, low: float, high: float) -> tuple[str, str, str]:
         decimals = _decimals(50.0 * (high - low))
         changes = (_signed(f"{100.0 * (value - 1.0):+.{decimals}f}") + " %" for value in values)
         return tuple(changes)  # type: ignore[return-value]
-    ratio_, low_, high_ = ratios(*values)
+    return factors(*values)
+
+
+def factors(ratio: float, low: float, high: float) -> tuple[str, str, str]:
+    """Return a size and its interval as factors, which is what shares of a labelled severity are."""
+    ratio_, low_, high_ = ratios(ratio, low, high)
     return f"× {ratio_}", f"× {low_}", f"× {high_}"
 
 
@@ -185,7 +191,7 @@ def meaning(name: str, words: Mapping[str, str], ratio: float = 1.0) -> str:
     """
     if name == UNKNOWN:
         return "none of the known faults"
-    text = " and ".join(words.get(part, part).partition(" (")[0] for part in name.split("+"))
+    text = " and ".join(words.get(part, part.replace("_", " ")).partition(" (")[0] for part in name.split("+"))
     return re.sub("^more ", "less ", text) if ratio < 1.0 else text
 
 
