@@ -63,6 +63,7 @@ def test_healthy_stays_healthy_and_nothing_is_said_before_the_fault(
 def test_faults_are_found_in_time_and_their_onset_is_right(
     kind: str, eha_cases: Path, eha_truth: dict[str, dict[str, Any]]
 ) -> None:
+    missed = []
     for case in _cases(eha_truth, kind):
         if case["ratios"]:
             diagnosis, _ = _examined(eha_cases, LEARNED_ON[kind], case["file"])
@@ -71,7 +72,10 @@ def test_faults_are_found_in_time_and_their_onset_is_right(
             assert diagnosis.detected_at_s is not None and diagnosis.onset_s is not None
             assert 30.0 <= diagnosis.detected_at_s <= 30.0 + limit, case["file"]
             if kind != "trapezoid":  # which stands still at 30 s: nobody can tell the onset there
-                assert diagnosis.onset_s[0] <= 30.0 <= diagnosis.onset_s[2], case["file"]
+                outside = max(diagnosis.onset_s[0] - 30.0, 30.0 - diagnosis.onset_s[2], 0.0)
+                missed.append(outside)
+    # 95 % intervals of a handful of recordings: one may miss, by little
+    assert sum(outside > 0.0 for outside in missed) <= 1 and max(missed, default=0.0) < 0.1
 
 
 @pytest.mark.parametrize("kind", ["profile", "multisine"])
@@ -96,12 +100,15 @@ def test_friction_on_a_trapezoid_is_friction_or_ambiguous_with_contamination(eha
             assert {c.name for c in diagnosis.candidates[:2]} == {"friction", "contamination"}
 
 
-def test_two_faults_at_once_are_never_named_as_one(eha_cases: Path) -> None:
+def test_two_faults_at_once_are_both_named_with_their_sizes(eha_cases: Path) -> None:
     for learned_on in (LEARNED_ON["multisine"], LEARNED_ON["profile"]):
         diagnosis, _ = _examined(eha_cases, learned_on, "multisine_p_sx0.9_C_iex1.3_32.csv")
-        assert diagnosis.verdict == "fault"
-        assert diagnosis.faults == ()
-        assert diagnosis.candidates[0].name == "unknown"
+        assert [fault.name for fault in diagnosis.faults] == ["pump", "leakage"]
+        for fault, ratio in zip(diagnosis.faults, (0.9, 1.3), strict=True):
+            assert fault.ratio == pytest.approx(ratio, rel=0.01)
+            assert fault.interval[0] < ratio < fault.interval[1]
+        assert diagnosis.refit is not None
+        assert diagnosis.refit.recursive[0].name == "unknown", "which knows single faults only"
 
 
 def test_dirty_recording_is_healthy_and_every_defect_is_told(eha_cases: Path) -> None:

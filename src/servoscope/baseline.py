@@ -55,6 +55,22 @@ class Promise(_Part):
     change: float | None
 
 
+class Exact(_Part):
+    """What the exact predictor, of which the refit makes use, says of the healthy recordings.
+
+    Parameters
+    ----------
+    noise
+        n_u and n_y that make their innovations likeliest.
+    misfit
+        What it leaves unexplained in the worst of them, over what noise leaves in all but one of a thousand: the refit
+        is made where this is at most 1.
+    """
+
+    noise: Noise
+    misfit: float
+
+
 class Baseline(_Part):
     """What a healthy loop looks like to the monitor; everything that `diagnose` needs.
 
@@ -99,8 +115,8 @@ class Baseline(_Part):
         Changes that the sequential test listens for; empty where there is none.
     promises
         Smallest changes that are seen with 90 % probability within the baseline's own excitation.
-    predictor_misfit
-        How badly the exact predictor explains the healthy recordings, at most 1 if well; None where there is none.
+    exact
+        What the exact predictor says of the healthy recordings; None where there is none.
     notes
         What `learn` found worth saying.
     learned
@@ -141,7 +157,7 @@ class Baseline(_Part):
     members: tuple[Member, ...]
     promises: tuple[Promise, ...]
     notes: tuple[str, ...]
-    predictor_misfit: float | None = None
+    exact: Exact | None = None
     learned: tuple[LearnedFault, ...] = ()
     point: str = ""
     others: tuple[Baseline, ...] = ()

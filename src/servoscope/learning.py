@@ -27,7 +27,7 @@ from servoscope.pipeline import Pipeline, Regression
 from servoscope.plants import FloatArray
 from servoscope.promises import WORTH_A_LOOK, misfit_of, noise_notes, promises, supported_budget
 from servoscope.recording import Recording
-from servoscope.refinement.gate import healthy_misfit
+from servoscope.refinement.gate import learn_exact
 from servoscope.rehearsal import Rehearsed, limit_of, prepare
 from servoscope.sequential import Member
 from servoscope.signatures import Expectation, colour_of, course, residual_system
@@ -278,13 +278,13 @@ def _assemble(
         notes=tuple(notes),
     )
     progress("predictor")
-    misfit = healthy_misfit(baseline, recordings)
-    if misfit is not None and misfit > 1.0:
+    predictor = learn_exact(baseline, recordings)
+    if predictor is not None and predictor.misfit > 1.0:
         notes.append(
-            f"the sampled plant does not explain the healthy recordings to the last digit ({misfit:.2g} times what "
-            "noise would leave): faults are named by the recursion alone, without a refit; check [plant] and delay"
+            f"the sampled plant leaves {predictor.misfit:.2g} times what noise would in the healthy recordings: faults are "
+            "named by the recursion alone, without a refit; check [plant] and delay"
         )
-    return baseline.model_copy(update={"predictor_misfit": misfit, "notes": tuple(notes)})
+    return baseline.model_copy(update={"exact": predictor, "notes": tuple(notes)})
 
 
 def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:

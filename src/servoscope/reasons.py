@@ -77,8 +77,8 @@ def _left(candidates: Sequence[Candidate], refit: Refit | None) -> str:
     if refit is None or best is None:
         return ""
     return (
-        f"From {refit.from_s:.1f} s to {refit.to_s:.1f} s {best.name} at its best leaves {refit.misfit:.3g} unexplained, "
-        f"a true explanation at most {refit.limit:.3g}."
+        f"From {refit.from_s:.1f} to {refit.to_s:.1f} s {best.name} at its best leaves {refit.misfit:.3g} unexplained; "
+        f"what is true leaves at most {refit.limit:.3g}."
     )
 
 

@@ -10,7 +10,6 @@ from servoscope.detection import Onset
 from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault, Mimic, Refit, Warning
 from servoscope.examination import Examination
 from servoscope.refinement import Hypothesis, Refined, causes, refine
-from servoscope.refinement.gate import exact
 
 WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
 APART = 3.0  # standard deviations between two sizes that are called different
@@ -18,8 +17,8 @@ APART = 3.0  # standard deviations between two sizes that are called different
 
 def refit(x: Examination, since: Onset, announced: int, last: int, progress: Callable[[], None]) -> Refined | None:
     """Refit the seconds around an onset; None where the exact predictor does not explain even healthy recordings."""
-    misfit = x.baseline.predictor_misfit
-    if misfit is None or misfit > 1.0 or not exact(x.baseline):
+    exact = x.baseline.exact
+    if exact is None or exact.misfit > 1.0:
         return None
     return refine(x.baseline, x.recording, since.sample, announced, last, progress)
 

@@ -25,6 +25,7 @@ from servoscope.examination import Compared, Examination, trace_of
 from servoscope.inverse import nominal_theta
 from servoscope.isolation import isolate
 from servoscope.reasons import reasons
+from servoscope.refinement import Refined
 from servoscope.refit import candidates_of, disagreements, onset_of, refit, said
 from servoscope.sentence import summary
 from servoscope.steady import isolation_inputs
@@ -54,7 +55,7 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         recursive = candidates = isolate(*isolation_inputs(x, since, at), lambda: progress("isolation"))
         progress("refit")
         refined = refit(x, since, announced, int(x.estimates.index[at]), lambda: progress("refit"))
-        if refined is not None and not (refined.is_unknown and recursive[0].is_learned):
+        if refined is not None and not _labelled(refined, recursive[0]):
             candidates, told = candidates_of(refined), said(refined, x, recursive)
             since = since if refined.is_unknown else onset_of(refined, x)
             warnings += disagreements(x, candidates, recursive, SURE)
@@ -87,6 +88,12 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         point=x.baseline.point or None,
     )
     return found, trace
+
+
+def _labelled(refined: Refined, recursive: Candidate) -> bool:
+    """Return whether a fault learned from labelled recordings says more than the refit, which knows none."""
+    sure = recursive.is_learned and recursive.probability >= SURE
+    return sure and (refined.is_unknown or len(refined.best.fitted.faults) > 1)
 
 
 def _announced(x: Examination, first: int) -> int:

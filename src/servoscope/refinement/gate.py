@@ -1,4 +1,4 @@
-"""Whether the exact predictor explains the healthy recordings: only then is a refit worth more than the recursion."""
+"""Whether the exact predictor explains the healthy recordings, and with which noise: only then is a refit worth it."""
 
 from __future__ import annotations
 
@@ -6,32 +6,58 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servoscope.baseline import Baseline
+from servoscope.baseline import Baseline, Exact
+from servoscope.noise import Noise
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import goodness, traces
 from servoscope.refinement.window import Growth, Window
 
 MOST = 60_000  # samples of a recording that are looked at
+SPLIT = 20.0  # times more or less noise on u, relative to that on y, than the recursion's residual shows
+SILENT = 1e-6  # of the noise; what is quieter was simulated without any
 
 
-def exact(baseline: Baseline) -> bool:
-    """Return whether the exact predictor can be written down: known noise, a linear plant, a held input."""
-    loop = baseline.loop
-    known = baseline.noise is not None and baseline.noise.y_std > 0.0 and not loop.monitor.model_error
-    return known and loop.plant.has_physics and loop.plant.linear and not loop.plant.extras and loop.hold == "zoh"
+def learn_exact(baseline: Baseline, recordings: Sequence[Recording]) -> Exact | None:
+    """Return the noise that makes the innovations of healthy recordings likeliest, and what they leave unexplained.
 
-
-def healthy_misfit(baseline: Baseline, recordings: Sequence[Recording]) -> float | None:
-    """Return how badly the worst healthy recording is explained: score statistic over its limit, at most 1 if well.
-
-    None where the predictor cannot be written down, see `exact`.
+    None where the predictor cannot be written down: the noise is unknown, the plant is not linear, the input is not
+    held. The split between n_u and n_y, which the filters of the recursion hide, shows in the innovations.
     """
-    if not exact(baseline):
+    from scipy.optimize import minimize_scalar
+
+    loop, noise = baseline.loop, baseline.noise
+    if noise is None or not noise.y_std > 0.0 or loop.monitor.model_error or loop.hold != "zoh":
         return None
-    return max(_misfit(Window.of(baseline, rec, 0, min(rec.samples, MOST))) for rec in recordings)
+    if not loop.plant.has_physics or not loop.plant.linear or loop.plant.extras:
+        return None
+
+    def windows(u_std: float, y_std: float) -> list[Window]:
+        known = baseline.model_copy(update={"exact": Exact(noise=Noise(u_std, y_std), misfit=0.0)})
+        return [Window.of(known, rec, 0, min(rec.samples, MOST)) for rec in recordings]
+
+    def parts(x: float) -> tuple[float, float]:
+        """Return the sum of squares and of log S, for noise of u exp(x) times as loud as y's in their usual units."""
+        each = windows(noise.y_std * usual * np.exp(x), noise.y_std)
+        squares = sum(float((window.innovations(window.healthy, Growth(window.samples)) ** 2).sum()) for window in each)
+        return squares, sum(window.samples * float(np.log(window.healthy.S[0, -1])) for window in each)
+
+    def cost(x: float) -> float:
+        squares, volume = parts(x)
+        return samples * float(np.log(squares)) + volume
+
+    samples = sum(min(rec.samples, MOST) for rec in recordings)
+    usual = max(noise.u_std / noise.y_std, 1e-3 * float(np.mean([rec.u.std() for rec in recordings])) / noise.y_std)
+    if parts(0.0)[0] < SILENT * samples:
+        return None
+    reach = float(np.log(SPLIT))
+    split = float(minimize_scalar(cost, bounds=(-reach, reach), method="bounded", options={"xatol": 0.02}).x)
+    std = noise.y_std * float(np.sqrt(parts(split)[0] / samples))
+    found = Noise(u_std=std * usual * float(np.exp(split)), y_std=std)
+    return Exact(noise=found, misfit=max(_misfit(window) for window in windows(found.u_std, found.y_std)))
 
 
 def _misfit(window: Window) -> float:
+    """Return the score statistic of a healthy window over its limit."""
     m, always = window.nuisances, Growth(window.samples)
     nothing = np.zeros(m)
     residual = window.residual(nothing, (), always)

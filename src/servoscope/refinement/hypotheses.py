@@ -119,6 +119,9 @@ def fit(
     def jacobian(z: FloatArray) -> FloatArray:
         return window.jacobian(whole(z), names, growth, slice(held, None))
 
+    if not len(lowest):  # nothing is open
+        e = window.residual(d, names, growth)
+        return Fitted((), growth, d, np.zeros(0), float(e @ e), np.zeros((0, 0)), np.zeros((len(e), 0)), e)
     ends = []
     for x in starts:
         z = np.clip(np.concatenate([d, x])[held:], lowest + AT_BOUND, highest - AT_BOUND)

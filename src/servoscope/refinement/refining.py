@@ -20,7 +20,7 @@ BEFORE_S = 60.0  # of healthy motion before the onset
 AFTER_S = 240.0  # of motion with the change
 MOST = 40_000  # samples in a window
 PAIRS = 0.02  # probability that two faults come at once, before anything is known
-IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth computing
+IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +189,7 @@ class _Search:
         told = [
             evidence(window, f, [scales[fault] for fault in f.faults], self.louder)
             if self._within(f, best)
-            else Evidence(-0.5 * f.J / self.louder, f.intervals(self.louder))
+            else Evidence(-np.inf, f.intervals(self.louder))
             for f in fitted
         ]
         logs = np.array([e.log + np.log(prior[len(f.names)]) for e, f in zip(told, fitted, strict=True)])

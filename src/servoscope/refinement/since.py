@@ -23,6 +23,7 @@ CLOSER = 3  # times closer together they are in each further look
 LOOKS = 5
 NEGLIGIBLE = 1e-4  # of the largest posterior, that a further look may leave out
 INTERVAL = 0.025, 0.975
+ALIKE = 3.84  # of the cost: 95 % of chi-square with one degree of freedom
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,9 @@ def since(window: Window, found: Fitted, latest: int, louder: float) -> Since:
     order = np.argsort(onsets, kind="stable")
     share = np.cumsum((likelihood * prior)[order])
     low, high = (int(onsets[order][np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
+    # at rest no onset is better than another: what is nearly as likely as the best belongs to the interval, its edge too
+    alike = onsets[cost <= cost.min() + ALIKE * louder]
+    low, high = min(low, int(alike.min())), max(high, int(alike.max()))
     best = int(np.argmax(likelihood * np.where(overs == 0, 1.0, NEGLIGIBLE**0.1)))
     return Since(Growth(int(onsets[best]), int(overs[best])), low, high)
 

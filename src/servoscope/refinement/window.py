@@ -76,12 +76,12 @@ class Window:
 
     @classmethod
     def of(cls, baseline: Baseline, recording: Recording, first: int, end: int) -> Window:
-        """Cut samples `first` to `end` out of a recording that a baseline has noise for."""
-        if baseline.noise is None:
-            raise ValueError("a window needs a baseline that knows the loop's noise")
+        """Cut samples `first` to `end` out of a recording; the baseline has an exact predictor."""
+        if baseline.exact is None:
+            raise ValueError("a window needs a baseline with an exact predictor")
         C = np.array(baseline.ratios_covariance)
         prior = np.linalg.inv(np.linalg.cholesky(C)) if len(C) else np.zeros((0, 0))
-        bench = Bench.of(baseline.loop, baseline.noise, recording.u)
+        bench = Bench.of(baseline.loop, baseline.exact.noise, recording.u)
         u = _delayed(acting(baseline.loop, recording.u), recording.restart, bench.whole)
         restart = recording.restart[first:end].copy()
         restart[0] = True
