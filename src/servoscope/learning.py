@@ -281,8 +281,8 @@ def _assemble(
     predictor = learn_exact(baseline, recordings)
     if predictor is not None and predictor.misfit > 1.0:
         notes.append(
-            f"the sampled plant leaves {predictor.misfit:.2g} times what noise would in the healthy recordings: faults are "
-            "named by the recursion alone, without a refit; check [plant] and delay"
+            f"the sampled plant leaves {predictor.misfit:.2g} times what noise would in the healthy recordings: faults "
+            "are named by the recursion alone, without a refit; check [plant] and delay"
         )
     return baseline.model_copy(update={"exact": predictor, "notes": tuple(notes)})
 

@@ -78,7 +78,7 @@ def since(window: Window, found: Fitted, latest: int, louder: float) -> Since:
     order = np.argsort(onsets, kind="stable")
     share = np.cumsum((likelihood * prior)[order])
     low, high = (int(onsets[order][np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
-    # at rest no onset is better than another: what is nearly as likely as the best belongs to the interval, its edge too
+    # at rest no onset is better than another: what is nearly as likely as the best belongs to it, its edge too
     alike = onsets[cost <= cost.min() + ALIKE * louder]
     low, high = min(low, int(alike.min())), max(high, int(alike.max()))
     best = int(np.argmax(likelihood * np.where(overs == 0, 1.0, NEGLIGIBLE**0.1)))
