@@ -135,70 +135,56 @@ def sweep(
     Returns
     -------
     sums
-        Shape (M, v + m, v + m): products of all pairs of the columns [e, its derivatives by the sizes, Q]; those of Q
-        with itself are not filled.
+        Shape (M, v, v + m): products of [e, its derivatives by the sizes] with themselves and with Q.
     volume
         Sum of log S relative to the healthy plant's, shape (M,).
     """
     V, P, n, L = A.shape[0], A.shape[1], A.shape[2], K.shape[2]
     N, m, M = len(y), Q.shape[1], len(onsets)
     W = V + m
-    states = np.zeros((N, V, n))
-    row = np.zeros(W)
-    x, following = np.zeros((V, n)), np.zeros(n)
-    before, after = np.zeros((N + 1, W, W)), np.zeros((N + 1, W, W))
-    volume_after = np.zeros(N + 1)
-    changed = np.zeros((N, V))
-    age = np.zeros(N, np.int64)
+    age = np.zeros(N, np.int64)  # samples since a restart, as far as the gains change
     j = L - 1
     for k in range(N):
-        if restart[k]:
-            j = 0
+        j = 0 if restart[k] else min(j + 1, L - 1)
         age[k] = j
-        j = min(j + 1, L - 1)
-    for final in range(2):  # the healthy plant all the way, and the changed one
-        p = (P - 1) * final
-        x[:] = 0.0
-        for k in range(N):
-            if not final:
-                states[k] = x
-            for v in range(V):
-                row[v] = _advance(A, b, late, c, K, S, v, p, age[k], k, u, y, restart, x, following)
-            if final:
-                changed[k] = row[:V]
-            else:
-                for v in range(1, V):
-                    row[v] = 0.0
-                row[V:] = Q[k]
-                before[k + 1] = before[k]
-                _add(before[k + 1], row, V)
+    row, x, following = np.zeros(W), np.zeros((V, n)), np.zeros(n)
+    states, changed = np.zeros((N + 1, V, n)), np.zeros((N, V))
+    before, after, volume_after = np.zeros((N + 1, V, W)), np.zeros((N + 1, V, W)), np.zeros(N + 1)
+    for k in range(N):  # the healthy plant all the way
+        for v in range(V):
+            row[v] = _advance(A, b, late, c, K, S, v, 0, age[k], k, u, y, restart, x, following)
+            for i in range(n):
+                states[k + 1, v, i] = x[v, i]
+        _add(before[k], before[k + 1], row, 0.0, Q, k, V)
+    for v in range(V):
+        for i in range(n):
+            x[v, i] = 0.0
+    for k in range(N):  # and the changed one
+        for v in range(V):
+            changed[k, v] = _advance(A, b, late, c, K, S, v, P - 1, age[k], k, u, y, restart, x, following)
     for k in range(N - 1, -1, -1):
-        row[0] = changed[k, 0]
-        for v in range(1, V):
-            row[v] = (changed[k, v] - changed[k, 0]) / step
-        row[V:] = Q[k]
-        after[k] = after[k + 1]
-        _add(after[k], row, V)
+        for v in range(V):
+            row[v] = changed[k, v]
+        _add(after[k + 1], after[k], row, 1.0 / step, Q, k, V)
         volume_after[k] = volume_after[k + 1] + np.log(S[0, P - 1, age[k]] / S[0, 0, age[k]])
-    sums, volume = np.zeros((M, W, W)), np.zeros(M)
+    sums, volume = np.zeros((M, V, W)), np.zeros(M)
     for i in range(M):
         onset, over = onsets[i], overs[i]
         stop = min(onset + over + settle, N)
-        total = before[onset] + after[stop]
         volume[i] = volume_after[stop]
-        x[:] = states[min(onset, N - 1)]
+        for v in range(V):
+            for q in range(n):
+                x[v, q] = states[onset, v, q]
+            for q in range(W):
+                sums[i, v, q] = before[onset, v, q] + after[stop, v, q]
         for k in range(onset, stop):
             p = P - 1
             if k < onset + over:
                 p = 1 + (k - onset) * (P - 2) // over
             for v in range(V):
                 row[v] = _advance(A, b, late, c, K, S, v, p, age[k], k, u, y, restart, x, following)
-            for v in range(1, V):
-                row[v] = (row[v] - row[0]) / step
-            row[V:] = Q[k]
-            _add(total, row, V)
+            _add(sums[i], sums[i], row, 1.0 / step, Q, k, V)
             volume[i] += np.log(S[0, p, age[k]] / S[0, 0, age[k]])
-        sums[i] = total
     return sums, volume
 
 
@@ -231,8 +217,15 @@ def _advance(
 
 
 @kernel
-def _add(total: Array, row: Array, V: int) -> None:
-    """Add the products of a row's first V entries with all of it."""
-    for a in range(V):
-        for other in range(len(row)):
-            total[a, other] += row[a] * row[other]
+def _add(old: Array, new: Array, row: Array, by: float, Q: Array, k: int, V: int) -> None:
+    """Add to sums the products of [e, its derivatives] with themselves and with Q's row k.
+
+    `row` holds the innovations of the variants, and afterwards their derivatives: differences times `by`.
+    """
+    for v in range(1, V):
+        row[v] = (row[v] - row[0]) * by
+    for v in range(V):
+        for other in range(V):
+            new[v, other] = old[v, other] + row[v] * row[other]
+        for q in range(Q.shape[1]):
+            new[v, V + q] = old[v, V + q] + row[v] * Q[k, q]
