@@ -140,8 +140,7 @@ class _Search:
         if len(best.faults) > 1:
             found = self._since(best)
         everything = [self._again(f, found.growth) for f in (*singles, *pairs)]
-        best = self._best(everything)
-        everything = [self._free(f) if self._within(f, best) else f for f in everything]
+        everything = self._freed(everything)
         best = self._best(everything)
         return self._weighed([self._own(f, best) for f in everything], found)
 
@@ -164,7 +163,8 @@ class _Search:
                 if found.growth == self.growth:
                     break
                 singles = self._singles(found.growth, d, ladders, singles)
-                if self._best(singles).J > before - WORTH_A_LOOK * self.louder:
+                gained = before - self._best(singles).J
+                if gained < WORTH_A_LOOK * self.louder:
                     break
         return found, singles
 
@@ -181,6 +181,21 @@ class _Search:
     def _fit(self, faults: Sequence[Fault], d: FloatArray, starts: Sequence[FloatArray]) -> Fitted:
         self.progress()
         return fit(self.window, faults, self.growth, d, starts, free=False)
+
+    def _freed(self, fitted: Sequence[Fitted]) -> list[Fitted]:
+        """Let the healthy parameters follow wherever that may bring a hypothesis within reach of the best one.
+
+        Under a large fault they matter: a second fault that stands in for their error must not outrun the first alone.
+        """
+        promised = [self._promised(f) for f in fitted]
+        limit = min(promised) + IN_REACH * self.louder
+        return [self._free(f) if limit >= J else f for f, J in zip(fitted, promised, strict=True)]
+
+    def _promised(self, fitted: Fitted) -> float:
+        """Return the sum of squares that one step of Gauss and Newton promises."""
+        J = self.window.jacobian(np.concatenate([fitted.d, fitted.x]), fitted.names, fitted.growth)
+        Q, _ = np.linalg.qr(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300))
+        return float(fitted.J - ((Q.T @ fitted.residual) ** 2).sum())
 
     def _free(self, fitted: Fitted) -> Fitted:
         self.progress()
