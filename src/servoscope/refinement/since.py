@@ -53,7 +53,7 @@ class _Tried:
     prior: FloatArray
 
 
-def since(window: Window, found: Fitted, latest: int, louder: float) -> Since:
+def since(window: Window, found: Fitted, latest: int, louder: float, drifts: bool = True) -> Since:
     """Find when a change began, as a step or as a drift.
 
     The likelihood of each onset and duration has the sizes and the healthy parameters at their best, by one step of
@@ -67,12 +67,14 @@ def since(window: Window, found: Fitted, latest: int, louder: float) -> Since:
         Sample of the window by which it had begun.
     louder
         Variance of the innovations.
+    drifts
+        Whether drifts are tried as well.
     """
     table = _Table(window, found, louder)
     tried = [_steps(table, latest, louder)]
-    drifts = _drifts(table, latest, louder)
-    if drifts is not None:
-        tried.append(drifts)
+    drifting = _drifts(table, latest, louder) if drifts else None
+    if drifting is not None:
+        tried.append(drifting)
     onsets, overs, cost, prior = (np.concatenate([getattr(t, name) for t in tried]) for name in vars(tried[0]))
     likelihood = np.exp(-0.5 * (cost - cost.min()) / louder)
     order = np.argsort(onsets, kind="stable")
