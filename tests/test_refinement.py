@@ -64,8 +64,7 @@ class TestPredictor:
         bench = window.bench
         plants = [window.plant, window.plant.with_ratios({"C_ie": np.exp(0.2), "b_p": np.exp(1.5)})]
         discrete = [discretise(plant.state_space(), 100.0) for plant in plants]
-        first = bench._open(predictor.A[0], predictor.b[0] + predictor.late[0], predictor.c[0])
-        T = bench.scale
+        first, T = bench.first, bench.scale
         state, P = np.zeros(3), np.zeros((3, 3))
         e = np.empty(window.samples)
         for k in range(window.samples):
