@@ -1,0 +1,165 @@
+"""A recording that is to come: the loop without noise under a reference, and the innovations that a change would leave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from servoscope.baseline import Baseline
+from servoscope.errors import BaselineError, LoopError, SimulationError
+from servoscope.loop import Loop
+from servoscope.plants import FloatArray
+from servoscope.recording import Recording
+from servoscope.refinement.refining import BEFORE_S
+from servoscope.refinement.window import Growth, Window
+from servoscope.simulation import response
+from servoscope.simulation.closed_loop import checked, recorded
+
+LEAD = 300  # samples before the onset, after which a predictor knows the state
+FEWEST = 50  # samples with the change
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is studied; build it with `of`.
+
+    Parameters
+    ----------
+    baseline
+        What healthy looks like.
+    r
+        Reference of the recording, shape (N,).
+    onset
+        First sample with the change; what is before is healthy.
+    prior
+        Inverse of a root of the covariance that the healthy parameters' logarithms have when the healthy seconds
+        before the onset are known as well, shape (m, m).
+    """
+
+    baseline: Baseline
+    r: FloatArray
+    onset: int
+    prior: FloatArray
+
+    @classmethod
+    def of(cls, baseline: Baseline, r: FloatArray, after_s: float = 30.0) -> Self:
+        """Prepare the study of changes that are `after_s` [s] old when the reference r (N,) ends.
+
+        Raises
+        ------
+        BaselineError, LoopError
+            If the loop cannot be simulated, or not by the exact predictor.
+        SimulationError
+            If r is no reference, or shorter than `after_s`.
+        """
+        check(baseline.loop)
+        if baseline.noise is None or not max(baseline.noise.u_std, baseline.noise.y_std) > 0.0:
+            raise BaselineError("the baseline knows no noise, without which every change is seen: learn it again")
+        r = checked(r)
+        after = round(after_s * baseline.loop.sample_rate)
+        if not FEWEST <= after <= len(r):
+            least = FEWEST / baseline.loop.sample_rate
+            longest = len(r) / baseline.loop.sample_rate
+            raise SimulationError(f"{after_s:g} s after the onset: give at least {least:g} s, at most {longest:g} s")
+        plain = cls(baseline, r, len(r) - after, np.zeros((0, 0)))
+        return replace(plain, prior=plain._known_before())
+
+    @property
+    def loop(self) -> Loop:
+        """The loop."""
+        return self.baseline.loop
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters of the k faults."""
+        return tuple(fault.parameter for fault in self.loop.plant.faults)
+
+    @property
+    def after_s(self) -> float:
+        """Seconds with the change."""
+        return (len(self.r) - self.onset) / self.loop.sample_rate
+
+    @property
+    def lead(self) -> int:
+        """Samples of a window before the onset."""
+        return min(self.onset, LEAD)
+
+    @property
+    def growth(self) -> Growth:
+        """The change, in samples of a window."""
+        return Growth(self.lead)
+
+    def window(self, ratios: Mapping[str, float]) -> Window:
+        """Return what a refit would see, without noise, of parameters that change to so many times their values.
+
+        Raises
+        ------
+        SimulationError
+            If the loop is unstable then.
+        """
+        plant = self.baseline.plant
+        ill = plant.with_ratios(ratios) if ratios else plant
+        plants, switch = ([plant, ill], [0, self.onset]) if self.onset else ([ill], [0])
+        u, y = response(self.loop, self.r, plants=plants, switch=switch)
+        seen = Window.of(self.baseline, self._recording(u, y), self.onset - self.lead, len(self.r))
+        return replace(seen, prior=self.prior)
+
+    @cached_property
+    def healthy(self) -> Window:
+        """The window of a healthy loop."""
+        return self.window({})
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Innovations and prior by the errors of the m healthy parameters and by the k changes, (N + m, m + k)."""
+        window = self.healthy
+        return window.jacobian(np.zeros(window.nuisances + len(self.names)), self.names, self.growth)
+
+    @property
+    def sensitivity(self) -> FloatArray:
+        """Innovations by the changes alone, shape (N + m, k): logarithms of ratios in standard deviations."""
+        return self.jacobian[:, self.healthy.nuisances :]
+
+    def projected(self, columns: FloatArray) -> FloatArray:
+        """Return what columns (N + m, q) say that errors of the healthy parameters do not say as well."""
+        nuisance = self.jacobian[:, : self.healthy.nuisances]
+        if not nuisance.shape[1]:
+            return columns
+        Q, _ = np.linalg.qr(nuisance / np.linalg.norm(nuisance, axis=0))
+        return np.asarray(columns - Q @ (Q.T @ columns))
+
+    def _known_before(self) -> FloatArray:
+        window = self.healthy
+        C = np.array(self.baseline.ratios_covariance)
+        prior = np.linalg.inv(C) if len(C) else np.zeros((0, 0))
+        if not len(C) or not self.onset:
+            return np.asarray(np.linalg.cholesky(prior).T) if len(C) else prior
+        first = max(self.onset - round(BEFORE_S * self.loop.sample_rate), 0)
+        u, y = response(self.loop, self.r[: self.onset], plants=[self.baseline.plant])
+        window = Window.of(self.baseline, self._recording(u, y), first, self.onset)
+        J = window.jacobian(np.zeros(window.nuisances), (), Growth(0))[: window.samples]
+        return np.asarray(np.linalg.cholesky(prior + J.T @ J).T)
+
+    def _recording(self, u: FloatArray, y: FloatArray) -> Recording:
+        return recorded(self.loop, self.r[: len(u)], u, y)
+
+
+def check(loop: Loop) -> None:
+    """Refuse a loop whose predictor would not be exact.
+
+    Raises
+    ------
+    LoopError
+        If so.
+    """
+    if loop.controller is None or not loop.plant.has_physics:
+        raise LoopError(f"{loop.name}: a study before deployment needs [controller] and the plant's nominal values")
+    if not loop.plant.linear or loop.plant.extras or loop.hold != "zoh":
+        raise LoopError(
+            f"{loop.name}: a study before deployment needs a linear plant with hold = 'zoh': leave out friction, "
+            "offset and the square-root valve"
+        )
