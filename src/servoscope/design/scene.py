@@ -12,6 +12,7 @@ import numpy as np
 from servoscope.baseline import Baseline
 from servoscope.errors import BaselineError, LoopError, SimulationError
 from servoscope.loop import Loop
+from servoscope.noise import Noise
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 from servoscope.refinement.refining import BEFORE_S
@@ -72,6 +73,12 @@ class Scene:
     def loop(self) -> Loop:
         """The loop."""
         return self.baseline.loop
+
+    @property
+    def noise(self) -> Noise:
+        """Its noise; `of` has made sure that there is some."""
+        assert self.baseline.noise is not None
+        return self.baseline.noise
 
     @property
     def names(self) -> tuple[str, ...]:
