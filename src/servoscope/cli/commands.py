@@ -181,6 +181,62 @@ def inspect(
 
 
 @app.command()
+def design(
+    loop: LoopFile,
+    healthy: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="HEALTHY", help="Healthy recordings, if there are any.", show_default=False),
+    ] = None,
+    reference: Annotated[
+        str, typer.Option(metavar="KIND|FILE", help="Motion, without recordings: as for simulate.")
+    ] = "profile",
+    after: Annotated[float, typer.Option(metavar="S", help="Time since the onset that may be used, in s.")] = 30.0,
+    noise_u: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on u, std. dev.")] = 1e-4,
+    noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on y, std. dev.")] = 3.162e-4,
+    columns: ColumnsText = None,
+    where: Where = None,
+    by: By = None,
+    from_s: From = None,
+    to_s: To = None,
+    as_json: AsJson = False,
+    report: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Write a page with plots.")] = None,
+) -> None:
+    """Say before deployment which faults can be detected and told apart, at which size, after how long."""
+    check_output(report, "--report", REPORTS, [loop, *(healthy or [])])
+    arguments.check_reference(reference)
+
+    from servoscope.cli import studies, summaries, terminal
+    from servoscope.cli.progress import progress
+    from servoscope.design import design_study
+    from servoscope.loop import Loop
+
+    settings = Loop.load(loop)
+    arguments.check_length(after, settings.sample_rate)
+    source = Source.of(settings, columns, where, by, (from_s, to_s))
+    with progress(1, 4 + 2 * len(settings.plant.faults)) as steps:
+        steps.begin("reading" if healthy else "simulating")
+        recordings = [recording for path in healthy or [] for recording in source.read(path)]
+        said = design_study(
+            settings,
+            recordings,
+            reference=reference,
+            after_s=after,
+            noise_u_std=noise_u,
+            noise_y_std=noise_y,
+            progress=steps.tell,
+        )
+    if as_json:
+        print_json(summaries.plain(said), lines=False)
+    else:
+        studies.study(terminal.console(), said)
+    if report is not None:
+        from servoscope.report import studies as pages
+
+        pages.write(report, said)
+        terminal.written(terminal.console(stderr=as_json), report)
+
+
+@app.command()
 def learn(
     loop: LoopFile,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="BASELINE", help="Baseline to write (JSON).")],

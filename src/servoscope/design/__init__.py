@@ -1,7 +1,7 @@
 """Before deployment: which faults can be detected and told apart, at which size, after how long."""
 
-from servoscope.design.designing import design
+from servoscope.design.designing import design_study
 from servoscope.design.findings import FaultStudy, Side, Study
 from servoscope.design.studying import study
 
-__all__ = ["FaultStudy", "Side", "Study", "design", "study"]
+__all__ = ["FaultStudy", "Side", "Study", "design_study", "study"]

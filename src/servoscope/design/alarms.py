@@ -104,10 +104,11 @@ class Alarms:
     def _statistic(self) -> None:
         """Prepare T^2: deviations of healthy recordings, whitened with what the baseline thinks of them."""
         e = []
+        loop = self.scene.loop.model_copy(update={"plant": self.plant})
         for seed in range(RECORDINGS):
-            loop = self.scene.loop.model_copy(update={"plant": self.plant})
-            noise = {"noise_u_std": self.noise.u_std, "noise_y_std": self.noise.y_std}
-            e.append(self.pipeline.estimate(self.tuning, simulate(loop, self.r, seed=SEED + seed, **noise)[0]))
+            u_std, y_std = self.noise.u_std, self.noise.y_std
+            recording, _ = simulate(loop, self.r, noise_u_std=u_std, noise_y_std=y_std, seed=SEED + seed)
+            e.append(self.pipeline.estimate(self.tuning, recording))
         self.looks = (e[0].updates > 0) & (e[0].index >= self.since)
         self.index = e[0].index[self.looks]
         self.start = np.array(self.baseline.model_theta)

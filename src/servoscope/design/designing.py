@@ -26,7 +26,7 @@ SEED = 1
 Progress = Callable[[str], None]
 
 
-def design(
+def design_study(
     loop: Loop,
     recordings: Sequence[Recording] = (),
     *,

@@ -1,4 +1,4 @@
-"""How far apart two explanations are, exactly: what another fault at its best leaves of the innovations of the true one."""
+"""How far apart two explanations are, exactly: what another fault at its best leaves of a true one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from servoscope.design.information import MISNAMED, bound, confusion, equivalent
 from servoscope.design.scene import Scene
 from servoscope.errors import SimulationError
 from servoscope.plants import Fault, FloatArray
-from servoscope.refinement.hypotheses import bounds, fit, start
+from servoscope.refinement.hypotheses import bounds, fit
 from servoscope.refinement.window import Window
 
 NEAR = 200.0  # squared distance from which hypotheses are never taken for each other, and not fitted any closer
@@ -21,8 +21,8 @@ STEPS = 6  # of Gauss and Newton
 CONVERGED = 1e-3  # of a squared distance of one
 GRID = 12  # sizes between the radius that linear distances promise and the end of the range
 FINE = 0.01  # relative precision of a radius
-SUSPICIOUS = 1.4  # logarithm of a distance relative to what is needed, below which a dip is looked into
-LOOKS = 8  # into a dip
+SUSPICIOUS = 1.0  # logarithm of a distance relative to what is needed, below which a dip is looked into
+LOOKS = 6  # into a dip
 FAR = 10.0  # stands for a distance beyond all need
 DRAWS = 20_000
 
@@ -61,7 +61,7 @@ class Apart:
 
         Drawn from the joint distribution of the log-likelihood ratios, D^2/2 + D'w each.
         """
-        root = np.linalg.qr(self.left.T, mode="r").T
+        root = np.asarray(np.linalg.qr(self.left.T, mode="r"), dtype=np.float64).T
         w = np.random.default_rng(seed).standard_normal((DRAWS, root.shape[1]))
         against = 0.5 * self.squared + w @ root.T
         wins = (against < 0.0) & (against <= against.min(axis=1, keepdims=True))
@@ -145,7 +145,10 @@ def unclear(scene: Scene, fault: Fault, up: bool, progress: Callable[[], None] =
         return ratio
 
     promised = min(bound(fisher(scene, exact=False), scene.names.index(fault.parameter)), 0.9 * end)
-    sizes = np.log(np.geomspace(0.9 * promised, end, GRID)).tolist()
+    learned = excess("squared")
+    points = [(x, learned(x)) for x in np.log(np.geomspace(0.9 * promised, end, GRID)).tolist()]
+    _look_into_dips(learned, points)
+    sizes = sorted(known)
     return Unclear(*(_below(excess(of), sizes) for of in ("squared", "certain")))
 
 
@@ -154,10 +157,9 @@ def _below(excess: Callable[[float], float], log_sizes: list[float]) -> tuple[Sp
     from scipy.optimize import brentq
 
     points = [(x, excess(x)) for x in log_sizes]
-    while points[0][1] > 0.0 and len(points) < 2 * GRID:
-        x = points[0][0] - 0.3
-        points.insert(0, (x, excess(x)))
-    points = sorted(points + _dips(excess, points))
+    for _ in range(GRID):
+        if points[0][1] > 0.0:
+            points.insert(0, (points[0][0] - 0.3, excess(points[0][0] - 0.3)))
     spans, begin = [], 0.0
     if points[0][1] > 0.0:
         return ()
@@ -174,17 +176,19 @@ def _below(excess: Callable[[float], float], log_sizes: list[float]) -> tuple[Sp
     return tuple(spans)
 
 
-def _dips(excess: Callable[[float], float], points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return points between others at which an excess may become negative and does."""
+def _look_into_dips(excess: Callable[[float], float], points: list[tuple[float, float]]) -> None:
+    """Evaluate an excess between points where it may become negative."""
     from scipy.optimize import minimize_scalar
 
-    found = []
-    for i in range(1, len(points) - 1):
-        (low, left), (_, middle), (high, right) = points[i - 1 : i + 2]
+    for (low, left), (_, middle), (high, right) in zip(points, points[1:], points[2:], strict=False):
         if 0.0 < middle <= min(left, right) and middle < SUSPICIOUS:
-            lowest = minimize_scalar(excess, bounds=(low, high), method="bounded", options={"maxiter": LOOKS})
-            found += [(float(lowest.x), float(lowest.fun))] if lowest.fun < 0.0 else []
-    return found
+            minimize_scalar(excess, bounds=(low, high), method="bounded", options={"maxiter": LOOKS})
+
+
+def _roughly(scene: Scene, window: Window, other: Fault) -> float:
+    """Return the best size of another fault on a coarse grid, the healthy parameters held."""
+    ladder = scene.ladders[other.parameter]
+    return min(ladder, key=lambda x: float((window.innovations(ladder[x], scene.growth) ** 2).sum()))
 
 
 class _Closest(NamedTuple):
@@ -201,7 +205,7 @@ def _closest(scene: Scene, window: Window, other: Fault, own: FloatArray, guess:
     m, names, growth = window.nuisances, (other.parameter,), scene.growth
     nothing = np.zeros(m)
     (low,), (high,) = bounds([other])
-    starts = [np.array([start(window, other, growth, nothing)])]
+    starts = [np.array([_roughly(scene, window, other)])]
     if abs(guess - float(starts[0][0])) < (high - low) / 4.0:
         starts.append(np.clip([guess], low, high))
     held = fit(window, [other], growth, nothing, starts, free=False)

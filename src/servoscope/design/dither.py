@@ -46,13 +46,13 @@ def without(scene: Scene) -> Dithered:
 
 
 def best(scene: Scene) -> list[Dithered]:
-    """Choose the frequency at which the smallest dither shrinks the radii most, and return it with each amplitude."""
+    """Choose the frequency at which the largest dither shrinks the radii most; return it with each amplitude."""
     frequencies = np.geomspace(LOWEST, scene.loop.sample_rate / 4.0, CANDIDATES)
     frequencies = np.unique([float(f"{f:.2g}") for f in frequencies])
-    tried = [_dithered(scene, float(f), SHARES[0]) for f in frequencies]
+    tried = [_dithered(scene, float(f), SHARES[-1]) for f in frequencies]
     gained = [float(np.log(np.minimum(each.radius, LARGEST)).sum()) for each in tried]
     chosen = tried[int(np.argmin(gained))]
-    return [chosen, *(_dithered(scene, chosen.frequency_hz, share) for share in SHARES[1:])]
+    return [*(_dithered(scene, chosen.frequency_hz, share) for share in SHARES[:-1]), chosen]
 
 
 def _dithered(scene: Scene, frequency_hz: float, share: float) -> Dithered:

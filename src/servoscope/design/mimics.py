@@ -1,4 +1,4 @@
-"""What no fault of the list is and yet looks like one: gains of the sensors, another delay, other parts of the plant."""
+"""What no fault of the list is and yet looks like one: gains of sensors, a delay, other parts of the plant."""
 
 from __future__ import annotations
 

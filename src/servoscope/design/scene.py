@@ -1,4 +1,4 @@
-"""A recording that is to come: the loop without noise under a reference, and the innovations that a change would leave."""
+"""A recording that is to come: the loop without noise under a reference, and what a change would leave."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from servoscope.loop import Loop
 from servoscope.noise import Noise
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
+from servoscope.refinement.hypotheses import GRID
+from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.refining import BEFORE_S
 from servoscope.refinement.window import Growth, Window
 from servoscope.simulation import response
@@ -76,9 +78,8 @@ class Scene:
 
     @property
     def noise(self) -> Noise:
-        """Its noise; `of` has made sure that there is some."""
-        assert self.baseline.noise is not None
-        return self.baseline.noise
+        """Its noise."""
+        return self.baseline.noise or Noise(0.0, 0.0)  # `of` has made sure that there is some
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,6 +120,17 @@ class Scene:
     def healthy(self) -> Window:
         """The window of a healthy loop."""
         return self.window({})
+
+    @cached_property
+    def ladders(self) -> dict[str, dict[float, Predictor]]:
+        """Predictors of each fault at sizes all over its range, by parameter and logarithm of the ratio."""
+        window, nothing = self.healthy, np.zeros(self.healthy.nuisances)
+        found = {}
+        for fault in self.loop.plant.faults:
+            sizes = np.linspace(np.log(fault.ratio_range[0]), np.log(fault.ratio_range[1]), GRID).tolist()
+            name = (fault.parameter,)
+            found[name[0]] = {x: window.predictor(nothing, name, np.array([x]), self.growth) for x in sizes}
+        return found
 
     @cached_property
     def jacobian(self) -> FloatArray:
