@@ -10,6 +10,7 @@ import typer
 
 from servoscope.cli import arguments
 from servoscope.cli.arguments import Source
+from servoscope.cli.options import AsJson, By, ColumnsText, From, LoopFile, Report, To, Trace, Where
 from servoscope.cli.outputs import Outputs, check_output, stem_of
 from servoscope.cli.shell import FAULT, Commands, Failures, print_json
 
@@ -26,28 +27,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings=CONTEXT,
 )
-
-LoopFile = Annotated[Path, typer.Argument(metavar="LOOP", help="Loop file (TOML).")]
-ColumnsText = Annotated[
-    str | None,
-    typer.Option("--columns", metavar="MAP", help="Where signals stand: 't=Time, r=Ref, u=2*Amps, y=Pos'."),
-]
-Where = Annotated[
-    list[str] | None,
-    typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges."),
-]
-By = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
-From = Annotated[float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time, in s.")]
-To = Annotated[float | None, typer.Option("--to", metavar="S", help="Leave out this time, in s, and what is after it.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
-Report = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.html", help="Write a page with plots; for several, one per recording."),
-]
-Trace = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.parquet", help="Write the course over time; for several, one each."),
-]
 
 
 def main() -> None:

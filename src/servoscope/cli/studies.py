@@ -8,13 +8,12 @@ from rich.console import Console
 from rich.text import Text
 
 from servoscope.cli.terminal import facts, notes, percent, span, table
+from servoscope.design.findings import SIZES
+from servoscope.report.wording import change
 
 if TYPE_CHECKING:
-    from servoscope.design import Side, Study
+    from servoscope.design import Study
     from servoscope.design.findings import Frequency
-
-SAME = 0.995  # cosine from which two changes are called the same
-DIRECTIONS = (("up", "more"), ("down", "less"))
 
 
 def study(out: Console, s: Study) -> None:
@@ -36,31 +35,25 @@ def study(out: Console, s: Study) -> None:
 
 
 def _faults(out: Console, s: Study) -> None:
-    rows, doubts = [], []
+    rows, late, doubts = [], [], []
     for fault in s.faults.values():
-        for direction, _ in DIRECTIONS:
-            side: Side = getattr(fault, direction)
-            later = {d.ratio: d for d in side.delays}
-            soon = [_seconds(d.half_s) for d in list(later.values())[:3:2]]
-            rows.append(
-                (
-                    fault.name if direction == "up" else "",
-                    fault.parameter if direction == "up" else "",
-                    size(side.detectable),
-                    *(soon + ["-", "-"])[:2],
-                    size(side.first_isolable),
-                    size(side.bound),
-                    side.nearest,
-                )
-            )
+        for direction, side in (("up", fault.up), ("down", fault.down)):
+            name = f"{fault.name} {direction}"
+            first = (side.detectable, side.first_isolable, side.bound)
+            rows.append((name, *(change(ratio) for ratio in first), side.nearest))
+            if side.delays:
+                late.append((name, *(f"{_seconds(each.half_s)}" for each in side.delays)))
             doubts += [
-                f"{fault.name}: looks like {side.nearest or 'another fault'} again from {size(low)}"
-                + (f" to {size(high)}" if high is not None else " on")
+                f"{name}: looks like another fault again from {change(low)}"
+                + (f" to {change(high)}" if high is not None else " on")
                 for low, high in side.unclear[1:]
             ]
-    header = ("fault", "parameter", "detected from", "half by", "twice that", "named from", "bound", "else taken for")
-    table(out, header, rows, words=2)
+    table(out, ("change", "detected from", "named from", "at best", "else taken for"), rows)
     notes(out, doubts)
+    out.print()
+    longest = max((len(row) for row in late), default=1)
+    header = ("half are detected by, at", *(f"{k:g} x" for k in SIZES[: longest - 1]))
+    table(out, header, [(*row, *[""] * (longest - len(row))) for row in late])
     out.print()
 
 
@@ -94,9 +87,9 @@ def _mimics(out: Console, s: Study) -> None:
         if each.told_apart is not None:
             told = percent(each.told_apart) if each.unit == "relative" else f"{each.told_apart:.2g} samples"
         rows.append(
-            (each.words, each.imitates, f"{each.cosines[each.imitates]:+.3f}", amount, f"x {each.looks_like:.4g}", told)
+            (each.name, each.imitates, f"{each.cosines[each.imitates]:+.3f}", amount, change(each.looks_like), told)
         )
-    table(out, ("not in the list", "is most like", "cosine", "so much", "looks like", "told apart from"), rows, words=2)
+    table(out, ("not in the list", "is like", "cosine", "so much", "looks like", "told apart from"), rows, words=2)
     out.print()
 
 
@@ -117,17 +110,8 @@ def _dither(out: Console, s: Study) -> None:
     rows = []
     for each in s.dither:
         name = f"{percent(each.share)} at {each.frequency_hz:g} Hz" if each.share else "none"
-        rows.append((name, f"{each.extra_u_rms:.3g}", *(size(each.radius[fault]) for fault in s.faults)))
+        rows.append((name, f"{each.extra_u_rms:.3g}", *(change(each.radius[fault]) for fault in s.faults)))
     table(out, ("sine on the reference", "adds to u (rms)", *(f"{name} from" for name in s.faults)), rows)
-
-
-def size(ratio: float | None) -> str:
-    """Return a ratio as people say it: +2.5 %, or x 3.1 where it is far from one; none: never."""
-    if ratio is None:
-        return "never"
-    if 0.5 < ratio < 2.0:
-        return f"{100.0 * (ratio - 1.0):+.3g} %"
-    return f"x {ratio:.3g}"
 
 
 def _seconds(value: float | None) -> str:

@@ -6,6 +6,8 @@ import math
 
 from pydantic import BaseModel, ConfigDict
 
+SIZES = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # detectability radii whose delays are told
+
 Spans = tuple[tuple[float, float | None], ...]
 
 

@@ -12,6 +12,7 @@ from servoscope.design import dither, frequencies, mimics
 from servoscope.design.alarms import Alarms, detectable
 from servoscope.design.distances import Span, apart, unclear
 from servoscope.design.findings import (
+    SIZES,
     Announced,
     Dither,
     FaultStudy,
@@ -34,7 +35,6 @@ from servoscope.plants import Fault, FloatArray
 Progress = Callable[[str], None]
 
 SECONDS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)  # after the onset, as far as they are studied
-SIZES = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # detectability radii whose delays are told
 AMOUNTS = {"relative": 0.01, "samples": 0.1}  # of mimics
 
 
