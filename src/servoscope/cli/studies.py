@@ -11,6 +11,8 @@ from servoscope.cli.terminal import facts, notes, percent, span, table
 from servoscope.design.findings import SIZES
 from servoscope.report.wording import change
 
+UNKNOWABLE = 10.0  # standard deviation from which a number says nothing
+
 if TYPE_CHECKING:
     from servoscope.design import Study
     from servoscope.design.findings import Frequency
@@ -61,7 +63,7 @@ def _sizes(out: Console, s: Study) -> None:
     first = next(iter(s.faults.values()))
     header = ("std. dev. of a size after", *(span(each.seconds) for each in first.sizes))
     rows = [
-        (f"{fault.name}{words}", *(percent(getattr(each, key)) for each in fault.sizes))
+        (f"{fault.name}{words}", *(_std(getattr(each, key)) for each in fault.sizes))
         for fault in s.faults.values()
         for key, words in (("alone_learned", ""), ("together_learned", ", all free"))
     ]
@@ -98,7 +100,7 @@ def _frequencies(out: Console, s: Study) -> None:
 
     def row(what: str, each: Frequency) -> tuple[str, ...]:
         shown = [each.apart[name] for name in names]
-        return (what, f"{each.frequency_hz:g} Hz", *(percent(x) if x is not None and x < 10.0 else "-" for x in shown))
+        return (what, f"{each.frequency_hz:g} Hz", *(_std(x) for x in shown))
 
     rows = [row("monitored", each) for each in s.frequencies.own] + [row("best", each) for each in s.frequencies.best]
     table(out, ("shown apart (std. dev.)", "frequency", *names), rows)
@@ -112,6 +114,10 @@ def _dither(out: Console, s: Study) -> None:
         name = f"{percent(each.share)} at {each.frequency_hz:g} Hz" if each.share else "none"
         rows.append((name, f"{each.extra_u_rms:.3g}", *(change(each.radius[fault]) for fault in s.faults)))
     table(out, ("sine on the reference", "adds to u (rms)", *(f"{name} from" for name in s.faults)), rows)
+
+
+def _std(value: float | None) -> str:
+    return f"{100.0 * value:.2g} %" if value is not None and value < UNKNOWABLE else "-"
 
 
 def _seconds(value: float | None) -> str:

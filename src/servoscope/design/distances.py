@@ -13,11 +13,12 @@ from servoscope.design.information import MISNAMED, bound, confusion, equivalent
 from servoscope.design.scene import Scene
 from servoscope.errors import SimulationError
 from servoscope.plants import Fault, FloatArray
-from servoscope.refinement.hypotheses import bounds, fit
+from servoscope.refinement.hypotheses import bounds
 from servoscope.refinement.window import Window
 
 NEAR = 200.0  # squared distance from which hypotheses are never taken for each other, and not fitted any closer
-STEPS = 6  # of Gauss and Newton
+STEPS = 8  # of Gauss and Newton
+SHORTER = (1.0, 0.3, 0.1)  # shares of a step that are tried
 CONVERGED = 1e-3  # of a squared distance of one
 GRID = 12  # sizes between the radius that linear distances promise and the end of the range
 FINE = 0.01  # relative precision of a radius
@@ -71,8 +72,9 @@ class Apart:
 def apart(scene: Scene, fault: Fault, x: float) -> Apart:
     """Measure how far all other single faults are from a fault whose logarithm of the ratio is x.
 
-    D^2 is the smallest sum of squares of another hypothesis, its size and the healthy parameters free, on a recording
-    without noise.
+    D^2 is the smallest sum of squares by which the innovations of another hypothesis differ from those of the truth,
+    its size and the healthy parameters free. The difference is known a sample ahead, so with the noise of the sample
+    the log-likelihood ratio is Gaussian with mean D^2/2 and variance D^2.
 
     Raises
     ------
@@ -185,12 +187,6 @@ def _look_into_dips(excess: Callable[[float], float], points: list[tuple[float, 
             minimize_scalar(excess, bounds=(low, high), method="bounded", options={"maxiter": LOOKS})
 
 
-def _roughly(scene: Scene, window: Window, other: Fault) -> float:
-    """Return the best size of another fault on a coarse grid, the healthy parameters held."""
-    ladder = scene.ladders[other.parameter]
-    return min(ladder, key=lambda x: float((window.innovations(ladder[x], scene.growth) ** 2).sum()))
-
-
 class _Closest(NamedTuple):
     size: float
     left: FloatArray
@@ -198,35 +194,53 @@ class _Closest(NamedTuple):
 
 
 def _closest(scene: Scene, window: Window, other: Fault, own: FloatArray, guess: float) -> _Closest:
-    """Return where another fault comes closest to the truth.
+    """Return where another fault comes closest to the truth, whose innovations are `own` (N + m,).
 
-    First with the healthy parameters held, by search; then with all free, by Gauss and Newton.
+    First with the healthy parameters held, by search; then with all free.
     """
-    m, names, growth = window.nuisances, (other.parameter,), scene.growth
-    nothing = np.zeros(m)
+    m, ladder = window.nuisances, scene.ladders[other.parameter]
     (low,), (high,) = bounds([other])
-    starts = [np.array([_roughly(scene, window, other)])]
-    if abs(guess - float(starts[0][0])) < (high - low) / 4.0:
-        starts.append(np.clip([guess], low, high))
-    held = fit(window, [other], growth, nothing, starts, free=False)
-    z = np.append(nothing, held.x)
-    left = held.residual - own
+
+    def off(x: float) -> float:
+        e = window.innovations(ladder[x], scene.growth) - own[: window.samples]
+        return float(e @ e)
+
+    starts = [np.append(np.zeros(m), x) for x in (min(ladder, key=off), float(np.clip(guess, low, high)))]
+    z = min(starts, key=lambda z: float(((window.residual(z, (other.parameter,), scene.growth) - own) ** 2).sum()))
+    z, left = _descended(scene, window, other, own, z, held=True)
     certain = float(left @ left)
-    for _ in range(STEPS if m else 0):
-        J = window.jacobian(z, names, growth)
+    if m:
+        z, left = _descended(scene, window, other, own, z, held=False)
+    return _Closest(float(z[m]), left, certain)
+
+
+def _descended(
+    scene: Scene, window: Window, other: Fault, own: FloatArray, z: FloatArray, held: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Go down to the closest point near z = [d, x] by Gauss and Newton; return it and what is left there."""
+    m, names, growth = window.nuisances, (other.parameter,), scene.growth
+    first = m if held else 0
+    (low,), (high,) = bounds([other])
+    left = window.residual(z, names, growth) - own
+    for _ in range(STEPS):
+        J = window.jacobian(z, names, growth, first)
         size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
         Q, R = np.linalg.qr(J / size)
         step = -np.linalg.lstsq(R, Q.T @ left, rcond=None)[0] / size
         predicted = left + J @ step
-        if predicted @ predicted > NEAR:
-            return _Closest(float(z[m]), predicted, certain)
-        new = z + step
-        new[m] = np.clip(new[m], low, high)
-        following = window.residual(new, names, growth) - own
-        gained = float(left @ left - following @ following)
-        if gained < 0.0:
+        if not held and predicted @ predicted > NEAR:
+            return z, predicted
+        for shorter in SHORTER:
+            new = z.copy()
+            new[first:] += shorter * step
+            new[m] = np.clip(new[m], low, high)
+            following = window.residual(new, names, growth) - own
+            gained = float(left @ left - following @ following)
+            if gained >= 0.0:
+                break
+        else:
             break
         z, left = new, following
         if gained < CONVERGED * (1.0 + float(left @ left)):
             break
-    return _Closest(float(z[m]), left, certain)
+    return z, left

@@ -78,17 +78,17 @@ class Side(_Said):
 
 
 class Sized(_Said):
-    """Smallest standard deviation of a size, relative, so many seconds after the onset.
+    """Smallest standard deviation of a size, relative, so many seconds after the onset; None: nothing tells it.
 
     `alone` if nothing else may have changed, `together` if all parameters may; `alone_learned` and `together_learned`
     with the healthy ones known only as the baseline and the seconds before the onset know them.
     """
 
     seconds: float
-    alone: float
-    together: float
-    alone_learned: float
-    together_learned: float
+    alone: float | None
+    together: float | None
+    alone_learned: float | None
+    together_learned: float | None
 
 
 class FaultStudy(_Said):
@@ -106,19 +106,19 @@ class PairStudy(_Said):
     """Two faults at once, nothing else: standard deviations of both sizes and their correlation."""
 
     names: tuple[str, str]
-    std: tuple[float, float]
+    std: tuple[float | None, float | None]
     correlation: float
 
 
 class Joint(_Said):
-    """All parameters at once.
+    """All parameters at once; the standard deviation is None where another change can take a size's place.
 
     `confused` are the shares of each parameter's logarithm in the combination that is known worst, the largest 1, and
     `worst` the standard deviation along it as a multiple of what it would be if they did not overlap.
     """
 
     parameters: tuple[str, ...]
-    std: tuple[float, ...]
+    std: tuple[float | None, ...]
     correlation: tuple[tuple[float, ...], ...]
     confused: dict[str, float]
     worst: float
@@ -172,7 +172,7 @@ class Dither(_Said):
     share: float
     amplitude: float
     extra_u_rms: float
-    std: dict[str, float]
+    std: dict[str, float | None]
     radius: dict[str, float | None]
 
 

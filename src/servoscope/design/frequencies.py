@@ -15,6 +15,7 @@ from servoscope.plants import FloatArray
 LOWEST = 0.1  # Hz
 CANDIDATES = 60
 CHOSEN = 3
+APART = 1.5  # smallest factor between two of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,8 @@ def best(scene: Scene, covariance: FloatArray) -> Seen:
     all_of_them = seen(scene, covariance, candidates)
     chosen: list[int] = []
     for _ in range(CHOSEN):
-        left = [i for i in range(len(candidates)) if i not in chosen]
+        near = [candidates[i] for i in chosen]
+        left = [i for i, f in enumerate(candidates) if all(abs(np.log(f / other)) > np.log(APART) for other in near)]
         chosen.append(max(left, key=lambda i: all_of_them.score([*chosen, i])))
     chosen.sort()
     return Seen(candidates[chosen], all_of_them.alone[chosen], all_of_them.apart[chosen])

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope.design.scene import Scene
 from servoscope.plants import FloatArray
 
 MISNAMED = 0.005  # probability of a wrong name at the isolability radius; as much is left for pairs and "unknown"
+SINGULAR = 1e-9  # eigenvalue of a correlation below which two changes are one
+BoolArray = npt.NDArray[np.bool_]
 
 
 def fisher(scene: Scene, seconds: float | None = None, exact: bool = True) -> FloatArray:
@@ -43,22 +46,26 @@ def deviations(F: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     Infinite where a change says nothing, or nothing of its own.
     """
-    size = np.sqrt(np.diag(F))
     with np.errstate(divide="ignore"):
-        alone = 1.0 / size
-    C = covariance(F)
-    return alone, np.asarray(np.sqrt(np.diag(C)))
+        alone = 1.0 / np.sqrt(np.diag(F))
+    together = np.where(_open(F), np.inf, np.sqrt(np.diag(covariance(F))))
+    return alone, together
 
 
 def covariance(F: FloatArray) -> FloatArray:
-    """Return the inverse of an information (k, k), infinite variances where there is none."""
+    """Return the inverse of an information (k, k); directions that say nothing keep a large variance."""
     size = np.sqrt(np.maximum(np.diag(F), 1e-300))
     value, vector = np.linalg.eigh(F / np.outer(size, size))
-    inverse = (vector / np.maximum(value, 1e-12)) @ vector.T
-    C = inverse / np.outer(size, size)
-    none = np.diag(F) <= 0.0
-    C[none, none] = np.inf
-    return np.asarray(C)
+    inverse = (vector / np.maximum(value, SINGULAR)) @ vector.T
+    return np.asarray(inverse / np.outer(size, size))
+
+
+def _open(F: FloatArray) -> BoolArray:
+    """Return which sizes take part in a combination that the information (k, k) says nothing of, shape (k,)."""
+    size = np.sqrt(np.maximum(np.diag(F), 1e-300))
+    value, vector = np.linalg.eigh(F / np.outer(size, size))
+    silent = vector[:, value < SINGULAR]
+    return np.asarray(((silent**2).sum(axis=1) > SINGULAR) | (np.diag(F) <= 0.0))
 
 
 def cosines(columns: FloatArray, others: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.window import TINY
 
 PARALLEL = 1e-6  # 1 - cosine^2 below which two changes are one and the same
+LOUDER = 1e-4  # gain by which one is taken
 LATER = 0.01  # samples of delay by which the derivative is taken
 
 
@@ -43,14 +44,13 @@ def causes(scene: Scene) -> list[Cause]:
     J = window.jacobian(np.zeros(m + len(names)), names, scene.growth, m)
     found = [Cause(name, plant.causes[name], "relative", J[:, i]) for i, name in enumerate(names)]
     healthy, bench = window.healthy, window.bench
-    step = 1j * TINY
-    # gains of the filter need not follow: a healthy loop has no innovations that they could weigh differently
-    louder = healthy._replace(c=healthy.c * (1.0 + step))
-    stronger = healthy._replace(b=healthy.b * (1.0 + step), late=healthy.late * (1.0 + step))
+    louder, softer = (bench.predictor(plant, output_gain=1.0 + step) for step in (LOUDER, -LOUDER))
+    stronger = bench.predictor(plant.model_copy(update={"input_gain": plant.input_gain * (1.0 + 1j * TINY)}))
     later = bench.predictor(plant, later_s=LATER / scene.loop.sample_rate)
+    gain_of_y = (_column(scene, louder) - _column(scene, softer)).real / (2.0 * LOUDER)
     return [
         *found,
-        Cause("gain of y", "another gain of the sensor of y", "relative", _column(scene, louder).imag / TINY),
+        Cause("gain of y", "another gain of the sensor of y", "relative", gain_of_y),
         Cause("gain of u", "another gain of the input", "relative", _column(scene, stronger).imag / TINY),
         Cause("delay", "a further delay", "samples", (_column(scene, later) - _column(scene, healthy)).real / LATER),
     ]

@@ -1,8 +1,12 @@
-"""A recording that is to come: the loop without noise under a reference, and what a change would leave."""
+"""A recording that is to come: the loop under a reference, and what a change would leave in the innovations.
+
+One realisation of the noise is part of it: what reaches u through the controller moves the actuator as well, and where
+the reference is smooth that tells more than the reference does.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -19,10 +23,11 @@ from servoscope.refinement.hypotheses import GRID
 from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.refining import BEFORE_S
 from servoscope.refinement.window import Growth, Window
-from servoscope.simulation import response
-from servoscope.simulation.closed_loop import checked, recorded
+from servoscope.simulation import FaultEvent, simulate
+from servoscope.simulation.closed_loop import checked
 
 LEAD = 300  # samples before the onset, after which a predictor knows the state
+SEED = 3  # of the noise; it is the same whatever changes
 FEWEST = 50  # samples with the change
 
 
@@ -102,18 +107,16 @@ class Scene:
         return Growth(self.lead)
 
     def window(self, ratios: Mapping[str, float]) -> Window:
-        """Return what a refit would see, without noise, of parameters that change to so many times their values.
+        """Return what a refit would see of parameters that change to so many times their values.
 
         Raises
         ------
         SimulationError
             If the loop is unstable then.
         """
-        plant = self.baseline.plant
-        ill = plant.with_ratios(ratios) if ratios else plant
-        plants, switch = ([plant, ill], [0, self.onset]) if self.onset else ([ill], [0])
-        u, y = response(self.loop, self.r, plants=plants, switch=switch)
-        seen = Window.of(self.baseline, self._recording(u, y), self.onset - self.lead, len(self.r))
+        onset_s = self.onset / self.loop.sample_rate
+        recording = self._recorded([FaultEvent(name, ratio, onset_s) for name, ratio in ratios.items()])
+        seen = Window.of(self.baseline, recording, self.onset - self.lead, len(self.r))
         return replace(seen, prior=self.prior)
 
     @cached_property
@@ -152,19 +155,21 @@ class Scene:
         return np.asarray(columns - Q @ (Q.T @ columns))
 
     def _known_before(self) -> FloatArray:
-        window = self.healthy
         C = np.array(self.baseline.ratios_covariance)
-        prior = np.linalg.inv(C) if len(C) else np.zeros((0, 0))
-        if not len(C) or not self.onset:
-            return np.asarray(np.linalg.cholesky(prior).T) if len(C) else prior
-        first = max(self.onset - round(BEFORE_S * self.loop.sample_rate), 0)
-        u, y = response(self.loop, self.r[: self.onset], plants=[self.baseline.plant])
-        window = Window.of(self.baseline, self._recording(u, y), first, self.onset)
-        J = window.jacobian(np.zeros(window.nuisances), (), Growth(0))[: window.samples]
-        return np.asarray(np.linalg.cholesky(prior + J.T @ J).T)
+        if not len(C):
+            return np.zeros((0, 0))
+        known = np.linalg.inv(C)
+        if self.onset:
+            first = max(self.onset - round(BEFORE_S * self.loop.sample_rate), 0)
+            window = Window.of(self.baseline, self._recorded([]), first, self.onset)
+            J = window.jacobian(np.zeros(window.nuisances), (), Growth(0))[: window.samples]
+            known = known + J.T @ J
+        return np.asarray(np.linalg.cholesky(known).T)
 
-    def _recording(self, u: FloatArray, y: FloatArray) -> Recording:
-        return recorded(self.loop, self.r[: len(u)], u, y)
+    def _recorded(self, faults: Sequence[FaultEvent]) -> Recording:
+        loop = self.loop.model_copy(update={"plant": self.baseline.plant})
+        u_std, y_std = self.noise.u_std, self.noise.y_std
+        return simulate(loop, self.r, faults=faults, noise_u_std=u_std, noise_y_std=y_std, seed=SEED)[0]
 
 
 def check(loop: Loop) -> None:

@@ -105,7 +105,7 @@ def _fault(scene: Scene, alarms: Alarms, fault: Fault, progress: Progress) -> Fa
     sizes = []
     for seconds in sorted({min(s, scene.after_s) for s in SECONDS}):
         exact, learned = (deviations(fisher(scene, seconds, known)) for known in (True, False))
-        values = [float(each[i]) for each in (*exact, *learned)]
+        values = [_finite(each[i]) for each in (*exact, *learned)]
         sizes.append(Sized(seconds=seconds, **dict(zip(STDS, values, strict=True))))
     sides = []
     for up in (True, False):
@@ -170,7 +170,7 @@ def _joint(scene: Scene) -> Joint:
     shares = shares / shares[int(np.argmax(np.abs(shares)))]
     return Joint(
         parameters=scene.names,
-        std=tuple(std.tolist()),
+        std=tuple(_finite(x) for x in deviations(F)[1]),
         correlation=tuple(tuple(row) for row in (C / np.outer(std, std)).tolist()),
         confused=dict(zip(scene.names, shares.tolist(), strict=True)),
         worst=float(1.0 / np.sqrt(max(value[0], 1e-12))),
@@ -178,11 +178,10 @@ def _joint(scene: Scene) -> Joint:
 
 
 def _pair(scene: Scene, names: Sequence[str], i: int, j: int) -> PairStudy:
-    C = covariance(fisher(scene, exact=False)[np.ix_([i, j], [i, j])])
-    std = np.sqrt(np.diag(C))
-    return PairStudy(
-        names=(names[i], names[j]), std=(float(std[0]), float(std[1])), correlation=float(C[0, 1] / (std[0] * std[1]))
-    )
+    F = fisher(scene, exact=False)[np.ix_([i, j], [i, j])]
+    C, (one, other) = covariance(F), deviations(F)[1]
+    correlation = float(C[0, 1] / np.sqrt(C[0, 0] * C[1, 1]))
+    return PairStudy(names=(names[i], names[j]), std=(_finite(one), _finite(other)), correlation=correlation)
 
 
 def _mimic(scene: Scene, cause: mimics.Cause) -> Mimic:
@@ -225,7 +224,7 @@ def _dither(names: Sequence[str], found: dither.Dithered) -> Dither:
         share=found.share,
         amplitude=found.amplitude,
         extra_u_rms=found.extra_u_rms,
-        std=dict(zip(names, found.std.tolist(), strict=True)),
+        std={name: _finite(x) for name, x in zip(names, found.std, strict=True)},
         radius={name: _ratio(float(x)) for name, x in zip(names, found.radius, strict=True)},
     )
 

@@ -67,9 +67,9 @@ def _faults(study: Study) -> str:
             rows.append(_row(f"{escape(fault.name)} {direction} <small>{symbol(fault.parameter)}</small>", cells))
     head = ("Change", "*Detected from", "*Named from", "*Linear bound", "*Else taken for", "*Unclear again")
     why = (
-        "Detected: announced in time with 90 % probability. Named: called by its own name with 99.5 % probability by the"
-        " refit of the seconds since the onset. Unclear again: larger sizes at which it looks like another fault once"
-        " more."
+        "Detected: announced in time with 90 % probability. Named: called by its own name with 99.5 % probability by"
+        " the refit of the seconds since the onset. Unclear again: larger sizes at which it looks like another fault"
+        " once more."
     )
     return section("Which faults, from which size on", why, grid(head, rows))
 
@@ -111,7 +111,9 @@ def _mimics(study: Study) -> str:
         cells = (escape(each.imitates), cosine, _amount(each.amount, each.unit), change(each.looks_like), told)
         rows.append(_row(f"{escape(each.words)} <small>{escape(each.name)}</small>", cells))
     head = ("Change", "*Is most like", "*Cosine", "*So much", "*Looks like", "*Told apart from")
-    why = "Changes that are no fault of the list, the fault that each looks like, and from where on it is told from it."
+    why = (
+        "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart."
+    )
     return section("What else it could be", why, grid(head, rows))
 
 
@@ -124,8 +126,9 @@ def _frequencies(study: Study) -> str:
             cells = [f"{100.0 * x:.3g} %" if x is not None and x < 10.0 else DASH for x in shown]
             rows.append(_row(f"{each.frequency_hz:g} Hz <small>{what}</small>", cells))
     why = (
-        "Standard deviation of each size as the iFRF of one frequency shows it, as far as no other fault could explain it."
-        f" With the best frequencies the faults are {number(study.frequencies.gain, 3)} times as far apart, on average."
+        "Standard deviation of each size as the iFRF of one frequency shows it, as far as no other fault could explain"
+        f" it. With the best frequencies the faults are {number(study.frequencies.gain, 3)} times as far apart, on"
+        " average."
     )
     return section("Frequencies to monitor", why, grid(("Frequency", *(f"*{escape(n)}" for n in names)), rows))
 

@@ -15,11 +15,12 @@ WIDTH = 9.0  # inches
 TONES = ("#1f5fa8", "#c6501c", "#7d8894", "#1c2530")  # one per fault, then again dashed
 DASHES = ("-", "--", ":")
 RULE = COLOURS["rule"]
+LARGEST = 30.0  # standard deviation that is worth showing
 
 
 def percent(value: float) -> str:
-    """Return a change as a share of the healthy value: 0.4 %, or x 3 for the logarithm of 3."""
-    return f"{100.0 * value:.3g} %" if value < 0.7 else f"× {math.exp(value):.3g}"
+    """Return the logarithm of a ratio as a share, 0.4 %, or as a factor where it is large."""
+    return f"{100.0 * value:.3g} %" if value < 0.7 else f"× {math.exp(min(value, 700.0)):.3g}"
 
 
 @styled()
@@ -87,16 +88,19 @@ def sizes(study: Study) -> Figure:
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     ax = figure.subplots()
     for i, fault in enumerate(study.faults.values()):
-        seconds = [each.seconds for each in fault.sizes]
         tone = TONES[i % len(TONES)]
-        ax.plot(seconds, [each.alone_learned for each in fault.sizes], "-", color=tone, marker=".", label=fault.name)
-        ax.plot(seconds, [each.together_learned for each in fault.sizes], ":", color=tone)
+        for key, dash, label in (("alone_learned", "-", fault.name), ("together_learned", ":", "")):
+            told = [(each.seconds, getattr(each, key)) for each in fault.sizes]
+            known = [(t, std) for t, std in told if std is not None]
+            if known:
+                ax.plot(*zip(*known, strict=True), dash, color=tone, marker="." if label else "", label=label)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.xaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: percent(x)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{100.0 * x:g} %"))
     ax.set_xlabel("time after the onset [s]")
     ax.set_ylabel("standard deviation")
+    ax.set_ylim(top=min(ax.get_ylim()[1], LARGEST))
     _dressed(figure, ax, columns=4)
     return figure
 
