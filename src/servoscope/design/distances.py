@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -207,20 +207,39 @@ def _closest(scene: Scene, window: Window, other: Fault, own: FloatArray, guess:
 
     starts = [np.append(np.zeros(m), x) for x in (min(ladder, key=off), float(np.clip(guess, low, high)))]
     z = min(starts, key=lambda z: float(((window.residual(z, (other.parameter,), scene.growth) - own) ** 2).sum()))
-    z, left = _descended(scene, window, other, own, z, held=True)
+    z, left = descended(scene, window, [other], own, z, held=True)
     certain = float(left @ left)
     if m:
-        z, left = _descended(scene, window, other, own, z, held=False)
+        z, left = descended(scene, window, [other], own, z, held=False)
     return _Closest(float(z[m]), left, certain)
 
 
-def _descended(
-    scene: Scene, window: Window, other: Fault, own: FloatArray, z: FloatArray, held: bool
+def descended(
+    scene: Scene, window: Window, faults: Sequence[Fault], own: FloatArray, z: FloatArray, held: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Go down to the closest point near z = [d, x] by Gauss and Newton; return it and what is left there."""
-    m, names, growth = window.nuisances, (other.parameter,), scene.growth
+    """Go down from z = [d, x] to where some faults are closest to the truth, by Gauss and Newton.
+
+    Parameters
+    ----------
+    scene, window
+        What is studied, and a recording of it.
+    faults
+        The explanation, x (q,) their logarithms of ratios.
+    own
+        Innovations and prior of the truth, shape (N + m,).
+    z
+        Where to begin, shape (m + q,).
+    held
+        Whether d stays as it is. Where it does not, the way ends as soon as a linear step leaves more than `NEAR`.
+
+    Returns
+    -------
+    z, left
+        The closest point, and by how much its innovations and prior differ from those of the truth, (N + m,).
+    """
+    m, names, growth = window.nuisances, tuple(fault.parameter for fault in faults), scene.growth
     first = m if held else 0
-    (low,), (high,) = bounds([other])
+    low, high = bounds(faults)
     left = window.residual(z, names, growth) - own
     for _ in range(STEPS):
         J = window.jacobian(z, names, growth, first)
@@ -233,7 +252,7 @@ def _descended(
         for shorter in SHORTER:
             new = z.copy()
             new[first:] += shorter * step
-            new[m] = np.clip(new[m], low, high)
+            new[m:] = np.clip(new[m:], low, high)
             following = window.residual(new, names, growth) - own
             gained = float(left @ left - following @ following)
             if gained >= 0.0:
