@@ -1,28 +1,29 @@
-"""When the monitor would alarm: both tests on the change as it comes through the loop and on drawn noise."""
+"""When the monitor would alarm: both tests on the change as it comes through the loop, and on simulated noise."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.cusum import columns
+from servoscope.cusum import LAGS, columns
 from servoscope.design.information import fisher
 from servoscope.design.scene import Scene
 from servoscope.detection import POWER, delayed, whiten
 from servoscope.errors import SimulationError
+from servoscope.identification import fault_directions
 from servoscope.inverse import nominal_theta
 from servoscope.pipeline import Regression
 from servoscope.plants import Fault, FloatArray
+from servoscope.recording import Recording
 from servoscope.refinement.hypotheses import bounds
 from servoscope.sequential import STEP
 from servoscope.signatures import Course, Expectation, colour_of
 from servoscope.simulation import simulate
 
-RUNS = 200  # realisations of the sequential test
-RECORDINGS = 40  # healthy ones that are simulated for T^2, whose errors are averages over its memory
+RUNS = 120  # healthy recordings that are simulated, each with an error of the baseline
 MEMORIES = 5.0  # before the onset, after which an estimate has forgotten how it began
 SEED = 77
 HOPELESS = 6.0  # standard deviations by which a CUSUM misses its limit on average
@@ -34,23 +35,17 @@ BoolArray = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """Times from onset to alarm [s], infinite where there is none in time: realisations of both tests, (M,) each."""
+    """Times from onset to alarm [s], infinite where there is none in time: one per realisation, (M,)."""
 
-    statistic: FloatArray
-    sequential: FloatArray
+    times: FloatArray
 
     def probability(self, within_s: float = np.inf) -> float:
-        """Return the probability of an alarm within some seconds; of either test, taken as independent."""
-        both = [float(np.mean((each <= within_s) & np.isfinite(each))) for each in (self.statistic, self.sequential)]
-        return 1.0 - (1.0 - both[0]) * (1.0 - both[1])
+        """Return the probability of an alarm within some seconds."""
+        return float(np.mean((self.times <= within_s) & np.isfinite(self.times)))
 
     def quantile(self, share: float) -> float:
         """Return the time by which a share of all changes is announced [s]; may be infinite."""
-        times = np.unique(np.concatenate([self.statistic, self.sequential]))
-        times = times[np.isfinite(times)]
-        later = [np.mean(each[:, None] > times, axis=0) for each in (self.statistic, self.sequential)]
-        enough = np.flatnonzero(1.0 - later[0] * later[1] >= share - 1e-9)
-        return float(times[enough[0]]) if len(enough) else np.inf
+        return float(np.sort(self.times)[int(np.ceil(share * len(self.times) - 1e-9)) - 1])
 
 
 class Alarms:
@@ -65,9 +60,14 @@ class Alarms:
         self.pipeline, self.tuning, self.noise = self.baseline.pipeline(), self.baseline.tuning, scene.noise
         kept = np.arange(len(self.r))
         self.expectation = Expectation(self.pipeline, self.tuning, self.noise, Course(self.r, kept, kept == 0))
-        self.rng = np.random.default_rng(SEED)
-        self._statistic()
-        self._sequential()
+        self.rng, self.theta = np.random.default_rng(SEED), nominal_theta(loop, self.plant)
+        healthy, (u_std, y_std) = loop.model_copy(update={"plant": self.plant}), (self.noise.u_std, self.noise.y_std)
+        recordings = [
+            simulate(healthy, self.r, noise_u_std=u_std, noise_y_std=y_std, seed=SEED + i)[0] for i in range(RUNS)
+        ]
+        parameters, coefficients = self._errors_of_baseline()
+        self._statistic(recordings, coefficients)
+        self._sequential(recordings, parameters)
 
     def delays(self, fault: Fault, x: float) -> Delays:
         """Return when a fault is announced whose logarithm of the ratio is x.
@@ -87,12 +87,12 @@ class Alarms:
         alarm = np.array([delayed(over, on, 0) for over in self.baseline.limit < T2])
         late = np.where(alarm.any(axis=1), (self.index[alarm.argmax(axis=1)] - self.since + 1) / rate, np.inf)
         if not len(self.limits):
-            return Delays(late, np.full(1, np.inf))
+            return Delays(late)
         shift = self._shift(self.expectation.regression(self.plant, ill, self.since))
         chosen = self._worth_hearing(shift)
         updates = crossings(shift, self.residuals, self.heard[chosen], self.limits[chosen], self.updates_since)
         evaluations = np.ceil(updates * self.pipeline.stride / every) + on
-        return Delays(late, evaluations * every / rate)
+        return Delays(np.minimum(late, evaluations * every / rate))
 
     def _worth_hearing(self, shift: FloatArray) -> BoolArray:
         """Return which CUSUMs have a chance to reach their limits, shape (q,)."""
@@ -101,55 +101,51 @@ class Alarms:
         reach = (drift + HOPELESS * np.sqrt(np.cumsum(s**2, axis=1))).max(axis=1)
         return np.asarray(reach >= self.limits)
 
-    def _statistic(self) -> None:
+    def _errors_of_baseline(self) -> tuple[FloatArray, FloatArray]:
+        """Draw errors of the healthy parameters, (M, m), and of the coefficients that they lead to, (M, n)."""
+        C = np.array(self.baseline.ratios_covariance)
+        if len(C) and self.baseline.members:  # both tests err together
+            error = self.rng.standard_normal((RUNS, len(C))) @ np.linalg.cholesky(C).T
+            directions = fault_directions(self.scene.loop, self.plant, self.theta)
+            return error, error @ np.array([directions[name] for name in self.plant.parameters])
+        C = self.baseline.cov()
+        size = np.sqrt(np.maximum(np.diag(C), 1e-300))
+        value, vector = np.linalg.eigh(C / np.outer(size, size))
+        root = size[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
+        return np.zeros((RUNS, 0)), self.rng.standard_normal((RUNS, len(C))) @ root.T
+
+    def _statistic(self, recordings: Sequence[Recording], errors: FloatArray) -> None:
         """Prepare T^2: deviations of healthy recordings, whitened with what the baseline thinks of them."""
-        e = []
-        loop = self.scene.loop.model_copy(update={"plant": self.plant})
-        for seed in range(RECORDINGS):
-            u_std, y_std = self.noise.u_std, self.noise.y_std
-            recording, _ = simulate(loop, self.r, noise_u_std=u_std, noise_y_std=y_std, seed=SEED + seed)
-            e.append(self.pipeline.estimate(self.tuning, recording))
+        e = [self.pipeline.estimate(self.tuning, recording) for recording in recordings]
         self.looks = (e[0].updates > 0) & (e[0].index >= self.since)
         self.index = e[0].index[self.looks]
         self.start = np.array(self.baseline.model_theta)
         self.healthy = self.expectation.path(self.start, self.plant)[self.looks]
-        n = len(self.start)
-        C = self.baseline.cov()
-        offset = self.tuning.theta - self.start
-        covariance = np.mean([each.S for each in e], axis=0)[self.looks] + C
+        covariance = np.mean([each.S for each in e], axis=0)[self.looks] + self.baseline.cov()
         self.covariance = covariance[len(covariance) // 2 :].mean(axis=0)
-        self.white = whiten(covariance, np.broadcast_to(np.eye(n), covariance.shape))
-        size = np.sqrt(np.maximum(np.diag(C), 1e-300))
-        value, vector = np.linalg.eigh(C / np.outer(size, size))
-        root = size[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
-        deviations = np.array([each.theta[self.looks] for each in e]) - self.healthy - offset
-        deviations = deviations + (self.rng.standard_normal((RECORDINGS, n)) @ root.T)[:, None, :]
+        self.white = whiten(covariance, np.broadcast_to(np.eye(len(self.start)), covariance.shape))
+        expected = self.healthy + (self.tuning.theta - self.start)
+        deviations = np.array([each.theta[self.looks] for each in e]) - expected + errors[:, None, :]
         self.errors = np.einsum("kij,rkj->rki", self.white, deviations)
 
-    def _sequential(self) -> None:
+    def _sequential(self, recordings: Sequence[Recording], errors: FloatArray) -> None:
         """Prepare the CUSUMs: what they listen for, their limits, and the residual of a healthy loop."""
         watch = self.baseline.watch(self.pipeline, self.expectation)
         self.limits = watch.limits if watch is not None else np.zeros(0)
         if watch is None or self.baseline.loudest is None:
             return
         g = self.expectation.regression(self.plant)
-        self.ok, self.theta = g.ok, nominal_theta(self.scene.loop, self.plant)
+        self.ok = g.ok
         self.whitening = colour_of(self.pipeline, self.plant, self.baseline.loudest)
-        scale = np.append(self.tuning.scale, [self.tuning.scale[-1]] * (watch.changes.shape[1] - len(self.theta)))
-        phi = columns(self.whitening.whiten(g.phi[g.ok]))
-        self.heard = np.ascontiguousarray((watch.changes / scale) @ phi.T)
+        scale = np.pad(self.tuning.scale, (0, LAGS), mode="edge")
+        self.heard = np.ascontiguousarray((watch.changes / scale) @ columns(self.whitening.whiten(g.phi[g.ok])).T)
         self.heard[:, : watch.warm] = 0.0
         self.quiet = self.whitening.whiten((g.eta - g.phi @ self.theta)[g.ok])
         self.updates_since = int(np.searchsorted(np.flatnonzero(g.ok), self.since))
-        coloured = colour_of(self.pipeline, self.plant, self.noise)
-        drawn = coloured.shape(self.rng.standard_normal((len(phi), RUNS)))
-        self.residuals = np.ascontiguousarray(self.whitening.whiten(drawn).T)
-        C = np.array(self.baseline.ratios_covariance)
-        if len(C):
-            nudged = [self.plant.with_ratios({p: float(np.exp(STEP))}) for p in self.plant.parameters]
-            drift = np.array([self._shift(self.expectation.regression(each)) for each in nudged]) / STEP
-            error = self.rng.standard_normal((RUNS, len(C))) @ np.linalg.cholesky(C).T
-            self.residuals += error @ drift
+        noisy = [self.pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
+        nudged = [self.plant.with_ratios({name: float(np.exp(STEP))}) for name in self.plant.parameters]
+        drift = np.array([self._shift(self.expectation.regression(each)) for each in nudged]) / STEP
+        self.residuals = np.array([self._shift(each) for each in noisy]) + errors @ drift
 
     def _shift(self, g: Regression) -> FloatArray:
         """Return what a noise-free regression has beyond the healthy one, whitened, update by update."""
