@@ -60,6 +60,11 @@ def scene(learned: Baseline) -> Scene:
     return Scene.of(learned, reference("profile", 90.0, 100.0), 30.0)
 
 
+@pytest.fixture(scope="module")
+def alarms(scene: Scene) -> Alarms:
+    return Alarms(scene)
+
+
 def recorded(scene: Scene, parameter: str, x: float, seed: int) -> ss.Recording:
     """Simulate one of the loops that the baseline may have been learned from, with a fault."""
     b = scene.baseline
@@ -145,8 +150,8 @@ class TestIsolability:
         assert confusion(apart(scene, fault, end).squared) == pytest.approx(MISNAMED, rel=0.2)
 
     def test_wrong_names_are_as_frequent_as_predicted(self, scene: Scene) -> None:
-        """Forty recordings of a pump fault: which of the two closest hypotheses fits better."""
-        faults, x, runs, wrong = scene.loop.plant.faults, 1.5e-3, 40, 0
+        """Thirty recordings of a pump fault: which of the two closest hypotheses fits better."""
+        faults, x, runs, wrong = scene.loop.plant.faults, 1.5e-3, 30, 0
         predicted = apart(scene, faults[0], x)
         expected = predicted.called()["friction"]
         assert 0.1 < expected < 0.25
@@ -165,8 +170,8 @@ class TestIsolability:
 
 
 class TestDetectability:
-    def test_nine_of_ten_are_announced_at_the_radius(self, scene: Scene) -> None:
-        fault, alarms, runs, seen = scene.loop.plant.faults[0], Alarms(scene), 40, []
+    def test_nine_of_ten_are_announced_at_the_radius(self, scene: Scene, alarms: Alarms) -> None:
+        fault, runs, seen = scene.loop.plant.faults[0], 30, []
         x = detectable(alarms, fault, up=True)
         promised = alarms.delays(fault, x)
         assert 0.9 <= promised.probability() < 0.96
@@ -177,8 +182,8 @@ class TestDetectability:
         assert np.mean(np.isfinite(seen)) > 0.9 - 3.0 * np.sqrt(0.09 / runs)
         assert np.median(seen) == pytest.approx(promised.quantile(0.5), rel=0.4)
 
-    def test_larger_changes_are_announced_sooner(self, scene: Scene) -> None:
-        fault, alarms = scene.loop.plant.faults[1], Alarms(scene)
+    def test_larger_changes_are_announced_sooner(self, scene: Scene, alarms: Alarms) -> None:
+        fault = scene.loop.plant.faults[1]
         times = [alarms.delays(fault, x).quantile(0.5) for x in (0.005, 0.01, 0.05)]
         assert times == sorted(times, reverse=True)
         assert times[-1] < 3.0
