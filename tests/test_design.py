@@ -14,7 +14,7 @@ from scipy import linalg
 import servoscope as ss
 from commands import one_line, run
 from servoscope.baseline import Baseline
-from servoscope.design import Study, study
+from servoscope.design import Study, explanations, study
 from servoscope.design.alarms import Alarms, detectable
 from servoscope.design.distances import apart, unclear
 from servoscope.design.information import MISNAMED, bound, confusion, deviations, fisher
@@ -167,6 +167,12 @@ class TestIsolability:
             ]
             wrong += J[1] < J[0]
         assert abs(wrong / runs - expected) < 3.0 * np.sqrt(expected * (1.0 - expected) / runs)
+
+    def test_pairs_stand_apart_from_all_that_does_not_contain_them(self, scene: Scene) -> None:
+        found = explanations(scene, {"p_s": 0.8, "C_ie": 1.2})
+        assert len(found) == 4 + 6 - 1  # single faults, and pairs but the pair itself
+        assert "pump + leakage" not in found
+        assert confusion(np.array(list(found.values()))) < MISNAMED
 
 
 class TestDetectability:

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from servoscope.cli.terminal import facts, notes, percent, span, table
 from servoscope.design.findings import SIZES
+from servoscope.detection import POWER
 from servoscope.report.wording import change
 
 UNKNOWABLE = 10.0  # standard deviation from which a number says nothing
@@ -45,6 +46,11 @@ def _faults(out: Console, s: Study) -> None:
             rows.append((name, *(change(ratio) for ratio in first), side.nearest))
             if side.delays:
                 late.append((name, *(f"{_seconds(each.half_s)}" for each in side.delays)))
+            doubts += [
+                f"{name}: {change(each.ratio)} is announced with {percent(each.probability)} only"
+                for each in side.delays
+                if each.probability < POWER
+            ]
             doubts += [
                 f"{name}: looks like another fault again from {change(low)}"
                 + (f" to {change(high)}" if high is not None else " on")
