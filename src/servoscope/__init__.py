@@ -23,6 +23,7 @@ __all__ = [
     "Recording",
     "Trace",
     "__version__",
+    "design_study",
     "diagnose",
     "inspect",
     "learn",
@@ -33,6 +34,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     from servoscope.baseline import Baseline
+    from servoscope.design import design_study
     from servoscope.diagnosis import Diagnosis, Trace
     from servoscope.inspection import inspect
     from servoscope.loop import Loop
@@ -49,6 +51,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "Monitor": "monitor",
         "Recording": "recording",
         "Trace": "diagnosis",
+        "design_study": "design",
         "diagnose": "monitor",
         "inspect": "inspection",
         "learn": "points",

@@ -1,130 +1,23 @@
-"""The command ``servoscope``, thin: parses, calls, prints."""
+"""The commands about recordings, thin: parse, call, print."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from servoscope.cli import arguments
+from servoscope.cli.app import app
 from servoscope.cli.arguments import Source
+from servoscope.cli.options import AsJson, By, ColumnsText, From, LoopFile, Report, To, Trace, Where
 from servoscope.cli.outputs import Outputs, check_output, stem_of
-from servoscope.cli.shell import FAULT, Commands, Failures, print_json
+from servoscope.cli.shell import FAULT, Failures, print_json
 
 if TYPE_CHECKING:
     from servoscope.recording import Recording
 
 REPORTS, TRACES, RECORDINGS = (".html", ".htm"), (".parquet", ".pq"), (".csv", ".parquet", ".pq")
-CONTEXT = {"help_option_names": ["-h", "--help"]}
-
-app = typer.Typer(
-    cls=Commands,
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings=CONTEXT,
-)
-
-LoopFile = Annotated[Path, typer.Argument(metavar="LOOP", help="Loop file (TOML).")]
-ColumnsText = Annotated[
-    str | None,
-    typer.Option("--columns", metavar="MAP", help="Where signals stand: 't=Time, r=Ref, u=2*Amps, y=Pos'."),
-]
-Where = Annotated[
-    list[str] | None,
-    typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges."),
-]
-By = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
-From = Annotated[float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time, in s.")]
-To = Annotated[float | None, typer.Option("--to", metavar="S", help="Leave out this time, in s, and what is after it.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
-Report = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.html", help="Write a page with plots; for several, one per recording."),
-]
-Trace = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.parquet", help="Write the course over time; for several, one each."),
-]
-
-
-def main() -> None:
-    """Run the command line of this process."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")  # a terminal without a sign for squared is no reason to stop
-    app(prog_name="servoscope")
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        from servoscope import __version__
-
-        typer.echo(f"servoscope {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def servoscope(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
-    """Say from r, u and y of a servo loop whether its actuator is healthy; if not, what changed, and when."""
-
-
-@app.command()
-def simulate(
-    loop: LoopFile,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="REC", help="Recording to write, CSV or Parquet.")],
-    reference: Annotated[
-        str, typer.Option(metavar="KIND|FILE", help="profile, multisine, trapezoid, steps, chirp, or a file.")
-    ] = "profile",
-    amplitude: Annotated[float, typer.Option(metavar="X", help="Factor on the reference.")] = 1.0,
-    duration: Annotated[float, typer.Option(metavar="S", help="Length in s.")] = 60.0,
-    fault: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=RATIO@S", help="C_ie=1.2@30: step; C_ie=1.2@30~600: ramp; repeatable."),
-    ] = None,
-    noise_u: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on u, std. dev.")] = 1e-4,
-    noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on y, std. dev.")] = 3.162e-4,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the noise.")] = 0,
-    rig: Annotated[
-        arguments.Rigs,
-        typer.Option(help="nonlinear: an EHA with friction, valve, sensor, limits and warming oil."),
-    ] = arguments.Rigs.linear,
-    as_json: AsJson = False,
-) -> None:
-    """Simulate a loop, with faults if wanted, and write what a machine would log."""
-    check_output(output, "-o", RECORDINGS, [loop, Path(reference)])
-    arguments.check_reference(reference)
-    events = arguments.fault_events(fault or [])
-
-    from servoscope import simulation, writers
-    from servoscope.cli import summaries, terminal
-    from servoscope.cli.progress import progress
-    from servoscope.loop import Loop
-
-    settings = Loop.load(loop)
-    arguments.check_length(duration, settings.sample_rate)
-    with progress(1, 1) as steps:
-        steps.begin("simulating")
-        r = simulation.reference(reference, duration, settings.sample_rate, amplitude=amplitude)
-        run = simulation.simulate if rig is arguments.Rigs.linear else simulation.simulate_rig
-        recording, truth = run(settings, r, faults=events, noise_u_std=noise_u, noise_y_std=noise_y, seed=seed)
-        steps.tell("writing")
-        used = writers.write(output, recording, settings.columns)
-    if as_json:
-        how = {"reference": reference, "amplitude": amplitude, "seed": seed, "rig": rig.value}
-        noise = {"noise_u_std": noise_u, "noise_y_std": noise_y}
-        facts = summaries.simulated(recording, truth, used)
-        print_json({"recording": str(output), **facts, **how, **noise}, lines=False)
-    else:
-        terminal.simulated(terminal.console(), str(output), reference, recording, truth)
-        if used != settings.columns:
-            terminal.renamed(terminal.console(), used)
 
 
 @app.command()
@@ -325,42 +218,3 @@ def diagnose(
     if fail_on_fault and faulty:
         raise typer.Exit(FAULT)
     failures.leave()
-
-
-@app.command()
-def reproduce(
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for figures and claims.")
-    ] = Path("paper-output"),
-    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="Realisations of the noise.")] = 1,
-    as_json: AsJson = False,
-) -> None:
-    """Reproduce the source paper: its figures, and every claim of it beside the measured number."""
-    from servoscope.cli import terminal
-    from servoscope.cli.progress import progress
-    from servoscope.output import make_folder
-    from servoscope.paper import measures, reproduction
-
-    make_folder(output)
-    numbers = range(1, seeds + 1)
-    with progress(len(measures.jobs(numbers)) + reproduction.DRAWINGS + 1, 1) as steps:
-        steps.begin("measuring")
-        found = reproduction.run(numbers, steps.begin)
-        reproduction.write(found, output, steps.begin)
-    if as_json:
-        print_json(found.to_dict(), lines=False)
-    else:
-        terminal.claims(terminal.console(), [(c.claim, c.measured, c.verdict) for c in found.claims])
-        terminal.written(terminal.console(), output)
-
-
-@app.command()
-def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for what it writes.")] = Path(
-        "demo-output"
-    ),
-) -> None:
-    """Simulate a rig, break it, learn and diagnose: the main job in four commands."""
-    from servoscope.cli import demo as demonstration
-
-    demonstration.show(output, lambda words: app(list(words), standalone_mode=False))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -29,7 +29,7 @@ from servoscope.report.wording import (
     units,
 )
 
-__all__ = ["page", "write"]
+__all__ = ["framed", "page", "write"]
 
 UNLIKELY = 0.05  # a candidate below this probability is not in the headline
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # the page could not load anything if it wanted to
@@ -84,8 +84,23 @@ def page(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loop, p
         warnings(diagnosis),
         settings(loop, provenance),
     )
-    style = files("servoscope.report").joinpath("report.css").read_text(encoding="utf-8")
     title = f"{KINDS[diagnosis.verdict][0]}: {diagnosis.recording}"
+    return framed(title, diagnosis.verdict, sections)
+
+
+def framed(title: str, kind: str, sections: Iterable[str]) -> str:
+    """Return a page with sections of HTML, empty ones left out, in the look of the style sheet.
+
+    Parameters
+    ----------
+    title
+        Of the window.
+    kind
+        Class of the page, which gives its tone: ``fault``, ``healthy`` or ``undetermined``.
+    sections
+        HTML.
+    """
+    style = files("servoscope.report").joinpath("report.css").read_text(encoding="utf-8")
     lines = (
         "<!DOCTYPE html>",
         '<html lang="en">',
@@ -96,7 +111,7 @@ def page(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loop, p
         f"<title>{escape(title)}</title>",
         f"<style>\n{style}</style>",
         "</head>",
-        f'<body>\n<main class="{diagnosis.verdict}">',
+        f'<body>\n<main class="{kind}">',
         *filter(None, sections),
         "</main>\n</body>\n</html>\n",
     )

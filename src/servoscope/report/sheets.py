@@ -25,7 +25,7 @@ from servoscope.report.wording import (
     with_std,
 )
 
-__all__ = ["candidates", "coefficient_units", "numbers", "section", "settings", "warnings"]
+__all__ = ["candidates", "coefficient_units", "grid", "numbers", "section", "settings", "warnings"]
 
 MOST_WARNINGS = 60
 
@@ -88,7 +88,7 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         ".Probability",
     )
     why = "What could explain the change, how large each explanation would have to be, how probable it is."
-    return section("Candidates", why, _table(head, rows), "whole candidates")
+    return section("Candidates", why, grid(head, rows), "whole candidates")
 
 
 def numbers(diagnosis: Diagnosis, loop: Loop) -> str:
@@ -110,7 +110,7 @@ def _coefficients(diagnosis: Diagnosis, loop: Loop) -> str:
         rows.append(f'<tr><th scope="row" class="t">{symbol(name)}</th>{unit}{"".join(map(_n, cells))}</tr>')
     head = ("*Estimate", "*Standard deviation", "*Healthy", "*Change", "*In standard deviations")
     first = ("Coefficient", "Unit") if of_u else ("Coefficient",)
-    return section("Coefficients at the end of the recording", "", _table((*first, *head), rows))
+    return section("Coefficients at the end of the recording", "", grid((*first, *head), rows))
 
 
 def _responses(diagnosis: Diagnosis, loop: Loop) -> str:
@@ -135,7 +135,7 @@ def _responses(diagnosis: Diagnosis, loop: Loop) -> str:
     head = ("Frequency", "*Real part", "*healthy", "*Imaginary part", "*healthy", "*Magnitude", "*Phase [°]")
     unit = f" in {of_u}/{of_y}" if of_u else ""
     why = f"Parts{unit} with one standard deviation; magnitude and phase are changes from healthy."
-    return section("Inverse frequency response at the end of the recording", why, _table(head, rows))
+    return section("Inverse frequency response at the end of the recording", why, grid(head, rows))
 
 
 def coefficient_units(plant: Plant) -> tuple[str, ...]:
@@ -171,7 +171,7 @@ def warnings(diagnosis: Diagnosis) -> str:
     more = len(diagnosis.warnings) - MOST_WARNINGS
     rest = f"\n<p>And {more} more.</p>" if more > 0 else ""
     why = "What the reader should know about the recording. Nothing was interpolated."
-    table = _table(("Time [s]", "Kind", "*Rows", "What happened"), rows)
+    table = grid(("Time [s]", "Kind", "*Rows", "What happened"), rows)
     return section("Warnings", why, table + rest, "long")
 
 
@@ -209,7 +209,7 @@ def _n(cell: str) -> str:
     return f'<td class="n">{cell}</td>'
 
 
-def _table(head: Iterable[str], rows: Iterable[str]) -> str:
+def grid(head: Iterable[str], rows: Iterable[str]) -> str:
     """Return a table; a heading with a leading asterisk stands over numbers, one with a dot over bars."""
     classes = {"*": ' class="n"', ".": ' class="p"'}
     cells = "".join(f'<th scope="col"{classes.get(name[0], "")}>{name.lstrip("*.")}</th>' for name in head)

@@ -14,6 +14,7 @@ from servoscope.plants import FloatArray
 
 __all__ = [
     "axis_scale",
+    "change",
     "clock_time",
     "count",
     "factors",
@@ -124,6 +125,13 @@ def signed_percent(change: float) -> str:
         return f"× {number(1.0 + change, 3)}"
     text = f"{100.0 * change:+.2f}" if abs(change) < 0.1 else f"{100.0 * change:+.1f}"
     return _signed(text) + " %"
+
+
+def change(ratio: float | None) -> str:
+    """Return from which ratio on something holds: as +2.5 %, as a factor where it is far from one; None: never."""
+    if ratio is None:
+        return "never"
+    return _signed(f"{100.0 * (ratio - 1.0):+.3g} %") if 0.5 < ratio < 2.0 else f"× {ratio:.3g}"
 
 
 def size_of(ratio: float, low: float, high: float) -> tuple[str, str, str]:

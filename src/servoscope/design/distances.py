@@ -1,0 +1,265 @@
+"""How far apart two explanations are, exactly: what another fault at its best leaves of a true one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.design.information import MISNAMED, bound, confusion, equivalent, fisher
+from servoscope.design.scene import Scene
+from servoscope.errors import SimulationError
+from servoscope.plants import Fault, FloatArray
+from servoscope.refinement.hypotheses import bounds
+from servoscope.refinement.window import Window
+
+NEAR = 200.0  # squared distance from which hypotheses are never taken for each other, and not fitted any closer
+STEPS = 8  # of Gauss and Newton
+SHORTER = (1.0, 0.3, 0.1)  # shares of a step that are tried
+CONVERGED = 1e-3  # of a squared distance of one
+GRID = 12  # sizes between the radius that linear distances promise and the end of the range
+FINE = 0.01  # relative precision of a radius
+SUSPICIOUS = 1.0  # logarithm of a distance relative to what is needed, below which a dip is looked into
+LOOKS = 6  # into a dip
+FAR = 10.0  # stands for a distance beyond all need
+DRAWS = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """How far the other hypotheses are from a fault of one size.
+
+    Parameters
+    ----------
+    others
+        The other faults, q of them.
+    squared
+        Squared distances, shape (q,).
+    certain
+        The same if the healthy parameters were known exactly, shape (q,).
+    sizes
+        Logarithms of the ratios at which each is closest, shape (q,).
+    left
+        What each leaves then, in standard deviations, shape (q, N + m).
+    """
+
+    others: tuple[Fault, ...]
+    squared: FloatArray
+    certain: FloatArray
+    sizes: FloatArray
+    left: FloatArray
+
+    @property
+    def nearest(self) -> str:
+        """Name of the closest other fault; empty where there is none."""
+        return self.others[int(np.argmin(self.squared))].name if self.others else ""
+
+    def called(self, seed: int = 0) -> dict[str, float]:
+        """Return the probability with which each of the others is more likely than the truth and all else.
+
+        Drawn from the joint distribution of the log-likelihood ratios, D^2/2 + D'w each.
+        """
+        root = np.asarray(np.linalg.qr(self.left.T, mode="r"), dtype=np.float64).T
+        w = np.random.default_rng(seed).standard_normal((DRAWS, root.shape[1]))
+        against = 0.5 * self.squared + w @ root.T
+        wins = (against < 0.0) & (against <= against.min(axis=1, keepdims=True))
+        return {fault.name: float(share) for fault, share in zip(self.others, wins.mean(axis=0), strict=True)}
+
+
+def apart(scene: Scene, fault: Fault, x: float) -> Apart:
+    """Measure how far all other single faults are from a fault whose logarithm of the ratio is x.
+
+    D^2 is the smallest sum of squares by which the innovations of another hypothesis differ from those of the truth,
+    its size and the healthy parameters free. The difference is known a sample ahead, so with the noise of the sample
+    the log-likelihood ratio is Gaussian with mean D^2/2 and variance D^2.
+
+    Raises
+    ------
+    SimulationError
+        If the loop is unstable with the fault.
+    """
+    window = scene.window({fault.parameter: float(np.exp(x))})
+    own = window.residual(np.append(np.zeros(window.nuisances), x), (fault.parameter,), scene.growth)
+    others = tuple(other for other in scene.loop.plant.faults if other.parameter != fault.parameter)
+    F, i = fisher(scene), scene.names.index(fault.parameter)
+    found = []
+    for other in others:
+        j = scene.names.index(other.parameter)
+        guess = x * float(F[i, j] / max(F[j, j], 1e-300))
+        found.append(_closest(scene, window, other, own, guess))
+    left = np.array([each.left for each in found]).reshape(len(others), len(own))
+    return Apart(
+        others,
+        (left**2).sum(axis=1),
+        np.array([each.certain for each in found]),
+        np.array([each.size for each in found]),
+        left,
+    )
+
+
+Span = tuple[float, float]
+
+
+class Unclear(NamedTuple):
+    """Sizes at which a fault is not named rightly, as spans of logarithms (positive) in rising order.
+
+    The first begins at 0; the last ends at infinity if the end of the range is among them. Those beyond the first are
+    sizes at which the fault looks like another once more: a resonance above half the sample rate comes back, for
+    example. `spans` are with the healthy parameters as well known as they are, `certain` if they were known exactly:
+    less nobody can reach, for it is the likelihood ratio that decides (Neyman and Pearson, 1933).
+    """
+
+    spans: tuple[Span, ...]
+    certain: tuple[Span, ...]
+
+
+def unclear(scene: Scene, fault: Fault, up: bool, progress: Callable[[], None] = lambda: None) -> Unclear:
+    """Return at which sizes another single fault is more likely with a probability above `MISNAMED`.
+
+    Sizes with which the loop is unstable do not count: nobody could have recorded them.
+    """
+    (low,), (high,) = bounds([fault])
+    sign, end = (1.0, float(high)) if up else (-1.0, float(-low))
+    if len(scene.names) == 1:
+        return Unclear((), ())
+    known: dict[float, Apart | None] = {}
+
+    def at(log_x: float) -> Apart | None:
+        if log_x not in known:
+            progress()
+            try:
+                known[log_x] = apart(scene, fault, sign * float(np.exp(log_x)))
+            except SimulationError:
+                known[log_x] = None
+        return known[log_x]
+
+    def excess(of: str) -> Callable[[float], float]:
+        def ratio(log_x: float) -> float:
+            """Return the logarithm of the distance relative to what is needed."""
+            found = at(log_x)
+            if found is None:
+                return FAR
+            return float(np.log(max(equivalent(confusion(getattr(found, of))), 1e-6) / equivalent(MISNAMED)))
+
+        return ratio
+
+    promised = min(bound(fisher(scene, exact=False), scene.names.index(fault.parameter)), 0.9 * end)
+    learned = excess("squared")
+    points = [(x, learned(x)) for x in np.log(np.geomspace(0.9 * promised, end, GRID)).tolist()]
+    _look_into_dips(learned, points)
+    sizes = sorted(known)
+    return Unclear(*(_below(excess(of), sizes) for of in ("squared", "certain")))
+
+
+def _below(excess: Callable[[float], float], log_sizes: list[float]) -> tuple[Span, ...]:
+    """Return where an excess is negative, as spans of sizes, from a function of rising logarithms of sizes."""
+    from scipy.optimize import brentq
+
+    points = [(x, excess(x)) for x in log_sizes]
+    for _ in range(GRID):
+        if points[0][1] > 0.0:
+            points.insert(0, (points[0][0] - 0.3, excess(points[0][0] - 0.3)))
+    spans, begin = [], 0.0
+    if points[0][1] > 0.0:
+        return ()
+    for (x, here), (following, there) in pairwise(points):
+        if here * there > 0.0:
+            continue
+        root = float(np.exp(brentq(excess, x, following, xtol=FINE, rtol=FINE)))
+        if here < 0.0:
+            spans.append((begin, root))
+        else:
+            begin = root
+    if points[-1][1] < 0.0:
+        spans.append((begin, float(np.inf)))
+    return tuple(spans)
+
+
+def _look_into_dips(excess: Callable[[float], float], points: list[tuple[float, float]]) -> None:
+    """Evaluate an excess between points where it may become negative."""
+    from scipy.optimize import minimize_scalar
+
+    for (low, left), (_, middle), (high, right) in zip(points, points[1:], points[2:], strict=False):
+        if 0.0 < middle <= min(left, right) and middle < SUSPICIOUS:
+            minimize_scalar(excess, bounds=(low, high), method="bounded", options={"maxiter": LOOKS})
+
+
+class _Closest(NamedTuple):
+    size: float
+    left: FloatArray
+    certain: float
+
+
+def _closest(scene: Scene, window: Window, other: Fault, own: FloatArray, guess: float) -> _Closest:
+    """Return where another fault comes closest to the truth, whose innovations are `own` (N + m,).
+
+    First with the healthy parameters held, by search; then with all free.
+    """
+    m, ladder = window.nuisances, scene.ladders[other.parameter]
+    (low,), (high,) = bounds([other])
+
+    def off(x: float) -> float:
+        e = window.innovations(ladder[x], scene.growth) - own[: window.samples]
+        return float(e @ e)
+
+    starts = [np.append(np.zeros(m), x) for x in (min(ladder, key=off), float(np.clip(guess, low, high)))]
+    z = min(starts, key=lambda z: float(((window.residual(z, (other.parameter,), scene.growth) - own) ** 2).sum()))
+    z, left = descended(scene, window, [other], own, z, held=True)
+    certain = float(left @ left)
+    if m:
+        z, left = descended(scene, window, [other], own, z, held=False)
+    return _Closest(float(z[m]), left, certain)
+
+
+def descended(
+    scene: Scene, window: Window, faults: Sequence[Fault], own: FloatArray, z: FloatArray, held: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Go down from z = [d, x] to where some faults are closest to the truth, by Gauss and Newton.
+
+    Parameters
+    ----------
+    scene, window
+        What is studied, and a recording of it.
+    faults
+        The explanation, x (q,) their logarithms of ratios.
+    own
+        Innovations and prior of the truth, shape (N + m,).
+    z
+        Where to begin, shape (m + q,).
+    held
+        Whether d stays as it is. Where it does not, the way ends as soon as a linear step leaves more than `NEAR`.
+
+    Returns
+    -------
+    z, left
+        The closest point, and by how much its innovations and prior differ from those of the truth, (N + m,).
+    """
+    m, names, growth = window.nuisances, tuple(fault.parameter for fault in faults), scene.growth
+    first = m if held else 0
+    low, high = bounds(faults)
+    left = window.residual(z, names, growth) - own
+    for _ in range(STEPS):
+        J = window.jacobian(z, names, growth, slice(first, None))
+        size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+        Q, R = np.linalg.qr(J / size)
+        step = -np.linalg.lstsq(R, Q.T @ left, rcond=None)[0] / size
+        predicted = left + J @ step
+        if not held and predicted @ predicted > NEAR:
+            return z, predicted
+        for shorter in SHORTER:
+            new = z.copy()
+            new[first:] += shorter * step
+            new[m:] = np.clip(new[m:], low, high)
+            following = window.residual(new, names, growth) - own
+            gained = float(left @ left - following @ following)
+            if gained >= 0.0:
+                break
+        else:
+            break
+        z, left = new, following
+        if gained < CONVERGED * (1.0 + float(left @ left)):
+            break
+    return z, left

@@ -1,0 +1,117 @@
+"""Fisher information: how surely each change could be sized, alone and together, and how alike any two look."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.design.scene import Scene
+from servoscope.plants import FloatArray
+
+MISNAMED = 0.005  # probability of a wrong name at the isolability radius; as much is left for pairs and "unknown"
+SINGULAR = 1e-9  # eigenvalue of a correlation below which two changes are one
+BoolArray = npt.NDArray[np.bool_]
+
+
+def fisher(scene: Scene, seconds: float | None = None, exact: bool = True) -> FloatArray:
+    """Return the Fisher information about the logarithms of the k ratios, shape (k, k).
+
+    From the innovations of the exact sampled plant (Ljung, 1999, section 7.4); information in the noise's colour is
+    left out.
+
+    Parameters
+    ----------
+    scene
+        What is studied.
+    seconds
+        After the onset that count; None: all.
+    exact
+        Whether the healthy parameters are known exactly, or as the baseline and the healthy seconds before the onset
+        know them.
+    """
+    m, end = scene.healthy.nuisances, scene.healthy.samples
+    if seconds is not None:
+        end = min(end, scene.lead + round(seconds * scene.loop.sample_rate))
+    J = np.delete(scene.jacobian, slice(end, scene.healthy.samples), axis=0)
+    H = J.T @ J
+    if exact or not m:
+        return np.asarray(H[m:, m:])
+    return np.asarray(H[m:, m:] - H[m:, :m] @ np.linalg.solve(H[:m, :m], H[:m, m:]))
+
+
+def deviations(F: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Cramer-Rao standard deviations from an information (k, k): each size alone, and all free; (k,) each.
+
+    Infinite where a change says nothing, or nothing of its own.
+    """
+    with np.errstate(divide="ignore"):
+        alone = 1.0 / np.sqrt(np.diag(F))
+    together = np.where(_open(F), np.inf, np.sqrt(np.diag(covariance(F))))
+    return alone, together
+
+
+def covariance(F: FloatArray) -> FloatArray:
+    """Return the inverse of an information (k, k); directions that say nothing keep a large variance."""
+    size = np.sqrt(np.maximum(np.diag(F), 1e-300))
+    value, vector = np.linalg.eigh(F / np.outer(size, size))
+    inverse = (vector / np.maximum(value, SINGULAR)) @ vector.T
+    return np.asarray(inverse / np.outer(size, size))
+
+
+def _open(F: FloatArray) -> BoolArray:
+    """Return which sizes take part in a combination that the information (k, k) says nothing of, shape (k,)."""
+    size = np.sqrt(np.maximum(np.diag(F), 1e-300))
+    value, vector = np.linalg.eigh(F / np.outer(size, size))
+    silent = vector[:, value < SINGULAR]
+    return np.asarray(((silent**2).sum(axis=1) > SINGULAR) | (np.diag(F) <= 0.0))
+
+
+def cosines(columns: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the cosines between columns (N, p) and others (N, q), shape (p, q)."""
+    one, other = (x / np.maximum(np.linalg.norm(x, axis=0), 1e-300) for x in (columns, others))
+    return np.asarray(one.T @ other)
+
+
+def confusion(squared: FloatArray) -> float:
+    """Return the probability that one of some hypotheses wins against the truth, given squared distances (q,).
+
+    The log-likelihood ratio of two hypotheses D standard deviations apart is Gaussian with mean D^2/2 and variance
+    D^2 (Kay, 1998, section 4.3), so each wins with Q(D/2); their sum bounds the whole.
+    """
+    from scipy import special
+
+    return float(special.ndtr(-0.5 * np.sqrt(np.maximum(squared, 0.0))).sum())
+
+
+def equivalent(probability: float) -> float:
+    """Return at which distance a single other hypothesis wins with a probability."""
+    from scipy import special
+
+    return max(float(-2.0 * special.ndtri(max(probability, 1e-300))), 0.0)
+
+
+def bound(F: FloatArray, i: int) -> float:
+    """Return the isolability radius of fault i that an information (k, k) allows, as a logarithm; may be infinite.
+
+    The same rule as for `servoscope.design.distances.isolable`, but with distances as they are for small changes:
+    D_ij = x sqrt(F_ii (1 - rho_ij^2)).
+    """
+    others = np.arange(len(F)) != i
+    if not F[i, i] > 0.0:
+        return np.inf
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shared = np.where(np.diag(F) > 0.0, F[i] ** 2 / np.diag(F), 0.0)
+    per_unit = np.maximum(F[i, i] - shared, 0.0)[others]
+    return smallest(lambda x: confusion(x**2 * per_unit) <= MISNAMED, 1e-9, 1e3)
+
+
+def smallest(holds: Callable[[float], bool], low: float, high: float) -> float:
+    """Return from where on a condition holds, by bisection on a logarithmic scale; infinity if not even at `high`."""
+    if not holds(high):
+        return np.inf
+    for _ in range(50):
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high
