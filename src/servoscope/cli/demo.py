@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import shlex
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
@@ -118,10 +119,12 @@ def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
     prepare(folder)
     out = terminal.console()
     told: list[bool] = []
+    stream = sys.stdout
 
     def compiling() -> None:
         if not told:
-            out.print(Text("  compiling, once: the next time this starts at once", style="dim"))
+            with redirect_stdout(stream):  # not among what a command prints into a file
+                out.print(Text("  compiling, once: the next time this starts at once", style="dim"))
         told.append(True)
 
     with on_compiling(compiling):
