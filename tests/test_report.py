@@ -19,7 +19,7 @@ from servoscope.errors import OutputError
 from servoscope.ifrf import Response
 from servoscope.loop import Loop
 from servoscope.recording import Recording
-from servoscope.report import canvas, figures, sheets
+from servoscope.report import canvas, figures
 
 PROVENANCE = {"baseline": "healthy.json", "hash": "0123456789abcdef", "threshold": "46.2"}
 VOID = {"meta", "br", "path", "use", "circle", "link", "img"}
@@ -216,9 +216,9 @@ def test_the_input_gain_is_told_in_words_and_once(ratio: float, words: str) -> N
 
 
 def test_what_is_no_percentage_has_a_unit(loop: Loop) -> None:
-    assert sheets.coefficient_units(loop.plant) == ("A/m", "A s/m", "A s²/m", "A s³/m")
+    assert loop.plant.coefficient_units == ("A/m", "A s/m", "A s²/m", "A s³/m")
     plant = {**AXIS["plant"], "friction": "directional", "offset": True}
-    told = sheets.coefficient_units(Loop.from_dict({**AXIS, "plant": plant}).plant)
+    told = Loop.from_dict({**AXIS, "plant": plant}).plant.coefficient_units
     assert told == ("u s²/y", "u s/y", "u s/y", "u", "u")
 
 

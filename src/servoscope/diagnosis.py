@@ -77,6 +77,11 @@ class Mimic(_Said):
     value: float
     unit: str
 
+    @property
+    def size(self) -> str:
+        """Its value with its unit, a ratio as a factor."""
+        return f"x {self.value:.4g}" if self.unit == "ratio" else f"{self.value:.3g} {self.unit}"
+
 
 class Refit(_Said):
     """The refit of the seconds around the onset, from which the diagnosis's onset and candidates are.
