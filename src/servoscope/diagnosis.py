@@ -90,6 +90,8 @@ class Refit(_Said):
     ----------
     from_s, to_s
         What it looked at.
+    over_s
+        How long the change of the best candidate grew; 0 for a step.
     noise
         Standard deviation of the innovations, as a multiple of the baseline's.
     misfit, limit
@@ -102,6 +104,7 @@ class Refit(_Said):
 
     from_s: float
     to_s: float
+    over_s: float
     noise: float
     misfit: float
     limit: float

@@ -33,7 +33,8 @@ def candidates_of(refined: Refined) -> tuple[Candidate, ...]:
         if len(each.fitted.faults) == 1 or each.probability >= WORTH_LISTING
     ]
     told.append(Candidate(name=UNKNOWN, probability=refined.unknown))
-    return tuple(sorted(told, key=lambda candidate: -candidate.probability))
+    # where probabilities vanish, the closest comes first
+    return tuple(sorted(told, key=lambda candidate: (-candidate.probability, candidate.misfit or 0.0)))
 
 
 def onset_of(refined: Refined, x: Examination) -> Onset:
@@ -53,6 +54,7 @@ def said(refined: Refined, x: Examination, recursive: tuple[Candidate, ...]) -> 
     return Refit(
         from_s=float(t[window.first]),
         to_s=float(t[window.first + window.samples - 1]),
+        over_s=refined.best.fitted.growth.over / x.recording.sample_rate,
         noise=float(np.sqrt(refined.louder)),
         misfit=refined.goodness.statistic,
         limit=refined.goodness.limit,
@@ -64,11 +66,9 @@ def said(refined: Refined, x: Examination, recursive: tuple[Candidate, ...]) -> 
     )
 
 
-def disagreements(
-    x: Examination, said: tuple[Candidate, ...], recursive: tuple[Candidate, ...], sure: float
-) -> list[Warning]:
+def disagreements(x: Examination, candidates: tuple[Candidate, ...], told: Refit, sure: float) -> list[Warning]:
     """Return a warning where the refit and the recursion contradict each other, both with probability `sure`."""
-    one, other, t = said[0], recursive[0], x.recording.t
+    one, other, t = candidates[0], told.recursive[0], x.recording.t
     message = ""
     if min(one.probability, other.probability) < sure or (len(one.faults) > 1 and other.name == UNKNOWN):
         return []  # the recursion knows no pairs
@@ -84,6 +84,10 @@ def disagreements(
     if not message:
         return []
     why = "the refit weighs every second since the onset, the recursion the last ones: look whether the change went on"
+    if len(one.faults) > 1:
+        why = "the recursion compares single faults only"
+    elif told.over_s > 0.0:
+        why = f"the change grew over {told.over_s:.3g} s, which the recursion follows late"
     return [Warning(kind="disagreement", from_s=float(t[0]), to_s=float(t[-1]), count=1, message=f"{message}; {why}")]
 
 

@@ -73,6 +73,7 @@ def _candidates(out: Console, candidates: Sequence[Candidate]) -> None:
     empty = {i for i in (5, 6) if not any(row[i] for row in rows)}
     empty |= {2} if all(fault.name == fault.parameter for fault in every) else set()
     empty |= {3, 4} if not every else set()
+    empty |= {5} if len(rows) == 1 else set()  # nothing listed to be compared with
     header = ("candidate", "probability", "parameter", "ratio", "95 % interval", "worse by", "cosine")
     columns = [i for i in range(len(header)) if i not in empty]
     if rows:

@@ -154,7 +154,10 @@ def _headline(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         return names[:1].upper() + names[1:]
     if diagnosis.candidates and diagnosis.candidates[0].name == UNKNOWN:
         return "The actuator has changed, in a way that no known fault explains"
-    likely = [c.name for c in diagnosis.candidates if c.name != UNKNOWN and c.probability >= UNLIKELY]
+    several = [c for c in diagnosis.candidates if c.name != UNKNOWN and c.probability >= UNLIKELY]
+    if len(several) > 1 and all(len(c.faults) > 1 for c in several):
+        return "The actuator has changed in two ways at once; which ones remains open"
+    likely = [c.name for c in several]
     if len(likely) > 1:
         return f"The actuator has changed: {' or '.join(meaning(name, words) for name in likely)}"
     return "The actuator has changed; which fault it is remains open"

@@ -63,7 +63,9 @@ def plain_symbol(name: str) -> str:
 
 def with_symbols(text: str) -> str:
     """Return a sentence as HTML, with parameters as symbols and factors with a true sign."""
-    told = re.sub(r"\b(?:theta|[A-Za-z]{1,2})_\w{1,3}\b", lambda found: symbol(found[0]), html.escape(text))
+    told = re.sub(
+        r"\b(?:theta_\d+|beta|rho|[A-Za-z]{1,2}_\w{1,3})\b", lambda found: symbol(found[0]), html.escape(text)
+    )
     return re.sub(r"\bx (?=\d)", "× ", told)
 
 
