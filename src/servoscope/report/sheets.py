@@ -27,6 +27,7 @@ from servoscope.report.wording import (
 __all__ = ["candidates", "cell", "numbers", "section", "settings", "table", "warnings"]
 
 MOST_WARNINGS = 60
+LIKELY = 0.05  # probability from which it is told how the sizes of a pair hang together
 
 
 def section(title: str, why: str, content: str, kind: str = "whole") -> str:
@@ -65,7 +66,7 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         bar = f'<span class="bar"><i style="width:{width:.1f}%"></i></span>'
         means = meaning(candidate.name, words, candidate.faults[0].ratio if len(candidate.faults) == 1 else 1.0)
         plain = candidate.name.replace("_", " ")
-        more = f"<br><small>{escape(means)}</small>" if means != plain else ""
+        more = f"<br><small>{escape(means)}</small>" if means != plain.replace(" + ", " and ") else ""
         sizes: Sequence[FoundFault | None] = candidate.faults or (None,)
         told = [
             ("" if f.parameter == candidate.name else f"{symbol(f.parameter)} ", *ratios(f.ratio, *f.interval))
@@ -74,7 +75,7 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
             for f in sizes
         ]
         worse = f"{number(float(np.sqrt(candidate.misfit)), 3)} σ" if candidate.misfit else ""
-        if candidate.covariance is not None:
+        if candidate.covariance is not None and candidate.probability >= LIKELY:
             more += f"<br><small>sizes correlated by {number(correlation(candidate.covariance), 2)}</small>"
         cells = (
             f'<th scope="row">{escape(plain)}{more}</th>',
