@@ -91,7 +91,7 @@ class Refit(_Said):
     from_s, to_s
         What it looked at.
     over_s
-        How long the change of the best candidate grew; 0 for a step.
+        How long the change grew; 0 where that is not told from a step, being shorter than the onset's interval.
     noise
         Standard deviation of the innovations, as a multiple of the baseline's.
     misfit, limit

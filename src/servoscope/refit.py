@@ -49,12 +49,13 @@ def onset_of(refined: Refined, x: Examination) -> Onset:
 def said(refined: Refined, x: Examination, recursive: tuple[Candidate, ...]) -> Refit:
     """Return what a diagnosis keeps of a refit."""
     t, window = x.recording.t, refined.window
+    over = refined.since.growth.over
     of_y, of_u = x.baseline.plant.units
     units = {"of y": of_y or "in units of y", "of u": of_u or "in units of u"}
     return Refit(
         from_s=float(t[window.first]),
         to_s=float(t[window.first + window.samples - 1]),
-        over_s=refined.best.fitted.growth.over / x.recording.sample_rate,
+        over_s=over / x.recording.sample_rate if over > refined.since.high - refined.since.low else 0.0,
         noise=float(np.sqrt(refined.louder)),
         misfit=refined.goodness.statistic,
         limit=refined.goodness.limit,
