@@ -16,6 +16,9 @@ from servoscope.signatures import Expectation
 
 Shift = Callable[[float], FloatArray]
 
+MOST_KEPT = 10_000  # points of signatures, of this process
+_kept: dict[tuple[object, ...], FloatArray] = {}
+
 
 def candidates_of(
     baseline: Baseline,
@@ -62,15 +65,21 @@ def _of_plant(
 
 
 def _simulated(baseline: Baseline, expectation: Expectation, since: int) -> Callable[[Fault], Shift]:
-    """Let the fault step in at the onset, and ask what the recursion would say at the end."""
+    """Let the fault step in at the onset, and ask what the recursion would say at the end; the answers are kept."""
     plant, start = baseline.plant, np.array(baseline.model_theta)
     healthy = expectation.path(start, plant)[-1]
+    common = (expectation.hash, plant.model_dump_json(), start.tobytes(), since)
 
     def of(fault: Fault) -> Shift:
         def shift(ratio: float) -> FloatArray:
-            ill = plant.with_ratios({fault.parameter: ratio})
-            moved: FloatArray = expectation.path(start, plant, ill, since)[-1] - healthy
-            return moved
+            key = (*common, fault.parameter, ratio)
+            if key not in _kept:
+                ill = plant.with_ratios({fault.parameter: ratio})
+                moved: FloatArray = expectation.path(start, plant, ill, since)[-1] - healthy
+                if len(_kept) >= MOST_KEPT:
+                    _kept.clear()
+                _kept[key] = moved
+            return _kept[key]
 
         return shift
 

@@ -8,6 +8,7 @@ moments. So the biases of the regression are in the expectation, and cancel from
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -127,6 +128,16 @@ class Expectation:
         if key not in self._moments:
             self._moments[key] = noise_moments(self.pipeline, plant, self.noise)
         return self._moments[key]
+
+    @cached_property
+    def hash(self) -> str:
+        """Digest of all that the path of a plant depends on: loop, recursion, noise, reference."""
+        tuning, noise = self.tuning, self.noise
+        numbers = np.array([tuning.R, noise.u_std, noise.y_std, self.pipeline.every])
+        digest = hashlib.sha256(self.pipeline.loop.hash().encode())
+        for array in (tuning.theta, tuning.scale, tuning.P_d, numbers, *self.course):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
 
     def regression(self, plant: Plant, ill: Plant | None = None, since: int = 0) -> Regression:
         """Return the noise-free regression of the loop with a plant that may turn ill.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,24 +38,19 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
     """Return the verdict on an examination and its trace; `progress` is told what is being done."""
     recording = x.recording
     warnings = [Warning.of(defect) for defect in recording.defects] + doubts(x)
-    alarms = np.flatnonzero(x.alarm)
+    alarm = alarm_of(x, progress)
     seen: dict[str, tuple[float, float]] = {}
     candidates: tuple[Candidate, ...] = ()
     faults: tuple[FoundFault, ...] = ()
     since: Onset | None = None
     told: Refit | None = None
     at, detected_at = len(x.t) - 1, None
-    if alarms.size:
-        first = int(alarms[0])
-        announced = _announced(x, first)
-        detected_at = float(recording.t[announced])
-        # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
-        at = at if x.alarm[-1] else first + int(np.argmax(x.statistic[first:]))
-        progress("onset")
-        since = _onset(x, announced, at)
+    if alarm is not None:
+        at, since = alarm.at, alarm.since
+        detected_at = float(recording.t[alarm.announced])
         recursive = candidates = isolate(*isolation_inputs(x, since, at), lambda: progress("isolation"))
         progress("refit")
-        refined = refit(x, since, announced, int(x.estimates.index[at]), lambda: progress("refit"))
+        refined = refit(x, since, alarm.announced, int(x.estimates.index[at]), lambda: progress("refit"))
         if refined is not None and not _labelled(refined, recursive[0]):
             candidates, told = candidates_of(refined), said(refined, x, recursive)
             since = since if refined.is_unknown else onset_of(refined, x)
@@ -66,7 +62,7 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         blind = blind_to(x, seen)
         span = float(recording.t[0]), float(recording.t[-1])
         warnings += [Warning(kind="power", from_s=span[0], to_s=span[1], count=1, message=text) for text in blind]
-    verdict: Verdict = "fault" if alarms.size else "undetermined" if blind else "healthy"
+    verdict: Verdict = "fault" if alarm else "undetermined" if blind else "healthy"
     compared = unbiased(x, candidates, since, at)
     trace = trace_of(x.baseline, x.pipeline, x.estimates, x.t, compared, recording.t)
     found = Diagnosis(
@@ -88,6 +84,28 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         point=x.baseline.point or None,
     )
     return found, trace
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """The alarm of a recording: its sample, the evaluation that is judged, and since when, by the recursion."""
+
+    announced: int
+    at: int
+    since: Onset
+
+
+def alarm_of(x: Examination, progress: Callable[[str], None] = lambda _: None) -> Alarm | None:
+    """Return the first alarm of an examination; None if there was none."""
+    alarms = np.flatnonzero(x.alarm)
+    if not alarms.size:
+        return None
+    first = int(alarms[0])
+    announced = _announced(x, first)
+    # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
+    at = len(x.t) - 1 if x.alarm[-1] else first + int(np.argmax(x.statistic[first:]))
+    progress("onset")
+    return Alarm(announced, at, _onset(x, announced, at))
 
 
 def _labelled(refined: Refined, recursive: Candidate) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from servoscope.plants import Fault, FloatArray
 from servoscope.refinement.goodness import LAGS, traces
-from servoscope.refinement.hypotheses import Fitted, fit, start
+from servoscope.refinement.hypotheses import Fitted, Ladder, fit
 from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.refining import Refined
 from servoscope.refinement.window import SENSOR_GAIN, Growth, Window
@@ -64,7 +64,8 @@ def _parametric(window: Window, growth: Growth, best: Fitted) -> Iterator[Cause]
     known = {**window.plant.causes, SENSOR_GAIN: "a gain error of the sensor of y"}
     for name, words in known.items():
         fault = Fault(name, name, RANGE, words)
-        held = fit(window, [fault], growth, best.d, [np.array([start(window, fault, growth, best.d)])], free=False)
+        size, _ = Ladder.of(window, fault, best.d).best(window, growth)
+        held = fit(window, [fault], growth, best.d, [np.array([size])], free=False)
         free = fit(window, [fault], growth, best.d, [held.x], free=True)
         yield Cause(name, words, float(np.exp(free.x[0])), "ratio", free.J)
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 
 from servoscope.plants import Fault, FloatArray
+from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.window import Growth, Window
 
 GRID = 17  # sizes at which a search begins
@@ -71,14 +73,34 @@ def bounds(faults: Sequence[Fault]) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-def start(window: Window, fault: Fault, growth: Growth, d: FloatArray) -> float:
-    """Return the best size on a coarse grid."""
-    (low,), (high,) = bounds([fault])
+@dataclass(frozen=True, eq=False)
+class Ladder:
+    """Sizes of one fault from one end of its range to the other, where a search may begin.
 
-    def cost(x: float) -> float:
-        return float((window.residual(np.append(d, x), (fault.parameter,), growth) ** 2).sum())
+    Parameters
+    ----------
+    sizes
+        Logarithms of the ratios.
+    predictors
+        Of the healthy plant and the one of each size.
+    """
 
-    return float(min(np.linspace(low, high, GRID), key=cost))
+    sizes: FloatArray
+    predictors: tuple[Predictor, ...]
+
+    @classmethod
+    def of(cls, window: Window, fault: Fault, d: FloatArray) -> Self:
+        """Make the predictors, for errors d (m,) of the healthy parameters."""
+        (low,), (high,) = bounds([fault])
+        sizes, step = np.linspace(low, high, GRID), Growth(0)
+        return cls(sizes, tuple(window.predictor(d, (fault.parameter,), np.array([x]), step) for x in sizes))
+
+    def best(self, window: Window, growth: Growth) -> tuple[float, float]:
+        """Return the best size and its sum of squares, a drift taken as a step in its middle."""
+        step = Growth(growth.since + growth.over // 2)
+        costs = [float((window.innovations(each, step) ** 2).sum()) for each in self.predictors]
+        at = int(np.argmin(costs))
+        return float(self.sizes[at]), costs[at]
 
 
 def fit(

@@ -13,7 +13,7 @@ Array = npt.NDArray[Any]  # float64, or complex128 for complex-step derivatives
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-SETTLED = 1e-8  # relative change of the gain from which it stays as it is
+SETTLED = 1e-6  # relative change of the gain from which it stays as it is
 
 
 @kernel

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -97,7 +98,7 @@ class Bench:
             b, late = late, b
         Q = self.noise.u_std**2 * (np.outer(b, b) + np.outer(late, late))
         K, S = np.zeros((LONGEST, len(b)), A.dtype), np.zeros(LONGEST, A.dtype)
-        gains(A, Q, c, self.noise.y_std**2, self._open(A, b + late, c), K, S)
+        gains(A, Q, c, self.noise.y_std**2, self.first.astype(kind), K, S)
         return Predictor(A[None], b[None], late[None], c[None], K[None], S[None])
 
     @property
@@ -111,9 +112,12 @@ class Bench:
         """Whole samples of the loop file's delay."""
         return int(np.floor(self.loop.delay * self.loop.sample_rate + 1e-9))
 
-    def _open(self, A: Array, b: Array, c: Array) -> Array:
-        """Return the covariance of the first state: what a loud and white u would have left."""
+    @cached_property
+    def first(self) -> FloatArray:
+        """Covariance of the first state after a restart, (n, n): what a loud and white u would have left."""
+        d = discretise(self.loop.plant.state_space(), self.loop.sample_rate, hold="zoh")
+        A, b, c = d.A * self.scale / self.scale[:, None], d.b_now / self.scale, d.c * self.scale
         P, power = (LOUD * self.u_std) ** 2 * np.outer(b, b), A
         for _ in range(DOUBLINGS):
             P, power = P + power @ P @ power.T, power @ power
-        return np.ascontiguousarray(P + (self.noise.y_std**2 / (c @ c) ** 2) * np.outer(c, c))
+        return np.asarray(P + (self.noise.y_std**2 / (c @ c) ** 2) * np.outer(c, c))

@@ -12,7 +12,7 @@ from servoscope.baseline import Baseline
 from servoscope.plants import Fault, FloatArray
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import Goodness, goodness, traces
-from servoscope.refinement.hypotheses import Evidence, Fitted, Scale, evidence, fit, start
+from servoscope.refinement.hypotheses import Evidence, Fitted, Ladder, Scale, evidence, fit
 from servoscope.refinement.since import Since, since
 from servoscope.refinement.window import Growth, Window
 
@@ -20,6 +20,8 @@ BEFORE_S = 60.0  # of healthy motion before the onset
 AFTER_S = 240.0  # of motion with the change
 MOST = 40_000  # samples in a window
 PAIRS = 0.02  # probability that two faults come at once, before anything is known
+LOOKS = 4  # for the onset, each with the sizes that fit the one before
+WORTH_A_LOOK = 1.0  # of the sum of squares that a look gained, for another one
 IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
 
 
@@ -128,12 +130,7 @@ class _Search:
 
     def run(self) -> Refined:
         nothing = np.zeros(self.window.nuisances)
-        singles = [
-            self._fit([fault], nothing, [np.array([start(self.window, fault, self.growth, nothing)])])
-            for fault in self.faults
-        ]
-        found = self._since(self._best(singles))
-        singles = [self._again(f, found.growth) for f in singles]
+        found, singles = self._begun(nothing)
         self.growth = found.growth
         pairs = [
             self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
@@ -143,14 +140,62 @@ class _Search:
         if len(best.faults) > 1:
             found = self._since(best)
         everything = [self._again(f, found.growth) for f in (*singles, *pairs)]
-        best = self._best(everything)
-        everything = [self._free(f) if self._within(f, best) else f for f in everything]
+        everything = self._freed(everything)
         best = self._best(everything)
         return self._weighed([self._own(f, best) for f in everything], found)
+
+    def _begun(self, d: FloatArray) -> tuple[Since, list[Fitted]]:
+        """Find the onset and the sizes of single faults in turns; drifts are tried once the steps have settled.
+
+        The recursion's onset may be far off where a fault moves its coefficients along a curve, as oil does; the alarm
+        is never far behind. Sizes that fit a wrong onset may be stuck: a ladder of sizes is looked at each time.
+        """
+        ladders = [Ladder.of(self.window, fault, d) for fault in self.faults]
+        begin = min(
+            sorted({self.rough, self.latest}),
+            key=lambda k: min(ladder.best(self.window, Growth(k))[1] for ladder in ladders),
+        )
+        singles = self._singles(Growth(begin), d, ladders)
+        for drifts in (False, True):
+            for _ in range(LOOKS):
+                before = self._best(singles).J
+                found = self._since(self._best(singles), drifts)
+                if found.growth == self.growth:
+                    break
+                singles = self._singles(found.growth, d, ladders, singles)
+                gained = before - self._best(singles).J
+                if gained < WORTH_A_LOOK * self.louder:
+                    break
+        return found, singles
+
+    def _singles(
+        self, growth: Growth, d: FloatArray, ladders: Sequence[Ladder], known: Sequence[Fitted] = ()
+    ) -> list[Fitted]:
+        """Fit every fault alone, from the best rung of its ladder and from a size that is known."""
+        self.growth = growth
+        starts = [[np.array([ladder.best(self.window, growth)[0]])] for ladder in ladders]
+        for each, other in zip(starts, known, strict=False):
+            each.append(other.x)
+        return [self._fit([fault], d, each) for fault, each in zip(self.faults, starts, strict=True)]
 
     def _fit(self, faults: Sequence[Fault], d: FloatArray, starts: Sequence[FloatArray]) -> Fitted:
         self.progress()
         return fit(self.window, faults, self.growth, d, starts, free=False)
+
+    def _freed(self, fitted: Sequence[Fitted]) -> list[Fitted]:
+        """Let the healthy parameters follow wherever that may bring a hypothesis within reach of the best one.
+
+        Under a large fault they matter: a second fault that stands in for their error must not outrun the first alone.
+        """
+        promised = [self._promised(f) for f in fitted]
+        limit = min(promised) + IN_REACH * self.louder
+        return [self._free(f) if limit >= J else f for f, J in zip(fitted, promised, strict=True)]
+
+    def _promised(self, fitted: Fitted) -> float:
+        """Return the sum of squares that one step of Gauss and Newton promises."""
+        J = self.window.jacobian(np.concatenate([fitted.d, fitted.x]), fitted.names, fitted.growth)
+        Q, _ = np.linalg.qr(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300))
+        return float(fitted.J - ((Q.T @ fitted.residual) ** 2).sum())
 
     def _free(self, fitted: Fitted) -> Fitted:
         self.progress()
@@ -177,8 +222,8 @@ class _Search:
         self.louder = best.J / self.window.samples
         return best
 
-    def _since(self, fitted: Fitted) -> Since:
-        return since(self.window, fitted, self.latest, self.louder)
+    def _since(self, fitted: Fitted, drifts: bool = True) -> Since:
+        return since(self.window, fitted, self.latest, self.louder, drifts)
 
     def _weighed(self, fitted: Sequence[Fitted], found: Since) -> Refined:
         window, n = self.window, len(self.faults)

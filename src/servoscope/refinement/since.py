@@ -17,8 +17,8 @@ FORGOTTEN = 1e-3  # share of its state from before a change that a predictor may
 SHORTEST_S = 0.2  # of a drift that is not called a step
 STEPLIKE = 0.5  # probability of a step, before anything is known
 STEPS = 400  # onsets of a step that are tried at first, at most
-RATIO = 1.5  # of one duration to the next, at first
-PER_DURATION = 6  # onsets that are tried within the duration of a drift
+RATIO = 1.6  # of one duration to the next, at first
+PER_DURATION = 4  # onsets that are tried within the duration of a drift
 CLOSER = 3  # times closer together they are in each further look
 LOOKS = 5
 NEGLIGIBLE = 1e-4  # of the largest posterior, that a further look may leave out
@@ -53,7 +53,7 @@ class _Tried:
     prior: FloatArray
 
 
-def since(window: Window, found: Fitted, latest: int, louder: float) -> Since:
+def since(window: Window, found: Fitted, latest: int, louder: float, drifts: bool = True) -> Since:
     """Find when a change began, as a step or as a drift.
 
     The likelihood of each onset and duration has the sizes and the healthy parameters at their best, by one step of
@@ -67,12 +67,14 @@ def since(window: Window, found: Fitted, latest: int, louder: float) -> Since:
         Sample of the window by which it had begun.
     louder
         Variance of the innovations.
+    drifts
+        Whether drifts are tried as well.
     """
     table = _Table(window, found, louder)
     tried = [_steps(table, latest, louder)]
-    drifts = _drifts(table, latest, louder)
-    if drifts is not None:
-        tried.append(drifts)
+    drifting = _drifts(table, latest, louder) if drifts else None
+    if drifting is not None:
+        tried.append(drifting)
     onsets, overs, cost, prior = (np.concatenate([getattr(t, name) for t in tried]) for name in vars(tried[0]))
     likelihood = np.exp(-0.5 * (cost - cost.min()) / louder)
     order = np.argsort(onsets, kind="stable")
