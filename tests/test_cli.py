@@ -146,6 +146,20 @@ def test_diagnose_writes_json_report_and_trace(made: Path, tmp_path: Path) -> No
     assert 0.0 <= first - said["detected_at_s"] < 0.1  # the sequential test speaks at once, its row comes 0.1 s later
 
 
+def test_two_faults_at_once_are_told_with_why_and_beside_the_recursion(made: Path, tmp_path: Path) -> None:
+    faults = ("--fault", "p_s=0.9@30", "--fault", "C_ie=1.2@30")
+    assert run("simulate", made / "loop.toml", "-o", tmp_path / "x.csv", *faults, "--seed", 5).code == 0
+    result = run("diagnose", made / "baseline.json", tmp_path / "x.csv")
+    lines = [" ".join(line.split()) for line in result.out.splitlines()]
+    assert "Fault: pump and leakage." in result.out
+    first = next(i for i, line in enumerate(lines) if line.startswith("pump > 99.9 % p_s "))
+    assert lines[first + 1].startswith("+ leakage C_ie ")
+    assert "Why:" in lines and any(line.startswith("- Rejected: leakage (C_ie x 1.") for line in lines)
+    assert any(line.startswith("refit 0 to 59.99 s, noise x 1.") for line in lines)
+    assert "recursion unknown, > 99.9 %" in lines
+    assert max(map(len, result.out.splitlines())) <= 80
+
+
 def test_the_exit_code_says_what_happened(made: Path, tmp_path: Path) -> None:
     baseline, healthy, suspect = (made / name for name in ("baseline.json", "healthy.csv", "suspect.csv"))
     missing = tmp_path / "missing.csv"

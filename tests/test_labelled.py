@@ -128,7 +128,7 @@ class TestBesidePhysics:
             said = ss.diagnose(worn, record(seed, at=15.0, p_s=ratios[0], C_ie=ratios[1]))
             assert [fault.name for fault in said.faults] == ["worn_pump"]
             assert said.faults[0].ratio == pytest.approx(share, rel=0.1)
-            assert "As labelled recordings show it" in said.summary and "times the labelled severity" in said.summary
+            assert "as labelled recordings show it" in said.summary and "times the labelled severity" in said.summary
             assert "healthy value" not in said.summary
         leak = ss.diagnose(worn, record(8, C_ie=1.2))
         assert [fault.name for fault in leak.faults] == ["leakage"]

@@ -125,6 +125,10 @@ class TestQube:
             assert baseline.loop.monitor.model_error == 0.02
             heavier = diagnose(baseline, _with_force(read(third, baseline.loop), baseline, "inertia"))
             assert heavier.verdict == "fault"
+            assert heavier.refit is None, "without nominal values there is none, and the reasons do without it"
+            assert heavier.explanation[0].startswith(("T²", "The sequential test"))
+            assert any("inertia has risen" in sentence for sentence in heavier.explanation)
+            assert any(sentence.startswith("Rejected: ") for sentence in heavier.explanation)
             assert {candidate.name for candidate in heavier.candidates[:2]} == {"inertia", "input_gain"}
 
 

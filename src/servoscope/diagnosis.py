@@ -77,6 +77,11 @@ class Mimic(_Said):
     value: float
     unit: str
 
+    @property
+    def size(self) -> str:
+        """Its value with its unit, a ratio as a factor."""
+        return f"x {self.value:.4g}" if self.unit == "ratio" else f"{self.value:.3g} {self.unit}"
+
 
 class Refit(_Said):
     """The refit of the seconds around the onset, from which the diagnosis's onset and candidates are.
@@ -85,6 +90,8 @@ class Refit(_Said):
     ----------
     from_s, to_s
         What it looked at.
+    over_s
+        How long the change grew; 0 where that is not told from a step, being shorter than the onset's interval.
     noise
         Standard deviation of the innovations, as a multiple of the baseline's.
     misfit, limit
@@ -97,6 +104,7 @@ class Refit(_Said):
 
     from_s: float
     to_s: float
+    over_s: float
     noise: float
     misfit: float
     limit: float

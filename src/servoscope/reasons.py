@@ -7,18 +7,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoscope.diagnosis import UNKNOWN, Candidate, Refit, Trace
+from servoscope.digits import short
 from servoscope.errors import LoopError
 from servoscope.examination import Examination
 from servoscope.inverse import nominal_theta
 from servoscope.plants import FloatArray
 
 MOVED = 3.0  # standard deviations from which a value has moved
+DEVIATIONS = " standard deviations"
 MOST = 3  # values and rejected candidates that are told
 REJECTED = 0.01  # probability below which a candidate is rejected
+LIKELY = 0.05  # probability below which a second fault is not worth its freedom
 
 
 def reasons(
-    x: Examination, trace: Trace, at: int, candidates: Sequence[Candidate], refit: Refit | None
+    x: Examination, trace: Trace, at: int, detected_at: float, candidates: Sequence[Candidate], refit: Refit | None
 ) -> tuple[str, ...]:
     """Return the explanation of an alarm, sentence by sentence.
 
@@ -28,92 +31,117 @@ def reasons(
         The examination, and its estimates without bias.
     at
         Evaluation that is explained.
-    candidates, refit
+    detected_at, candidates, refit
         Of the diagnosis.
     """
-    told = [_raised(x), _coefficients(trace, at), _frequencies(trace, at), _left(candidates, refit)]
-    told += [_against(x, trace, at, c) for c in _rejected(candidates)]
-    return tuple(sentence for sentence in (*told, _second(candidates), _mimics(refit)) if sentence)
+    told = (
+        _raised(x, detected_at),
+        _coefficients(x, trace, at),
+        _frequencies(x, trace, at),
+        _left(candidates, refit),
+        _rejected(x, trace, at, candidates),
+        _second(candidates),
+        _mimics(candidates, refit),
+    )
+    return tuple(sentence for sentence in told if sentence)
 
 
-def _raised(x: Examination) -> str:
+def _raised(x: Examination, detected_at: float) -> str:
     first = int(np.flatnonzero(x.alarm)[0])
-    statistic, level = float(x.statistic[first]), float(x.estimates.level[first])
-    if level >= 1.0:
-        return f"The sequential test passed its limit at {x.t[first]:.1f} s ({level:.3g} times the limit)."
-    return f"T² passed its limit at {x.t[first]:.1f} s ({statistic:.3g}, limit {x.baseline.limit:.3g})."
+    if x.estimates.level[first] >= 1.0:
+        return f"The sequential test passed its limit at {detected_at:.2f} s."
+    reached, limit = short(float(x.statistic[first])), short(x.baseline.limit)
+    return f"T² passed its limit at {detected_at:.2f} s: {reached}, limit {limit}."
 
 
-def _moved(what: str, value: float, expected: float, std: float) -> tuple[float, str]:
+def _moved(what: str, value: float, expected: float, std: float, unit: str = "") -> tuple[float, str]:
     by = abs(value - expected) / std if std > 0.0 else 0.0
-    way = "rose" if value > expected else "fell"
-    return by, f"{what} {way} from {expected:.4g} to {value:.4g} ({by:.3g} standard deviations)"
+    way = "risen" if value > expected else "fallen"
+    return by, f"{what} has {way} from {expected:.4g} to {value:.4g}{unit and ' '}{unit} ({short(by)}{DEVIATIONS})"
 
 
 def _listed(found: Sequence[tuple[float, str]]) -> str:
-    return "; ".join([words for by, words in sorted(found, reverse=True)[:MOST] if by >= MOVED])
+    """Join what moved most, with the unit spelled out once."""
+    return _joined([words for by, words in sorted(found, reverse=True)[:MOST] if by >= MOVED])
 
 
-def _coefficients(trace: Trace, at: int) -> str:
-    std = np.sqrt(np.diag(trace.covariance[at]))
-    values = zip(trace.names, trace.theta[at], trace.expected[at], std, strict=True)
-    told = _listed([_moved(name, float(v), float(e), float(s)) for name, v, e, s in values])
-    return f"At {trace.t[at]:.1f} s {told or 'no coefficient alone is far from healthy'}."
+def _joined(told: Sequence[str]) -> str:
+    return "; ".join([*told[:1], *(words.replace(DEVIATIONS, "") for words in told[1:])])
 
 
-def _frequencies(trace: Trace, at: int) -> str:
+def _coefficients(x: Examination, trace: Trace, at: int) -> str:
+    std, plant = np.sqrt(np.diag(trace.covariance[at])), x.baseline.plant
+    units = plant.coefficient_units if plant.units[1] else ("",) * len(std)
+    values = zip(trace.names, trace.theta[at], trace.expected[at], std, units, strict=True)
+    told = _listed([_moved(name, float(v), float(e), float(s), unit) for name, v, e, s, unit in values])
+    return f"By {trace.t[at]:.1f} s {told or 'no coefficient alone has left its healthy range'}."
+
+
+def _frequencies(x: Examination, trace: Trace, at: int) -> str:
+    of_y, of_u = x.baseline.plant.units
+    unit = f"{of_u}/{of_y}" if of_u else ""
     found = []
     for i, f in enumerate(trace.ifrf.frequencies):
         now, healthy = trace.ifrf.H[at, i], trace.ifrf_expected.H[at, i]
         real, imag = np.sqrt(np.diag(trace.ifrf.covariance[at, i])).tolist()
-        found.append(_moved(f"the real part at {f:g} Hz", float(now.real), float(healthy.real), real))
-        found.append(_moved(f"the imaginary part at {f:g} Hz", float(now.imag), float(healthy.imag), imag))
+        found.append(_moved(f"real part at {f:g} Hz", float(now.real), float(healthy.real), real, unit))
+        found.append(_moved(f"imaginary part at {f:g} Hz", float(now.imag), float(healthy.imag), imag, unit))
     told = _listed(found)
-    return f"Of the inverse frequency response {told}." if told else ""
+    return f"Inverse frequency response: {told}." if told else ""
 
 
 def _left(candidates: Sequence[Candidate], refit: Refit | None) -> str:
+    """Say how well the closest explanation fits."""
     best = next((c for c in candidates if c.faults), None)
     if refit is None or best is None:
         return ""
-    return (
-        f"From {refit.from_s:.1f} to {refit.to_s:.1f} s {best.name} at its best leaves {refit.misfit:.3g} unexplained; "
-        f"what is true leaves at most {refit.limit:.3g}."
-    )
+    over = f"From {refit.from_s:.1f} to {refit.to_s:.1f} s"
+    numbers = f"misfit {short(refit.misfit)}, limit {short(refit.limit)}"
+    if refit.misfit > refit.limit:
+        return f"{over} even the closest of all faults and pairs leaves more unexplained than noise would: {numbers}."
+    return f"{over} {best.name} leaves no more unexplained than noise would: {numbers}."
 
 
-def _rejected(candidates: Sequence[Candidate]) -> list[Candidate]:
+def _rejected(x: Examination, trace: Trace, at: int, candidates: Sequence[Candidate]) -> str:
     singles = [c for c in candidates[1:] if len(c.faults) == 1 and c.probability < REJECTED]
-    return sorted(singles, key=lambda c: c.misfit or 0.0)[:MOST]
+    closest = sorted(singles, key=lambda c: c.misfit or 0.0)[:MOST]
+    return f"Rejected: {_joined([_against(x, trace, at, c) for c in closest])}." if closest else ""
 
 
 def _against(x: Examination, trace: Trace, at: int, other: Candidate) -> str:
-    """Say why a candidate was rejected, and where it shows."""
+    """Say by how much a candidate fits worse, and where it shows."""
     (fault,) = other.faults
-    further = np.sqrt(other.misfit or 0.0)
-    words = (
-        f"{other.name} ({fault.parameter} x {fault.ratio:.3g} at best) is {further:.3g} standard deviations further off"
-    )
+    further = float(np.sqrt(other.misfit or 0.0))
+    size = "labelled severity" if fault.learned else fault.parameter
+    what = "" if fault.parameter == fault.name else f"{size} "
+    fit = f"fits {short(further)}{DEVIATIONS} worse" if further else "is the closest but does not fit"
+    words = f"{other.name} ({what}x {fault.ratio:.3g} at best) {fit}"
     theta = _theta_of(x, other)
     if theta is not None:
         off = (theta - trace.theta[at]) / np.sqrt(np.diag(trace.covariance[at]))
         worst = int(np.argmax(np.abs(off)))
         if abs(off[worst]) >= MOVED:
-            words += f": {trace.names[worst]} would be {'higher' if off[worst] > 0.0 else 'lower'} than it is"
-    return f"{words}."
+            words += f" with {trace.names[worst]} too {'high' if off[worst] > 0.0 else 'low'}"
+    return words
 
 
 def _second(candidates: Sequence[Candidate]) -> str:
     best = candidates[0]
-    pairs = [
-        c for c in candidates[1:] if len(c.faults) > 1 and {f.name for f in best.faults} < {f.name for f in c.faults}
-    ]
-    if not pairs or candidates[0].name == UNKNOWN:
+    named = {fault.name for fault in best.faults}
+    pairs = [c for c in candidates[1:] if len(c.faults) > 1 and named < {fault.name for fault in c.faults}]
+    if not pairs or best.name == UNKNOWN or max(c.probability for c in pairs) >= LIKELY:
         return ""
-    others = sorted({fault.name for pair in pairs for fault in pair.faults} - {fault.name for fault in best.faults})
-    return (
-        f"A second fault beside {best.name} ({' or '.join(others)}) would explain too little to be worth its freedom."
-    )
+    others = sorted({fault.name for pair in pairs for fault in pair.faults} - named)
+    return f"A second fault beside {best.name} ({' or '.join(others)}) explains too little to be worth its freedom."
+
+
+def _mimics(candidates: Sequence[Candidate], refit: Refit | None) -> str:
+    if refit is None or not refit.mimics:
+        return ""
+    told = " or ".join(f"{mimic.words} ({mimic.size})" for mimic in refit.mimics)
+    if candidates[0].name == UNKNOWN:
+        return f"Outside the list of faults this would explain it: {told}."
+    return f"The same recording would come from {told}."
 
 
 def _theta_of(x: Examination, candidate: Candidate) -> FloatArray | None:
@@ -124,13 +152,3 @@ def _theta_of(x: Examination, candidate: Candidate) -> FloatArray | None:
         return nominal_theta(x.pipeline.loop, x.baseline.plant.with_ratios(ratios))
     except LoopError:
         return None
-
-
-def _mimics(refit: Refit | None) -> str:
-    if refit is None or not refit.mimics:
-        return ""
-    told = [
-        f"{m.words} (x {m.value:.3g})" if m.unit == "ratio" else f"{m.words} ({m.value:.3g} {m.unit})"
-        for m in refit.mimics
-    ]
-    return f"The same recording would come from {' or '.join(told)}."

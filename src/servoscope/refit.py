@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from servoscope import digits
 from servoscope.detection import Onset
 from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault, Mimic, Refit, Warning
 from servoscope.examination import Examination
@@ -32,7 +33,8 @@ def candidates_of(refined: Refined) -> tuple[Candidate, ...]:
         if len(each.fitted.faults) == 1 or each.probability >= WORTH_LISTING
     ]
     told.append(Candidate(name=UNKNOWN, probability=refined.unknown))
-    return tuple(sorted(told, key=lambda candidate: -candidate.probability))
+    # where probabilities vanish, the closest comes first
+    return tuple(sorted(told, key=lambda candidate: (-candidate.probability, candidate.misfit or 0.0)))
 
 
 def onset_of(refined: Refined, x: Examination) -> Onset:
@@ -47,24 +49,27 @@ def onset_of(refined: Refined, x: Examination) -> Onset:
 def said(refined: Refined, x: Examination, recursive: tuple[Candidate, ...]) -> Refit:
     """Return what a diagnosis keeps of a refit."""
     t, window = x.recording.t, refined.window
+    over = refined.since.growth.over
+    of_y, of_u = x.baseline.plant.units
+    units = {"of y": of_y or "in units of y", "of u": of_u or "in units of u"}
     return Refit(
         from_s=float(t[window.first]),
         to_s=float(t[window.first + window.samples - 1]),
+        over_s=over / x.recording.sample_rate if over > refined.since.high - refined.since.low else 0.0,
         noise=float(np.sqrt(refined.louder)),
         misfit=refined.goodness.statistic,
         limit=refined.goodness.limit,
         recursive=recursive,
         mimics=tuple(
-            Mimic(name=cause.name, words=cause.words, value=cause.value, unit=cause.unit) for cause in causes(refined)
+            Mimic(name=cause.name, words=cause.words, value=cause.value, unit=units.get(cause.unit, cause.unit))
+            for cause in causes(refined)
         ),
     )
 
 
-def disagreements(
-    x: Examination, said: tuple[Candidate, ...], recursive: tuple[Candidate, ...], sure: float
-) -> list[Warning]:
+def disagreements(x: Examination, candidates: tuple[Candidate, ...], told: Refit, sure: float) -> list[Warning]:
     """Return a warning where the refit and the recursion contradict each other, both with probability `sure`."""
-    one, other, t = said[0], recursive[0], x.recording.t
+    one, other, t = candidates[0], told.recursive[0], x.recording.t
     message = ""
     if min(one.probability, other.probability) < sure or (len(one.faults) > 1 and other.name == UNKNOWN):
         return []  # the recursion knows no pairs
@@ -72,16 +77,25 @@ def disagreements(
         message = f"the refit says {one.name}, the recursion's last estimate {other.name}"
     else:
         for a, b in zip(one.faults, other.faults, strict=True):
-            spread = np.hypot(*(np.log(f.interval[1] / f.interval[0]) / 3.92 for f in (a, b)))
-            if abs(np.log(a.ratio / b.ratio)) > APART * spread:
+            if apart(a, b) > APART:
                 message = (
-                    f"{a.parameter} is {a.ratio:.4g} times its healthy value by the refit, {b.ratio:.4g} by the "
-                    "recursion's last estimate"
+                    f"{a.parameter} is {digits.ratios(a.ratio, *a.interval)[0]} times its healthy value by the refit, "
+                    f"{digits.ratios(b.ratio, *b.interval)[0]} by the recursion's last estimate"
                 )
     if not message:
         return []
     why = "the refit weighs every second since the onset, the recursion the last ones: look whether the change went on"
+    if len(one.faults) > 1:
+        why = "the recursion compares single faults only"
+    elif told.over_s > 0.0:
+        why = f"the change grew over {told.over_s:.3g} s, which the recursion follows late"
     return [Warning(kind="disagreement", from_s=float(t[0]), to_s=float(t[-1]), count=1, message=f"{message}; {why}")]
+
+
+def apart(a: FoundFault, b: FoundFault) -> float:
+    """Return how many standard deviations the logarithms of two sizes are apart, as if they shared no data."""
+    spread = float(np.hypot(*(np.log(fault.interval[1] / fault.interval[0]) / 3.92 for fault in (a, b))))
+    return abs(float(np.log(a.ratio / b.ratio))) / max(spread, 1e-12)
 
 
 def _candidate(each: Hypothesis, least: float, louder: float) -> Candidate:

@@ -54,7 +54,7 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         if refined is not None and not _labelled(refined, recursive[0]):
             candidates, told = candidates_of(refined), said(refined, x, recursive)
             since = since if refined.is_unknown else onset_of(refined, x)
-            warnings += disagreements(x, candidates, recursive, SURE)
+            warnings += disagreements(x, candidates, told, SURE)
         if candidates[0].probability >= SURE and candidates[0].name != UNKNOWN:
             faults = candidates[0].faults
     else:
@@ -70,13 +70,13 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         samples=recording.samples,
         duration_s=recording.duration_s,
         verdict=verdict,
-        summary=summary(verdict, faults, candidates, _since(x, since), seen, warnings, told, x.baseline.point),
+        summary=summary(verdict, faults, candidates, _since(x, since, told), seen, warnings, told, x.baseline.point),
         detected_at_s=detected_at,
         onset_s=(since.low_s, since.likely_s, since.high_s) if since is not None else None,
         probability=candidates[0].probability if candidates else None,
         faults=faults,
         candidates=candidates,
-        explanation=reasons(x, trace, at, candidates, told) if alarm else (),
+        explanation=reasons(x, trace, at, detected_at, candidates, told) if detected_at is not None else (),
         refit=told,
         parameters=_parameters(trace),
         ifrf=_ifrf(trace),
@@ -133,13 +133,14 @@ def _onset(x: Examination, announced: int, at: int) -> Onset:
     )
 
 
-def _since(x: Examination, found: Onset | None) -> str:
+def _since(x: Examination, found: Onset | None, told: Refit | None) -> str:
     if found is None:
         return ""
     start = float(x.recording.t[0])
     if found.likely_s - start <= 3.0 * x.pipeline.bank.wait / x.recording.sample_rate:
         return "since the start of the recording or before"
-    return f"since {found.likely_s:.1f} s"
+    drifting = told is not None and told.over_s > 0.0 and told.misfit <= told.limit
+    return f"since {found.likely_s:.1f} s{f', growing over {told.over_s:.3g} s' if told and drifting else ''}"
 
 
 def unbiased(x: Examination, candidates: tuple[Candidate, ...], since: Onset | None, at: int) -> Compared:

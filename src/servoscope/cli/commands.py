@@ -178,7 +178,7 @@ def diagnose(
 
     from servoscope import monitor, writers
     from servoscope.baseline import Baseline
-    from servoscope.cli import summaries, terminal
+    from servoscope.cli import summaries, terminal, verdicts
     from servoscope.cli.progress import progress
 
     healthy = Baseline.load(baseline)
@@ -201,7 +201,7 @@ def diagnose(
                             if as_json:
                                 print_json(summaries.plain(said), lines=many)
                             else:
-                                terminal.diagnosis(out, said)
+                                verdicts.diagnosis(out, said)
                         stem = stem_of(path, recording.name)
                         if traces is not None:
                             target = traces.path(stem)

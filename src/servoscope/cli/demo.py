@@ -113,7 +113,7 @@ def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
     OutputError
         If the folder cannot be written.
     """
-    from servoscope.cli import terminal
+    from servoscope.cli import terminal, verdicts
     from servoscope.diagnosis import Diagnosis
 
     prepare(folder)
@@ -138,7 +138,7 @@ def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
                 with redirect_stdout(said):
                     _checked(run(step.arguments))
                 atomic_write(step.into, said.getvalue().encode())
-                terminal.diagnosis(out, Diagnosis.model_validate_json(said.getvalue()))
+                verdicts.diagnosis(out, Diagnosis.model_validate_json(said.getvalue()))
             if step.after:
                 terminal.notes(out, [step.after], "blue", "-")
             out.print()

@@ -1,4 +1,4 @@
-"""How results look in a terminal: simulations, inspections, baselines, diagnoses."""
+"""How results look in a terminal: simulations, inspections, baselines; tables, facts and notes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from servoscope.baseline import Baseline
-    from servoscope.diagnosis import Diagnosis, Warning
     from servoscope.inspection import Inspection
     from servoscope.loop import Columns
     from servoscope.readers import ChannelInfo
@@ -35,8 +34,6 @@ COLOURS = {
     "does not hold": "red",
 }
 INDENT = (0, 0, 0, 2)
-MOST_WARNINGS = 12
-LEAST_SHOWN = 0.0005  # probability below which a candidate is not worth its line
 
 
 def console(*, stderr: bool = False) -> Console:
@@ -144,41 +141,6 @@ def _baseline(out: Console, b: Baseline) -> None:
     notes(out, b.notes)
 
 
-def diagnosis(out: Console, d: Diagnosis) -> None:
-    """Print a verdict, what stands behind it, and the warnings."""
-    out.print(Text.assemble((d.recording, "bold"), f": {span(d.duration_s)}, {d.samples} samples"))
-    out.print(Padding(Text(d.summary, style=f"bold {COLOURS[d.verdict]}"), INDENT, expand=False))
-    told = []
-    if d.detected_at_s is not None:
-        told.append(("detected", f"{d.detected_at_s:.4g} s"))
-    if d.onset_s is not None:
-        low, likely, high = d.onset_s
-        told.append(("onset", f"{likely:.4g} s ({low:.4g} to {high:.4g} s, 95 %)"))
-    if told:
-        facts(out, told)
-    from servoscope.report.wording import probability
-
-    shown = [c for c in d.candidates if c.probability >= LEAST_SHOWN or c.name == d.candidates[0].name]
-    rows = []
-    for c in shown:
-        fault = c.faults[0] if c.faults else None
-        size = (
-            (fault.parameter, f"{fault.ratio:.4g}", f"{fault.interval[0]:.4g} to {fault.interval[1]:.4g}")
-            if fault
-            else ("", "", "")
-        )
-        cosine = f"{c.cosine:.3f}" if c.cosine is not None else ""
-        rows.append((c.name, probability(c.probability), *size, cosine))
-    twice = all(row[2] in ("", row[0]) for row in rows)  # the fault is called as its parameter
-    empty = {2} if twice else set()
-    empty |= {5} if not any(row[5] for row in rows) else set()
-    columns = [i for i in range(6) if i not in empty]
-    header = ("candidate", "probability", "parameter", "ratio", "95 % interval", "cosine")
-    if rows:
-        table(out, [header[i] for i in columns], [[row[i] for i in columns] for row in rows])
-    _warnings(out, d.warnings)
-
-
 def channels(out: Console, name: str, found: Sequence[ChannelInfo]) -> None:
     """Print the columns of a file."""
     out.print(Text.assemble((name, "bold"), f": {len(found)} columns"))
@@ -192,20 +154,6 @@ def _sources(b: Baseline) -> str:
     if len(b.sources) > 3:
         return f"{len(b.sources)} recordings, {length}"
     return f"{', '.join(source.name for source in b.sources)}, {length}"
-
-
-def _warnings(out: Console, warnings: Sequence[Warning]) -> None:
-    texts = []
-    for w in warnings:
-        if w.kind == "power":
-            texts.append(w.message)
-            continue
-        when = f"at {w.from_s:.6g} s" if w.from_s == w.to_s else f"{w.from_s:.6g} to {w.to_s:.6g} s"
-        texts.append(f"{when}: {w.message}")
-    more = len(texts) - MOST_WARNINGS
-    if more > 1:
-        texts[MOST_WARNINGS:] = [f"and {more} more, all of them with --json"]
-    notes(out, texts)
 
 
 def renamed(out: Console, columns: Columns) -> None:

@@ -83,6 +83,18 @@ class Plant(BaseModel, abc.ABC):
         return ()
 
     @property
+    def units(self) -> tuple[str, str]:
+        """Units of y and u; empty where they depend on the machine."""
+        return "", ""
+
+    @property
+    def coefficient_units(self) -> tuple[str, ...]:
+        """Units of the n coefficients, in u and y themselves where theirs are not known."""
+        of_y, of_u = (unit or letter for unit, letter in zip(self.units, "yu", strict=True))
+        extra = [f"{of_u} s/{of_y}" if name in ("forward_v", "backward_v") else of_u for name in self.extras]
+        return (*(f"{of_u}{('', ' s', ' s²', ' s³', ' s⁴')[power]}/{of_y}" for power in self.powers), *extra)
+
+    @property
     def linear(self) -> bool:
         """Whether it is linear but for `extras`, which are simulated and regressed as what they are."""
         return True

@@ -95,6 +95,11 @@ class EHA(Plant):
         return ("theta_0", "theta_1", "theta_2", "theta_3")
 
     @property
+    def units(self) -> tuple[str, str]:
+        """Metres and amperes."""
+        return "m", "A"
+
+    @property
     def powers(self) -> tuple[int, ...]:
         """Powers of s: 0, 1, 2, 3."""
         return (0, 1, 2, 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from html import escape
 from importlib.resources import files
@@ -14,7 +13,8 @@ from servoscope.diagnosis import UNKNOWN, Diagnosis, Trace
 from servoscope.loop import Loop
 from servoscope.output import atomic_write
 from servoscope.recording import Recording
-from servoscope.report.sheets import candidates, coefficient_units, numbers, section, settings, warnings
+from servoscope.report.grounds import beside, mimics, why
+from servoscope.report.sheets import candidates, numbers, section, settings, warnings
 from servoscope.report.wording import (
     clock_time,
     count,
@@ -26,7 +26,7 @@ from servoscope.report.wording import (
     size_of,
     symbol,
     time_decimals,
-    units,
+    with_symbols,
 )
 
 __all__ = ["framed", "page", "write"]
@@ -78,7 +78,10 @@ def page(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loop, p
     sections = (
         _header(diagnosis, loop),
         _verdict(diagnosis, trace, words),
+        why(diagnosis),
         candidates(diagnosis, words),
+        beside(diagnosis, _drawing(diagnosis)),
+        mimics(diagnosis, words),
         _pictures(diagnosis, trace, recording, loop),
         numbers(diagnosis, loop),
         warnings(diagnosis),
@@ -133,10 +136,12 @@ def _header(diagnosis: Diagnosis, loop: Loop) -> str:
 def _verdict(diagnosis: Diagnosis, trace: Trace, words: Mapping[str, str]) -> str:
     kind, icon = KINDS[diagnosis.verdict]
     # What the words of a fault say in brackets, for example what it cannot be told from.
-    asides = [words[f.name].rstrip(")").split(" (") for f in diagnosis.faults if " (" in words.get(f.name, "")]
-    # What "more" of something means says nothing of less.
-    asides = [a for a, f in zip(asides, diagnosis.faults, strict=False) if f.ratio > 1.0 or not a[0].startswith("more")]
-    notes = [f'<p class="note">{_with_symbols(a[:1].upper() + a[1:])}: {_with_symbols(b)}.</p>' for a, b in asides]
+    notes = []
+    for fault in diagnosis.faults:
+        what, _, aside = words.get(fault.name, "").rstrip(")").partition(" (")
+        # What "more" of something means says nothing of less.
+        if aside and (fault.ratio > 1.0 or not what.startswith("more")):
+            notes.append(f'<p class="note">{with_symbols(what[:1].upper() + what[1:])}: {with_symbols(aside)}.</p>')
     facts = _fault_facts(diagnosis) if diagnosis.verdict == "fault" else _quiet_facts(diagnosis, trace)
     lines = (
         '<div class="verdict">',
@@ -164,14 +169,13 @@ def _headline(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         return names[:1].upper() + names[1:]
     if diagnosis.candidates and diagnosis.candidates[0].name == UNKNOWN:
         return "The actuator has changed, in a way that no known fault explains"
-    likely = [c.name for c in diagnosis.candidates if c.name != UNKNOWN and c.probability >= UNLIKELY]
+    several = [c for c in diagnosis.candidates if c.name != UNKNOWN and c.probability >= UNLIKELY]
+    if len(several) > 1 and all(len(c.faults) > 1 for c in several):
+        return "The actuator has changed in two ways at once; which ones remains open"
+    likely = [c.name for c in several]
     if len(likely) > 1:
         return f"The actuator has changed: {' or '.join(meaning(name, words) for name in likely)}"
     return "The actuator has changed; which fault it is remains open"
-
-
-def _with_symbols(text: str) -> str:
-    return re.sub(r"\b[A-Za-z]{1,2}_\w{1,3}\b", lambda found: symbol(found[0]), escape(text))
 
 
 def _fault_facts(diagnosis: Diagnosis) -> Iterator[Fact]:
@@ -188,7 +192,8 @@ def _fault_facts(diagnosis: Diagnosis) -> Iterator[Fact]:
         size, low, high = told(fault.ratio, *fault.interval)
         yield "How large", f"{symbol(fault.parameter)} {size.replace(' ', '&nbsp;')}", f"95 %: {low} to {high}"
     if diagnosis.faults:
-        yield "How sure", probability(diagnosis.probability), "among the faults that this plant knows"
+        among = ", and pairs of them" if diagnosis.refit is not None else ""
+        yield "How sure", probability(diagnosis.probability), f"among the faults that this plant knows{among}"
     elif diagnosis.candidates:
         best = diagnosis.candidates[0]
         small = f"for {escape(best.name)}: too little to name it"
@@ -209,6 +214,13 @@ def _quiet_facts(diagnosis: Diagnosis, trace: Trace) -> Iterator[Fact]:
     yield "Warnings", str(told) if told else "none", "listed below" if told else "about this recording"
 
 
+def _drawing(diagnosis: Diagnosis) -> str:
+    from servoscope.report import canvas, comparison  # late: matplotlib takes half a second to import
+
+    figure = comparison.sizes(diagnosis)
+    return f'<figure aria-label="Sizes">{canvas.svg(figure, "sizes")}</figure>' if figure is not None else ""
+
+
 def _pictures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loop) -> str:
     from servoscope.report import canvas, figures  # late: matplotlib takes half a second to import
 
@@ -226,7 +238,7 @@ def _pictures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Lo
             "Signals",
             "Reference, output, tracking error and input as recorded. Grey bands are gaps, in which nothing"
             " was recorded.",
-            figures.signals(recording, diagnosis, units=units(loop.plant.kind)),
+            figures.signals(recording, diagnosis, units=loop.plant.units),
         ),
         (
             "Inverse frequency response",
@@ -239,7 +251,7 @@ def _pictures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Lo
             "Coefficients",
             "The estimated coefficients of the actuator's inverse, relative to what a healthy one would show"
             " under the same reference; as a difference where that is nearly zero.",
-            figures.coefficients(trace, diagnosis, units=coefficient_units(loop.plant)),
+            figures.coefficients(trace, diagnosis, units=loop.plant.coefficient_units),
         ),
     )
     return "\n".join(

@@ -10,9 +10,9 @@ import numpy as np
 
 from servoscope.diagnosis import Diagnosis, FoundFault
 from servoscope.loop import Loop
-from servoscope.plants import Plant
 from servoscope.report.wording import (
     DASH,
+    correlation,
     count,
     meaning,
     number,
@@ -21,13 +21,13 @@ from servoscope.report.wording import (
     ratios,
     signed_percent,
     symbol,
-    units,
     with_std,
 )
 
-__all__ = ["candidates", "coefficient_units", "grid", "numbers", "section", "settings", "warnings"]
+__all__ = ["candidates", "cell", "numbers", "section", "settings", "table", "warnings"]
 
 MOST_WARNINGS = 60
+LIKELY = 0.05  # probability from which it is told how the sizes of a pair hang together
 
 
 def section(title: str, why: str, content: str, kind: str = "whole") -> str:
@@ -59,13 +59,14 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
     if not diagnosis.candidates:
         return ""
     rows = []
+    compared = any(candidate.misfit for candidate in diagnosis.candidates)
     labelled = any(candidate.cosine is not None for candidate in diagnosis.candidates)
     for i, candidate in enumerate(diagnosis.candidates):
         width = 100.0 * min(max(candidate.probability, 0.0), 1.0)
         bar = f'<span class="bar"><i style="width:{width:.1f}%"></i></span>'
         means = meaning(candidate.name, words, candidate.faults[0].ratio if len(candidate.faults) == 1 else 1.0)
         plain = candidate.name.replace("_", " ")
-        more = f"<br><small>{escape(means)}</small>" if means != plain else ""
+        more = f"<br><small>{escape(means)}</small>" if means != plain.replace(" + ", " and ") else ""
         sizes: Sequence[FoundFault | None] = candidate.faults or (None,)
         told = [
             ("" if f.parameter == candidate.name else f"{symbol(f.parameter)} ", *ratios(f.ratio, *f.interval))
@@ -73,10 +74,14 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
             else None
             for f in sizes
         ]
+        worse = f"{number(float(np.sqrt(candidate.misfit)), 3)} σ" if candidate.misfit else ""
+        if candidate.covariance is not None and candidate.probability >= LIKELY:
+            more += f"<br><small>sizes correlated by {number(correlation(candidate.covariance), 2)}</small>"
         cells = (
             f'<th scope="row">{escape(plain)}{more}</th>',
-            _n("<br>".join(f"{each[0]}× {each[1]}" if each else DASH for each in told)),
-            _n("<br>".join(f"{each[2]} to {each[3]}" if each else DASH for each in told)),
+            cell("<br>".join(f"{each[0]}× {each[1]}" if each else DASH for each in told)),
+            cell("<br>".join(f"{each[2]} to {each[3]}" if each else DASH for each in told)),
+            *([cell(worse)] if compared else []),
             f'<td class="t p">{bar}{probability(candidate.probability)}</td>',
         )
         mark = ' class="first"' if i == 0 else ""
@@ -85,10 +90,11 @@ def candidates(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         "Explanation",
         f"*Size, relative to {'healthy or labelled' if labelled else 'healthy'}",
         "*95 % interval",
+        *(["*Fits worse by"] if compared else []),
         ".Probability",
     )
     why = "What could explain the change, how large each explanation would have to be, how probable it is."
-    return section("Candidates", why, grid(head, rows), "whole candidates")
+    return section("Candidates", why, table(head, rows), "whole candidates")
 
 
 def numbers(diagnosis: Diagnosis, loop: Loop) -> str:
@@ -99,22 +105,22 @@ def numbers(diagnosis: Diagnosis, loop: Loop) -> str:
 
 
 def _coefficients(diagnosis: Diagnosis, loop: Loop) -> str:
-    of_y, of_u = units(loop.plant.kind)
-    powers = dict(zip(loop.plant.names, loop.plant.powers, strict=False))
+    known = bool(loop.plant.units[1])
+    units = dict(zip(loop.plant.names, loop.plant.coefficient_units, strict=True))
     rows = []
     for name, p in diagnosis.parameters.items():
         change = signed_percent(p.value / p.nominal - 1.0) if p.nominal else DASH
         away = number((p.value - p.nominal) / p.std, 2) if p.std > 0.0 else DASH
-        unit = f'<td class="t">{_unit(of_u, of_y, powers.get(name))}</td>' if of_u else ""
+        unit = f'<td class="t">{units.get(name, "")}</td>' if known else ""
         cells = (*with_std(p.value, p.std, p.nominal), change, away)
-        rows.append(f'<tr><th scope="row" class="t">{symbol(name)}</th>{unit}{"".join(map(_n, cells))}</tr>')
+        rows.append(f'<tr><th scope="row" class="t">{symbol(name)}</th>{unit}{"".join(map(cell, cells))}</tr>')
     head = ("*Estimate", "*Standard deviation", "*Healthy", "*Change", "*In standard deviations")
-    first = ("Coefficient", "Unit") if of_u else ("Coefficient",)
-    return section("Coefficients at the end of the recording", "", grid((*first, *head), rows))
+    first = ("Coefficient", "Unit") if known else ("Coefficient",)
+    return section("Coefficients at the end of the recording", "", table((*first, *head), rows))
 
 
 def _responses(diagnosis: Diagnosis, loop: Loop) -> str:
-    of_y, of_u = units(loop.plant.kind)
+    of_y, of_u = loop.plant.units
     rows = []
     for point in diagnosis.ifrf:
         H = complex(point.real, point.imag)
@@ -131,27 +137,11 @@ def _responses(diagnosis: Diagnosis, loop: Loop) -> str:
             number(float(np.degrees(np.angle(ratio))), 2),
         )
         frequency = f"{quantity(point.frequency_hz)} Hz"
-        rows.append(f'<tr><th scope="row" class="t">{frequency}</th>{"".join(map(_n, cells))}</tr>')
+        rows.append(f'<tr><th scope="row" class="t">{frequency}</th>{"".join(map(cell, cells))}</tr>')
     head = ("Frequency", "*Real part", "*healthy", "*Imaginary part", "*healthy", "*Magnitude", "*Phase [°]")
     unit = f" in {of_u}/{of_y}" if of_u else ""
     why = f"Parts{unit} with one standard deviation; magnitude and phase are changes from healthy."
-    return section("Inverse frequency response at the end of the recording", why, grid(head, rows))
-
-
-def coefficient_units(plant: Plant) -> tuple[str, ...]:
-    """Return the unit of each coefficient, in u and y themselves where the machine's units are not known."""
-    of_y, of_u = units(plant.kind)
-    powers: tuple[int | None, ...] = (
-        *plant.powers,
-        *(1 if "_v" in e and e != "sign_v" else None for e in plant.extras),
-    )
-    return tuple(_unit(of_u or "u", of_y or "y", power) for power in powers)
-
-
-def _unit(of_u: str, of_y: str, power: int | None) -> str:
-    if power is None:
-        return of_u
-    return f"{of_u}{('', ' s', ' s²', ' s³', ' s⁴')[power]}/{of_y}"
+    return section("Inverse frequency response at the end of the recording", why, table(head, rows))
 
 
 def warnings(diagnosis: Diagnosis) -> str:
@@ -164,15 +154,15 @@ def warnings(diagnosis: Diagnosis) -> str:
         cells = (
             f'<td class="t">{when.replace("-", "−")}</td>',
             f'<th scope="row" class="t">{escape(w.kind)}</th>',
-            _n(count(w.count)),
+            cell(count(w.count)),
             f'<td class="w">{escape(w.message)}</td>',
         )
         rows.append(f"<tr>{''.join(cells)}</tr>")
     more = len(diagnosis.warnings) - MOST_WARNINGS
     rest = f"\n<p>And {more} more.</p>" if more > 0 else ""
     why = "What the reader should know about the recording. Nothing was interpolated."
-    table = grid(("Time [s]", "Kind", "*Rows", "What happened"), rows)
-    return section("Warnings", why, table + rest, "long")
+    found = table(("Time [s]", "Kind", "*Rows", "What happened"), rows)
+    return section("Warnings", why, found + rest, "long")
 
 
 def settings(loop: Loop, provenance: Mapping[str, str]) -> str:
@@ -205,13 +195,14 @@ def _setting(value: Any) -> str:
     return escape(str(value))
 
 
-def _n(cell: str) -> str:
+def cell(cell: str) -> str:
+    """Return a cell that is a number."""
     return f'<td class="n">{cell}</td>'
 
 
-def grid(head: Iterable[str], rows: Iterable[str]) -> str:
+def table(head: Iterable[str], rows: Iterable[str]) -> str:
     """Return a table; a heading with a leading asterisk stands over numbers, one with a dot over bars."""
     classes = {"*": ' class="n"', ".": ' class="p"'}
     cells = "".join(f'<th scope="col"{classes.get(name[0], "")}>{name.lstrip("*.")}</th>' for name in head)
-    table = f"<table><thead><tr>{cells}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    return f'<div class="scroll">{table}</div>'
+    body = f"<table><thead><tr>{cells}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return f'<div class="scroll">{body}</div>'

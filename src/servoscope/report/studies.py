@@ -9,7 +9,7 @@ from pathlib import Path
 from servoscope.design import Study
 from servoscope.output import atomic_write
 from servoscope.report.document import framed
-from servoscope.report.sheets import grid, section
+from servoscope.report.sheets import section, table
 from servoscope.report.wording import DASH, change, clock_time, number, symbol
 
 __all__ = ["page", "write"]
@@ -71,7 +71,7 @@ def _faults(study: Study) -> str:
         " the refit of the seconds since the onset. Unclear again: larger sizes at which it looks like another fault"
         " once more."
     )
-    return section("Which faults, from which size on", why, grid(head, rows))
+    return section("Which faults, from which size on", why, table(head, rows))
 
 
 def _pictures(study: Study) -> Iterator[str]:
@@ -100,7 +100,7 @@ def _cosines(study: Study) -> str:
         "Cosine between what small changes do to the innovations: 1 or −1 cannot be told apart, 0 is as different as"
         " can be."
     )
-    return section("How alike they look", why, grid(("Change", *(f"*{escape(name)}" for name in names)), rows))
+    return section("How alike they look", why, table(("Change", *(f"*{escape(name)}" for name in names)), rows))
 
 
 def _mimics(study: Study) -> str:
@@ -114,7 +114,7 @@ def _mimics(study: Study) -> str:
     why = (
         "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart."
     )
-    return section("What else it could be", why, grid(head, rows))
+    return section("What else it could be", why, table(head, rows))
 
 
 def _frequencies(study: Study) -> str:
@@ -130,7 +130,7 @@ def _frequencies(study: Study) -> str:
         f" it. With the best frequencies the faults are {number(study.frequencies.gain, 3)} times as far apart, on"
         " average."
     )
-    return section("Frequencies to monitor", why, grid(("Frequency", *(f"*{escape(n)}" for n in names)), rows))
+    return section("Frequencies to monitor", why, table(("Frequency", *(f"*{escape(n)}" for n in names)), rows))
 
 
 def _dither(study: Study) -> str:
@@ -143,7 +143,7 @@ def _dither(study: Study) -> str:
         "Sizes from which on each fault is named, of linear sensitivities; amplitude as a share of the reference's rms."
     )
     head = ("Sine on the reference", "*Adds to u (rms)", *(f"*{escape(n)} from" for n in names))
-    return section("What a dither would buy", why, grid(head, rows))
+    return section("What a dither would buy", why, table(head, rows))
 
 
 def _row(name: str, cells: Sequence[str]) -> str:

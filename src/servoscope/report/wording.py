@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from servoscope import digits
 from servoscope.diagnosis import UNKNOWN
 from servoscope.plants import FloatArray
 
@@ -16,6 +17,7 @@ __all__ = [
     "axis_scale",
     "change",
     "clock_time",
+    "correlation",
     "count",
     "factors",
     "meaning",
@@ -29,15 +31,14 @@ __all__ = [
     "symbol",
     "time_decimals",
     "times",
-    "units",
     "with_std",
+    "with_symbols",
 ]
 
 GREEK = {"theta": "θ", "beta": "β", "rho": "ρ"}
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "µ"), (1e9, "n"))
 DASH = "–"
-UNITS = {"eha": ("m", "A")}  # of y and u, where the kind of plant fixes them
 
 
 def symbol(name: str) -> str:
@@ -59,6 +60,20 @@ def plain_symbol(name: str) -> str:
         return GREEK[found[1]] + (found[2] or "").translate(SUBSCRIPTS)
     short = re.fullmatch(r"[A-Za-z]{1,2}_\w{1,3}", name)
     return (name if short else name.replace("_", " ")).replace("$", r"\$")
+
+
+def with_symbols(text: str) -> str:
+    """Return a sentence as HTML, with parameters as symbols and factors with a true sign."""
+    told = re.sub(
+        r"\b(?:theta_\d+|beta|rho|[A-Za-z]{1,2}_\w{1,3})\b", lambda found: symbol(found[0]), html.escape(text)
+    )
+    return re.sub(r"\bx (?=\d)", "× ", told)
+
+
+def correlation(covariance: Sequence[Sequence[float]]) -> float:
+    """Return that of two sizes, from their covariance (2, 2)."""
+    scale = math.sqrt(covariance[0][0] * covariance[1][1])
+    return covariance[0][1] / scale if scale > 0.0 else math.nan
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -99,7 +114,7 @@ def with_std(value: float, std: float, *others: float) -> tuple[str, ...]:
     top = max((abs(each) for each in values if math.isfinite(each)), default=0.0)
     exponent = math.floor(math.log10(top)) if top > 0.0 else 0
     exponent = 0 if -3 <= exponent < 6 else exponent
-    decimals = _decimals(std / 10.0**exponent, most=7)
+    decimals = digits.decimals(std / 10.0**exponent, most=7)
     power = _power(exponent) if exponent else ""
     return tuple(
         _signed(f"{each / 10.0**exponent:.{decimals}f}") + power if math.isfinite(each) else DASH for each in values
@@ -141,7 +156,7 @@ def size_of(ratio: float, low: float, high: float) -> tuple[str, str, str]:
     """
     values = (ratio, low, high)
     if all(0.2 <= value < 3.0 for value in values):
-        decimals = _decimals(50.0 * (high - low))
+        decimals = digits.decimals(50.0 * (high - low))
         changes = (_signed(f"{100.0 * (value - 1.0):+.{decimals}f}") + " %" for value in values)
         return tuple(changes)  # type: ignore[return-value]
     return factors(*values)
@@ -157,22 +172,12 @@ def ratios(ratio: float, low: float, high: float) -> tuple[str, str, str]:
     """Return a ratio and its interval to the digits that the interval supports."""
     if not math.isfinite(high - low):
         return number(ratio), number(low), number(high)
-    # four digits are enough for anybody
-    size = max(abs(ratio), abs(low), abs(high), 1e-12)
-    decimals = min(_decimals((high - low) / 2.0), max(3 - math.floor(math.log10(size)), 0))
-    return tuple(_signed(f"{value:.{decimals}f}") for value in (ratio, low, high))  # type: ignore[return-value]
-
-
-def _decimals(uncertainty: float, most: int = 6) -> int:
-    """Return how many decimals show the first digit of an uncertainty, or two where they are below 35."""
-    if not uncertainty > 0.0:
-        return 3
-    return min(max(-math.floor(math.log10(uncertainty / 3.5)), 0), most)
+    return tuple(_signed(text) for text in digits.ratios(ratio, low, high))  # type: ignore[return-value]
 
 
 def time_decimals(width: float) -> int:
     """Return with how many decimals times [s] are told that are known to within `width` [s]."""
-    return min(max(_decimals(width), 1), 4)
+    return min(max(digits.decimals(width), 1), 4)
 
 
 def clock_time(seconds: float, decimals: int = 1) -> str:
@@ -191,7 +196,7 @@ def meaning(name: str, words: Mapping[str, str], ratio: float = 1.0) -> str:
     Parameters
     ----------
     name
-        Of the candidate, several faults joined by "+".
+        Of the candidate, several faults joined by " + ".
     words
         Name of a fault -> its words; what they say in brackets is left out.
     ratio
@@ -199,7 +204,7 @@ def meaning(name: str, words: Mapping[str, str], ratio: float = 1.0) -> str:
     """
     if name == UNKNOWN:
         return "none of the known faults"
-    text = " and ".join(words.get(part, part.replace("_", " ")).partition(" (")[0] for part in name.split("+"))
+    text = " and ".join(words.get(part, part.replace("_", " ")).partition(" (")[0] for part in name.split(" + "))
     return re.sub("^more ", "less ", text) if ratio < 1.0 else text
 
 
@@ -208,11 +213,6 @@ def times(duration_s: float) -> tuple[str, float]:
     if duration_s > 4.0 * 3600.0:
         return "h", 3600.0
     return ("min", 60.0) if duration_s > 1200.0 else ("s", 1.0)
-
-
-def units(kind: str) -> tuple[str, str]:
-    """Return the units of y and u for a kind of plant; empty where they depend on the machine."""
-    return UNITS.get(kind, ("", ""))
 
 
 def axis_scale(values: Sequence[FloatArray], unit: str) -> tuple[str, float]:
