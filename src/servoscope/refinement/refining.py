@@ -12,7 +12,7 @@ from servoscope.baseline import Baseline
 from servoscope.plants import Fault, FloatArray
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import Goodness, goodness, traces
-from servoscope.refinement.hypotheses import Evidence, Fitted, Ladder, Scale, evidence, fit
+from servoscope.refinement.hypotheses import Evidence, Fitted, Ladder, Scale, evidence, fit, valleys
 from servoscope.refinement.since import Since, since
 from servoscope.refinement.window import Growth, Window
 
@@ -136,13 +136,31 @@ class _Search:
             self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
             for one, other in combinations(singles, 2)
         ]
-        best = self._best([*singles, *pairs])
-        if len(best.faults) > 1:
-            found = self._since(best)
-        everything = [self._again(f, found.growth) for f in (*singles, *pairs)]
-        everything = self._freed(everything)
+        found, everything = self._settled(found, [*singles, *pairs])
+        if not self._explains(self._best(everything)):
+            # no fault alone is near the truth, nor are the sizes that the pairs started from
+            pairs = [self._fit(p.faults, nothing, [p.x, *valleys(self.window, p.faults, self.growth)]) for p in pairs]
+            found, everything = self._settled(found, [*singles, *pairs])
         best = self._best(everything)
         return self._weighed([self._own(f, best) for f in everything], found)
+
+    def _settled(self, found: Since, fitted: Sequence[Fitted]) -> tuple[Since, list[Fitted]]:
+        """Find the onset and the sizes of the best hypothesis in turns if it is a pair, then let the others follow."""
+        best = self._best(fitted)
+        for _ in range(LOOKS if len(best.faults) > 1 else 0):
+            found = self._since(best)
+            after = self._again(best, found.growth)
+            gained, best = best.J - after.J, after
+            if gained < WORTH_A_LOOK * self.louder:
+                break
+        self.growth = found.growth
+        everything = self._freed([self._again(f, found.growth) for f in fitted])
+        self._best(everything)
+        return found, everything
+
+    def _explains(self, fitted: Fitted) -> bool:
+        good = self._goodness(fitted)
+        return good.statistic <= good.limit
 
     def _begun(self, d: FloatArray) -> tuple[Since, list[Fitted]]:
         """Find the onset and the sizes of single faults in turns; drifts are tried once the steps have settled.
