@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Self
 
 import numpy as np
 
 from servoscope.plants import Fault, FloatArray
-from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.window import Growth, Window
 
-GRID = 17  # sizes at which a search begins
-VALLEYS = 3  # of the grid over two sizes where searches begin
-BESIDE_S = 2.0, 10.0  # before and after the onset that the grid looks at
 STEPS = 12  # of the search, at most
 UNSEEN = 3.0  # standard deviations below which a size is as good as none
 REACH = 5.0  # standard deviations of the size over which its likelihood is integrated
@@ -73,56 +68,6 @@ def bounds(faults: Sequence[Fault]) -> tuple[FloatArray, FloatArray]:
     """Return the smallest and largest logarithms of the ratios that are searched, shapes (k,)."""
     low, high = np.log(np.array([fault.ratio_range for fault in faults]).reshape(-1, 2)).T
     return low, high
-
-
-@dataclass(frozen=True, eq=False)
-class Ladder:
-    """Sizes of one fault from one end of its range to the other, where a search may begin.
-
-    Parameters
-    ----------
-    sizes
-        Logarithms of the ratios.
-    predictors
-        Of the healthy plant and the one of each size.
-    """
-
-    sizes: FloatArray
-    predictors: tuple[Predictor, ...]
-
-    @classmethod
-    def of(cls, window: Window, fault: Fault, d: FloatArray) -> Self:
-        """Make the predictors, for errors d (m,) of the healthy parameters."""
-        (low,), (high,) = bounds([fault])
-        sizes, step = np.linspace(low, high, GRID), Growth(0)
-        return cls(sizes, tuple(window.predictor(d, (fault.parameter,), np.array([x]), step) for x in sizes))
-
-    def best(self, window: Window, growth: Growth) -> tuple[float, float]:
-        """Return the best size and its sum of squares, a drift taken as a step in its middle."""
-        step = Growth(growth.since + growth.over // 2)
-        costs = [float((window.innovations(each, step) ** 2).sum()) for each in self.predictors]
-        at = int(np.argmin(costs))
-        return float(self.sizes[at]), costs[at]
-
-
-def valleys(window: Window, faults: Sequence[Fault], growth: Growth) -> list[FloatArray]:
-    """Return the sizes (2,) of two faults at the lowest valleys of a grid over both ranges.
-
-    Only the seconds around the onset are looked at: far from the truth they say enough.
-    """
-    rate, step = window.bench.loop.sample_rate, growth.since + growth.over // 2
-    first, end = max(step - round(BESIDE_S[0] * rate), 0), step + round(BESIDE_S[1] * rate)
-    near, names, d = window.cut(first, end), [fault.parameter for fault in faults], np.zeros(window.nuisances)
-    low, high = bounds(faults)
-    axes = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]
-    cost = np.full((GRID + 2, GRID + 2), np.inf)
-    for i, x in enumerate(axes[0], start=1):
-        for j, z in enumerate(axes[1], start=1):
-            cost[i, j] = (near.residual(np.append(d, [x, z]), names, Growth(step - first)) ** 2).sum()
-    around = np.lib.stride_tricks.sliding_window_view(cost, (3, 3)).min(axis=(2, 3))
-    lowest = np.argwhere(cost[1:-1, 1:-1] <= around)
-    ranked = sorted(lowest.tolist(), key=lambda at: float(cost[at[0] + 1, at[1] + 1]))
-    return [np.array([axes[0][i], axes[1][j]]) for i, j in ranked[:VALLEYS]]
 
 
 def fit(

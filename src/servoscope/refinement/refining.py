@@ -12,8 +12,9 @@ from servoscope.baseline import Baseline
 from servoscope.plants import Fault, FloatArray
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import Goodness, goodness, traces
-from servoscope.refinement.hypotheses import Evidence, Fitted, Ladder, Scale, evidence, fit, valleys
+from servoscope.refinement.hypotheses import Evidence, Fitted, Scale, evidence, fit
 from servoscope.refinement.since import Since, since
+from servoscope.refinement.starts import Ladder, valleys
 from servoscope.refinement.window import Growth, Window
 
 BEFORE_S = 60.0  # of healthy motion before the onset
@@ -171,7 +172,7 @@ class _Search:
         ladders = [Ladder.of(self.window, fault, d) for fault in self.faults]
         begin = min(
             sorted({self.rough, self.latest}),
-            key=lambda k: min(ladder.best(self.window, Growth(k))[1] for ladder in ladders),
+            key=lambda k: min(float(ladder.costs(self.window, Growth(k)).min()) for ladder in ladders),
         )
         singles = self._singles(Growth(begin), d, ladders)
         for drifts in (False, True):
@@ -189,9 +190,9 @@ class _Search:
     def _singles(
         self, growth: Growth, d: FloatArray, ladders: Sequence[Ladder], known: Sequence[Fitted] = ()
     ) -> list[Fitted]:
-        """Fit every fault alone, from the best rung of its ladder and from a size that is known."""
+        """Fit every fault alone, from the valleys of its ladder and from a size that is known."""
         self.growth = growth
-        starts = [[np.array([ladder.best(self.window, growth)[0]])] for ladder in ladders]
+        starts = [ladder.valleys(self.window, growth) for ladder in ladders]
         for each, other in zip(starts, known, strict=False):
             each.append(other.x)
         return [self._fit([fault], d, each) for fault, each in zip(self.faults, starts, strict=True)]
