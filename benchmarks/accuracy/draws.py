@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -58,11 +59,17 @@ def large(rng: np.random.Generator, *parameters: str) -> dict[str, float]:
     """Draw ratios, log-uniform over the ranges of Table 2, under which the loop is stable."""
     while True:
         ratios = {name: between(rng, *TABLE_2[name]) for name in parameters}
-        try:
-            ss.simulate(loop(), np.zeros(2), faults=[FaultEvent(name, ratio, 0.0) for name, ratio in ratios.items()])
-        except SimulationError:
-            continue
-        return ratios
+        if stable([FaultEvent(name, ratio, 0.0) for name, ratio in ratios.items()]):
+            return ratios
+
+
+def stable(events: Sequence[FaultEvent]) -> bool:
+    """Return whether the loop is stable all the time, on the way of a drift too."""
+    try:
+        ss.simulate(loop(), np.zeros(round(SECONDS * loop().sample_rate)), faults=events)
+    except SimulationError:
+        return False
+    return True
 
 
 def between(rng: np.random.Generator, low: float, high: float) -> float:

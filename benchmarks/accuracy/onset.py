@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from accuracy.draws import KINDS, PARAMETERS, SECONDS, between, large, small
+from accuracy.draws import KINDS, PARAMETERS, SECONDS, between, large, small, stable
 from accuracy.rig import baseline, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import percent, told
@@ -24,14 +24,20 @@ def job(seed: int, kind: str, runs: int = RUNS) -> Numbers:
     learned, rng = baseline(kind, SECONDS, seed), np.random.default_rng(seed)
     said = []
     for i in range(runs):
-        parameter = PARAMETERS[int(rng.integers(len(PARAMETERS)))]
-        is_small = bool(i // 2 % 2)
-        ratio = small(rng, kind, parameter) if is_small else large(rng, parameter)[parameter]
-        begin, over = float(rng.uniform(*BEGIN)), between(rng, *DURATIONS) if i % 2 else 0.0
-        fault = FaultEvent(parameter, ratio, begin, over)
+        fault = drawn(rng, kind, is_small=bool(i // 2 % 2), drifts=bool(i % 2))
         run = told(learned, record(kind, SECONDS, seed, 1 + i, (fault,)), [fault])
-        said.append(run | {"begin": round(begin, 3), "over": round(over, 3), "small": is_small})
+        said.append(run | {"begin": round(fault.at_s, 3), "over": round(fault.ramp_s, 3), "small": bool(i // 2 % 2)})
     return {"runs": said}
+
+
+def drawn(rng: np.random.Generator, kind: str, is_small: bool, drifts: bool) -> FaultEvent:
+    """Draw a fault under which the loop stays stable."""
+    while True:
+        parameter = PARAMETERS[int(rng.integers(len(PARAMETERS)))]
+        ratio = small(rng, kind, parameter) if is_small else large(rng, parameter)[parameter]
+        fault = FaultEvent(parameter, ratio, float(rng.uniform(*BEGIN)), between(rng, *DURATIONS) if drifts else 0.0)
+        if stable([fault]):
+            return fault
 
 
 def covered(words: str, found: Sequence[Numbers]) -> list[Row]:
