@@ -54,6 +54,11 @@ class Fitted:
         """Parameters that change."""
         return tuple(fault.parameter for fault in self.faults)
 
+    @property
+    def is_free(self) -> bool:
+        """Whether the healthy parameters followed."""
+        return bool(self.jacobian.shape[1] == len(self.d) + len(self.x))
+
     def intervals(self, louder: float) -> tuple[tuple[float, float], ...]:
         """Return 95 % intervals of x within the ranges, for innovations of a variance."""
         std = np.sqrt(np.diag(self.covariance) * louder)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -208,7 +208,9 @@ class _Search:
         """
         promised = [self._promised(f) for f in fitted]
         limit = min(promised) + IN_REACH * self.louder
-        return [self._free(f) if limit >= J else f for f, J in zip(fitted, promised, strict=True)]
+        freed = [self._free(f) if limit >= J else f for f, J in zip(fitted, promised, strict=True)]
+        best = self._best(freed)
+        return [self._free(f) if self._within(f, best) and not f.is_free else f for f in freed]
 
     def _promised(self, fitted: Fitted) -> float:
         """Return the sum of squares that one step of Gauss and Newton promises."""
@@ -250,21 +252,25 @@ class _Search:
         several = PAIRS if n > 1 else 0.0
         prior = {1: (1.0 - several) / n, 2: several / max(n * (n - 1) / 2, 1)}
         best = self._best(fitted)
+        top = self._evidence(best, scales)
         told = [
-            evidence(window, f, [scales[fault] for fault in f.faults], self.louder)
+            self._evidence(f, scales)
             if self._within(f, best)
-            else Evidence(-0.5 * f.J / self.louder, f.intervals(self.louder))
+            else Evidence(top.log - 0.5 * (f.J - best.J) / self.louder, f.intervals(self.louder))
             for f in fitted
         ]
         logs = np.array([e.log + np.log(prior[len(f.names)]) for e, f in zip(told, fitted, strict=True)])
-        top = int(np.argmax(logs))
-        good = self._goodness(fitted[top])
-        logs = np.append(logs, logs[top] + 0.5 * (good.statistic - good.limit))
+        likeliest = int(np.argmax(logs))
+        good = self._goodness(fitted[likeliest])
+        logs = np.append(logs, logs[likeliest] + 0.5 * (good.statistic - good.limit))
         probability = np.exp(logs - logs.max())
         probability /= probability.sum()
         hypotheses = [Hypothesis(f, e, float(p)) for f, e, p in zip(fitted, told, probability[:-1], strict=True)]
         hypotheses.sort(key=lambda h: -h.probability)
         return Refined(window, tuple(hypotheses), float(probability[-1]), good, found, self.louder, self.rough)
+
+    def _evidence(self, fitted: Fitted, scales: Mapping[Fault, Scale]) -> Evidence:
+        return evidence(self.window, fitted, [scales[fault] for fault in fitted.faults], self.louder)
 
     def _goodness(self, fitted: Fitted) -> Goodness:
         window, growth = self.window, fitted.growth
