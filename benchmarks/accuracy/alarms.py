@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 
 import servoscope as ss
-from accuracy.innovations import innovations, predictor
+from accuracy.innovations import innovations
 from accuracy.rig import FAULT_AT, HOURS_PER_YEAR, alarm_times, baseline, loop, record, until_first
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from servoscope.plants import FloatArray
@@ -46,9 +46,8 @@ def raised(seed: int, kind: str, minutes: int, recordings: Iterable[ss.Recording
     same = baseline(kind, 60.0 * minutes, seed, per_year=BUDGETS[0] * HOURS_PER_YEAR)
     learned = {f"{budget:g}": same.shared(round(BUDGETS[0] / budget)) for budget in BUDGETS}
     assert same.noise is not None, "the rig has a controller and physics"
-    expected = predictor(same.plant, same.noise.u_std, same.noise.y_std)
     for recording in recordings:
-        e = innovations(expected, recording)
+        e = innovations(recording, same.plant, same.noise)
         found = {budget: alarm_times(each, recording) for budget, each in learned.items()}
         yield found | {name: recording.t[events(detector(e))] for name, detector in detectors().items()}
 

@@ -1,57 +1,31 @@
-"""The exact predictor of the closed loop: standardised innovations, and what a change adds to them."""
+"""What the exact predictor of the plant leaves of a recording, and what a change adds to that."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
 import servoscope as ss
 from accuracy.rig import FAULT_AT, loop
+from servoscope.noise import Noise
 from servoscope.plants import FloatArray, Plant
+from servoscope.refinement.predictor import Bench
+from servoscope.refinement.window import Growth, Window
 from servoscope.simulation import FaultEvent, reference
 from servoscope.simulation.closed_loop import NOISE_U_STD, NOISE_Y_STD
-from servoscope.simulation.discretise import discretise
+
+TRUE = Noise(u_std=NOISE_U_STD, y_std=NOISE_Y_STD)
 
 
-class Predictor(NamedTuple):
-    """Transfer functions from y and u to the innovation e = y - y_hat, over one denominator, and its variance S."""
-
-    from_y: FloatArray
-    from_u: FloatArray
-    denominator: FloatArray
-    S: float
+def known(recording: ss.Recording, plant: Plant, noise: Noise = TRUE) -> Window:
+    """Return all of a recording as the refit sees it that knows plant and noise exactly."""
+    bench, nothing = Bench.of(loop(), noise, recording.u), np.zeros((0, 0))
+    return Window(bench, plant, nothing, 0, recording.u, recording.y, recording.restart)
 
 
-def predictor(plant: Plant, u_std: float = NOISE_U_STD, y_std: float = NOISE_Y_STD) -> Predictor:
-    """Return the steady Kalman predictor of y for white noise that enters with u and adds to y.
-
-    ``x(k+1) = A x + b (u + n_u), y = c x + n_y``. The controller's u is known, so the loop being closed changes
-    nothing (Anderson and Moore, 1979, chapter 9).
-    """
-    from scipy import linalg, signal
-
-    d = discretise(plant.state_space(), loop().sample_rate)
-    # states in SI differ by ten decades, which the Riccati equation would not survive
-    _, (scale, _) = linalg.matrix_balance(d.A, permute=False, separate=True)
-    A, b, c = d.A * scale / scale[:, None], d.b_now / scale, d.c * scale
-    P = linalg.solve_discrete_are(A.T, c[:, None], u_std**2 * np.outer(b, b), np.array([[y_std**2]]))
-    S = float(c @ P @ c) + y_std**2
-    K = A @ P @ c / S
-    closed = A - np.outer(K, c)
-    numerators, denominator = zip(
-        *(signal.ss2tf(closed, column[:, None], -c[None, :], [[direct]]) for column, direct in ((K, 1.0), (b, 0.0))),
-        strict=True,
-    )
-    return Predictor(numerators[0][0], numerators[1][0], denominator[0], S)
-
-
-def innovations(p: Predictor, recording: ss.Recording) -> FloatArray:
-    """Return the innovations of a recording that begins at rest, in standard deviations, shape (N,)."""
-    from scipy.signal import lfilter
-
-    e = lfilter(p.from_y, p.denominator, recording.y) + lfilter(p.from_u, p.denominator, recording.u)
-    return np.asarray(e / np.sqrt(p.S))
+def innovations(recording: ss.Recording, plant: Plant, noise: Noise = TRUE) -> FloatArray:
+    """Return the innovations of a recording in standard deviations, shape (N,)."""
+    window = known(recording, plant, noise)
+    return np.asarray(window.innovations(window.healthy, Growth(0)), dtype=np.float64)
 
 
 def information(fault: FaultEvent, kind: str, seconds: float) -> FloatArray:
@@ -62,4 +36,4 @@ def information(fault: FaultEvent, kind: str, seconds: float) -> FloatArray:
     """
     r = reference(kind, seconds, loop().sample_rate)
     quiet, _ = ss.simulate(loop(), r, faults=(fault,), noise_u_std=0.0, noise_y_std=0.0)
-    return innovations(predictor(loop().plant), quiet)[quiet.t >= FAULT_AT] ** 2 / 2.0
+    return innovations(quiet, loop().plant)[quiet.t >= FAULT_AT] ** 2 / 2.0

@@ -3,7 +3,7 @@
     python benchmarks/accuracy/run.py [ID ...] [--list] [--workers N] [--share 0.1] [--render]
 
 Without an ID all of them run; an ID may be the beginning of several, as "bias/" or "coverage". --render writes the
-tables and the figure from the results that are there; together with IDs or --share, after running them.
+tables and figures from the results that are there; together with IDs or --share, after running them.
 """
 
 from __future__ import annotations
@@ -28,14 +28,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one thread per worker
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: E402
 from tables import machine  # noqa: E402
 
-from accuracy import alarms, bias, confidence, delay  # noqa: E402
+from accuracy import alarms, bias, confidence, delay, isolation, onset, pairs, sizes, unknown  # noqa: E402
 from accuracy.scenario import Numbers, Scenario, Table  # noqa: E402
 from servoscope.output import atomic_write  # noqa: E402
 
 RESULTS = BENCHMARKS / "accuracy" / "results"
 DOCS = BENCHMARKS.parent / "docs"
-PAGE, FIGURE = DOCS / "accuracy.md", DOCS / "images" / "accuracy" / "delay.png"
-TABLES: tuple[Table, ...] = (*bias.TABLES, *confidence.TABLES, *alarms.TABLES, *delay.TABLES)
+PAGE, IMAGES = DOCS / "accuracy.md", DOCS / "images" / "accuracy"
+TABLES: tuple[Table, ...] = (
+    *(*bias.TABLES, *confidence.TABLES, *alarms.TABLES, *delay.TABLES),
+    *(*isolation.TABLES, *unknown.TABLES, *pairs.TABLES, *sizes.TABLES, *onset.TABLES),
+)
 SCENARIOS = {scenario.id: scenario for table in TABLES for scenario in table.scenarios}
 
 
@@ -83,7 +86,7 @@ def path_of(scenario: Scenario) -> Path:
 
 
 def render() -> None:
-    """Write the tables of all results between their markers on the page, and the figure."""
+    """Write the tables of all results between their markers on the page, and the figures."""
     results = {
         id_: json.loads(path_of(scenario).read_text(encoding="utf-8"))
         for id_, scenario in SCENARIOS.items()
@@ -98,7 +101,9 @@ def render() -> None:
         made = f"{begin}\n\n{markdown(table, results)}\n\n{end}"
         page = marked.sub(lambda _, made=made: made, page)
     atomic_write(PAGE, page.encode())
-    delay.figure({id_: result["numbers"] for id_, result in results.items()}, FIGURE)
+    numbers = {id_: result["numbers"] for id_, result in results.items()}
+    delay.figure(numbers, IMAGES / "delay.png")
+    isolation.figure(numbers, IMAGES / "reliability.png")
 
 
 def markdown(table: Table, results: dict[str, Any]) -> str:

@@ -9,9 +9,10 @@ import numpy as np
 
 from servoscope.plants import Fault, FloatArray
 from servoscope.refinement.goodness import LAGS, traces
-from servoscope.refinement.hypotheses import Fitted, Ladder, fit
+from servoscope.refinement.hypotheses import Fitted, fit
 from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.refining import Refined
+from servoscope.refinement.starts import Ladder
 from servoscope.refinement.window import SENSOR_GAIN, Growth, Window
 
 AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
@@ -64,8 +65,8 @@ def _parametric(window: Window, growth: Growth, best: Fitted) -> Iterator[Cause]
     known = {**window.plant.causes, SENSOR_GAIN: "a gain error of the sensor of y"}
     for name, words in known.items():
         fault = Fault(name, name, RANGE, words)
-        size, _ = Ladder.of(window, fault, best.d).best(window, growth)
-        held = fit(window, [fault], growth, best.d, [np.array([size])], free=False)
+        starts = Ladder.of(window, fault, best.d).valleys(window, growth)
+        held = fit(window, [fault], growth, best.d, starts, free=False)
         free = fit(window, [fault], growth, best.d, [held.x], free=True)
         yield Cause(name, words, float(np.exp(free.x[0])), "ratio", free.J)
 

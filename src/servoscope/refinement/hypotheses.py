@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Self
 
 import numpy as np
 
 from servoscope.plants import Fault, FloatArray
-from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.window import Growth, Window
 
-GRID = 17  # sizes at which a search begins
 STEPS = 12  # of the search, at most
 UNSEEN = 3.0  # standard deviations below which a size is as good as none
 REACH = 5.0  # standard deviations of the size over which its likelihood is integrated
@@ -57,6 +54,11 @@ class Fitted:
         """Parameters that change."""
         return tuple(fault.parameter for fault in self.faults)
 
+    @property
+    def is_free(self) -> bool:
+        """Whether the healthy parameters followed."""
+        return bool(self.jacobian.shape[1] == len(self.d) + len(self.x))
+
     def intervals(self, louder: float) -> tuple[tuple[float, float], ...]:
         """Return 95 % intervals of x within the ranges, for innovations of a variance."""
         std = np.sqrt(np.diag(self.covariance) * louder)
@@ -71,36 +73,6 @@ def bounds(faults: Sequence[Fault]) -> tuple[FloatArray, FloatArray]:
     """Return the smallest and largest logarithms of the ratios that are searched, shapes (k,)."""
     low, high = np.log(np.array([fault.ratio_range for fault in faults]).reshape(-1, 2)).T
     return low, high
-
-
-@dataclass(frozen=True, eq=False)
-class Ladder:
-    """Sizes of one fault from one end of its range to the other, where a search may begin.
-
-    Parameters
-    ----------
-    sizes
-        Logarithms of the ratios.
-    predictors
-        Of the healthy plant and the one of each size.
-    """
-
-    sizes: FloatArray
-    predictors: tuple[Predictor, ...]
-
-    @classmethod
-    def of(cls, window: Window, fault: Fault, d: FloatArray) -> Self:
-        """Make the predictors, for errors d (m,) of the healthy parameters."""
-        (low,), (high,) = bounds([fault])
-        sizes, step = np.linspace(low, high, GRID), Growth(0)
-        return cls(sizes, tuple(window.predictor(d, (fault.parameter,), np.array([x]), step) for x in sizes))
-
-    def best(self, window: Window, growth: Growth) -> tuple[float, float]:
-        """Return the best size and its sum of squares, a drift taken as a step in its middle."""
-        step = Growth(growth.since + growth.over // 2)
-        costs = [float((window.innovations(each, step) ** 2).sum()) for each in self.predictors]
-        at = int(np.argmin(costs))
-        return float(self.sizes[at]), costs[at]
 
 
 def fit(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -12,8 +12,9 @@ from servoscope.baseline import Baseline
 from servoscope.plants import Fault, FloatArray
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import Goodness, goodness, traces
-from servoscope.refinement.hypotheses import Evidence, Fitted, Ladder, Scale, evidence, fit
+from servoscope.refinement.hypotheses import Evidence, Fitted, Scale, evidence, fit
 from servoscope.refinement.since import Since, since
+from servoscope.refinement.starts import Ladder, valleys
 from servoscope.refinement.window import Growth, Window
 
 BEFORE_S = 60.0  # of healthy motion before the onset
@@ -136,13 +137,31 @@ class _Search:
             self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
             for one, other in combinations(singles, 2)
         ]
-        best = self._best([*singles, *pairs])
-        if len(best.faults) > 1:
-            found = self._since(best)
-        everything = [self._again(f, found.growth) for f in (*singles, *pairs)]
-        everything = self._freed(everything)
+        found, everything = self._settled(found, [*singles, *pairs])
+        if not self._explains(self._best(everything)):
+            # no fault alone is near the truth, nor are the sizes that the pairs started from
+            pairs = [self._fit(p.faults, nothing, [p.x, *valleys(self.window, p.faults, self.growth)]) for p in pairs]
+            found, everything = self._settled(found, [*singles, *pairs])
         best = self._best(everything)
         return self._weighed([self._own(f, best) for f in everything], found)
+
+    def _settled(self, found: Since, fitted: Sequence[Fitted]) -> tuple[Since, list[Fitted]]:
+        """Find the onset and the sizes of the best hypothesis in turns if it is a pair, then let the others follow."""
+        best = self._best(fitted)
+        for _ in range(LOOKS if len(best.faults) > 1 else 0):
+            found = self._since(best)
+            after = self._again(best, found.growth)
+            gained, best = best.J - after.J, after
+            if gained < WORTH_A_LOOK * self.louder:
+                break
+        self.growth = found.growth
+        everything = self._freed([self._again(f, found.growth) for f in fitted])
+        self._best(everything)
+        return found, everything
+
+    def _explains(self, fitted: Fitted) -> bool:
+        good = self._goodness(fitted)
+        return good.statistic <= good.limit
 
     def _begun(self, d: FloatArray) -> tuple[Since, list[Fitted]]:
         """Find the onset and the sizes of single faults in turns; drifts are tried once the steps have settled.
@@ -153,7 +172,7 @@ class _Search:
         ladders = [Ladder.of(self.window, fault, d) for fault in self.faults]
         begin = min(
             sorted({self.rough, self.latest}),
-            key=lambda k: min(ladder.best(self.window, Growth(k))[1] for ladder in ladders),
+            key=lambda k: min(float(ladder.costs(self.window, Growth(k)).min()) for ladder in ladders),
         )
         singles = self._singles(Growth(begin), d, ladders)
         for drifts in (False, True):
@@ -171,9 +190,9 @@ class _Search:
     def _singles(
         self, growth: Growth, d: FloatArray, ladders: Sequence[Ladder], known: Sequence[Fitted] = ()
     ) -> list[Fitted]:
-        """Fit every fault alone, from the best rung of its ladder and from a size that is known."""
+        """Fit every fault alone, from the valleys of its ladder and from a size that is known."""
         self.growth = growth
-        starts = [[np.array([ladder.best(self.window, growth)[0]])] for ladder in ladders]
+        starts = [ladder.valleys(self.window, growth) for ladder in ladders]
         for each, other in zip(starts, known, strict=False):
             each.append(other.x)
         return [self._fit([fault], d, each) for fault, each in zip(self.faults, starts, strict=True)]
@@ -189,7 +208,9 @@ class _Search:
         """
         promised = [self._promised(f) for f in fitted]
         limit = min(promised) + IN_REACH * self.louder
-        return [self._free(f) if limit >= J else f for f, J in zip(fitted, promised, strict=True)]
+        freed = [self._free(f) if limit >= J else f for f, J in zip(fitted, promised, strict=True)]
+        best = self._best(freed)
+        return [self._free(f) if self._within(f, best) and not f.is_free else f for f in freed]
 
     def _promised(self, fitted: Fitted) -> float:
         """Return the sum of squares that one step of Gauss and Newton promises."""
@@ -231,21 +252,26 @@ class _Search:
         several = PAIRS if n > 1 else 0.0
         prior = {1: (1.0 - several) / n, 2: several / max(n * (n - 1) / 2, 1)}
         best = self._best(fitted)
+        top = self._evidence(best, scales)
         told = [
-            evidence(window, f, [scales[fault] for fault in f.faults], self.louder)
+            self._evidence(f, scales)
             if self._within(f, best)
-            else Evidence(-np.inf, f.intervals(self.louder))
+            else Evidence(top.log - 0.5 * (f.J - best.J) / self.louder, f.intervals(self.louder))
             for f in fitted
         ]
         logs = np.array([e.log + np.log(prior[len(f.names)]) for e, f in zip(told, fitted, strict=True)])
-        top = int(np.argmax(logs))
-        good = self._goodness(fitted[top])
-        logs = np.append(logs, logs[top] + 0.5 * (good.statistic - good.limit))
+        likeliest = int(np.argmax(logs))
+        good = self._goodness(fitted[likeliest])
+        logs = np.append(logs, logs[likeliest] + 0.5 * (good.statistic - good.limit))
         probability = np.exp(logs - logs.max())
         probability /= probability.sum()
-        hypotheses = [Hypothesis(f, e, float(p)) for f, e, p in zip(fitted, told, probability[:-1], strict=True)]
-        hypotheses.sort(key=lambda h: -h.probability)
-        return Refined(window, tuple(hypotheses), float(probability[-1]), good, found, self.louder, self.rough)
+        # by their logarithms: under a change that is unknown all probabilities may vanish
+        order = np.argsort(-logs[:-1], kind="stable")
+        hypotheses = tuple(Hypothesis(fitted[i], told[i], float(probability[i])) for i in order)
+        return Refined(window, hypotheses, float(probability[-1]), good, found, self.louder, self.rough)
+
+    def _evidence(self, fitted: Fitted, scales: Mapping[Fault, Scale]) -> Evidence:
+        return evidence(self.window, fitted, [scales[fault] for fault in fitted.faults], self.louder)
 
     def _goodness(self, fitted: Fitted) -> Goodness:
         window, growth = self.window, fitted.growth

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -86,6 +86,12 @@ class Window:
         restart = recording.restart[first:end].copy()
         restart[0] = True
         return cls(bench, baseline.plant, prior, first, u[first:end].copy(), recording.y[first:end].copy(), restart)
+
+    def cut(self, first: int, end: int) -> Window:
+        """Return samples `first` to `end` of it."""
+        restart = self.restart[first:end].copy()
+        restart[0] = True
+        return replace(self, first=self.first + first, u=self.u[first:end], y=self.y[first:end], restart=restart)
 
     @property
     def samples(self) -> int:
