@@ -19,9 +19,9 @@ from servoscope.loop import Loop
 from servoscope.noise import Noise
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
-from servoscope.refinement.hypotheses import GRID
 from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.refining import BEFORE_S
+from servoscope.refinement.starts import GRID
 from servoscope.refinement.window import Growth, Window
 from servoscope.simulation import FaultEvent, simulate
 from servoscope.simulation.closed_loop import checked

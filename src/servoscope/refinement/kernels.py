@@ -65,49 +65,85 @@ def gains(A: Array, Q: Array, c: Array, r: float, P: Array, K: Array, S: Array) 
 
 @kernel
 def innovations(
-    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, edges: IntArray,
+    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, since: int, over: int,
     u: Array, y: Array, restart: BoolArray,
 ) -> Array:  # fmt: skip
-    """Return e(k) = y(k) - y_hat(k | k-1) in standard deviations, shape (N,), through plants that follow each other.
+    """Return e(k) = y(k) - y_hat(k | k-1) in standard deviations, shape (N,), through a change of the plant.
 
-    Plant p holds from sample edges[p] on; A (p, n, n), b, late and c (p, n), gains K (p, L, n) and variances S (p, L)
-    are its own, the state goes on. All are multiplied by one factor, the geometric mean of the standard deviations
+    The first plant holds up to sample `since` and the last one from `over` samples later on; in between it goes
+    through the others, evenly and in straight lines. A (1, p, n, n), b, late and c (1, p, n), gains K (1, p, L, n) and
+    variances S (1, p, L); the state goes on. All are multiplied by one factor, the geometric mean of the deviations
     relative to the first plant's, so that the sum of squares ranks hypotheses as the likelihood does whose noise is
     known but for a common factor.
     """
-    N, n, L = len(y), A.shape[1], S.shape[1]
-    zero = 0.0 * A[0, 0, 0]
+    N, P, L = len(y), A.shape[1], S.shape[2]
     e = np.empty(N, A.dtype)
-    x, following = np.zeros(n, A.dtype), np.zeros(n, A.dtype)
-    p, j, volume, last = 0, L - 1, zero, 0.0 * u[0]
+    x, following = np.zeros((1, A.shape[2]), A.dtype), np.zeros(A.shape[2], A.dtype)
+    j, volume = L - 1, 0.0 * A[0, 0, 0, 0]
     for k in range(N):
-        while p + 1 < len(A) and edges[p + 1] <= k:
-            p += 1
         if restart[k]:
-            j, last = 0, u[k]
-            reach = zero
-            for i in range(n):
-                reach += c[p, i] * c[p, i]
-            for i in range(n):  # what y says at once; the first covariance knows that the rest is open
-                x[i] = c[p, i] * y[k] / reach
-        predicted = zero
-        for i in range(n):
-            predicted += c[p, i] * x[i]
-        error = y[k] - predicted
-        e[k] = error / np.sqrt(S[p, j])
-        volume += np.log(S[p, j] / S[0, j])
-        for i in range(n):
-            total = K[p, j, i] * error + b[p, i] * u[k] + late[p, i] * last
-            for q in range(n):
-                total += A[p, i, q] * x[q]
-            following[i] = total
-        for i in range(n):
-            x[i] = following[i]
-        last = u[k]
-        if j < L - 1:
-            j += 1
+            j = 0
+        p, q, w = _plant(k, since, over, P)
+        e[k] = _advance(A, b, late, c, K, S, 0, p, q, w, j, k, u, y, restart, x, following)
+        volume += np.log(S[0, p, j] / S[0, 0, j])
+        j = min(j + 1, L - 1)
     scaled: Array = e * np.exp(0.5 * volume / N)
     return scaled
+
+
+@kernel
+def _plant(k: int, since: int, over: int, P: int) -> tuple[int, int, float]:
+    """Return the plants p and q between which that of sample k lies, and its share of q."""
+    if k < since:
+        return 0, 0, 0.0
+    if k >= since + over:
+        return P - 1, P - 1, 0.0
+    place = (k - since + 0.5) / over * (P - 1)
+    p = int(place)
+    return p, p + 1, place - p
+
+
+@kernel
+def _advance(
+    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, p: int, q: int, w: float, j: int, k: int,
+    u: Array, y: Array, restart: BoolArray, x: Array, following: Array,
+) -> Any:  # fmt: skip
+    """Take variant v through sample k, by plants p and q mixed; returns its innovation in standard deviations."""
+    n = x.shape[1]
+    if restart[k]:
+        reach = 0.0 * x[v, 0]
+        for i in range(n):
+            reach += c[v, p, i] * c[v, p, i]
+        for i in range(n):  # what y says at once; the first covariance knows that the rest is open
+            x[v, i] = c[v, p, i] * y[k] / reach
+    error = y[k] - 0.0 * x[v, 0]
+    before = u[k] if restart[k] else u[max(k - 1, 0)]
+    variance = _mixed(S[v, p, j], S[v, q, j], w)
+    if w == 0.0:
+        for i in range(n):
+            error -= c[v, p, i] * x[v, i]
+        for i in range(n):
+            total = K[v, p, j, i] * error + b[v, p, i] * u[k] + late[v, p, i] * before
+            for o in range(n):
+                total += A[v, p, i, o] * x[v, o]
+            following[i] = total
+    else:
+        for i in range(n):
+            error -= _mixed(c[v, p, i], c[v, q, i], w) * x[v, i]
+        for i in range(n):
+            total = _mixed(K[v, p, j, i], K[v, q, j, i], w) * error
+            total += _mixed(b[v, p, i], b[v, q, i], w) * u[k] + _mixed(late[v, p, i], late[v, q, i], w) * before
+            for o in range(n):
+                total += _mixed(A[v, p, i, o], A[v, q, i, o], w) * x[v, o]
+            following[i] = total
+    for i in range(n):
+        x[v, i] = following[i]
+    return error / np.sqrt(variance)
+
+
+@kernel
+def _mixed(one: Any, other: Any, share: float) -> Any:
+    return one + share * (other - one)
 
 
 @kernel
@@ -123,8 +159,7 @@ def sweep(
     Parameters
     ----------
     A, b, late, c, K, S
-        As for `innovations`, with two more axes in front: variants v (0: as it is; i: size i moved by `step`), and
-        plants (0 healthy, the pieces of a drift, last the changed one).
+        As for `innovations`, the first axis being variants v (0: as it is; i: size i moved by `step`).
     onsets, overs
         First changed sample and duration of each change, shapes (M,).
     settle
@@ -152,7 +187,7 @@ def sweep(
     before, after, volume_after = np.zeros((N + 1, V, W)), np.zeros((N + 1, V, W)), np.zeros(N + 1)
     for k in range(N):  # the healthy plant all the way
         for v in range(V):
-            row[v] = _advance(A, b, late, c, K, S, v, 0, age[k], k, u, y, restart, x, following)
+            row[v] = _advance(A, b, late, c, K, S, v, 0, 0, 0.0, age[k], k, u, y, restart, x, following)
             for i in range(n):
                 states[k + 1, v, i] = x[v, i]
         _add(before[k], before[k + 1], row, 0.0, Q, k, V)
@@ -161,7 +196,7 @@ def sweep(
             x[v, i] = 0.0
     for k in range(N):  # and the changed one
         for v in range(V):
-            changed[k, v] = _advance(A, b, late, c, K, S, v, P - 1, age[k], k, u, y, restart, x, following)
+            changed[k, v] = _advance(A, b, late, c, K, S, v, P - 1, P - 1, 0.0, age[k], k, u, y, restart, x, following)
     for k in range(N - 1, -1, -1):
         for v in range(V):
             row[v] = changed[k, v]
@@ -173,47 +208,17 @@ def sweep(
         stop = min(onset + over + settle, N)
         volume[i] = volume_after[stop]
         for v in range(V):
-            for q in range(n):
-                x[v, q] = states[onset, v, q]
-            for q in range(W):
-                sums[i, v, q] = before[onset, v, q] + after[stop, v, q]
+            for o in range(n):
+                x[v, o] = states[onset, v, o]
+            for o in range(W):
+                sums[i, v, o] = before[onset, v, o] + after[stop, v, o]
         for k in range(onset, stop):
-            p = P - 1
-            if k < onset + over:
-                p = 1 + (k - onset) * (P - 2) // over
+            p, q, w = _plant(k, onset, over, P)
             for v in range(V):
-                row[v] = _advance(A, b, late, c, K, S, v, p, age[k], k, u, y, restart, x, following)
+                row[v] = _advance(A, b, late, c, K, S, v, p, q, w, age[k], k, u, y, restart, x, following)
             _add(sums[i], sums[i], row, 1.0 / step, Q, k, V)
             volume[i] += np.log(S[0, p, age[k]] / S[0, 0, age[k]])
     return sums, volume
-
-
-@kernel
-def _advance(
-    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, p: int, j: int, k: int,
-    u: Array, y: Array, restart: BoolArray, x: Array, following: Array,
-) -> float:  # fmt: skip
-    """Take variant v of plant p through sample k; returns its innovation in standard deviations."""
-    n = x.shape[1]
-    if restart[k]:
-        reach = 0.0
-        for i in range(n):
-            reach += c[v, p, i] ** 2
-        for i in range(n):
-            x[v, i] = c[v, p, i] * y[k] / reach
-    error = y[k]
-    for i in range(n):
-        error -= c[v, p, i] * x[v, i]
-    before = u[k] if restart[k] else u[max(k - 1, 0)]
-    for i in range(n):
-        total = K[v, p, j, i] * error + b[v, p, i] * u[k] + late[v, p, i] * before
-        for q in range(n):
-            total += A[v, p, i, q] * x[v, q]
-        following[i] = total
-    for i in range(n):
-        x[v, i] = following[i]
-    standardised: float = error / np.sqrt(S[v, p, j])
-    return standardised
 
 
 @kernel

@@ -12,7 +12,7 @@ import numpy as np
 from servoscope.loop import Loop
 from servoscope.noise import Noise
 from servoscope.plants import FloatArray, Plant
-from servoscope.refinement.kernels import Array, BoolArray, IntArray
+from servoscope.refinement.kernels import Array, BoolArray
 from servoscope.simulation.discretise import discretise
 
 LONGEST = 1024  # samples after a restart until the gain stays as it is
@@ -35,11 +35,12 @@ class Predictor(NamedTuple):
         """Put plants in a row."""
         return cls(*(np.ascontiguousarray(np.concatenate(parts)) for parts in zip(*each, strict=True)))
 
-    def innovations(self, edges: IntArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Array:
-        """Return the innovations of a recording in standard deviations, shape (N,)."""
+    def innovations(self, since: int, over: int, u: FloatArray, y: FloatArray, restart: BoolArray) -> Array:
+        """Return the innovations of a recording in standard deviations, shape (N,), under a change of the plant."""
         from servoscope.refinement.kernels import innovations
 
-        return innovations(*self, edges, u, y, restart)
+        A, b, late, c, K, S = (part[None] for part in self)
+        return innovations(A, b, late, c, K, S, since, over, u, y, restart)
 
 
 @dataclass(frozen=True, eq=False)

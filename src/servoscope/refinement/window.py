@@ -15,7 +15,7 @@ from servoscope.recording import Recording
 from servoscope.refinement.kernels import Array, BoolArray
 from servoscope.refinement.predictor import Bench, Predictor
 
-PIECES = 8  # plants that stand for a drift
+PIECES = 8  # of a drift, within which the predictor changes in straight lines
 TINY = 1e-30  # complex step
 SENSOR_GAIN = "sensor_gain"
 """What stands among the parameters for a factor on y as measured."""
@@ -32,17 +32,9 @@ class Growth:
     over: int = 0
 
     @property
-    def edges(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-        """Samples from which the plants of `shares` hold, after the healthy one."""
-        if not self.over:
-            return np.array([0, self.since], dtype=np.int64)
-        pieces = self.since + self.over * np.arange(PIECES + 1) / PIECES
-        return np.concatenate([[0], np.round(pieces)]).astype(np.int64)
-
-    @property
     def shares(self) -> FloatArray:
-        """Shares of the change that each of them has, shape (p - 1,)."""
-        return np.append((np.arange(PIECES) + 0.5) / PIECES, 1.0) if self.over else np.ones(1)
+        """Shares of the change that the plants after the healthy one have, shape (p - 1,); in between it is linear."""
+        return np.arange(1, PIECES + 1) / PIECES if self.over else np.ones(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +124,7 @@ class Window:
 
     def innovations(self, predictor: Predictor, growth: Growth) -> Array:
         """Return the innovations in standard deviations, shape (N,)."""
-        return predictor.innovations(growth.edges, self.u, self.y, self.restart)
+        return predictor.innovations(growth.since, growth.over, self.u, self.y, self.restart)
 
     def residual(self, z: Array, names: Sequence[str], growth: Growth) -> Array:
         """Return what least squares makes small: innovations and prior, shape (N + m,), at z = [d, x]."""
@@ -155,7 +147,7 @@ class Window:
     def disturbed(self, predictor: Predictor, growth: Growth, u: FloatArray, y: FloatArray) -> FloatArray:
         """Return what disturbances of u and of y, shape (N,), add to the innovations: they are linear in both."""
         restart = np.zeros_like(self.restart)
-        return np.asarray(predictor.innovations(growth.edges, u, y, restart), dtype=np.float64)
+        return np.asarray(predictor.innovations(growth.since, growth.over, u, y, restart), dtype=np.float64)
 
 
 def acting(loop: Loop, u: FloatArray) -> FloatArray:
