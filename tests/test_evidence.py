@@ -18,6 +18,7 @@ def learned(seed: int) -> ss.Baseline:
     return rig.baseline("multisine", 60.0, seed)
 
 
+@pytest.mark.slow
 def test_random_faults() -> None:
     found = isolation.job(0, "multisine", runs=3)
     (row,) = isolation.scores("multisine", [found])
@@ -52,6 +53,7 @@ def test_what_is_not_on_the_list() -> None:
     assert sensor["mimics"]["sensor_gain"] == pytest.approx(1.05, abs=0.001)
 
 
+@pytest.mark.slow
 def test_sizes_and_tables() -> None:
     found = sizes.job(0, "profile", runs=1)
     errors = [error for each in found.values() for error in each["errors"]]

@@ -16,8 +16,8 @@ from servoscope.refinement.hypotheses import deviation
 from servoscope.refinement.window import Growth, Window
 from servoscope.simulation import FaultEvent
 
-RUNS = 5  # per baseline and fault
-UNITS = 20
+RUNS = 1  # per baseline and fault: the error of the baseline is part of the size's
+UNITS = 100
 RATIOS = {"p_s": 0.8, "C_ie": 1.2, "b_p": 20.0, "beta": 0.1}
 ANNOUNCED_S = 2.0  # after the onset
 MOST = 1.3  # times the bound's variance
