@@ -76,50 +76,50 @@ def innovations(
     relative to the first plant's, so that the sum of squares ranks hypotheses as the likelihood does whose noise is
     known but for a common factor.
     """
-    N, P, L = len(y), A.shape[1], S.shape[2]
-    e = np.empty(N, A.dtype)
+    N, last = len(y), A.shape[1] - 1
+    e, age = np.empty((1, N), A.dtype), ages(restart, S.shape[2])
     x, following = np.zeros((1, A.shape[2]), A.dtype), np.zeros(A.shape[2], A.dtype)
-    j, volume = L - 1, 0.0 * A[0, 0, 0, 0]
-    for k in range(N):
-        if restart[k]:
-            j = 0
-        p, q, w = _plant(k, since, over, P)
-        e[k] = _advance(A, b, late, c, K, S, 0, p, q, w, j, k, u, y, restart, x, following)
-        volume += np.log(S[0, p, j] / S[0, 0, j])
-        j = min(j + 1, L - 1)
-    scaled: Array = e * np.exp(0.5 * volume / N)
+    begin, end = min(since, N), min(since + over, N)
+    if last == 0:
+        begin = N
+    hold(A, b, late, c, K, S, 0, 0, 0, begin, age, u, y, restart, x, following, e, 0)
+    drift(A, b, late, c, K, S, 0, since, over, begin, end, age, u, y, restart, x, following, e, 0)
+    hold(A, b, late, c, K, S, 0, last, max(begin, end), N, age, u, y, restart, x, following, e, 0)
+    volume = 0.0 * A[0, 0, 0, 0]
+    for k in range(begin, N):
+        p = last if k >= end else (k - since) * last // over
+        volume += np.log(S[0, p, age[k]] / S[0, 0, age[k]])
+    scaled: Array = e[0] * np.exp(0.5 * volume / N)
     return scaled
 
 
 @kernel
-def _plant(k: int, since: int, over: int, P: int) -> tuple[int, int, float]:
-    """Return the plants p and q between which that of sample k lies, and its share of q."""
-    if k < since:
-        return 0, 0, 0.0
-    if k >= since + over:
-        return P - 1, P - 1, 0.0
-    place = (k - since + 0.5) / over * (P - 1)
-    p = int(place)
-    return p, p + 1, place - p
+def ages(restart: BoolArray, L: int) -> IntArray:
+    """Return the samples since a restart, as far as the gains change with them, shape (N,)."""
+    age = np.empty(len(restart), np.int64)
+    j = L - 1
+    for k in range(len(restart)):
+        j = 0 if restart[k] else min(j + 1, L - 1)
+        age[k] = j
+    return age
 
 
 @kernel
-def _advance(
-    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, p: int, q: int, w: float, j: int, k: int,
-    u: Array, y: Array, restart: BoolArray, x: Array, following: Array,
-) -> Any:  # fmt: skip
-    """Take variant v through sample k, by plants p and q mixed; returns its innovation in standard deviations."""
+def hold(
+    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, p: int, begin: int, end: int,
+    age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
+) -> None:  # fmt: skip
+    """Take variant v through samples begin to end by plant p: its state x[v], its innovations into e[v, k - first]."""
     n = x.shape[1]
-    if restart[k]:
-        reach = 0.0 * x[v, 0]
-        for i in range(n):
-            reach += c[v, p, i] * c[v, p, i]
-        for i in range(n):  # what y says at once; the first covariance knows that the rest is open
-            x[v, i] = c[v, p, i] * y[k] / reach
-    error = y[k] - 0.0 * x[v, 0]
-    before = u[k] if restart[k] else u[max(k - 1, 0)]
-    variance = _mixed(S[v, p, j], S[v, q, j], w)
-    if w == 0.0:
+    for k in range(begin, end):
+        if restart[k]:  # what y says at once; the first covariance knows that the rest is open
+            reach = 0.0 * x[v, 0]
+            for i in range(n):
+                reach += c[v, p, i] * c[v, p, i]
+            for i in range(n):
+                x[v, i] = c[v, p, i] * y[k] / reach
+        j, before = age[k], u[k] if restart[k] else u[max(k - 1, 0)]
+        error = y[k] - 0.0 * x[v, 0]
         for i in range(n):
             error -= c[v, p, i] * x[v, i]
         for i in range(n):
@@ -127,23 +127,42 @@ def _advance(
             for o in range(n):
                 total += A[v, p, i, o] * x[v, o]
             following[i] = total
-    else:
         for i in range(n):
-            error -= _mixed(c[v, p, i], c[v, q, i], w) * x[v, i]
-        for i in range(n):
-            total = _mixed(K[v, p, j, i], K[v, q, j, i], w) * error
-            total += _mixed(b[v, p, i], b[v, q, i], w) * u[k] + _mixed(late[v, p, i], late[v, q, i], w) * before
-            for o in range(n):
-                total += _mixed(A[v, p, i, o], A[v, q, i, o], w) * x[v, o]
-            following[i] = total
-    for i in range(n):
-        x[v, i] = following[i]
-    return error / np.sqrt(variance)
+            x[v, i] = following[i]
+        e[v, k - first] = error / np.sqrt(S[v, p, j])
 
 
 @kernel
-def _mixed(one: Any, other: Any, share: float) -> Any:
-    return one + share * (other - one)
+def drift(
+    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, since: int, over: int, begin: int, end: int,
+    age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
+) -> None:  # fmt: skip
+    """Do as `hold` while the plant drifts through all of them from sample `since` on, over so many samples."""
+    n, last = x.shape[1], A.shape[1] - 1
+    for k in range(begin, end):
+        place = (k - since + 0.5) / over * last
+        p = int(place)
+        q, w = p + 1, place - p
+        if restart[k]:
+            reach = 0.0 * x[v, 0]
+            for i in range(n):
+                reach += c[v, p, i] * c[v, p, i]
+            for i in range(n):
+                x[v, i] = c[v, p, i] * y[k] / reach
+        j, before = age[k], u[k] if restart[k] else u[max(k - 1, 0)]
+        error = y[k] - 0.0 * x[v, 0]
+        for i in range(n):
+            error -= (c[v, p, i] + w * (c[v, q, i] - c[v, p, i])) * x[v, i]
+        for i in range(n):
+            total = (K[v, p, j, i] + w * (K[v, q, j, i] - K[v, p, j, i])) * error
+            total += (b[v, p, i] + w * (b[v, q, i] - b[v, p, i])) * u[k]
+            total += (late[v, p, i] + w * (late[v, q, i] - late[v, p, i])) * before
+            for o in range(n):
+                total += (A[v, p, i, o] + w * (A[v, q, i, o] - A[v, p, i, o])) * x[v, o]
+            following[i] = total
+        for i in range(n):
+            x[v, i] = following[i]
+        e[v, k - first] = error / np.sqrt(S[v, p, j] + w * (S[v, q, j] - S[v, p, j]))
 
 
 @kernel
@@ -174,63 +193,67 @@ def sweep(
     volume
         Sum of log S relative to the healthy plant's, shape (M,).
     """
-    V, P, n, L = A.shape[0], A.shape[1], A.shape[2], K.shape[2]
+    V, last, n, L = A.shape[0], A.shape[1] - 1, A.shape[2], K.shape[2]
     N, m, M = len(y), Q.shape[1], len(onsets)
-    W = V + m
-    age = np.zeros(N, np.int64)  # samples since a restart, as far as the gains change
-    j = L - 1
-    for k in range(N):
-        j = 0 if restart[k] else min(j + 1, L - 1)
-        age[k] = j
-    row, x, following = np.zeros(W), np.zeros((V, n)), np.zeros(n)
-    states, changed = np.zeros((N + 1, V, n)), np.zeros((N, V))
-    before, after, volume_after = np.zeros((N + 1, V, W)), np.zeros((N + 1, V, W)), np.zeros(N + 1)
+    age = ages(restart, L)
+    x, following, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, N))
+    states = np.zeros((N + 1, V, n))
+    before, after = np.zeros((N + 1, V, V + m)), np.zeros((N + 1, V, V + m))
+    louder = np.zeros((last + 1, L))
+    for p in range(last + 1):
+        for j in range(L):
+            louder[p, j] = np.log(S[0, p, j] / S[0, 0, j])
     for k in range(N):  # the healthy plant all the way
         for v in range(V):
-            row[v] = _advance(A, b, late, c, K, S, v, 0, 0, 0.0, age[k], k, u, y, restart, x, following)
+            hold(A, b, late, c, K, S, v, 0, k, k + 1, age, u, y, restart, x, following, e, 0)
             for i in range(n):
                 states[k + 1, v, i] = x[v, i]
-        _add(before[k], before[k + 1], row, 0.0, Q, k, V)
-    for v in range(V):
+    add(before, e, 0, 0, N, 0.0, Q)
+    for v in range(V):  # and the changed one
         for i in range(n):
             x[v, i] = 0.0
-    for k in range(N):  # and the changed one
-        for v in range(V):
-            changed[k, v] = _advance(A, b, late, c, K, S, v, P - 1, P - 1, 0.0, age[k], k, u, y, restart, x, following)
+        hold(A, b, late, c, K, S, v, last, 0, N, age, u, y, restart, x, following, e, 0)
+    add(after, e, 0, 0, N, 1.0 / step, Q)
+    volume_after = np.zeros(N + 1)
     for k in range(N - 1, -1, -1):
-        for v in range(V):
-            row[v] = changed[k, v]
-        _add(after[k + 1], after[k], row, 1.0 / step, Q, k, V)
-        volume_after[k] = volume_after[k + 1] + np.log(S[0, P - 1, age[k]] / S[0, 0, age[k]])
-    sums, volume = np.zeros((M, V, W)), np.zeros(M)
+        volume_after[k] = volume_after[k + 1] + louder[last, age[k]]
+    sums, volume = np.zeros((M, V, V + m)), np.zeros(M)
+    total = np.zeros((N + 1, V, V + m))
     for i in range(M):
         onset, over = onsets[i], overs[i]
-        stop = min(onset + over + settle, N)
-        volume[i] = volume_after[stop]
+        end, stop = min(onset + over, N), min(onset + over + settle, N)
+        volume[i] = volume_after[end]
+        for k in range(onset, end):
+            volume[i] += louder[(k - onset) * last // over, age[k]]
         for v in range(V):
             for o in range(n):
                 x[v, o] = states[onset, v, o]
-            for o in range(W):
-                sums[i, v, o] = before[onset, v, o] + after[stop, v, o]
-        for k in range(onset, stop):
-            p, q, w = _plant(k, onset, over, P)
-            for v in range(V):
-                row[v] = _advance(A, b, late, c, K, S, v, p, q, w, age[k], k, u, y, restart, x, following)
-            _add(sums[i], sums[i], row, 1.0 / step, Q, k, V)
-            volume[i] += np.log(S[0, p, age[k]] / S[0, 0, age[k]])
+            drift(A, b, late, c, K, S, v, onset, over, onset, end, age, u, y, restart, x, following, e, onset)
+            hold(A, b, late, c, K, S, v, last, end, stop, age, u, y, restart, x, following, e, onset)
+        for v in range(V):
+            for o in range(V + m):
+                total[0, v, o] = before[onset, v, o] + after[N, v, o] - after[stop, v, o]
+        add(total, e, onset, onset, stop, 1.0 / step, Q)
+        for v in range(V):
+            for o in range(V + m):
+                sums[i, v, o] = total[stop - onset, v, o]
     return sums, volume
 
 
 @kernel
-def _add(old: Array, new: Array, row: Array, by: float, Q: Array, k: int, V: int) -> None:
-    """Add to sums the products of [e, its derivatives] with themselves and with Q's row k.
+def add(sums: Array, e: Array, first: int, begin: int, end: int, by: float, Q: Array) -> None:
+    """Sum up products of innovations, their derivatives and Q: sums[k - begin + 1] is what they are up to sample k.
 
-    `row` holds the innovations of the variants, and afterwards their derivatives: differences times `by`.
+    e[v, k - first] are the innovations of the variants; derivatives are their differences times `by`.
     """
-    for v in range(1, V):
-        row[v] = (row[v] - row[0]) * by
-    for v in range(V):
-        for other in range(V):
-            new[v, other] = old[v, other] + row[v] * row[other]
-        for q in range(Q.shape[1]):
-            new[v, V + q] = old[v, V + q] + row[v] * Q[k, q]
+    V, m = e.shape[0], Q.shape[1]
+    row = np.zeros(V)
+    for k in range(begin, end):
+        row[0] = e[0, k - first]
+        for v in range(1, V):
+            row[v] = (e[v, k - first] - row[0]) * by
+        for v in range(V):
+            for o in range(V):
+                sums[k - begin + 1, v, o] = sums[k - begin, v, o] + row[v] * row[o]
+            for o in range(m):
+                sums[k - begin + 1, v, V + o] = sums[k - begin, v, V + o] + row[v] * Q[k, o]
