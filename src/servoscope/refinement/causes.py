@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoscope.plants import Fault, FloatArray
+from servoscope.plants import FloatArray
 from servoscope.refinement.goodness import LAGS, traces
 from servoscope.refinement.hypotheses import Fitted, fit
+from servoscope.refinement.outside import outside
 from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.refining import Refined
-from servoscope.refinement.starts import Ladder
-from servoscope.refinement.window import SENSOR_GAIN, Growth, Window
+from servoscope.refinement.window import Growth, Window
 
 AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
-RANGE = (0.3, 3.0)  # of the ratios that are tried
-NEARLY_ALL = 0.95
+NEARLY_ALL = 0.95  # of what the healthy plant does not explain
+QUIET = 1.15  # variance of the innovations up to which nothing but noise is left
 TRIED = 9  # delays up to one further sample, before the best is refined
 
 
@@ -52,23 +52,19 @@ def causes(refined: Refined) -> list[Cause]:
     # the onset of an explanation that is none means nothing
     growth = Growth(refined.rough) if refined.is_unknown else best.growth
     healthy = fit(window, [], growth, best.d, [np.zeros(0)], free=True)
-    found = [*_parametric(window, growth, best), *_added(window, growth, healthy)]
+    others = refined.outside if growth == best.growth else outside(window, growth, best)
+    found = [*map(_ratio, others), *_added(window, growth, healthy)]
     limit = best.J
     if refined.is_unknown:
         most = window.samples + (1.0 - NEARLY_ALL) * (healthy.J - window.samples)
-        limit = min([cause.J for cause in found if most >= cause.J], default=-np.inf)
+        enough = min(max(most, QUIET * window.samples), best.J)
+        limit = min([cause.J for cause in found if enough >= cause.J], default=-np.inf)
     return sorted((c for c in found if limit + AS_WELL * refined.louder >= c.J), key=lambda cause: cause.J)
 
 
-def _parametric(window: Window, growth: Growth, best: Fitted) -> Iterator[Cause]:
-    """Try other parameters of the plant and the gain of the sensor."""
-    known = {**window.plant.causes, SENSOR_GAIN: "a gain error of the sensor of y"}
-    for name, words in known.items():
-        fault = Fault(name, name, RANGE, words)
-        starts = Ladder.of(window, fault, best.d).valleys(window, growth)
-        held = fit(window, [fault], growth, best.d, starts, free=False)
-        free = fit(window, [fault], growth, best.d, [held.x], free=True)
-        yield Cause(name, words, float(np.exp(free.x[0])), "ratio", free.J)
+def _ratio(other: Fitted) -> Cause:
+    (fault,) = other.faults
+    return Cause(fault.name, fault.words, float(np.exp(other.x[0])), "ratio", other.J)
 
 
 def _added(window: Window, growth: Growth, healthy: Fitted) -> Iterator[Cause]:

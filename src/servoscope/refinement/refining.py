@@ -13,6 +13,7 @@ from servoscope.plants import Fault, FloatArray
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import Goodness, goodness, traces
 from servoscope.refinement.hypotheses import Evidence, Fitted, Scale, evidence, fit
+from servoscope.refinement.outside import outside
 from servoscope.refinement.since import Since, since
 from servoscope.refinement.starts import Ladder, valleys
 from servoscope.refinement.window import Growth, Window
@@ -21,6 +22,7 @@ BEFORE_S = 60.0  # of healthy motion before the onset
 AFTER_S = 240.0  # of motion with the change
 MOST = 40_000  # samples in a window
 PAIRS = 0.02  # probability that two faults come at once, before anything is known
+OUTSIDE = 0.01  # and that it is a parameter outside the list of faults
 LOOKS = 4  # for the onset, each with the sizes that fit the one before
 WORTH_A_LOOK = 1.0  # of the sum of squares that a look gained, for another one
 IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
@@ -50,8 +52,10 @@ class Refined:
         What it looked at.
     hypotheses
         Most probable first.
+    outside
+        Parameters outside the list of faults, each as if it alone had changed.
     unknown
-        Probability that it is none of them.
+        Probability that it is none of the hypotheses.
     goodness
         Of the most probable one.
     since
@@ -64,6 +68,7 @@ class Refined:
 
     window: Window
     hypotheses: tuple[Hypothesis, ...]
+    outside: tuple[Fitted, ...]
     unknown: float
     goodness: Goodness
     since: Since
@@ -250,7 +255,7 @@ class _Search:
         window, n = self.window, len(self.faults)
         scales = {fault: Scale.of(window, fault, found.growth) for fault in self.faults}
         several = PAIRS if n > 1 else 0.0
-        prior = {1: (1.0 - several) / n, 2: several / max(n * (n - 1) / 2, 1)}
+        prior = {1: (1.0 - several - OUTSIDE) / n, 2: several / max(n * (n - 1) / 2, 1)}
         best = self._best(fitted)
         top = self._evidence(best, scales)
         told = [
@@ -262,16 +267,24 @@ class _Search:
         logs = np.array([e.log + np.log(prior[len(f.names)]) for e, f in zip(told, fitted, strict=True)])
         likeliest = int(np.argmax(logs))
         good = self._goodness(fitted[likeliest])
-        logs = np.append(logs, logs[likeliest] + 0.5 * (good.statistic - good.limit))
+        # unknown: what nothing explains, or what a parameter outside the list explains better
+        others = outside(window, fitted[likeliest].growth, fitted[likeliest])
+        rivals = [self._outside(f) - np.log(len(others) / OUTSIDE) for f in others if self._within(f, best)]
+        nothing = logs[likeliest] + 0.5 * (good.statistic - good.limit)
+        logs = np.append(logs, np.logaddexp.reduce([nothing, *rivals]))
         probability = np.exp(logs - logs.max())
         probability /= probability.sum()
         # by their logarithms: under a change that is unknown all probabilities may vanish
         order = np.argsort(-logs[:-1], kind="stable")
         hypotheses = tuple(Hypothesis(fitted[i], told[i], float(probability[i])) for i in order)
-        return Refined(window, hypotheses, float(probability[-1]), good, found, self.louder, self.rough)
+        return Refined(window, hypotheses, tuple(others), float(probability[-1]), good, found, self.louder, self.rough)
 
     def _evidence(self, fitted: Fitted, scales: Mapping[Fault, Scale]) -> Evidence:
         return evidence(self.window, fitted, [scales[fault] for fault in fitted.faults], self.louder)
+
+    def _outside(self, fitted: Fitted) -> float:
+        scale = Scale.of(self.window, fitted.faults[0], fitted.growth)
+        return evidence(self.window, fitted, [scale], self.louder).log
 
     def _goodness(self, fitted: Fitted) -> Goodness:
         window, growth = self.window, fitted.growth
