@@ -49,17 +49,25 @@ def causes(refined: Refined) -> list[Cause]:
     those as good as it, if they explain nearly all that the healthy plant does not.
     """
     window, best = refined.window, refined.best.fitted
-    # the onset of an explanation that is none means nothing
-    growth = Growth(refined.rough) if refined.is_unknown else best.growth
-    healthy = fit(window, [], growth, best.d, [np.zeros(0)], free=True)
-    others = refined.outside if growth == best.growth else outside(window, growth, best)
-    found = [*map(_ratio, others), *_added(window, growth, healthy)]
+    found, healthy = _at(refined, best.growth)
     limit = best.J
     if refined.is_unknown:
-        most = window.samples + (1.0 - NEARLY_ALL) * (healthy.J - window.samples)
+        # the onset of an explanation that is none may mean nothing
+        earlier, other = _at(refined, Growth(refined.rough))
+        if min(cause.J for cause in earlier) < min(cause.J for cause in found):
+            found, healthy = earlier, other
+        most = window.samples + (1.0 - NEARLY_ALL) * (healthy - window.samples)
         enough = min(max(most, QUIET * window.samples), best.J)
         limit = min([cause.J for cause in found if enough >= cause.J], default=-np.inf)
     return sorted((c for c in found if limit + AS_WELL * refined.louder >= c.J), key=lambda cause: cause.J)
+
+
+def _at(refined: Refined, growth: Growth) -> tuple[list[Cause], float]:
+    """Return all causes for a change at some time, and the sum of squares of no change at all."""
+    window, best = refined.window, refined.best.fitted
+    healthy = fit(window, [], growth, best.d, [np.zeros(0)], free=True)
+    others = refined.outside if growth == best.growth else outside(window, growth, best)
+    return [*map(_ratio, others), *_added(window, growth, healthy)], healthy.J
 
 
 def _ratio(other: Fitted) -> Cause:
