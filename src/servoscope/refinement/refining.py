@@ -25,6 +25,7 @@ PAIRS = 0.02  # probability that two faults come at once, before anything is kno
 OUTSIDE = 0.01  # and that it is a parameter outside the list of faults
 LOOKS = 4  # for the onset, each with the sizes that fit the one before
 WORTH_A_LOOK = 1.0  # of the sum of squares that a look gained, for another one
+SHARP = 20  # samples of an onset's interval, up to which the step is loud
 IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
 
 
@@ -148,7 +149,27 @@ class _Search:
             pairs = [self._fit(p.faults, nothing, [p.x, *valleys(self.window, p.faults, self.growth)]) for p in pairs]
             found, everything = self._settled(found, [*singles, *pairs])
         best = self._best(everything)
-        return self._weighed([self._own(f, best) for f in everything], found)
+        everything = [self._own(f, best) for f in everything]
+        if found.high - found.low <= SHARP and not found.growth.over:
+            found, everything = self._sharpened(found, everything)
+        return self._weighed(everything, found)
+
+    def _sharpened(self, found: Since, fitted: Sequence[Fitted]) -> tuple[Since, list[Fitted]]:
+        """Move the onset of a loud step sample by sample: its sizes do not follow linearly from one to the next."""
+        best = self._best(fitted)
+        for step in (4, 2, 1):
+            for way in (-step, step):
+                while 0 <= best.growth.since + way <= self.latest:
+                    moved = self._free(self._again(best, Growth(best.growth.since + way)))
+                    if best.J - WORTH_A_LOOK * self.louder < moved.J:
+                        break
+                    best = moved
+        growth = best.growth
+        if growth == found.growth:
+            return found, list(fitted)
+        onset = Since(growth, min(found.low, growth.since), max(found.high, growth.since))
+        everything = self._freed([self._again(f, growth) for f in fitted])
+        return onset, [best if f.names == best.names else f for f in everything]
 
     def _settled(self, found: Since, fitted: Sequence[Fitted]) -> tuple[Since, list[Fitted]]:
         """Find the onset and the sizes of the best hypothesis in turns if it is a pair, then let the others follow."""
