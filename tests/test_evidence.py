@@ -49,7 +49,7 @@ def test_what_is_not_on_the_list() -> None:
     assert delayed["first"] == "unknown"
     assert delayed["mimics"] == pytest.approx({"delay": 0.01}, rel=0.01)
     sensor = told(learned(0), unknown.changed("sensor", "multisine", 0, 1), (), mimics=True)
-    assert sensor["first"] == "pump" and sensor["named"]
+    assert sensor["first"] == "pump"  # or a gain error, which takes its share
     assert sensor["mimics"]["sensor_gain"] == pytest.approx(1.05, abs=0.001)
 
 

@@ -144,7 +144,7 @@ def test_a_fault_is_found_and_sized_at_every_point(
 def test_a_change_that_two_points_explain_is_told_with_both(points: ss.Baseline) -> None:
     said = ss.diagnose(points, record(70, 1.5))
     (warning,) = [w for w in said.warnings if w.kind == "point"]
-    assert said.point == "warm" and "Fault at cold: leakage. C_ie is 1.499" in warning.message
+    assert said.point == "warm" and "Fault at cold: leakage. C_ie is 1.49" in warning.message
 
 
 def test_a_monitor_follows_one_point(points: ss.Baseline) -> None:

@@ -149,7 +149,7 @@ def test_the_sweep_is_what_whole_passes_give(window: Window, names: tuple[str, .
     table = _Table(window, found, 1.0)
     Q, _ = np.linalg.qr(window.jacobian(np.concatenate([found.d, found.x]), names, found.growth, slice(4)))
     for onsets, overs in (([1500, 1990, 2000, 2500], [0] * 4), ([1500, 1900], [300, 40])):
-        got = table.costs(np.array(onsets), np.array(overs))
+        got, _ = table.costs(np.array(onsets), np.array(overs))
         for cost, onset, over in zip(got, onsets, overs, strict=True):
             assert cost == pytest.approx(brute(window, names, found.x, found.d, Growth(onset, over), Q), rel=1e-3)
 

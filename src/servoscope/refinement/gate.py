@@ -7,13 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoscope.baseline import Baseline, Exact
-from servoscope.noise import Noise
+from servoscope.noise import DOUBT, Noise
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import goodness, traces
 from servoscope.refinement.window import Growth, Window
 
 MOST = 60_000  # samples of a recording that are looked at
 SPLIT = 20.0  # times more or less noise on u, relative to that on y, than the recursion's residual shows
+BISECTIONS = 6
 SILENT = 1e-6  # of the noise; what is quieter was simulated without any
 
 
@@ -21,7 +22,7 @@ def learn_exact(baseline: Baseline, recordings: Sequence[Recording]) -> Exact | 
     """Return the noise that makes the innovations of healthy recordings likeliest, and what they leave unexplained.
 
     None where the predictor cannot be written down: the noise is unknown, the plant is not linear, the input is not
-    held. The split between n_u and n_y, which the filters of the recursion hide, shows in the innovations.
+    held. n_u is the loudest that the innovations allow: their likelihood has fallen by exp(-`DOUBT`) there.
     """
     from scipy.optimize import minimize_scalar
 
@@ -51,6 +52,11 @@ def learn_exact(baseline: Baseline, recordings: Sequence[Recording]) -> Exact | 
         return None
     reach = float(np.log(SPLIT))
     split = float(minimize_scalar(cost, bounds=(-reach, reach), method="bounded", options={"xatol": 0.02}).x)
+    # a minute hardly tells how loud n_u is: too much of it costs little, too little makes slow errors look certain
+    likely, high = cost(split), reach
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (split + high)
+        split, high = (middle, high) if cost(middle) < likely + 2.0 * DOUBT else (split, middle)
     std = noise.y_std * float(np.sqrt(parts(split)[0] / samples))
     found = Noise(u_std=std * usual * float(np.exp(split)), y_std=std)
     return Exact(noise=found, misfit=max(_misfit(window) for window in windows(found.u_std, found.y_std)))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -192,6 +192,14 @@ class Evidence:
 
     log: float
     intervals: tuple[tuple[float, float], ...]
+
+    def wider(self, fitted: Fitted, spread: Mapping[str, float]) -> Evidence:
+        """Return the same with intervals that hold what is not known of the onset, `spread` by parameter, too."""
+        intervals = []
+        for name, x, (low, high) in zip(fitted.names, fitted.x, self.intervals, strict=True):
+            more = 1.96 * spread.get(name, 0.0)
+            intervals.append((float(x - np.hypot(x - low, more)), float(x + np.hypot(high - x, more))))
+        return replace(self, intervals=tuple(intervals))
 
 
 def evidence(window: Window, found: Fitted, scales: Sequence[Scale], louder: float) -> Evidence:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -167,7 +167,7 @@ class _Search:
         growth = best.growth
         if growth == found.growth:
             return found, list(fitted)
-        onset = Since(growth, min(found.low, growth.since), max(found.high, growth.since))
+        onset = replace(found, growth=growth, low=min(found.low, growth.since), high=max(found.high, growth.since))
         everything = self._freed([self._again(f, growth) for f in fitted])
         return onset, [best if f.names == best.names else f for f in everything]
 
@@ -295,6 +295,7 @@ class _Search:
         logs = np.append(logs, np.logaddexp.reduce([nothing, *rivals]))
         probability = np.exp(logs - logs.max())
         probability /= probability.sum()
+        told = [e.wider(f, found.spread) for e, f in zip(told, fitted, strict=True)]
         # by their logarithms: under a change that is unknown all probabilities may vanish
         order = np.argsort(-logs[:-1], kind="stable")
         hypotheses = tuple(Hypothesis(fitted[i], told[i], float(probability[i])) for i in order)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,21 +37,28 @@ class Since:
         The most likely one.
     low, high
         95 % interval of the first changed sample, whatever the duration.
+    spread
+        Standard deviations of the sizes' logarithms that come from not knowing when, by parameter.
     """
 
     growth: Growth
     low: int
     high: int
+    spread: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """Changes that were tried: onsets and durations [samples], their cost and their share of the prior, (M,)."""
+    """Changes that were tried: onsets and durations [samples], their cost and their share of the prior, (M,).
+
+    `moved` (M, k) is how far each takes the sizes.
+    """
 
     onsets: IntArray
     overs: IntArray
     cost: FloatArray
     prior: FloatArray
+    moved: FloatArray
 
 
 def since(window: Window, found: Fitted, latest: int, louder: float, drifts: bool = True) -> Since:
@@ -75,7 +83,7 @@ def since(window: Window, found: Fitted, latest: int, louder: float, drifts: boo
     drifting = _drifts(table, latest, louder) if drifts else None
     if drifting is not None:
         tried.append(drifting)
-    onsets, overs, cost, prior = (np.concatenate([getattr(t, name) for t in tried]) for name in vars(tried[0]))
+    onsets, overs, cost, prior, moved = (np.concatenate([getattr(t, name) for t in tried]) for name in vars(tried[0]))
     likelihood = np.exp(-0.5 * (cost - cost.min()) / louder)
     order = np.argsort(onsets, kind="stable")
     share = np.cumsum((likelihood * prior)[order])
@@ -83,23 +91,30 @@ def since(window: Window, found: Fitted, latest: int, louder: float, drifts: boo
     # at rest no onset is better than another: what is nearly as likely as the best belongs to it, its edge too
     alike = onsets[cost <= cost.min() + ALIKE * louder]
     low, high = min(low, int(alike.min())), max(high, int(alike.max()))
-    best = int(np.argmax(likelihood * np.where(overs == 0, 1.0, NEGLIGIBLE**0.1)))
-    return Since(Growth(int(onsets[best]), int(overs[best])), low, high)
+    # the best of so many drifts beats the best step easily: all of them together are compared
+    steps = overs == 0
+    weight = likelihood * prior
+    kind = steps if weight[steps].sum() >= weight[~steps].sum() else ~steps
+    best = int(np.argmax(np.where(kind, likelihood, 0.0)))
+    spread = np.sqrt(np.average((moved - moved[best]) ** 2, axis=0, weights=weight))
+    return Since(
+        Growth(int(onsets[best]), int(overs[best])), low, high, dict(zip(found.names, spread.tolist(), strict=True))
+    )
 
 
 def _steps(table: _Table, latest: int, louder: float) -> _Tried:
     """Try steps everywhere, and at every sample where they are likely."""
     apart = max(1, latest // STEPS)
     onsets = np.arange(0, latest + 1, apart)
-    cost = table.costs(onsets, np.zeros_like(onsets))
+    cost, moved = table.costs(onsets, np.zeros_like(onsets))
     if apart > 1:
         best = int(np.argmin(cost))  # between two tries it may fall as deep as it rises beside the best one
         beside = float(cost[max(best - 1, 0) : best + 2].max() - cost[best])
         near = onsets[cost <= cost[best] + max(_unlikely(louder), beside)]
         onsets = np.unique((near[:, None] + np.arange(1 - apart, apart)).ravel())
         onsets = onsets[(onsets >= 0) & (onsets <= latest)]
-        cost = table.costs(onsets, np.zeros_like(onsets))
-    return _Tried(onsets, np.zeros_like(onsets), cost, np.full(len(onsets), STEPLIKE))
+        cost, moved = table.costs(onsets, np.zeros_like(onsets))
+    return _Tried(onsets, np.zeros_like(onsets), cost, np.full(len(onsets), STEPLIKE), moved)
 
 
 def _drifts(table: _Table, latest: int, louder: float) -> _Tried | None:
@@ -120,10 +135,10 @@ def _drifts(table: _Table, latest: int, louder: float) -> _Tried | None:
         points, onsets, overs = points[inside], onsets[inside], overs[inside]
         if not len(points):
             return None
-        cost = table.costs(onsets, overs)
+        cost, moved = table.costs(onsets, overs)
         width = np.maximum(points[:, 1] * share, 1.0) * np.log(ratio)
         prior = (1.0 - STEPLIKE) * width / np.log(longest / shortest)
-        tried = _Tried(onsets, overs, cost, prior)
+        tried = _Tried(onsets, overs, cost, prior, moved)
         worth = cost <= cost.min() + _unlikely(louder)
         if look == LOOKS - 1 or worth.sum() > 40 or points[worth, 1].max() * share <= 1.0:
             break
@@ -180,8 +195,11 @@ class _Table:
         slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
         self.settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), window.samples)
 
-    def costs(self, onsets: IntArray, overs: IntArray) -> FloatArray:
-        """Return the smallest cost of each change, shape (M,): all steps or all drifts."""
+    def costs(self, onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the smallest cost of each change, (M,), and by how much it moves the sizes, (M, k).
+
+        All changes are steps, or all are drifts.
+        """
         from servoscope.refinement.kernels import sweep
 
         window = self.window
@@ -196,4 +214,4 @@ class _Table:
         ridge = 1e-9 * np.einsum("ikk->ik", H) + 1e-12
         step = np.linalg.solve(H + ridge[:, :, None] * np.eye(V - 1), g[..., None])[..., 0]
         gained = (in_e**2).sum(axis=1) + (step * g).sum(axis=1)
-        return np.asarray(sums[:, 0, 0] + self.outside - gained + self.louder * volume)
+        return np.asarray(sums[:, 0, 0] + self.outside - gained + self.louder * volume), np.asarray(-step)
