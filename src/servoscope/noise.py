@@ -63,6 +63,18 @@ class Coloured:
             )
         return self.variance * psi
 
+    def chain(self) -> tuple[FloatArray, FloatArray]:
+        """Return v as the output of a chain of delays: its weights a_i and E[v(k) x_i(k+1)], both (max(p, q),).
+
+        v = x_0 + e, x_i(k+1) = a_i v + x_(i+1) + b_i e; coefficients that are zero but for rounding are left out.
+        """
+        moving = np.trim_zeros(np.where(np.abs(self.b) > 1e-12, self.b, 0.0), "b")
+        order, p, q = max(len(self.a), len(moving)), len(self.a), len(moving)
+        a, b = np.pad(self.a, (0, order - p)), np.pad(moving, (0, order - q))
+        gamma, c = np.pad(self.gamma, (0, order - p)), np.pad(self.c[:q], (0, order - q))
+        heads = [float(a[i:] @ gamma[: order - i] + b[i:] @ c[: order - i]) for i in range(order)]
+        return a, np.array(heads)
+
     def times(self, factor: float) -> Coloured:
         """Return the same colour with `factor` times the power."""
         return replace(self, gamma=factor * self.gamma, variance=factor * self.variance)
