@@ -33,10 +33,22 @@ class Truth:
     def __or__(self, other: Truth) -> Truth:
         return Truth(self.builder, self.builder.or_(self.value, other.value))
 
+    @property
+    def everywhere(self) -> Any:
+        """Whether it holds in all lanes, as one value."""
+        from llvmlite import ir
+
+        kind = self.value.type
+        if not hasattr(kind, "count"):
+            return self.value
+        full, module = f"llvm.vector.reduce.and.v{kind.count}i1", self.builder.module
+        signature = ir.FunctionType(ir.IntType(1), [kind])
+        return self.builder.call(module.globals.get(full) or ir.Function(module, signature, full), [self.value])
+
 
 @dataclass(frozen=True, eq=False)
 class Number:
-    """A number that code computes: builder of the code, and its value."""
+    """A number that code computes, or one number per lane: builder of the code, and its value."""
 
     builder: Any
     value: Any
@@ -46,11 +58,13 @@ class Number:
         from llvmlite import ir
 
         kind = self.value.type
+        element = getattr(kind, "element", kind)
         if not isinstance(other, Number):
-            return ir.Constant(kind, float(other))
+            one = ir.Constant(element, float(other))
+            return one if element is kind else ir.Constant(kind, [one] * kind.count)
         if other.value.type == kind:
             return other.value
-        wider = isinstance(kind, ir.DoubleType)
+        wider = isinstance(element, ir.DoubleType)
         return (self.builder.fpext if wider else self.builder.fptrunc)(other.value, kind)
 
     def _made(self, value: Any) -> Number:
@@ -101,8 +115,11 @@ class Number:
         from llvmlite import ir
 
         kind = self.value.type
+        width = f"v{kind.count}" if hasattr(kind, "count") else ""
         signature = ir.FunctionType(kind, [kind] * len(numbers))
-        function = self.builder.module.declare_intrinsic(f"llvm.{name}", [kind], signature)
+        full = f"llvm.{name}.{width}{getattr(kind, 'element', kind).intrinsic_name}"
+        module = self.builder.module
+        function = module.globals.get(full) or ir.Function(module, signature, full)
         return self.builder.call(function, [self.like(x) for x in numbers], fastmath=flags)
 
 
@@ -128,41 +145,75 @@ class Index:
 
 
 class Rows:
-    """One lane of an array (rows, lanes): a row is read once, and what was written is stored by `flush`.
+    """One lane, or several neighbours, of an array (rows, lanes), where `shared` all alike: a row is read once, and what was written is stored by `flush`.
 
     Rows whose number is itself computed are read and stored at once; they must not be among the others.
     """
 
-    def __init__(self, context: Any, builder: Any, kind: Any, array: Any, lane: Any) -> None:
+    def __init__(
+        self, context: Any, builder: Any, kind: Any, array: Any, lane: Any, width: int, shared: bool
+    ) -> None:
         self._context, self._builder, self._kind, self._array, self._lane = context, builder, kind, array, lane
+        self._width, self._shared = width, shared
         self._known: dict[int, Number] = {}
         self._written: set[int] = set()
 
     def _place(self, row: int | Index) -> Any:
+        from llvmlite import ir
         from numba.core import cgutils, types
 
         number = row.value if isinstance(row, Index) else self._context.get_constant(types.intp, row)
-        return cgutils.get_item_pointer(self._context, self._builder, self._kind, self._array, (number, self._lane))
+        place = cgutils.get_item_pointer(self._context, self._builder, self._kind, self._array, (number, self._lane))
+        if self._width == 1 or self._shared:
+            return place
+        element = self._context.get_data_type(self._kind.dtype)
+        return self._builder.bitcast(place, ir.VectorType(element, self._width).as_pointer())
+
+    def _load(self, row: int | Index) -> Number:
+        width = self._context.get_abi_sizeof(self._context.get_data_type(self._kind.dtype))
+        one = self._builder.load(self._place(row), align=width)
+        if self._width > 1 and self._shared:
+            one = lanes_of(self._builder, one, self._width)
+        return Number(self._builder, one)
+
+    def _store(self, number: Number, row: int | Index) -> None:
+        width = self._context.get_abi_sizeof(self._context.get_data_type(self._kind.dtype))
+        self._builder.store(number.value, self._place(row), align=width)
 
     def __getitem__(self, row: int | Index) -> Number:
         if isinstance(row, Index):
-            return Number(self._builder, self._builder.load(self._place(row)))
+            return self._load(row)
         if row not in self._known:
-            self._known[row] = Number(self._builder, self._builder.load(self._place(row)))
+            self._known[row] = self._load(row)
         return self._known[row]
 
     def __setitem__(self, row: int | Index, number: Any) -> None:
-        zero = Number(self._builder, self._context.get_constant(self._kind.dtype, 0.0))
+        from llvmlite import ir
+
+        element = self._context.get_data_type(self._kind.dtype)
+        kind = element if self._width == 1 else ir.VectorType(element, self._width)
+        as_stored = Number(self._builder, Number(self._builder, ir.Constant(kind, ir.Undefined)).like(number))
         if isinstance(row, Index):
-            self._builder.store(zero.like(number), self._place(row))
+            self._store(as_stored, row)
             return
-        self._known[row] = Number(self._builder, zero.like(number))
+        self._known[row] = as_stored
         self._written.add(row)
 
     def flush(self) -> None:
         """Store what was written."""
         for row in sorted(self._written):
-            self._builder.store(self._known[row].value, self._place(row))
+            self._store(self._known[row], row)
+
+
+def lanes_of(builder: Any, one: Any, width: int) -> Any:
+    """Return a value as a vector of so many."""
+    from llvmlite import ir
+
+    if width == 1:
+        return one
+    several, index = ir.Constant(ir.VectorType(one.type, width), ir.Undefined), ir.IntType(32)
+    alone = builder.insert_element(several, one, index(0))
+    return builder.shuffle_vector(alone, several, ir.Constant(ir.VectorType(index, width), [index(0)] * width))
 
 
 def _symbol(*numbers: Any) -> Number | None:
@@ -174,7 +225,7 @@ def fma(a: Any, b: Any, c: Any) -> Any:
     symbol = _symbol(a, b, c)
     if symbol is None:
         return a * b + c
-    return Number(symbol.builder, symbol.builder.fma(*(symbol.like(x) for x in (a, b, c))))
+    return Number(symbol.builder, symbol.call("fma", a, b, c))
 
 
 def larger(a: Any, b: Any) -> Any:
@@ -200,7 +251,11 @@ def where(condition: Any, a: Any, b: Any) -> Any:
         return a if condition else b
     from llvmlite import ir
 
-    symbol = _symbol(a, b) or Number(condition.builder, ir.Constant(ir.DoubleType(), 0.0))
+    symbol = _symbol(a, b)
+    if symbol is None:
+        lanes, double = getattr(condition.value.type, "count", 0), ir.DoubleType()
+        kind = ir.VectorType(double, lanes) if lanes else double
+        symbol = Number(condition.builder, ir.Constant(kind, ir.Undefined))
     return Number(symbol.builder, symbol.builder.select(condition.value, symbol.like(a), symbol.like(b)))
 
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from servoscope import straight
-from servoscope.arithmetic import dot, fma, larger, lower, root, smaller, where
+from servoscope.arithmetic import Truth, dot, fma, larger, lower, root, smaller, where
 from servoscope.cusum import CLIP, LAGS, grown, whitened
 from servoscope.propagation import remember, spread
 
@@ -23,6 +23,8 @@ ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, STILL, USED_UP, CROSSED = range(8)
 HEAD = 8
 # what is said of a sample
 MISSING, HELD, USED, BETWEEN = -1.0, 0.0, 1.0, 2.0
+ABSURD = 1e100  # no physical signal; its square would overflow and stay in the state for ever
+TILE = 8  # samples that are fetched together: a cache line of each signal
 TINY = 1e-30  # no variance is smaller; a number of single precision, too
 WHITE, LARGEST, COUNTS = range(3)  # of the sequential test: whitened residual, largest CUSUM, whether it counts
 
@@ -38,37 +40,49 @@ class Chain:
         self.size, self.to, self.at = plan.sizes, SimpleNamespace(**dict(plan.to)), SimpleNamespace(**dict(plan.at))
         self._bank, self._shadow, self._steady = plan.bank, plan.shadow, steady
 
-    def begin(self, c: Any, s: Any, h: Any, r: Any, u: Any, y: Any) -> None:
+    def tick(self, s: Any, h: Any, tile: Any, i: Any, first: Any) -> Truth:
+        """Count a sample, and begin a new evaluation with the first of it; return whether there is nothing odd about it."""
+        h[SAMPLE] = h[SAMPLE] + 1.0
+        if self.size.shadow:
+            h[CROSSED] = where(first & (s[self.to.level] < 1.0), 0.0, h[CROSSED])
+            s[self.to.peak] = where(first, s[self.to.level], s[self.to.peak])
+        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
+        whole = (abs(r) < ABSURD) & (abs(u) < ABSURD) & (abs(y) < ABSURD)
+        return whole & (tile[i + 3 * TILE] <= 0.0) & (h[ARMED] > 0.0)
+
+    def begin(self, c: Any, s: Any, h: Any, tile: Any, i: Any) -> None:
         """Put the filters into their steady state at one sample, after a gap."""
+        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
         h[ARMED] = 1.0
         h[WAIT] = c[self.at.wait]
         speed = None
         if self.size.speed:
             source = r if self.size.speed == 2 else y
-            for i in range(2):
-                s[self.to.velocity + i] = c[self.at.velocity + 9 + i] * source
+            for j in range(2):
+                s[self.to.velocity + j] = c[self.at.velocity + 9 + j] * source
             speed = self._speed(c, s, source)
         w = self._inputs(c, r, u, y, speed)
-        for i in range(self.size.states):
-            s[self.to.x + i] = dot([c[self.at.steady + i * len(w) + j] for j in range(len(w))], w)
-        for i in range(self.size.shadow):
-            s[self.to.shadow + i] = c[self.at.shadow_steady + i] * r
+        for k in range(self.size.states):
+            s[self.to.x + k] = dot([c[self.at.steady + k * len(w) + j] for j in range(len(w))], w)
+        for k in range(self.size.shadow):
+            s[self.to.shadow + k] = c[self.at.shadow_steady + k] * r
 
     def advance(
-        self, c: Any, s: Any, h: Any, said: Any, v: Any, shadow: Any, r: Any, u: Any, y: Any, turn: Any
-    ) -> None:
+        self, c: Any, s: Any, h: Any, said: Any, v: Any, shadow: Any, tile: Any, i: Any, turn: Any
+    ) -> Truth:
         """Pass one whole sample through the filters.
 
         It is said to be `USED` when it may update the estimator, `HELD` when the filters settle, the axis rests or u is
-        dead, `BETWEEN` when it is not the turn of the estimator.
+        dead, `BETWEEN` when it is not the turn of the estimator. Returns whether it is `USED`.
         """
+        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
         speed, hold = None, None
         if self.size.speed:
             source = r if self.size.speed == 2 else y
             speed = self._speed(c, s, source)
             k, x = self.at.velocity, [s[self.to.velocity], s[self.to.velocity + 1]]
-            for i in range(2):
-                s[self.to.velocity + i] = dot([c[k + 2 * i], c[k + 2 * i + 1], c[k + 4 + i]], [*x, source])
+            for j in range(2):
+                s[self.to.velocity + j] = dot([c[k + 2 * j], c[k + 2 * j + 1], c[k + 4 + j]], [*x, source])
         w = self._inputs(c, r, u, y, speed)
         if self.size.speed:
             # a reversal is short; an axis that has stood longer than the filters remember is at rest
@@ -79,16 +93,21 @@ class Chain:
             if self.size.gated:
                 dead = (w[1] >= c[self.at.dead_low]) & (w[1] <= c[self.at.dead_high])
                 hold = hold | (abs(speed) <= c[self.at.rest_speed]) | dead
-        for i, number in enumerate(straight.advance(self._bank, c, self.at.bank, s, self.to.x, w)):
-            v[i] = number
-        for i, number in enumerate(straight.advance(self._shadow, c, self.at.shadow, s, self.to.shadow, w)):
-            shadow[i] = number
+        for k, number in enumerate(straight.advance(self._bank, c, self.at.bank, s, self.to.x, w)):
+            v[k] = number
+        for k, number in enumerate(straight.advance(self._shadow, c, self.at.shadow, s, self.to.shadow, w)):
+            shadow[k] = number
         waiting = h[WAIT]
         settling = waiting > 0.0
         # what enters the filters while it rests has nothing to do with the motion: wait until they have forgotten it
         h[WAIT] = larger(waiting - 1.0, 0.0) if hold is None else where(hold, c[self.at.wait], larger(waiting - 1.0, 0.0))
         held = settling if hold is None else hold | settling
         said[0] = where(held, HELD, where(turn, USED, BETWEEN))
+        return self.used(said)
+
+    def used(self, said: Any) -> Truth:
+        """Return whether the sample updates the estimator."""
+        return (said[0] >= USED) & (said[0] <= USED)
 
     def learn(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any) -> None:
         """Take one sample into the estimate, with an estimator whose P stays at P_d, and into all that goes with it."""
@@ -102,9 +121,10 @@ class Chain:
         s[self.to.power] = self._mean(c, s, left)
         self._carry(c, s, h, v, shadow, e, phi, K)
 
-    def follow(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, k: Any, refused: Any) -> None:
-        """Do as `learn` behind an estimator that has updated theta and P itself; k holds its gain and residual."""
+    def follow(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, k: Any) -> None:
+        """Do as `learn` behind an estimator that has updated theta and P; k holds its gain, residual and status."""
         n = self.size.n
+        refused = k[n + 1]
         h[UPDATES] = h[UPDATES] + (1.0 - refused)
         h[SKIPPED] = h[SKIPPED] + refused
         s[self.to.power] = where(refused > 0.0, s[self.to.power], self._mean(c, s, k[n]))
@@ -121,15 +141,27 @@ class Chain:
             for i in range(count):
                 s[begin + i] = 0.0
 
-    def listen(self, c: Any, s: Any, g: Any, e: Any, j: Any, count: Any) -> None:
-        """Add the whitened residual to CUSUM j, whose weights and limit stand `count` rows apart."""
-        columns = self.size.n + LAGS
-        tail = j + self.at.tail
-        weights = [c[tail + count * i] for i in range(columns)]
-        new = grown(weights, [s[self.to.psi + i] for i in range(columns)], e[WHITE], g[j], c[tail + count * columns])
+    def prick(self, c: Any, h: Any, said: Any, e: Any) -> None:
+        """Get ready to listen: the CUSUMs count once the whitening filter has forgotten where it began."""
+        e[LARGEST] = 0.0
+        e[COUNTS] = where(self.used(said) & (h[USED_UP] > c[self.at.warm]), 1.0, 0.0)
+
+    def listen(self, c: Any, s: Any, g: Any, e: Any, j: Any) -> None:
+        """Add the whitened residual to CUSUM j."""
+        columns, count = self.size.n + LAGS, self.size.watched
+        weights = [c[j + (self.at.tail + count * i)] for i in range(columns)]
+        limit, inverse = (c[j + (self.at.tail + count * (columns + i))] for i in range(2))
+        new = grown(weights, [s[self.to.psi + i] for i in range(columns)], e[WHITE], g[j], limit)
         new = where(e[COUNTS] > 0.0, new, g[j])
         g[j] = new
-        e[LARGEST] = larger(e[LARGEST], new * c[tail + count * (columns + 1)])
+        e[LARGEST] = larger(e[LARGEST], new * inverse)
+
+    def alarm(self, s: Any, h: Any, said: Any, e: Any) -> None:
+        """Note how high the largest CUSUM is, and when one passes its limit."""
+        used, level = self.used(said), e[LARGEST]
+        s[self.to.peak] = where(used, larger(s[self.to.peak], level), s[self.to.peak])
+        s[self.to.level] = where(used, level, s[self.to.level])
+        h[CROSSED] = where(used & (level >= 1.0) & (h[CROSSED] <= 0.0), h[SAMPLE], h[CROSSED])
 
     def evaluate(self, c: Any, s: Any, h: Any, q: Any) -> None:
         """Write one complete evaluation but for the frequency response, in physical units.

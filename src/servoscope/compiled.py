@@ -14,7 +14,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-from servoscope.arithmetic import Index, Number, Rows, Truth
+from servoscope.arithmetic import Index, Rows, Truth, lanes_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -84,11 +84,12 @@ def filled(template: Callable[..., Any], names: Mapping[str, object], what: str 
     return function
 
 
-def traced(function: Callable[..., None]) -> Callable[..., None]:
+def traced(function: Callable[..., Truth | None], width: int = 1, shared: bool = False) -> Callable[..., bool]:
     """Return what kernels call as ``part(lane, ...)`` for a function of `servoscope.arithmetic`.
 
-    Arrays (rows, lanes) arrive as one lane of them, floats as numbers, integers as rows, booleans as conditions. The function runs
-    once, with symbols, and leaves straight-line code.
+    Arrays (rows, lanes) arrive as `width` lanes of them from `lane` on, integers as numbers of rows, booleans as
+    conditions; `shared` says that the lanes of the first array are all one. The function runs once, with symbols, and
+    leaves straight-line code of vectors. What it returns holds in all lanes, or does not.
     """
 
     def part(typing: Any, lane: Any, *kinds: Any) -> Any:
@@ -97,22 +98,22 @@ def traced(function: Callable[..., None]) -> Callable[..., None]:
             for kind, value in zip(signature.args[1], cgutils.unpack_tuple(builder, values[1]), strict=True):
                 if isinstance(kind, types.Array):
                     array = make_array(kind)(context, builder, value)
-                    given.append(Rows(context, builder, kind, array, values[0]))
+                    alike = shared and not given
+                    given.append(Rows(context, builder, kind, array, values[0], width, alike))
                 elif isinstance(kind, types.Boolean):
-                    given.append(Truth(builder, builder.trunc(value, ir.IntType(1))))
-                elif isinstance(kind, types.Integer):
-                    given.append(Index(builder, value))
+                    given.append(Truth(builder, lanes_of(builder, builder.trunc(value, ir.IntType(1)), width)))
                 else:
-                    given.append(Number(builder, value))
-            function(*given)
+                    given.append(Index(builder, value))
+            said = function(*given)
             for each in given:
                 if isinstance(each, Rows):
                     each.flush()
-            return context.get_dummy_value()
+            holds = ir.IntType(1)(1) if said is None else said.everywhere
+            return holds
 
-        return types.none(lane, types.StarArgTuple(kinds)), emit
+        return types.boolean(lane, types.StarArgTuple(kinds)), emit
 
-    made: Callable[..., None] = intrinsic(part)
+    made: Callable[..., bool] = intrinsic(part)
     return made
 
 

@@ -19,10 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope import drive, estimators
-from servoscope.chain import HEAD, SAMPLE, Chain
+from servoscope.chain import HEAD, SAMPLE, TILE, Chain
 from servoscope.compiled import filled, inlined, kernel, traced
 from servoscope.cusum import LAGS, Watch
-from servoscope.drive import TILE
 from servoscope.linear import Linear
 from servoscope.plants import FloatArray
 from servoscope.straight import Pattern, coefficients, pattern
@@ -31,7 +30,10 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 LANES = {"float64": 16, "float32": 32}  # assets side by side: state and constants stay in the first-level cache
-STEPS = ("begin", "advance", "learn", "follow", "forget", "listen", "evaluate", "respond", "tell")
+WIDTH = {"float64": 8, "float32": 16}  # numbers in a vector
+WATCHED = 8  # CUSUMs are counted in such steps, so that few codes serve many baselines
+STEPS = ("tick", "advance", "used", "learn", "prick", "listen", "alarm", "evaluate", "respond", "tell")
+ALONE = ("begin", "advance", "learn", "follow", "forget")  # where neighbours may do something else
 NOTHING = 1e-12  # of the first coefficient of a filter
 WORTH = 200_000  # samples from which a second core pays
 
@@ -103,6 +105,7 @@ class Sizes(NamedTuple):
     lags: int
     shadow: int
     memory: int
+    watched: int
     steady: bool
     extra: int
     frequencies: int
@@ -157,21 +160,20 @@ class Recursion:
         first = self.constants[0]
         self._plan = _plan(self.constants)
         self.sizes = self._plan.sizes
-        self._watched = max(len(c.watch.limits) if c.watch else 0 for c in self.constants)
         self._type = np.dtype(np.float32 if single else np.float64)
         to = dict(self._plan.to)
         names = list(to)
         spans = {a: slice(HEAD + to[a], HEAD + to[b]) for a, b in zip(names, names[1:], strict=False)}
         lowest = HEAD + to["end"]
-        self.size = lowest + self._watched + first.extra
-        self.slices = {**spans, "cusum": slice(lowest, lowest + self._watched), "extra": slice(lowest + self._watched, self.size)}
+        self.size = lowest + self.sizes.watched + first.extra
+        self.slices = {**spans, "cusum": slice(lowest, lowest + self.sizes.watched), "extra": slice(lowest + self.sizes.watched, self.size)}
         self._own = len({id(c) for c in self.constants}) > 1
-        table = np.array([_packed(c, self._plan, self._watched) for c in (self.constants if self._own else (first,))])
+        table = np.array([_packed(c, self._plan) for c in (self.constants if self._own else (first,))])
         self._table = table
         self._lanes = 1 if len(self.constants) == 1 and not single or first.extra else LANES[self._type.name]
         self._blocks = -(-len(self.constants) // self._lanes)
         self._laid = self._layer()
-        self._code = machine(self._plan, self._lanes, int(self._own))
+        self._code = machine(self._plan, self._lanes, min(self._lanes, WIDTH[self._type.name]), int(self._own))
 
     def _layer(self) -> npt.NDArray[Any]:
         """Return the constants as the compiled blocks take them, (blocks, rows times lanes)."""
@@ -212,11 +214,10 @@ class Recursion:
         new = np.empty_like(state)
         out = np.empty((len(state), len(self.rows(state, r.shape[1])), self.sizes.row), dtype=self._type)
         flags = np.zeros((0, 0), dtype=np.bool_) if restart is None else restart
-        signals = state, new, r, u, y, flags, c.every, c.stride, self._watched
+        signals = state, new, r, u, y, flags, c.every, c.stride
 
         def part(begin: int, end: int) -> None:
-            scratch = np.empty(max(self._watched, 1) * self._lanes, dtype=self._type)
-            self._code.block(self._laid, *signals, scratch, out, begin, end)
+            self._code.block(self._laid, *signals, out, begin, end)
 
         workers = min(_cores(), self._blocks) if r.size >= WORTH else 1
         if workers == 1:
@@ -230,12 +231,12 @@ class Recursion:
     @property
     def stepper(self) -> tuple[Callable[[FloatArray, FloatArray, float, float, float], bool], FloatArray]:
         """What takes one sample of the first asset, and its first argument; the second is the state (size,)."""
-        return machine(self._plan, 1, 1).step, np.ascontiguousarray(self._table[0])
+        return machine(self._plan, 1, 1, 1).step, np.ascontiguousarray(self._table[0])
 
     def look(self, state: FloatArray) -> FloatArray:
         """Return the evaluations of states as they are, shape (assets, row)."""
         out = np.empty((len(state), self.sizes.row))
-        machine(self._plan, 1, int(self._own)).look(self._table, np.ascontiguousarray(state), out)
+        machine(self._plan, 1, 1, int(self._own)).look(self._table, np.ascontiguousarray(state), out)
         return out
 
     def regressors(
@@ -244,7 +245,7 @@ class Recursion:
         """Return [eta, phi, z] of every sample of the first asset (N, rows), and what it is good for (N,)."""
         out = np.zeros((len(r), self.sizes.rows))  # a missing sample writes nothing
         ok = np.empty(len(r), dtype=np.int64)
-        machine(self._plan, 1, 1).regress(self._table[0], self.start()[0], r, u, y, restart, self.constants[0].stride, out, ok)
+        machine(self._plan, 1, 1, 1).regress(self._table[0], self.start()[0], r, u, y, restart, self.constants[0].stride, out, ok)
         return out, ok
 
 
@@ -259,6 +260,7 @@ def _plan(constants: Sequence[Constants]) -> Plan:
     n, rows = len(first.basis), len(first.bank.C)
     nxs = len(shadows[0].A) if shadows else 0
     memory = max((_order(c.watch) for c in watched if c.watch), default=0)
+    heard = max((len(c.watch.limits) for c in watched if c.watch), default=0)
     lags = max(len(c.a) for c in constants)
     speed = 0
     if first.codes or first.only_moving or first.still_speed > 0.0:
@@ -277,7 +279,7 @@ def _plan(constants: Sequence[Constants]) -> Plan:
     names = ("low", "high", "dead_low", "dead_high", "sign_speed", "rest_speed", "still_speed", "wait", "forget")
     at = _places(
         {
-            **dict.fromkeys(("every", "stride", "watched", *names, "memory", "share", "R", "warm"), 1),
+            **dict.fromkeys(("every", "stride", *names, "memory", "share", "R", "warm"), 1),
             **{"velocity": 11, "bank": entries[0], "steady": len(first.bank.A) * first.bank.B.shape[1]},
             **{"P_d": 0 if first.steady else n * n, "noise": 1 + 2 * lags, "shadow": entries[1], "shadow_steady": nxs},
             **{"apart": n, "white": 1 + 2 * memory, "prior": 0 if start else n * n, "origin": 0 if start else n},
@@ -295,6 +297,7 @@ def _plan(constants: Sequence[Constants]) -> Plan:
         lags=lags,
         shadow=nxs,
         memory=memory,
+        watched=-(-heard // WATCHED) * WATCHED,
         steady=first.steady,
         extra=first.extra,
         frequencies=frequencies,
@@ -305,9 +308,9 @@ def _plan(constants: Sequence[Constants]) -> Plan:
     return Plan(first.estimator, sizes, tuple(to.items()), tuple((*at.items(), ("tail", at["end"]))), found, seen)
 
 
-def _packed(c: Constants, plan: Plan, watched: int) -> FloatArray:
+def _packed(c: Constants, plan: Plan) -> FloatArray:
     """Return the constants of one asset as one row."""
-    n, lags, memory, v = plan.sizes.n, plan.sizes.lags, plan.sizes.memory, c.velocity
+    n, lags, memory, watched, v = plan.sizes.n, plan.sizes.lags, plan.sizes.memory, plan.sizes.watched, c.velocity
     test, view = c.watch, c.view
 
     def wide(x: FloatArray, size: int) -> FloatArray:
@@ -334,7 +337,7 @@ def _packed(c: Constants, plan: Plan, watched: int) -> FloatArray:
         E = view.response.reshape(-1, 2, n)
         parts = [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E]
         seen = [view.covariance.ravel(), view.origin, c.basis.ravel(), *parts]
-    counts = [c.every, c.stride, watched]
+    counts = [c.every, c.stride]
     gates = [*c.limits, *c.deadzone, c.sign_speed, c.rest_speed, c.still_speed, c.wait, 1.0 / c.wait]
     return np.concatenate(
         [
@@ -347,22 +350,25 @@ def _packed(c: Constants, plan: Plan, watched: int) -> FloatArray:
 
 
 @functools.cache
-def machine(plan: Plan, lanes: int, own: int) -> SimpleNamespace:
+def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
     """Return `block`, `step`, `look` and `regress` of `servoscope.drive` for a plan; each compiles when it is called."""
     estimator, sizes = estimators.load(plan.estimator), plan.sizes
     steps = Chain(plan, getattr(estimator, "steady", None))
     to, at = dict(plan.to), dict(plan.at)
-    literals = {name: getattr(sizes, name) for name in ("n", "rows", "row", "floats", "frequencies", "extra")}
-    literals |= {"columns": sizes.n + 1, "tile": 4 * TILE, "lanes": lanes, "own": own}
+    literals = {x: getattr(sizes, x) for x in ("n", "rows", "row", "floats", "frequencies", "extra", "watched")}
+    literals |= {"columns": sizes.n + 1, "room": sizes.n + 2, "tile": 4 * TILE}
+    literals |= {"lanes": lanes, "width": width, "own": own}
     names: dict[str, object] = {f"_{name}": number for name, number in literals.items()}
     names |= {"_to": namedtuple("To", to)(**to), "_at": namedtuple("At", at)(**at), "_update": estimator.update}
     for step in STEPS:
-        names[f"_{step}"] = traced(getattr(steps, step))
+        names[f"_{step}"] = traced(getattr(steps, step), width, not own)
+    for step in ALONE:
+        names[f"_{step}_one"] = traced(getattr(steps, step))
     heap = not sizes.steady  # estimators with a P of their own allocate
     for template in drive.PARTS:
         names[f"_{template.__name__}"] = inlined(filled(template, names), heap)
         names["_take"] = names.get("_settled" if sizes.steady else "_refreshed")
-        names["_test"] = names.get("_test" if sizes.shadow else "_untested")
+        names["_take_all"] = names.get("_together" if sizes.steady else "_apart")
         names["_write"] = names.get("_plain" if sizes.start else "_complete")
-    what = repr((plan, lanes, own))
+    what = repr((plan, lanes, width, own))
     return SimpleNamespace(**{driver.__name__: kernel(filled(driver, names, what), heap) for driver in drive.DRIVERS})
