@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -84,22 +85,24 @@ def filled(template: Callable[..., Any], names: Mapping[str, object], what: str 
     return function
 
 
-def traced(function: Callable[..., Truth | None], width: int = 1, shared: bool = False) -> Callable[..., bool]:
+def traced(function: Callable[..., Truth | None], width: int = 1, shared: str = "") -> Callable[..., bool]:
     """Return what kernels call as ``part(lane, ...)`` for a function of `servoscope.arithmetic`.
 
     Arrays (rows, lanes) arrive as `width` lanes of them from `lane` on, integers as numbers of rows, booleans as
-    conditions; `shared` says that the lanes of the first array are all one. The function runs once, with symbols, and
+    conditions; `shared` is the argument whose lanes are all one. The function runs once, with symbols, and
     leaves straight-line code of vectors. What it returns holds in all lanes, or does not.
     """
+
+    arguments = tuple(inspect.signature(function).parameters)
 
     def part(typing: Any, lane: Any, *kinds: Any) -> Any:
         def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             given: list[Any] = []
-            for kind, value in zip(signature.args[1], cgutils.unpack_tuple(builder, values[1]), strict=True):
+            passed = cgutils.unpack_tuple(builder, values[1])
+            for name, kind, value in zip(arguments, signature.args[1], passed, strict=True):
                 if isinstance(kind, types.Array):
                     array = make_array(kind)(context, builder, value)
-                    alike = shared and not given
-                    given.append(Rows(context, builder, kind, array, values[0], width, alike))
+                    given.append(Rows(context, builder, kind, array, values[0], width, name == shared))
                 elif isinstance(kind, types.Boolean):
                     given.append(Truth(builder, lanes_of(builder, builder.trunc(value, ir.IntType(1)), width)))
                 else:

@@ -361,7 +361,7 @@ def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
     names: dict[str, object] = {f"_{name}": number for name, number in literals.items()}
     names |= {"_to": namedtuple("To", to)(**to), "_at": namedtuple("At", at)(**at), "_update": estimator.update}
     for step in STEPS:
-        names[f"_{step}"] = traced(getattr(steps, step), width, not own)
+        names[f"_{step}"] = traced(getattr(steps, step), width, "" if own else "c")
     for step in ALONE:
         names[f"_{step}_one"] = traced(getattr(steps, step))
     heap = not sizes.steady  # estimators with a P of their own allocate
