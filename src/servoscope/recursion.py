@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import os
 from collections import namedtuple
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -39,10 +39,10 @@ WORTH = 200_000  # samples from which a second core pays
 
 
 class View(NamedTuple):
-    """What complete evaluations take, in the coordinates of the recursion; `response` holds Re and Im of E(f).
+    """What complete evaluations take; `response` holds Re and Im of E(f).
 
-    `covariance` is that of the baseline (n, n), `origin` (n,) what theta is in physical units where the recursion's is
-    zero, and `response` has shape (2 F, n).
+    `covariance` is that of the baseline (n, n), `origin` (n,) what is said where theta is the baseline's, both in
+    physical units, and `response` has shape (2 F, n).
     """
 
     covariance: FloatArray
@@ -253,6 +253,13 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def structure(c: Constants) -> Hashable:
+    """Return what assets must have in common to be followed side by side."""
+    plan = _plan([c])
+    sizes = plan.sizes._replace(lags=0, memory=0, watched=0, floats=0)
+    return plan.estimator, sizes, plan.bank, c.stride, c.every, c.memory
+
+
 def _plan(constants: Sequence[Constants]) -> Plan:
     first = constants[0]
     watched = [c for c in constants if c.watch is not None]
@@ -336,7 +343,8 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
     if view is not None:
         E = view.response.reshape(-1, 2, n)
         parts = [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E]
-        seen = [view.covariance.ravel(), view.origin, c.basis.ravel(), *parts]
+        back = np.linalg.inv(c.basis)
+        seen = [(back @ view.covariance @ back.T).ravel(), view.origin, c.basis.ravel(), *parts]
     counts = [c.every, c.stride]
     gates = [*c.limits, *c.deadzone, c.sign_speed, c.rest_speed, c.still_speed, c.wait, 1.0 / c.wait]
     return np.concatenate(
