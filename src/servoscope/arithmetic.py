@@ -150,9 +150,7 @@ class Rows:
     Rows whose number is itself computed are read and stored at once; they must not be among the others.
     """
 
-    def __init__(
-        self, context: Any, builder: Any, kind: Any, array: Any, lane: Any, width: int, shared: bool
-    ) -> None:
+    def __init__(self, context: Any, builder: Any, kind: Any, array: Any, lane: Any, width: int, shared: bool) -> None:
         self._context, self._builder, self._kind, self._array, self._lane = context, builder, kind, array, lane
         self._width, self._shared = width, shared
         self._known: dict[int, Number] = {}

@@ -67,9 +67,7 @@ class Chain:
         for k in range(self.size.shadow):
             s[self.to.shadow + k] = c[self.at.shadow_steady + k] * r
 
-    def advance(
-        self, c: Any, s: Any, h: Any, said: Any, v: Any, shadow: Any, tile: Any, i: Any, turn: Any
-    ) -> Truth:
+    def advance(self, c: Any, s: Any, h: Any, said: Any, v: Any, shadow: Any, tile: Any, i: Any, turn: Any) -> Truth:
         """Pass one whole sample through the filters.
 
         It is said to be `USED` when it may update the estimator, `HELD` when the filters settle, the axis rests or u is
@@ -100,7 +98,9 @@ class Chain:
         waiting = h[WAIT]
         settling = waiting > 0.0
         # what enters the filters while it rests has nothing to do with the motion: wait until they have forgotten it
-        h[WAIT] = larger(waiting - 1.0, 0.0) if hold is None else where(hold, c[self.at.wait], larger(waiting - 1.0, 0.0))
+        h[WAIT] = (
+            larger(waiting - 1.0, 0.0) if hold is None else where(hold, c[self.at.wait], larger(waiting - 1.0, 0.0))
+        )
         held = settling if hold is None else hold | settling
         said[0] = where(held, HELD, where(turn, USED, BETWEEN))
         return self.used(said)
@@ -230,9 +230,7 @@ class Chain:
     def _mean(self, c: Any, s: Any, left: Any) -> Any:
         return fma(fma(left, left, -s[self.to.power]), c[self.at.share], s[self.to.power])
 
-    def _carry(
-        self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, phi: Sequence[Any], K: Sequence[Any]
-    ) -> None:
+    def _carry(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, phi: Sequence[Any], K: Sequence[Any]) -> None:
         spread(c, self.at.noise, s, self.to.S, self.size.lags, phi, K)
         if self.size.start:
             remember(s, self.to.Psi, phi, K)

@@ -92,7 +92,6 @@ def traced(function: Callable[..., Truth | None], width: int = 1, shared: str = 
     conditions; `shared` is the argument whose lanes are all one. The function runs once, with symbols, and
     leaves straight-line code of vectors. What it returns holds in all lanes, or does not.
     """
-
     arguments = tuple(inspect.signature(function).parameters)
 
     def part(typing: Any, lane: Any, *kinds: Any) -> Any:

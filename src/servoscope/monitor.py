@@ -230,7 +230,7 @@ class Monitor:
             rows = rows.copy()
             signals[1] = self._led(rows, *signals, np.zeros(shape, dtype=np.bool_) if flags is None else flags)
         if len(self._groups) == 1 and not self._head:
-            (_, recursion), = self._groups
+            ((_, recursion),) = self._groups
             index = recursion.rows(rows, shape[1])
             new, out = recursion.run(rows, signals[0], signals[1], signals[2], flags)
         else:

@@ -8,6 +8,7 @@ nothing, because everything that is carried from sample to sample stands in that
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 from collections import namedtuple
 from collections.abc import Callable, Hashable, Sequence
@@ -127,7 +128,9 @@ class Plan(NamedTuple):
 
 def _places(sizes: dict[str, int], begin: int = 0) -> dict[str, int]:
     ends = begin + np.cumsum(list(sizes.values()))
-    return {name: int(end) - size for (name, size), end in zip(sizes.items(), ends, strict=True)} | {"end": int(ends[-1])}
+    return {name: int(end) - size for (name, size), end in zip(sizes.items(), ends, strict=True)} | {
+        "end": int(ends[-1])
+    }
 
 
 def _shadow(c: Constants) -> Linear:
@@ -163,14 +166,18 @@ class Recursion:
         self._type = np.dtype(np.float32 if single else np.float64)
         to = dict(self._plan.to)
         names = list(to)
-        spans = {a: slice(HEAD + to[a], HEAD + to[b]) for a, b in zip(names, names[1:], strict=False)}
+        spans = {a: slice(HEAD + to[a], HEAD + to[b]) for a, b in itertools.pairwise(names)}
         lowest = HEAD + to["end"]
         self.size = lowest + self.sizes.watched + first.extra
-        self.slices = {**spans, "cusum": slice(lowest, lowest + self.sizes.watched), "extra": slice(lowest + self.sizes.watched, self.size)}
+        self.slices = {
+            **spans,
+            "cusum": slice(lowest, lowest + self.sizes.watched),
+            "extra": slice(lowest + self.sizes.watched, self.size),
+        }
         self._own = len({id(c) for c in self.constants}) > 1
         table = np.array([_packed(c, self._plan) for c in (self.constants if self._own else (first,))])
         self._table = table
-        self._lanes = 1 if len(self.constants) == 1 and not single or first.extra else LANES[self._type.name]
+        self._lanes = 1 if (len(self.constants) == 1 and not single) or first.extra else LANES[self._type.name]
         self._blocks = -(-len(self.constants) // self._lanes)
         self._laid = self._layer()
         self._code = machine(self._plan, self._lanes, min(self._lanes, WIDTH[self._type.name]), int(self._own))
@@ -245,7 +252,9 @@ class Recursion:
         """Return [eta, phi, z] of every sample of the first asset (N, rows), and what it is good for (N,)."""
         out = np.zeros((len(r), self.sizes.rows))  # a missing sample writes nothing
         ok = np.empty(len(r), dtype=np.int64)
-        machine(self._plan, 1, 1, 1).regress(self._table[0], self.start()[0], r, u, y, restart, self.constants[0].stride, out, ok)
+        machine(self._plan, 1, 1, 1).regress(
+            self._table[0], self.start()[0], r, u, y, restart, self.constants[0].stride, out, ok
+        )
         return out, ok
 
 
@@ -359,7 +368,7 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
 
 @functools.cache
 def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
-    """Return `block`, `step`, `look` and `regress` of `servoscope.drive` for a plan; each compiles when it is called."""
+    """Return the drivers of `servoscope.drive` for a plan, by name; each compiles when it is first called."""
     estimator, sizes = estimators.load(plan.estimator), plan.sizes
     steps = Chain(plan, getattr(estimator, "steady", None))
     to, at = dict(plan.to), dict(plan.at)
