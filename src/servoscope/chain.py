@@ -1,22 +1,20 @@
 """One sample of one asset through the whole chain: filters, estimator, covariance, sequential test, evaluation.
 
-Said in `servoscope.arithmetic`, so that it becomes straight-line code for the sizes of one loop; a lane is an asset. With
-one lane it is the recursion of one series, kept in registers; with many, the same lines become vector instructions.
+Said in `servoscope.arithmetic`, so that it becomes straight-line code for the sizes of one loop; a lane is an asset.
+With one lane it is the recursion of one series, kept in registers; with many, the same lines become vector instructions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 from servoscope import straight
 from servoscope.arithmetic import Truth, dot, fma, larger, lower, root, smaller, where
 from servoscope.cusum import CLIP, LAGS, grown, whitened
 from servoscope.propagation import remember, spread
-
-if TYPE_CHECKING:
-    from servoscope.recursion import Plan
+from servoscope.straight import Pattern
 
 # counters at the head of a state row
 ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, STILL, USED_UP, CROSSED = range(8)
@@ -27,6 +25,39 @@ ABSURD = 1e100  # no physical signal; its square would overflow and stay in the 
 TILE = 8  # samples that are fetched together: a cache line of each signal
 TINY = 1e-30  # no variance is smaller; a number of single precision, too
 WHITE, LARGEST, COUNTS = range(3)  # of the sequential test: whitened residual, largest CUSUM, whether it counts
+
+
+class Sizes(NamedTuple):
+    """What code is compiled for."""
+
+    n: int
+    rows: int
+    inputs: int
+    states: int
+    speed: int
+    gated: bool
+    codes: tuple[int, ...]
+    lags: int
+    shadow: int
+    memory: int
+    watched: int
+    steady: bool
+    extra: int
+    frequencies: int
+    start: bool
+    row: int
+    floats: int
+
+
+class Plan(NamedTuple):
+    """Sizes, places and code of a recursion; equal plans share their machine code."""
+
+    estimator: str
+    sizes: Sizes
+    to: tuple[tuple[str, int], ...]
+    at: tuple[tuple[str, int], ...]
+    bank: Pattern
+    shadow: Pattern
 
 
 class Chain:
@@ -41,7 +72,7 @@ class Chain:
         self._bank, self._shadow, self._steady = plan.bank, plan.shadow, steady
 
     def tick(self, s: Any, h: Any, tile: Any, i: Any, first: Any) -> Truth:
-        """Count a sample, and begin a new evaluation with the first of it; return whether there is nothing odd about it."""
+        """Count a sample, and begin a new evaluation with its first; return whether there is nothing odd about it."""
         h[SAMPLE] = h[SAMPLE] + 1.0
         if self.size.shadow:
             h[CROSSED] = where(first & (s[self.to.level] < 1.0), 0.0, h[CROSSED])

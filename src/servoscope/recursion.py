@@ -20,12 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope import drive, estimators
-from servoscope.chain import HEAD, SAMPLE, TILE, Chain
+from servoscope.chain import HEAD, SAMPLE, TILE, Chain, Plan, Sizes
 from servoscope.compiled import filled, inlined, kernel, traced
 from servoscope.cusum import LAGS, Watch
 from servoscope.linear import Linear
 from servoscope.plants import FloatArray
-from servoscope.straight import Pattern, coefficients, pattern
+from servoscope.straight import coefficients, pattern
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -91,39 +91,6 @@ class Constants(NamedTuple):
     extra: int
     watch: Watch | None
     view: View | None = None
-
-
-class Sizes(NamedTuple):
-    """What code is compiled for."""
-
-    n: int
-    rows: int
-    inputs: int
-    states: int
-    speed: int
-    gated: bool
-    codes: tuple[int, ...]
-    lags: int
-    shadow: int
-    memory: int
-    watched: int
-    steady: bool
-    extra: int
-    frequencies: int
-    start: bool
-    row: int
-    floats: int
-
-
-class Plan(NamedTuple):
-    """Sizes, places and code of a recursion; equal plans share their machine code."""
-
-    estimator: str
-    sizes: Sizes
-    to: tuple[tuple[str, int], ...]
-    at: tuple[tuple[str, int], ...]
-    bank: Pattern
-    shadow: Pattern
 
 
 def _places(sizes: dict[str, int], begin: int = 0) -> dict[str, int]:

@@ -54,8 +54,10 @@ class StageOne:
 
 
 class Constants(NamedTuple):
-    """What the compiled stage takes: the functions of r as a linear system (`straight.coefficients` of it, and its steady
-    state X0), and the tuning; rows of P_d are filled up with zeros to whole vectors.
+    """What the compiled stage takes: the functions of r as a linear system, and the tuning.
+
+    `functions` are the `straight.coefficients` of the system, X0 its steady state; the rows of P_d are filled up with
+    zeros to whole vectors.
     """
 
     functions: FloatArray
