@@ -147,7 +147,8 @@ class Index:
 class Rows:
     """One lane, or several neighbours, of an array (rows, lanes); where `shared`, all lanes are one.
 
-    A row is read once, and what was written is stored by `flush`. Rows whose number is itself computed are read and stored at once; they must not be among the others.
+    A row is read once, and what was written is stored by `flush`. Rows whose number is itself
+    computed are read and stored at once; they must not be among the others.
     """
 
     def __init__(self, context: Any, builder: Any, kind: Any, array: Any, lane: Any, width: int, shared: bool) -> None:

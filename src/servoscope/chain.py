@@ -1,7 +1,7 @@
 """One sample of one asset through the whole chain: filters, estimator, covariance, sequential test, evaluation.
 
 Said in `servoscope.arithmetic`, so that it becomes straight-line code for the sizes of one loop; a lane is an asset.
-With one lane it is the recursion of one series, kept in registers; with many, the same lines become vector instructions.
+With one lane it is the recursion of one series, kept in registers; with many, the same lines become vectors.
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ class Chain:
             s[self.to.peak] = where(first, s[self.to.level], s[self.to.peak])
         r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
         whole = (abs(r) < ABSURD) & (abs(u) < ABSURD) & (abs(y) < ABSURD)
-        return whole & (tile[i + 3 * TILE] <= 0.0) & (h[ARMED] > 0.0)
+        sound: Truth = whole & (tile[i + 3 * TILE] <= 0.0) & (h[ARMED] > 0.0)
+        return sound
 
     def begin(self, c: Any, s: Any, h: Any, tile: Any, i: Any) -> None:
         """Put the filters into their steady state at one sample, after a gap."""
@@ -105,7 +106,8 @@ class Chain:
         dead, `BETWEEN` when it is not the turn of the estimator. Returns whether it is `USED`.
         """
         r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
-        speed, hold = None, None
+        speed: Any = None
+        hold: Any = None
         if self.size.speed:
             source = r if self.size.speed == 2 else y
             speed = self._speed(c, s, source)
@@ -138,7 +140,8 @@ class Chain:
 
     def used(self, said: Any) -> Truth:
         """Return whether the sample updates the estimator."""
-        return (said[0] >= USED) & (said[0] <= USED)
+        used: Truth = (said[0] >= USED) & (said[0] <= USED)
+        return used
 
     def learn(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any) -> None:
         """Take one sample into the estimate, with an estimator whose P stays at P_d, and into all that goes with it."""

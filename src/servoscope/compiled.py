@@ -113,7 +113,7 @@ def traced(function: Callable[..., Truth | None], width: int = 1, shared: str = 
             holds = ir.IntType(1)(1) if said is None else said.everywhere
             return holds
 
-        return types.boolean(lane, types.StarArgTuple(kinds)), emit
+        return types.boolean(lane, types.StarArgTuple(kinds)), emit  # type: ignore[attr-defined]  # it has
 
     made: Callable[..., bool] = intrinsic(part)
     return made

@@ -228,7 +228,8 @@ class Monitor:
         rows = np.ascontiguousarray(np.atleast_2d(state), dtype=np.float64)
         if self._head:
             rows = rows.copy()
-            signals[1] = self._led(rows, *signals, np.zeros(shape, dtype=np.bool_) if flags is None else flags)
+            gaps = np.zeros(shape, dtype=np.bool_) if flags is None else flags
+            signals[1] = self._led(rows, signals[0], signals[1], signals[2], gaps)
         if len(self._groups) == 1 and not self._head:
             ((_, recursion),) = self._groups
             index = recursion.rows(rows, shape[1])
@@ -290,7 +291,7 @@ class Monitor:
 
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of this moment, one evaluation, from a state."""
-        from servoscope.recursion import SAMPLE
+        from servoscope.chain import SAMPLE
 
         rows = np.atleast_2d(state)[:, self._head :]
         out = np.empty((len(rows), self._groups[0][1].sizes.row))

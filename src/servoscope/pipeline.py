@@ -200,8 +200,8 @@ class Pipeline:
         basis = np.diag(1.0 / tuning.scale)
         if steady:
             basis = basis @ np.linalg.cholesky(tuning.P_d * pairs)
-        theta = np.linalg.solve(basis, tuning.theta)
         back = np.linalg.inv(basis)
+        theta = np.asarray(back @ tuning.theta, dtype=np.float64)
         rows = np.eye(len(self._behind_valve.C))
         rows[1 : 1 + bank.n, 1 : 1 + bank.n] = basis.T
         if bank.has_instrument:
@@ -291,8 +291,8 @@ class Pipeline:
         recursion = Recursion([c])
         state = recursion.start()
         r, y, restart = recording.r, recording.y, recording.restart
-        signals = (r, self.input(r, self.flow(recording.u, y, restart), restart), y, restart)
-        _, out = recursion.run(state, *(signal[None, :] for signal in signals))
+        u = self.input(r, self.flow(recording.u, y, restart), restart)
+        _, out = recursion.run(state, r[None], u[None], y[None], restart[None])
         return self.unpack(c, out[0], recursion.rows(state, recording.samples))
 
     def unpack(self, c: Constants, rows: FloatArray, index: IntArray) -> Estimates:

@@ -115,8 +115,8 @@ class ResidualGenerator:
             state[:, recursion.slices["theta"]] = -c.theta
             state[:, recursion.slices["P"]] *= IGNORANT
         r, restart = recording.r, recording.restart
-        signals = (r, pipeline.input(r, recording.u, restart), self.output(recording), restart)
-        _, out = recursion.run(state, *(signal[None, :] for signal in signals))
+        u, y = pipeline.input(r, recording.u, restart), self.output(recording)
+        _, out = recursion.run(state, r[None], u[None], y[None], restart[None])
         index = recursion.rows(state, recording.samples)
         theta = pipeline.unpack(c, out[0], index).theta
         H = theta @ pipeline.bank.E(FREQUENCIES).T
