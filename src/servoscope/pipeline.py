@@ -229,6 +229,7 @@ class Pipeline:
             scale=tuning.scale,
             basis=basis,
             theta=theta,
+            origin=tuning.theta,
             P_d=back @ tuning.P_d @ back.T,
             R=tuning.R,
             a=lags,
@@ -306,7 +307,7 @@ class Pipeline:
             power=rows[:, 2] / c.variance,
             level=rows[:, 3],
             crossed=rows[:, 4],
-            theta=(theta + c.theta) @ basis.T,
+            theta=c.origin + theta @ basis.T,
             S=basis @ S.reshape(-1, n, n) @ basis.T,
             Psi=basis @ Psi.reshape(-1, n, n) @ np.linalg.inv(basis),
         )

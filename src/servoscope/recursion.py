@@ -56,7 +56,7 @@ class Constants(NamedTuple):
 
     The recursion's coordinates: phi is `basis`' times the physical one, theta what is left when the baseline's is taken
     off and the rest divided by `basis` (n, n). With `steady` they are chosen so that P_d is the identity, and P stays
-    there. `theta` is the baseline's in these coordinates.
+    there. `theta` is the baseline's in these coordinates, `origin` the same in physical units.
 
     `bank` and `velocity` are filters, `codes` the non-linear inputs, `limits` and `deadzone` of u; `a` (lags,) and
     `heads` (lags,) are the noise's model as `servoscope.propagation.spread` takes it, `variance` that of v, in updates:
@@ -82,6 +82,7 @@ class Constants(NamedTuple):
     scale: FloatArray
     basis: FloatArray
     theta: FloatArray
+    origin: FloatArray
     P_d: FloatArray
     R: float
     a: FloatArray
