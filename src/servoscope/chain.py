@@ -113,7 +113,7 @@ class Chain:
             speed = self._speed(c, s, source)
             k, x = self.at.velocity, [s[self.to.velocity], s[self.to.velocity + 1]]
             for j in range(2):
-                s[self.to.velocity + j] = dot([c[k + 2 * j], c[k + 2 * j + 1], c[k + 4 + j]], [*x, source])
+                s[self.to.velocity + j] = c[k + 2 * j] * x[0] + c[k + 2 * j + 1] * x[1] + c[k + 4 + j] * source
         w = self._inputs(c, r, u, y, speed)
         if self.size.speed:
             # a reversal is short; an axis that has stood longer than the filters remember is at rest
@@ -247,7 +247,8 @@ class Chain:
 
     def _speed(self, c: Any, s: Any, source: Any) -> Any:
         k = self.at.velocity  # A (2, 2), B, C, D, steady state
-        return dot([c[k + 6 + i] for i in range(3)], [s[self.to.velocity], s[self.to.velocity + 1], source])
+        # not fused: at rest what is left of it is rounding, whose sign must not hang on how the sum is rounded
+        return c[k + 8] * source + c[k + 6] * s[self.to.velocity] + c[k + 7] * s[self.to.velocity + 1]
 
     def _inputs(self, c: Any, r: Any, u: Any, y: Any, speed: Any) -> list[Any]:
         """Return the bank's inputs: r, u within its limits, y, and what friction and offset make of the speed."""
