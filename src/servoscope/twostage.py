@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from servoscope import estimators, straight
-from servoscope.arithmetic import dot
+from servoscope.arithmetic import dot, fma
 from servoscope.errors import NotEnoughError
 from servoscope.linear import Linear, taps
 from servoscope.plants import FloatArray
@@ -56,8 +56,8 @@ class StageOne:
 class Constants(NamedTuple):
     """What the compiled stage takes: the functions of r as a linear system, and the tuning.
 
-    `functions` are the `straight.coefficients` of the system, X0 its steady state; the rows of P_d are filled up with
-    zeros to whole vectors.
+    `functions` are the `straight.coefficients` of the system, X0 its steady state; P_d is filled up with zeros to whole
+    vectors.
     """
 
     functions: FloatArray
@@ -123,7 +123,7 @@ class Stage:
             **{
                 "limits": limits,
                 "theta": tuning.theta,
-                "P_d": np.pad(P_d, ((0, 0), (0, _rows(len(P_d)) * WIDE - len(P_d)))),
+                "P_d": _filled(P_d),
             },
         }
         self._constants = Constants(
@@ -143,7 +143,7 @@ class Stage:
         if not self.size:
             return np.zeros(0)
         c = self._constants
-        P = np.zeros(0) if self._steady else c.P_d[:, : len(c.theta)].ravel()
+        P = np.zeros(0) if self._steady else c.P_d[: len(c.theta), : len(c.theta)].ravel()
         used = np.concatenate([np.zeros(HEAD + len(c.X0)), c.theta, P])
         return np.pad(used, (0, self.size - len(used)))
 
@@ -210,6 +210,8 @@ _padded: Any = None
 _laid: Any = None
 _functions: Any = None
 _products: Any = None
+_column: Any = None
+_steady: Any = None
 _learn: Any = None
 _update: Any = None
 
@@ -234,7 +236,7 @@ def refreshed(
     n = len(c.theta)
     P = s[HEAD + _states + n : HEAD + _states + n + n * n].reshape((n, n))
     extra = s[HEAD + _states + n + n * n :]
-    _update(theta[:n], P, c.P_d[:, :n], c.R, c.memory, eta, phi[:n], phi[:n], K[:n], extra)
+    _update(theta[:n], P, c.P_d[:n, :n], c.R, c.memory, eta, phi[:n], phi[:n], K[:n], extra)
 
 
 def stage(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray, u_a: FloatArray) -> None:
@@ -250,7 +252,8 @@ def stage(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: Bo
         np.zeros(2 * WIDE),
     )
     theta[:n] = s[HEAD + _states : HEAD + _states + n]
-    one, wide = _laid(phi, 1, 1), _laid(phi, WIDE, 1)
+    one, wide, weight, gain = _laid(phi, 1, 1), _laid(phi, WIDE, 1), _laid(theta, WIDE, 1), _laid(K, WIDE, 1)
+    parts = _laid(sums, WIDE, 1)
     for k in range(len(r)):
         u_a[k] = np.nan
         if not (np.isfinite(r[k]) and np.isfinite(u[k])):
@@ -266,7 +269,11 @@ def stage(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: Bo
         if s[WAIT] > 0.0:
             s[WAIT] -= 1.0
             continue
-        _products(0, P_d, one, wide, _laid(theta, WIDE, 1), _laid(K, WIDE, 1), _laid(sums, WIDE, 1))
+        if _steady:
+            K[:] = 0.0
+            for j in range(0, _padded, WIDE):
+                _column(0, P_d, one, gain, j)
+        _products(0, wide, weight, gain, parts)
         total = 0.0
         for i in range(WIDE):
             total += sums[i]
@@ -287,28 +294,38 @@ def block(estimator: str, found: straight.Pattern) -> Callable[..., None]:
         for i, number in enumerate(straight.advance(found, c, 0, s, 0, [w[0]])):
             v[i] = number
 
-    def products(P_d: Any, one: Any, phi: Any, theta: Any, K: Any, sums: Any) -> None:
-        """K = P_d phi, where P stays there, and the products phi' theta and phi' K, in as many parts as are wide."""
-        sums[0] = dot([phi[i] for i in range(rows)], [theta[i] for i in range(rows)])
-        if steady:
-            for i in range(rows):  # two sums each: one alone would wait for itself
-                halves = [
-                    dot([P_d[j * rows + i] for j in js], [one[j] for j in js])
-                    for js in (range(0, n, 2), range(1, n, 2))
-                    if js
-                ]
-                K[i] = halves[0] + halves[1] if len(halves) > 1 else halves[0]
-            sums[1] = dot([phi[i] for i in range(rows)], [K[i] for i in range(rows)])
+    def column(P_d: Any, one: Any, K: Any, j: Any) -> None:
+        """Add so many columns of P_d as a vector is wide, each times its phi, to K."""
+        for i in range(rows):
+            total = K[i]
+            for k in range(WIDE):
+                total = fma(P_d[j * rows + (k * rows + i)], one[j + k], total)
+            K[i] = total
+
+    def products(phi: Any, theta: Any, K: Any, sums: Any) -> None:
+        """Write the products phi' theta and phi' K, in as many parts as a vector is wide."""
+        for place, other in enumerate((theta, K)):
+            sums[place] = dot([phi[i] for i in range(rows)], [other[i] for i in range(rows)])
 
     names: dict[str, object] = {
         "_states": len(found[1]),
         "_padded": rows * WIDE,
         "_update": tools.update,
         "_laid": laid,
+        "_steady": steady,
     }
-    names |= {"_functions": traced(functions), "_products": traced(products, WIDE, "one")}
+    names |= {
+        "_functions": traced(functions),
+        "_products": traced(products, WIDE),
+        "_column": traced(column, WIDE, "one"),
+    }
     names["_learn"] = inlined(filled(settled if steady else refreshed, names), heap=True)
     return kernel(filled(stage, names, repr((estimator, found))))
+
+
+def _filled(P_d: FloatArray) -> FloatArray:
+    """Return a matrix filled up with zeros to whole vectors, in both directions."""
+    return np.pad(P_d, (0, _rows(len(P_d)) * WIDE - len(P_d)))
 
 
 def _rows(n: int) -> int:

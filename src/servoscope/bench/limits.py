@@ -11,24 +11,32 @@ CHAINS, WIDTH = 16, 8  # independent sums, numbers in a vector
 BYTES = 1 << 27
 
 _burn: Any = None
+_local: Any = None
 
 
 def burn(x: Any, rounds: int) -> None:
     """Multiply and add `rounds` times in all chains."""
+    here = _local(x, CHAINS, WIDTH)
+    for i in range(CHAINS):
+        for a in range(WIDTH):
+            here[i, a] = x[i, a]
     for _ in range(rounds):
-        _burn(0, x)
+        _burn(0, here)
+    for i in range(CHAINS):
+        for a in range(WIDTH):
+            x[i, a] = here[i, a]
 
 
 def multiply_adds(rounds: int) -> tuple[Callable[[], object], int]:
     """Return a job that does nothing but fused multiply-adds in double precision, and how many it does."""
     from servoscope.arithmetic import fma
-    from servoscope.compiled import filled, kernel, traced
+    from servoscope.compiled import filled, kernel, local, traced
 
     def once(x: Any) -> None:
         for i in range(CHAINS):
             x[i] = fma(x[i], 0.999, 0.001)
 
-    run = kernel(filled(burn, {"_burn": traced(once, WIDTH)}, "burn"), heap=False)
+    run = kernel(filled(burn, {"_burn": traced(once, WIDTH), "_local": local}, "burn"), heap=False)
     x = np.ones((CHAINS, WIDTH))
     return lambda: run(x, rounds), rounds * CHAINS * WIDTH
 
