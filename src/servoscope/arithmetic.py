@@ -86,6 +86,9 @@ class Number:
 
     __rmul__ = __mul__
 
+    def __truediv__(self, other: Any) -> Number:
+        return self._made(self.builder.fdiv(self.value, self.like(other)))
+
     def __rtruediv__(self, other: Any) -> Number:
         return self._made(self.builder.fdiv(self.like(other), self.value))
 

@@ -81,19 +81,17 @@ class Coloured:
 
     def whiten(self, x: FloatArray) -> FloatArray:
         """Return innovations of unit variance for a column or columns of v, shape (N,) or (N, m)."""
-        from scipy.signal import lfilter
+        from servoscope.filtering import filtered
 
         numerator, denominator = np.concatenate([[1.0], -self.a]), np.concatenate([[1.0], self.b])
-        white: FloatArray = lfilter(numerator, denominator, x, axis=0) / np.sqrt(self.variance)
-        return white
+        return filtered(numerator, denominator, x) / np.sqrt(self.variance)
 
     def shape(self, x: FloatArray) -> FloatArray:
         """Return x passed through the filter that turns white noise of unit variance into v, shape as x."""
-        from scipy.signal import lfilter
+        from servoscope.filtering import filtered
 
         numerator, denominator = np.concatenate([[1.0], self.b]), np.concatenate([[1.0], -self.a])
-        shaped: FloatArray = lfilter(numerator, denominator, x, axis=0) * np.sqrt(self.variance)
-        return shaped
+        return filtered(numerator, denominator, x) * np.sqrt(self.variance)
 
     def autocovariance(self, lags: int) -> FloatArray:
         """Return the autocovariance of v at lags 0 to `lags`, shape (lags + 1,)."""
