@@ -323,7 +323,8 @@ class Monitor:
             "crossed": np.where(out[..., 3] > 0.0, (out[..., 3] - 1.0) / self.loop.sample_rate, np.nan),
             "ready": out[..., 0] > 0.0,
         }
-        seen = H[..., 0] + 1j * H[..., 1], H[..., 2:].reshape(*shape, F, 2, 2)
+        pairs = np.ascontiguousarray(H[..., :2])
+        seen = pairs.view(np.result_type(pairs, np.complex64))[..., 0], H[..., 2:].reshape(*shape, F, 2, 2)
         healthy = [of_baseline([getattr(each.healthy, x) for each in self._followed]) for x in ("H", "covariance")]
         threshold: Any = np.array([each.limit for each in self.baselines])[:, None]
         if not self.fleet:

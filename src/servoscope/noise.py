@@ -84,14 +84,16 @@ class Coloured:
         from servoscope.filtering import filtered
 
         numerator, denominator = np.concatenate([[1.0], -self.a]), np.concatenate([[1.0], self.b])
-        return filtered(numerator, denominator, x) / np.sqrt(self.variance)
+        white: FloatArray = filtered(numerator, denominator, x) / np.sqrt(self.variance)
+        return white
 
     def shape(self, x: FloatArray) -> FloatArray:
         """Return x passed through the filter that turns white noise of unit variance into v, shape as x."""
         from servoscope.filtering import filtered
 
         numerator, denominator = np.concatenate([[1.0], self.b]), np.concatenate([[1.0], -self.a])
-        return filtered(numerator, denominator, x) * np.sqrt(self.variance)
+        shaped: FloatArray = filtered(numerator, denominator, x) * np.sqrt(self.variance)
+        return shaped
 
     def autocovariance(self, lags: int) -> FloatArray:
         """Return the autocovariance of v at lags 0 to `lags`, shape (lags + 1,)."""

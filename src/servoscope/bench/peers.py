@@ -51,9 +51,9 @@ def kalman(eta: FloatArray, phi: FloatArray, P_d: FloatArray, R: float, memory: 
         from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
         f = KalmanFilter(k_endog=1, k_states=n)
+        f.bind(eta)
         f["design"], f["transition"], f["selection"] = np.ascontiguousarray(phi.T[None]), np.eye(n), np.eye(n)
         f["obs_cov"], f["state_cov"] = np.array([[R]]), Q
-        f.bind(eta)
         f.initialize_known(np.zeros(n), P_d)
         return np.asarray(f.filter().predicted_state[:, -1])
 
