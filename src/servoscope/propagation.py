@@ -78,7 +78,9 @@ def mean_path(
     (p, n, n) are the noise's E[phi eta] and E[phi phi'] with the plant ``which[k]`` (N,).
     """
     N, n = phi.shape
-    theta = start.copy()
+    theta = np.empty(n)
+    for i in range(n):
+        theta[i] = start[i]
     path = np.empty((N // every, n))
     gain = np.empty(n)
     pull = np.empty(n)
@@ -102,5 +104,6 @@ def mean_path(
                     step += P_d[i, j] * pull[j]
                 theta[i] += step / denominator
         if (k + 1) % every == 0:
-            path[(k + 1) // every - 1] = theta
+            for i in range(n):
+                path[(k + 1) // every - 1, i] = theta[i]
     return path
