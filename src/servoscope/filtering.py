@@ -18,12 +18,13 @@ def filtered(numerator: FloatArray, denominator: FloatArray, x: FloatArray) -> F
     x
         What goes in.
     """
-    columns = np.ascontiguousarray(x, dtype=np.float64).reshape(len(x), -1)
+    signals = np.ascontiguousarray(x, dtype=np.float64)
+    columns = signals[:, None] if signals.ndim == 1 else signals
     order = max(len(numerator), len(denominator)) - 1
     b, a = (np.pad(np.asarray(c, dtype=np.float64), (0, order + 1 - len(c))) for c in (numerator, denominator))
     out = np.empty_like(columns)
     _run(b, a, columns, out)
-    return out.reshape(np.shape(x))
+    return out.reshape(signals.shape)
 
 
 @kernel
