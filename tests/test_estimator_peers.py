@@ -22,7 +22,7 @@ from servoscope.loop import Loop
 from servoscope.monitor import examine
 from servoscope.pipeline import Pipeline, Tuning
 from servoscope.readers import read
-from servoscope.recursion import Constants, Layout, block
+from servoscope.recursion import Constants, Recursion
 from servoscope.simulation import reference, simulate
 from servoscope.tuning import fit
 from test_estimators import ALL, MEMORY, R, Run, n, samples, spd
@@ -254,47 +254,60 @@ def chain(name: str) -> tuple[Pipeline, Tuning, Constants, Signals]:
     tuning = fit(pipeline, [g]).tuning
     r, u, y = recording.r.copy(), 0.9 * recording.u, recording.y.copy()
     u[300], y[301], r[500:510], restart[700] = np.nan, np.nan, np.nan, True
-    return pipeline, tuning, pipeline.constants(tuning), tuple(signal[None, :] for signal in (r, u, y, restart))
+    return (
+        pipeline,
+        tuning,
+        pipeline.constants(tuning, steady=False),
+        tuple(signal[None, :] for signal in (r, u, y, restart)),
+    )
 
 
 @pytest.mark.parametrize("name", ALL)
 class TestInTheRecursion:
     def test_is_its_updates_one_after_the_other(self, name: str) -> None:
         pipeline, tuning, c, signals = chain(name)
-        state, out = Layout(c).start(c, 1), np.empty((1, 1200, Layout(c).row))
-        assert block(name)(c, state, *signals, out) == 1200
+        recursion = Recursion([c])
+        _, out = recursion.run(recursion.start(), *signals)
+        assert out.shape[1] == 1200
         g = pipeline.regression(*(signal[0] for signal in signals))
         run = Run(name, c.P_d, c.P_d, c.memory)
         run.theta[:], run.R = c.theta, c.R
         for k in np.flatnonzero(g.ok):
             run.step(g.eta[k], g.phi[k] / tuning.scale, g.z[k] / tuning.scale)
-            assert out[0, k, 5 : 5 + n] == pytest.approx(run.theta, rel=1e-7, abs=1e-9)
+            assert out[0, k, 5 : 5 + n] + c.theta == pytest.approx(run.theta, rel=1e-7, abs=1e-9)
         assert 900 < out[0, -1, 0] <= 1200
-        assert len(state[0, Layout(c).slices["extra"]]) == estimators.extra(name, n, c.memory)
+        size = recursion.slices["extra"]
+        assert size.stop - size.start == estimators.extra(name, n, c.memory)
 
     def test_a_missing_value_keeps_the_state(self, name: str) -> None:
         _, _, c, signals = chain(name)
-        layout = Layout(c)
-        state, out = layout.start(c, 1), np.empty((1, 1200, layout.row))
-        block(name)(c, state, *(signal[:, :290] for signal in signals), out)
-        kept = state.copy()
+        recursion = Recursion([c])
+        kept, _ = recursion.run(recursion.start(), *(signal[:, :290] for signal in signals))
         nothing = np.full((1, 40), np.nan)
-        block(name)(c, state, nothing, nothing, nothing, np.zeros((1, 40), dtype=np.bool_), out)
+        state, _ = recursion.run(kept, nothing, nothing, nothing, np.zeros((1, 40), dtype=np.bool_))
         for part in ("theta", "P", "S", "Psi", "extra"):
-            assert np.array_equal(state[0, layout.slices[part]], kept[0, layout.slices[part]]), part
+            assert np.array_equal(state[0, recursion.slices[part]], kept[0, recursion.slices[part]]), part
 
     def test_split_saved_and_resumed_anywhere(self, name: str) -> None:
         _, _, c, signals = chain(name)
-        layout = Layout(c)
-        whole, state = layout.start(c, 1), layout.start(c, 1)
-        out, parts = np.empty((1, 1200, layout.row)), np.empty((1, 1200, layout.row))
-        block(name)(c, whole, *signals, out)
+        recursion = Recursion([c])
+        whole, out = recursion.run(recursion.start(), *signals)
+        state, parts = recursion.start(), []
         edges = [0, 1, 2, 137, 301, 301, 502, 640, 1199, 1200]
         for begin, end in itertools.pairwise(edges):
-            state = np.frombuffer(state.tobytes(), dtype=np.float64).reshape(state.shape).copy()
-            block(name)(c, state, *(signal[:, begin:end] for signal in signals), parts[:, begin:end])
+            state = np.frombuffer(state.tobytes(), dtype=np.float64).reshape(state.shape)
+            state, part = recursion.run(state, *(signal[:, begin:end] for signal in signals))
+            parts.append(part)
         assert np.array_equal(state, whole)
-        assert np.array_equal(parts, out)
+        assert np.array_equal(np.concatenate(parts, axis=1), out)
+
+    def test_a_fleet_is_its_assets(self, name: str) -> None:
+        _, _, c, signals = chain(name)
+        alone, fleet = Recursion([c]), Recursion([c] * 3)
+        state, out = alone.run(alone.start(), *signals)
+        states, outs = fleet.run(fleet.start(), *(np.repeat(signal, 3, axis=0) for signal in signals))
+        assert np.array_equal(states, np.repeat(state, 3, axis=0))
+        assert np.array_equal(outs, np.repeat(out, 3, axis=0))
 
 
 @cache

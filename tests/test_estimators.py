@@ -14,7 +14,9 @@ from scipy.signal import lfilter
 
 import naive
 from servoscope import estimators
+from servoscope.arithmetic import lower
 from servoscope.errors import LoopError
+from servoscope.noise import Coloured
 from servoscope.propagation import spread
 
 n = 4
@@ -158,11 +160,13 @@ def check_covariance(name: str) -> None:
     phi = rng.standard_normal((steps, n)) @ np.linalg.cholesky(spd(3, 100.0)).T
     phi[np.arange(steps) % 300 >= 150] *= 1e-3
     P_d = R / memory * np.linalg.inv(phi.T @ phi / steps)
-    S, M, Psi = np.zeros((n, n)), np.zeros((n, 2)), np.eye(n)
+    lags, heads = Coloured(np.array([a]), np.array([b]), np.array([R]), variance).chain()
+    model, state = [R, *lags, *heads], dict.fromkeys(range(n * (n + 1) // 2 + n), 0.0)
     tracked = Run(name, P_d, P_d, memory)
     for k in range(steps):
         tracked.step(0.0, phi[k])
-        spread(np.array([a, b]), np.array([R, variance]), 1, tracked.K, phi[k], S, M, Psi)
+        spread(model, 0, state, 0, 1, phi[k], tracked.K)
+    S = np.array([[state[lower(i, j)] for j in range(n)] for i in range(n)])
     for _ in range(1500):
         white = rng.standard_normal(settled + steps) * np.sqrt(variance)
         run = Run(name, P_d, P_d, memory)

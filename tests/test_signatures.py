@@ -72,7 +72,7 @@ def test_path_is_the_mean_of_noisy_runs(
     path = expected(run, fault)
     assert path.shape == run.theta.shape[1:]
     error = run.theta.std(axis=0, ddof=1) / np.sqrt(SEEDS)
-    z = ((run.theta.mean(axis=0) - path) / error)[LATE]
+    z = (run.theta.mean(axis=0) - path)[LATE] / error[LATE]
     # neighbours hang together: many z at once, of which none may be far and all together must be like a normal's
     assert np.abs(z).max() < 4.5, np.round(z, 1)
     assert np.sqrt((z**2).mean()) < 1.6, np.round(z, 1)

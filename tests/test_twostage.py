@@ -124,7 +124,7 @@ class TestMonitor:
         assert np.array_equal(stepped, state)
         assert np.array_equal(monitor.latest(stepped).theta[0], trace.theta[-1])
         raw = baseline.pipeline().estimate(baseline.tuning, recording).theta
-        assert np.array_equal(raw - baseline.bias, trace.theta)
+        assert trace.theta == pytest.approx(raw - baseline.bias, rel=1e-12, abs=1e-12)
 
     def test_a_fleet_is_its_assets(self, baseline: Baseline) -> None:
         recordings = [recorded(baseline.loop, seed, 20.0) for seed in (2, 3)]

@@ -119,7 +119,7 @@ def test_blocks_and_single_samples_leave_the_same_bits(rig: dict[str, Any]) -> N
         monitor.step(state, *(float(x) for x in sample))
     assert np.array_equal(state, whole)
     # a monitor and a diagnosis run the same recursion, whatever a monitor adds to its result once and for all
-    added = thetas - monitor.pipeline.estimate(monitor.tunings[0], part).theta
+    added = thetas - monitor.pipeline.estimate(monitor.baselines[0].tuning, part).theta
     assert added == pytest.approx(np.broadcast_to(added[0], added.shape), abs=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""The sequential test, compiled: what a healthy loop would do is taken off, the rest whitened, and CUSUMs add it up.
+"""The sequential test: what a healthy loop would do is taken off, the rest whitened, and CUSUMs add it up.
 
 Beside the measured loop runs a shadow: the healthy loop without noise, driven by the same reference, through the same
 filters. What the measured residual has beyond the shadow's is noise, white after its own filter; a change of the
@@ -8,11 +8,12 @@ ratio of "changed by Delta" against "healthy", and starts anew whenever that fal
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from servoscope.compiled import kernel
+from servoscope.arithmetic import dot, fma, larger, smaller
 from servoscope.noise import Coloured
 from servoscope.plants import FloatArray
 
@@ -45,21 +46,6 @@ class Watch(NamedTuple):
     changes: FloatArray
     limits: FloatArray
 
-    @property
-    def size(self) -> int:
-        """Numbers that the test keeps from sample to sample."""
-        memory = len(self.numerator) - 1
-        n = len(self.theta)
-        return len(self.A) + (n + 1) * memory + n + LAGS + len(self.limits) if len(self.limits) else 0
-
-
-def idle(n: int) -> Watch:
-    """Return the constants of no test, for n coefficients."""
-    none, one = np.zeros((0, 0)), np.ones(2)
-    return Watch(
-        none, np.zeros((0, 1)), none, none, none, np.zeros(n), one, one, 1.0, 0, np.zeros((0, n + LAGS)), np.zeros(0)
-    )
-
 
 def whitening(noise: Coloured) -> tuple[FloatArray, FloatArray, float, int]:
     """Return numerator, denominator, gain and warm-up of the filter that whitens a noise."""
@@ -78,64 +64,19 @@ def columns(phi: FloatArray) -> FloatArray:
     return np.column_stack([phi, *late])
 
 
-@kernel
-def follow(watch: Watch, x: FloatArray, r: float, arm: bool, out: FloatArray) -> None:
-    """Let the shadow follow the reference for one sample; `out` (1 + n,) becomes its [eta, phi]."""
-    nx = watch.A.shape[0]
-    if arm:
-        for i in range(nx):
-            x[i] = watch.X0[i, 0] * r
-    for i in range(len(out)):
-        out[i] = watch.D[i, 0] * r
-        for j in range(nx):
-            out[i] += watch.C[i, j] * x[j]
-    new = np.empty(nx)
-    for i in range(nx):
-        new[i] = watch.B[i, 0] * r
-        for j in range(nx):
-            new[i] += watch.A[i, j] * x[j]
-    for i in range(nx):
-        x[i] = new[i]
+def whitened(c: Any, model: int, s: Any, at: int, memory: int, x: Any) -> Any:
+    """Whiten one sample; s[at:] holds the filter's memory (transposed direct form II).
 
-
-@kernel
-def _white(watch: Watch, d: FloatArray, x: float) -> float:
-    """Whiten one sample; d holds the filter's memory (transposed direct form II)."""
-    y = x + d[0]
-    last = len(d) - 1
-    for i in range(last):
-        d[i] = watch.numerator[i + 1] * x - watch.denominator[i + 1] * y + d[i + 1]
-    d[last] = watch.numerator[last + 1] * x - watch.denominator[last + 1] * y
-    white: float = y * watch.gain
-    return white
-
-
-@kernel
-def accumulate(watch: Watch, s: FloatArray, eta: float, phi: FloatArray, shadow: FloatArray, used: float) -> float:
-    """Take one update into the CUSUMs; return the largest of them, as a multiple of its limit.
-
-    `s` is the filters' memory, the whitened columns and the CUSUMs, `shadow` what `follow` wrote, `used` the updates
-    since the last interruption.
+    c[model:] is the gain, then `memory` coefficients of the numerator and as many of the denominator, from lag 1 on.
     """
-    n = len(watch.theta)
-    memory = len(watch.numerator) - 1
-    filters = (n + 1) * memory
-    psi = s[filters : filters + n + LAGS]
-    for lag in range(LAGS, 0, -1):
-        psi[n - 1 + lag] = psi[n - 2 + lag]
-    residual = eta - shadow[0]
-    for i in range(n):
-        residual -= watch.theta[i] * (phi[i] - shadow[1 + i])
-        psi[i] = _white(watch, s[(i + 1) * memory : (i + 2) * memory], shadow[1 + i])
-    e = _white(watch, s[:memory], residual)
-    e = min(max(e, -CLIP), CLIP)
-    g = s[filters + n + LAGS :]
-    largest = 0.0
-    for j in range(len(watch.limits)):
-        if used > watch.warm:
-            shift = 0.0
-            for i in range(n + LAGS):
-                shift += watch.changes[j, i] * psi[i]
-            g[j] = min(max(g[j] + shift * (e - 0.5 * shift), 0.0), CAP * watch.limits[j])
-        largest = max(largest, g[j] / watch.limits[j])
-    return largest
+    y = x + s[at]
+    for i in range(memory):
+        new = fma(c[model + 1 + i], x, -(c[model + 1 + memory + i] * y))
+        s[at + i] = new + s[at + i + 1] if i < memory - 1 else new
+    return y * c[model]
+
+
+def grown(weights: Sequence[Any], psi: Sequence[Any], e: Any, g: Any, limit: Any) -> Any:
+    """Return a CUSUM g after one more whitened residual e, whose change would shift it by weights' psi."""
+    shift = dot(weights, psi)
+    return smaller(larger(fma(shift, fma(shift, -0.5, e), g), 0.0), limit * CAP)

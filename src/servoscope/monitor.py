@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from servoscope import ifrf
 from servoscope.baseline import Baseline
-from servoscope.detection import statistic
 from servoscope.diagnosis import UNKNOWN, Diagnosis, Trace, Warning
 from servoscope.errors import BaselineError, RecordingError
-from servoscope.examination import Compared, Examination, trace_of
-from servoscope.pipeline import Estimates, Pipeline
+from servoscope.examination import Examination
+from servoscope.ifrf import Response
+from servoscope.pipeline import Pipeline
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
 from servoscope.twostage import Stage
 from servoscope.verdict import judge
 
 if TYPE_CHECKING:
-    from servoscope.recursion import Constants, Layout
+    from servoscope.recursion import Constants, Recursion
 
 DOUBTFUL = 0.05  # probability of an unknown change, from which an operating point does not explain a recording
 
@@ -97,7 +99,7 @@ def _explained(said: Diagnosis) -> bool:
 
 
 class Monitor:
-    """Follows one asset, or a fleet of assets that share one loop, block by block or sample by sample.
+    """Follows one asset, or a fleet of assets, block by block or sample by sample.
 
     Its state is one plain array, shape (size,) for one asset and (assets, size) for a fleet: saving it is copying it,
     resuming is bit-identical, and splitting the samples into blocks anywhere changes nothing. The state of a valve law
@@ -106,60 +108,80 @@ class Monitor:
     Parameters
     ----------
     baseline
-        One baseline, or one per asset.
+        One baseline, or one per asset. The assets of a fleet may differ in everything but sample rate, evaluation rate,
+        coefficients and monitored frequencies; those of one structure are followed together.
     share_budget
         Whether the assets of a fleet share the budget of false alarms, which is then divided among them; otherwise
         each of them has it for itself.
+    precision
+        ``"single"`` follows a fleet about twice as fast; what that costs is in the documentation's page on speed.
 
     Raises
     ------
     BaselineError
-        If the baselines do not share one loop, or one of them has several operating points.
+        If the baselines cannot be followed together, or one of them has several operating points.
     """
 
-    def __init__(self, baseline: Baseline | Sequence[Baseline], *, share_budget: bool = False) -> None:
-        from servoscope.recursion import Layout, block
-
+    def __init__(
+        self,
+        baseline: Baseline | Sequence[Baseline],
+        *,
+        share_budget: bool = False,
+        precision: Literal["double", "single"] = "double",
+    ) -> None:
         self.baselines = (baseline,) if isinstance(baseline, Baseline) else tuple(baseline)
         self.fleet = not isinstance(baseline, Baseline)
-        for each in self.baselines:
+        kinds = {id(each): each for each in self.baselines}
+        for each in kinds.values():
             if each.others:
                 raise BaselineError(
                     f"a monitor follows one operating point, this baseline has {', '.join(each.points)}: give "
                     f"baseline.at({each.points[0]!r})"
                 )
-        if share_budget:
-            self.baselines = tuple(each.shared(len(self.baselines)) for each in self.baselines)
         if not self.baselines:
             raise BaselineError("a monitor needs at least one baseline")
-        if len({each.loop.hash() for each in self.baselines}) > 1:
-            raise BaselineError("the baselines of one monitor must share one loop: make one monitor per loop")
+        if share_budget:
+            shared = {key: each.shared(len(self.baselines)) for key, each in kinds.items()}
+            self.baselines = tuple(shared[id(each)] for each in self.baselines)
+            kinds = {id(each): each for each in self.baselines}
+        if len({_clock(each) for each in kinds.values()}) > 1:
+            raise BaselineError(
+                "the baselines of one monitor must share sample rate, evaluation rate, coefficients and frequencies: "
+                "make one monitor for each kind of loop"
+            )
         self.loop = self.baselines[0].loop
-        self._pipelines = tuple(each.pipeline() for each in self.baselines)
-        self.pipeline = self._pipelines[0]
-        self.tunings = tuple(each.tuning for each in self.baselines)
-        self._constants: tuple[Constants, ...] = tuple(
-            pipeline.constants(each.tuning, each.watch(pipeline))
-            for pipeline, each in zip(self._pipelines, self.baselines, strict=True)
-        )
-        self._layouts: tuple[Layout, ...] = tuple(Layout(c) for c in self._constants)
-        self._size = max(layout.size for layout in self._layouts)  # models of the noise differ in length
-        self._stages = tuple(Stage(self.loop, each.stage_one) for each in self.baselines)
-        self._valve = self.pipeline.valve.size  # where the state of stage 1 begins,
-        self._head = self._valve + self._stages[0].size  # and that of stage 2
-        self._block = block(self.loop.monitor.estimator)
-        self._one = np.empty((3, 1, 1))
-        self._go_on = np.zeros((1, 1), dtype=np.bool_)
-        self._row = np.empty((1, 1, self._layouts[0].row))
+        followed = {key: _Followed.of(each) for key, each in kinds.items()}
+        self._followed = tuple(followed[id(each)] for each in self.baselines)
+        self.pipeline = self._followed[0].pipeline
+        self._narrow = precision == "single"
+        self._groups = self._grouped()
+        self._head = max(each.head for each in self._followed)  # where the state of stage 2 begins
+        self._size = self._head + max(recursion.size for _, recursion in self._groups)
+        self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
+        self._constants = np.zeros(0)
+
+    def _grouped(self) -> list[tuple[npt.NDArray[np.intp], Recursion]]:
+        """Return which assets go through the recursion together."""
+        from servoscope.recursion import Recursion, structure
+
+        keys = {id(each): structure(each.constants) for each in self._followed}
+        members: dict[Hashable, list[int]] = {}
+        for i, each in enumerate(self._followed):
+            members.setdefault(keys[id(each)], []).append(i)
+        return [
+            (np.array(assets), Recursion([self._followed[i].constants for i in assets], single=self._narrow))
+            for assets in members.values()
+        ]
 
     def init(self) -> FloatArray:
         """Return the state before the first sample."""
-        states = []
-        for stage, layout, c in zip(self._stages, self._layouts, self._constants, strict=True):
-            own = layout.start(c, 1)[0]
-            rest = np.zeros(self._size - len(own))
-            states.append(np.concatenate([self.pipeline.valve.start(), stage.start(), own, rest]))
-        return np.array(states) if self.fleet else states[0]
+        states = np.zeros((len(self.baselines), self._size))
+        for assets, recursion in self._groups:
+            states[assets, self._head : self._head + recursion.size] = recursion.start()
+        if self._head:
+            for row, each in zip(states, self._followed, strict=True):
+                row[: each.head] = np.concatenate([each.pipeline.valve.start(), each.stage.start()])
+        return states if self.fleet else states[0]
 
     def run(
         self,
@@ -190,85 +212,162 @@ class Monitor:
         RecordingError
             If the shapes do not fit together.
         """
-        from servoscope.recursion import SAMPLE
-
-        signals = [np.atleast_2d(np.ascontiguousarray(signal, dtype=np.float64)) for signal in (r, u, y)]
+        number = np.float32 if self._narrow else np.float64
+        signals = [np.atleast_2d(np.ascontiguousarray(signal, dtype=number)) for signal in (r, u, y)]
         shape = (len(self.baselines), signals[0].shape[1])
         if any(signal.shape != shape for signal in signals) or state.shape != self._shape:
             raise RecordingError(
                 f"r, u, y must have the same shape ({'assets, N' if self.fleet else 'N,'}) for {shape[0]} asset(s), "
                 "and the state must come from this monitor's init or run"
             )
-        flags = np.zeros(shape, dtype=np.bool_)
+        flags = None
         if restart is not None:
             flags = np.atleast_2d(np.ascontiguousarray(restart, dtype=np.bool_))
-        if flags.shape != shape:
-            raise RecordingError("restart must have the shape of r")
-        new = np.array(state, dtype=np.float64, copy=True)
-        rows = new if self.fleet else new[None, :]
-        sample = int(rows[0, self._head + SAMPLE])
-        every = self.pipeline.every
-        count = (sample + shape[1]) // every - sample // every
-        out = np.empty((shape[0], count, self._layouts[0].row))
-        for i, c in enumerate(self._constants):
-            one = slice(i, i + 1)
-            r, u, y = (signal[one] for signal in signals)
-            u = self._lead(i, rows[i], r[0], u[0], y[0], flags[i])[None, :]
-            self._block(c, rows[one, self._head :], r, u, y, flags[one], out[one])
-        index = (sample // every + 1 + np.arange(count)) * every - 1
-        return new, self._trace(out, index)
+            if flags.shape != shape:
+                raise RecordingError("restart must have the shape of r")
+        rows = np.ascontiguousarray(np.atleast_2d(state), dtype=np.float64)
+        if self._head:
+            rows = rows.copy()
+            gaps = np.zeros(shape, dtype=np.bool_) if flags is None else flags
+            signals[1] = self._led(rows, signals[0], signals[1], signals[2], gaps)
+        if len(self._groups) == 1 and not self._head:
+            ((_, recursion),) = self._groups
+            index = recursion.rows(rows, shape[1])
+            new, out = recursion.run(rows, signals[0], signals[1], signals[2], flags)
+        else:
+            new, out, index = self._apart(rows, signals, flags)
+        return new if self.fleet else new[0], self._trace(out, index)
+
+    def _apart(
+        self, rows: FloatArray, signals: list[npt.NDArray[Any]], flags: npt.NDArray[np.bool_] | None
+    ) -> tuple[FloatArray, npt.NDArray[Any], npt.NDArray[np.int64]]:
+        """Run each group for itself."""
+        new, outs = rows.copy(), []
+        for assets, recursion in self._groups:
+            part = slice(self._head, self._head + recursion.size)
+            own = np.ascontiguousarray(rows[assets, part])
+            index = recursion.rows(own, signals[0].shape[1])
+            r, u, y = (signal[assets] for signal in signals)
+            new[assets, part], out = recursion.run(own, r, u, y, None if flags is None else flags[assets])
+            outs.append(out)
+        together = np.empty((len(rows), *outs[0].shape[1:]), dtype=outs[0].dtype)
+        for (assets, _), out in zip(self._groups, outs, strict=True):
+            together[assets] = out
+        return new, together, index
 
     def step(self, state: FloatArray, r: float, u: float, y: float) -> bool:
         """Feed one sample of one asset, in place; return whether a new evaluation stands in the state.
 
         Read it with `latest`. NaN in any of the three is a gap.
         """
-        if state.shape != self._shape or self.fleet:
-            raise RecordingError("step follows one asset: give the state of a monitor with one baseline, or use run")
-        self._one[0, 0, 0], self._one[1, 0, 0], self._one[2, 0, 0] = r, u, y
-        one, head = self._one, self._head
-        if head:
-            one[1] = self._lead(0, state, one[0, 0], one[1, 0], one[2, 0], self._go_on[0])
-        return self._block(self._constants[0], state[None, head:], one[0], one[1], one[2], self._go_on, self._row) == 1
+        if self._step is None or len(state) != self._size or state.ndim != 1:
+            self._prepare(state)
+        if self._head:
+            one = np.array([[r], [u], [y]])
+            u = float(self._led(state[None, :], one[:1], one[1:2], one[2:], np.zeros((1, 1), dtype=np.bool_))[0, 0])
+            state = state[self._head :]
+        return self._step(self._constants, state, r, u, y)  # type: ignore[misc]  # it is prepared now
 
-    def _lead(
-        self, asset: int, state: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: npt.NDArray[np.bool_]
-    ) -> FloatArray:
-        """Return what takes the place of u, behind the valve law and stage 1, and change their states in place."""
-        flow = self.pipeline.valve.run(state[: self._valve], u, y, restart)
-        return self._stages[asset].run(state[self._valve : self._head], r, flow, restart)
+    def _prepare(self, state: FloatArray) -> None:
+        if state.shape != self._shape or self.fleet or self._narrow:
+            raise RecordingError("step follows one asset: give the state of a monitor with one baseline, or use run")
+        self._step, self._constants = self._groups[0][1].stepper
+
+    def _led(
+        self,
+        rows: FloatArray,
+        r: npt.NDArray[Any],
+        u: npt.NDArray[Any],
+        y: npt.NDArray[Any],
+        flags: npt.NDArray[np.bool_],
+    ) -> npt.NDArray[Any]:
+        """Return what takes the place of u, behind valve law and stage 1, and change their states in place."""
+        led = np.empty_like(u)
+        for i, each in enumerate(self._followed):
+            valve = each.pipeline.valve
+            flow = valve.run(rows[i, : valve.size], u[i], y[i], flags[i])
+            led[i] = each.stage.run(rows[i, valve.size : each.head], r[i], flow, flags[i])
+        return led
 
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of this moment, one evaluation, from a state."""
-        from servoscope.recursion import CROSSED, PEAK, POWER, SAMPLE, UPDATES
+        from servoscope.chain import SAMPLE
 
-        rows = (state if self.fleet else state[None, :])[:, self._head :]
-        out = []
-        for row, layout in zip(rows, self._layouts, strict=True):
-            at = layout.slices
-            counted = row[UPDATES : POWER + 1], row[PEAK : CROSSED + 1]
-            out.append(np.concatenate([*counted, row[at["theta"]], row[at["S"]], row[at["Psi"]]]))
-        return self._trace(np.array(out)[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]))
+        rows = np.atleast_2d(state)[:, self._head :]
+        out = np.empty((len(rows), self._groups[0][1].sizes.row))
+        for assets, recursion in self._groups:
+            out[assets] = recursion.look(rows[assets, : recursion.size])
+        return self._trace(out[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]))
 
     @property
     def _shape(self) -> tuple[int, ...]:
-        size = self._head + self._size
-        return (len(self.baselines), size) if self.fleet else (size,)
+        return (len(self.baselines), self._size) if self.fleet else (self._size,)
 
-    def _trace(self, out: FloatArray, index: npt.NDArray[np.int64]) -> Trace:
-        t = index / self.loop.sample_rate
-        traces = [
-            _compared(baseline, pipeline, pipeline.unpack(tuning, rows, index), t)
-            for baseline, pipeline, tuning, rows in zip(self.baselines, self._pipelines, self.tunings, out, strict=True)
-        ]
-        return Trace.stacked(traces) if self.fleet else traces[0]
+    def _trace(self, out: npt.NDArray[Any], index: npt.NDArray[np.int64]) -> Trace:
+        """Name what stands in complete evaluations (assets, K, row)."""
+        n, frequencies = len(self._followed[0].origin), self.loop.monitor.frequencies
+        shape, F = out.shape[:2], len(frequencies)
+        H = out[..., 4 + n + n * n :].reshape(*shape, F, 6)
+
+        def of_baseline(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+            """Return what an asset's baseline says, the same at all times."""
+            own = np.array(values) if len({id(value) for value in values}) > 1 else np.array(values[:1])
+            return np.broadcast_to(own[:, None], (*shape, *own.shape[1:]))
+
+        columns: dict[str, Any] = {
+            "theta": out[..., 4 : 4 + n],
+            "covariance": out[..., 4 + n : 4 + n + n * n].reshape(*shape, n, n),
+            "expected": of_baseline([each.origin for each in self._followed]),
+            "statistic": out[..., 1],
+            "level": out[..., 2],
+            "crossed": np.where(out[..., 3] > 0.0, (out[..., 3] - 1.0) / self.loop.sample_rate, np.nan),
+            "ready": out[..., 0] > 0.0,
+        }
+        pairs = np.ascontiguousarray(H[..., :2])
+        seen = pairs.view(np.result_type(pairs, np.complex64))[..., 0], H[..., 2:].reshape(*shape, F, 2, 2)
+        healthy = [of_baseline([getattr(each.healthy, x) for each in self._followed]) for x in ("H", "covariance")]
+        threshold: Any = np.array([each.limit for each in self.baselines])[:, None]
+        if not self.fleet:
+            columns = {name: values[0] for name, values in columns.items()}
+            seen, healthy, threshold = (seen[0][0], seen[1][0]), [x[0] for x in healthy], self.baselines[0].limit
+        f = np.asarray(frequencies, dtype=np.float64)
+        return Trace(
+            t=index / self.loop.sample_rate,
+            names=self.pipeline.bank.names,
+            threshold=threshold,
+            ifrf=Response(f, *seen),
+            ifrf_expected=Response(f, healthy[0], healthy[1]),
+            **columns,
+        )
 
 
-def _compared(baseline: Baseline, pipeline: Pipeline, e: Estimates, t: FloatArray) -> Trace:
-    """Compare with the healthy coefficients of the baseline; their bias under its references is taken out of both."""
-    covariance = e.S + baseline.cov()
-    theta = np.array(baseline.theta)
-    expected = np.broadcast_to(theta, e.theta.shape)
-    T2 = statistic(e.theta, expected, covariance)
-    bias = baseline.bias
-    return trace_of(baseline, pipeline, e, t, Compared(e.theta - bias, covariance, expected - bias, baseline.cov(), T2))
+def _clock(baseline: Baseline) -> Hashable:
+    """Return what all assets of one monitor must have in common."""
+    loop = baseline.loop
+    return loop.sample_rate, loop.monitor.evaluation_rate, baseline.names, loop.monitor.frequencies
+
+
+@dataclass(frozen=True, eq=False)
+class _Followed:
+    """What a monitor keeps of one baseline: everything but state."""
+
+    pipeline: Pipeline
+    stage: Stage
+    head: int
+    constants: Constants
+    origin: FloatArray
+    healthy: Response
+
+    @classmethod
+    def of(cls, baseline: Baseline) -> _Followed:
+        """Turn a baseline into constants; the bias under its references is taken out of estimate and expectation."""
+        from servoscope.recursion import View
+
+        pipeline, stage = baseline.pipeline(), Stage(baseline.loop, baseline.stage_one)
+        frequencies, origin = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
+        E = pipeline.bank.E(frequencies)
+        response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
+        view = View(baseline.cov(), origin, response)
+        constants = pipeline.constants(baseline.tuning, baseline.watch(pipeline), view)
+        healthy = ifrf.response(pipeline.bank, frequencies, origin, baseline.cov())
+        return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, origin, healthy)

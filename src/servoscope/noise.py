@@ -68,24 +68,36 @@ class Coloured:
             )
         return self.variance * psi
 
+    def chain(self) -> tuple[FloatArray, FloatArray]:
+        """Return v as the output of a chain of delays: its weights a_i and E[v(k) x_i(k+1)], both (max(p, q),).
+
+        v = x_0 + e, x_i(k+1) = a_i v + x_(i+1) + b_i e; coefficients that are zero but for rounding are left out.
+        """
+        moving = np.trim_zeros(np.where(np.abs(self.b) > 1e-12, self.b, 0.0), "b")
+        order, p, q = max(len(self.a), len(moving)), len(self.a), len(moving)
+        a, b = np.pad(self.a, (0, order - p)), np.pad(moving, (0, order - q))
+        gamma, c = np.pad(self.gamma, (0, order - p)), np.pad(self.c[:q], (0, order - q))
+        heads = [float(a[i:] @ gamma[: order - i] + b[i:] @ c[: order - i]) for i in range(order)]
+        return a, np.array(heads)
+
     def times(self, factor: float) -> Coloured:
         """Return the same colour with `factor` times the power."""
         return replace(self, gamma=factor * self.gamma, variance=factor * self.variance)
 
     def whiten(self, x: FloatArray) -> FloatArray:
         """Return innovations of unit variance for a column or columns of v, shape (N,) or (N, m)."""
-        from scipy.signal import lfilter
+        from servoscope.filtering import filtered
 
         A, B = self.polynomials
-        white: FloatArray = lfilter(A, B, x, axis=0) / np.sqrt(self.variance)
+        white: FloatArray = filtered(A, B, x) / np.sqrt(self.variance)
         return white
 
     def shape(self, x: FloatArray) -> FloatArray:
         """Return x passed through the filter that turns white noise of unit variance into v, shape as x."""
-        from scipy.signal import lfilter
+        from servoscope.filtering import filtered
 
         A, B = self.polynomials
-        shaped: FloatArray = lfilter(B, A, x, axis=0) * np.sqrt(self.variance)
+        shaped: FloatArray = filtered(B, A, x) * np.sqrt(self.variance)
         return shaped
 
     def autocovariance(self, lags: int) -> FloatArray:

@@ -21,7 +21,7 @@ from servoscope.valve import Valve, held_back
 if TYPE_CHECKING:
     from servoscope.cusum import Watch
     from servoscope.loop import Loop
-    from servoscope.recursion import BoolArray, Constants, IntArray
+    from servoscope.recursion import BoolArray, Constants, IntArray, Recursion, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,60 +174,71 @@ class Pipeline:
         """Memory N of the estimator in updates."""
         return self.loop.monitor.memory * self.loop.sample_rate / self.stride
 
-    def constants(self, tuning: Tuning, watch: Watch | None = None) -> Constants:
-        """Turn loop and tuning into what the compiled recursion takes; phi is divided by the tuning's scale.
+    def constants(
+        self, tuning: Tuning, watch: Watch | None = None, view: View | None = None, *, steady: bool = True
+    ) -> Constants:
+        """Turn loop and tuning into what the compiled recursion takes.
 
-        `watch` is the sequential test, scaled alike; without it there is none.
+        Parameters
+        ----------
+        tuning
+            Of the baseline.
+        watch
+            The sequential test; without it there is none.
+        view
+            What complete evaluations take; without it there are only those that a diagnosis takes.
+        steady
+            Whether P begins at P_d, so that an estimator that leaves it there needs none.
         """
         from servoscope import estimators
-        from servoscope.cusum import idle
         from servoscope.recursion import Constants
 
-        loop, bank, n = self.loop, self.bank, self.bank.n
-        system = self._behind_valve
-        rows = np.ones(len(system.C))
-        rows[1 : 1 + n] = 1.0 / tuning.scale
-        if bank.has_instrument:
-            rows[1 + n :] = 1.0 / tuning.scale
+        loop, bank, name = self.loop, self.bank, self.loop.monitor.estimator
+        steady = steady and hasattr(estimators.load(name), "steady")
+        # phi times this has P_d = I; the scale keeps Cholesky's factor from mixing units
         pairs = np.outer(tuning.scale, tuning.scale)
-        infinite = (-np.inf, np.inf)
+        basis = np.diag(1.0 / tuning.scale)
+        if steady:
+            basis = basis @ np.linalg.cholesky(tuning.P_d * pairs)
+        back = np.linalg.inv(basis)
+        theta = np.asarray(back @ tuning.theta, dtype=np.float64)
+        rows = np.eye(len(self._behind_valve.C))
+        rows[1 : 1 + bank.n, 1 : 1 + bank.n] = basis.T
+        if bank.has_instrument:
+            rows[1 + bank.n :, 1 + bank.n :] = basis.T
+        rows[0] -= theta @ rows[1 : 1 + bank.n]
         dead = loop.input_deadzone or (np.inf, -np.inf)
         unlimited = loop.input_logged == "after_limiter" or self.valve.size  # a valve law limits u itself
-        limits = infinite if unlimited else (loop.input_limits or infinite)
-        arrays = {
-            "A": system.A,
-            "B": system.B,
-            "C": rows[:, None] * system.C,
-            "D": rows[:, None] * system.D,
-            "X0": system.steady,
-            "vA": bank.velocity.A,
-            "vB": bank.velocity.B,
-            "vC": bank.velocity.C,
-            "vD": bank.velocity.D,
-            "vX0": bank.velocity.steady,
-            "limits": limits,
-            "deadzone": dead,
-            "theta": tuning.theta * tuning.scale,
-            "P_d": tuning.P_d * pairs,
-            "weights": np.concatenate([tuning.noise.a, tuning.noise.b]),
-            "heads": np.concatenate([tuning.noise.gamma, tuning.noise.c]),
-        }
+        lags, heads = tuning.noise.chain()
         return Constants(
-            **{name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()},
-            codes=np.array([EXTRAS.index(extra) for extra in bank.extras], dtype=np.int64),
+            estimator=name,
+            steady=steady,
+            bank=self._behind_valve.output(rows),
+            velocity=bank.velocity,
             v_of_r=bank.velocity_of_reference,
+            codes=tuple(EXTRAS.index(extra) for extra in bank.extras),
+            limits=(-np.inf, np.inf) if unlimited else (loop.input_limits or (-np.inf, np.inf)),
+            deadzone=dead,
             sign_speed=float(getattr(loop.plant, "sign_speed", 0.0)),
             rest_speed=loop.monitor.rest_speed,
             still_speed=self.still_speed,
             only_moving=loop.monitor.update_when == "moving",
             wait=bank.wait,
-            lags=len(tuning.noise.a),
             stride=self.stride,
             every=self.every,
+            scale=tuning.scale,
+            basis=basis,
+            theta=theta,
+            origin=tuning.theta,
+            P_d=back @ tuning.P_d @ back.T,
             R=tuning.R,
+            a=lags,
+            heads=heads,
+            variance=float(tuning.noise.gamma[0]),
             memory=self.memory,
-            extra=estimators.extra(loop.monitor.estimator, n, self.memory),
-            watch=watch or idle(n),
+            extra=estimators.extra(name, bank.n, self.memory),
+            watch=watch,
+            view=view,
         )
 
     def blank(self) -> Tuning:
@@ -260,49 +271,43 @@ class Pipeline:
         return self.valve.run(self.valve.start(), u, y, restart)
 
     @cached_property
-    def _plain(self) -> Constants:
-        """Constants that only form regressors: asked for again and again while signatures are drawn."""
-        return self.constants(self.blank())
+    def _plain(self) -> Recursion:
+        """The recursion that only forms regressors: asked for again and again while signatures are drawn."""
+        from servoscope.recursion import Recursion
+
+        return Recursion([self.constants(self.blank())])
 
     def regression(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
         """Form eta, phi and z of a block, each input of shape (N,); phi and z in physical units."""
-        from servoscope.recursion import Layout, regressors
-
-        c, n = self._plain, self.bank.n
-        state = Layout(c).start(c, 1)
-        out = np.zeros((len(r), len(c.C)))  # a missing sample writes nothing
-        ok = np.empty(len(r), dtype=np.int64)
+        n = self.bank.n
         u = self.input(r, self.flow(u, y, restart), restart)
-        regressors(c, state[0], r, u, y, restart, out, ok)
+        out, ok = self._plain.regressors(r, u, y, restart)
         return Regression(out[:, 0], out[:, 1 : 1 + n].copy(), out[:, -n:].copy(), ok == 1)
 
     def estimate(self, tuning: Tuning, recording: Recording, watch: Watch | None = None) -> Estimates:
         """Run the recursion over a recording, from the tuning's theta, with or without the sequential test."""
-        from servoscope.recursion import Layout, block
+        from servoscope.recursion import Recursion
 
         c = self.constants(tuning, watch)
-        layout = Layout(c)
-        state = layout.start(c, 1)
-        out = np.empty((1, recording.samples // self.every, layout.row))
+        recursion = Recursion([c])
+        state = recursion.start()
         r, y, restart = recording.r, recording.y, recording.restart
-        signals = (r, self.input(r, self.flow(recording.u, y, restart), restart), y, restart)
-        block(self.loop.monitor.estimator)(c, state, *(signal[None, :] for signal in signals), out)
-        index = (np.arange(out.shape[1]) + 1) * self.every - 1
-        return self.unpack(tuning, out[0], index)
+        u = self.input(r, self.flow(recording.u, y, restart), restart)
+        _, out = recursion.run(state, r[None], u[None], y[None], restart[None])
+        return self.unpack(c, out[0], recursion.rows(state, recording.samples))
 
-    def unpack(self, tuning: Tuning, rows: FloatArray, index: IntArray) -> Estimates:
-        """Turn rows of the recursion, shape (K, row), into estimates in physical units."""
-        n, s = self.bank.n, tuning.scale
-        pairs = np.outer(s, s)
+    def unpack(self, c: Constants, rows: FloatArray, index: IntArray) -> Estimates:
+        """Turn rows of a recursion, shape (K, row), into estimates in physical units."""
+        n, basis = self.bank.n, c.basis
         theta, S, Psi = np.split(rows[:, 5:], [n, n + n * n], axis=1)
         return Estimates(
             index=index,
             updates=rows[:, 0],
             skipped=rows[:, 1],
-            power=rows[:, 2] / tuning.noise.gamma[0],
+            power=rows[:, 2] / c.variance,
             level=rows[:, 3],
             crossed=rows[:, 4],
-            theta=theta / s,
-            S=S.reshape(-1, n, n) / pairs,
-            Psi=Psi.reshape(-1, n, n) * (s[None, :] / s[:, None]),
+            theta=c.origin + theta @ basis.T,
+            S=basis @ S.reshape(-1, n, n) @ basis.T,
+            Psi=basis @ Psi.reshape(-1, n, n) @ np.linalg.inv(basis),
         )

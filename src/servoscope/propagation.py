@@ -1,10 +1,14 @@
-"""Mean and covariance of theta_hat, carried through the recursion sample by sample; compiled."""
+"""Mean and covariance of theta_hat, carried through the recursion sample by sample."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.arithmetic import dot, fma, lower
 from servoscope.compiled import kernel
 from servoscope.plants import FloatArray
 
@@ -12,63 +16,46 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 
-@kernel
-def spread(
-    weights: FloatArray,
-    heads: FloatArray,
-    lags: int,
-    K: FloatArray,
-    phi: FloatArray,
-    S: FloatArray,
-    M: FloatArray,
-    Psi: FloatArray,
-) -> None:
-    """Carry the covariance of theta_hat through one update of gain K, for coloured noise v.
+def spread(c: Any, model: int, s: Any, at: int, lags: int, phi: Sequence[Any], K: Sequence[Any]) -> None:
+    """Carry the covariance of theta_hat through one update of gain K (n), regressor phi (n), for coloured noise v.
 
-    With theta_err(k+1) = (I - K phi') theta_err(k) + K v(k) and v(k) = sum a_j v(k-j) + e(k) + sum b_j e(k-j), the
-    joint covariance of theta_err, the last p values of v and the last q of e obeys a recursion of its own:
-    S = Cov(theta_err), M = E[theta_err [v_past e_past]']. It is exact for given phi, whatever the excitation and the
-    gating. `weights` are [a b], `heads` are E[v(k) v(k-j)] and E[v(k) e(k-j)], `lags` is p. Psi is the share of the
-    starting value that is left.
+    theta_err(k+1) = (I - K phi') theta_err(k) + K v(k), and v is an ARMA process with the state x of the filter that
+    makes it of white noise e (transposed direct form II): v = x_0 + e, x_i(k+1) = a_i v + x_(i+1) + b_i e. The joint
+    covariance of theta_err and x obeys a recursion of its own: S = Cov(theta_err), M = E[theta_err x']. It is exact for
+    given phi, whatever the excitation and the gating.
+
+    Parameters
+    ----------
+    c, model
+        Where the noise's model begins in the constants: E[v^2], `lags` weights a_i, as many E[v(k) x_i(k+1)].
+    s, at
+        Where S begins in the state: its lower triangle row by row, then M column by column.
     """
-    n, past = M.shape
-    m = np.empty(n)  # E[theta_err(k) v(k)]
-    q = np.empty(n)  # S phi
-    h = np.empty(n)  # phi' Psi
-    phi_m = 0.0
-    phi_q = 0.0
-    for i in range(n):
-        m[i] = 0.0
-        for j in range(past):
-            m[i] += M[i, j] * weights[j]
-        q[i] = 0.0
-        h[i] = 0.0
-        for j in range(n):
-            q[i] += S[i, j] * phi[j]
-            h[i] += phi[j] * Psi[j, i]
-    for i in range(n):
-        phi_m += phi[i] * m[i]
-        phi_q += phi[i] * q[i]
+    n = len(phi)
+    to_M = at + n * (n + 1) // 2
+    S = [[s[at + lower(i, j)] for j in range(n)] for i in range(n)]
+    m = [s[to_M + i] for i in range(n)]  # E[theta_err v]
+    q = [dot(S[i], phi) for i in range(n)]
+    half = (c[model] + dot(phi, q)) * 0.5 - dot(phi, m)
+    b = [fma(K[i], half, m[i] - q[i]) for i in range(n)]
     for i in range(n):
         for j in range(i + 1):
-            am_i = m[i] - K[i] * phi_m
-            am_j = m[j] - K[j] * phi_m
-            S[i, j] += (phi_q + heads[0]) * K[i] * K[j] - K[i] * q[j] - q[i] * K[j] + am_i * K[j] + K[i] * am_j
-            S[j, i] = S[i, j]
-        for j in range(n):
-            Psi[i, j] -= K[i] * h[j]
-    for j in range(past - 1, 0, -1):
-        if j == lags:  # e(k) is new: nothing before knew it
-            for i in range(n):
-                M[i, j] = K[i] * heads[j]
-        else:
-            phi_M = 0.0
-            for i in range(n):
-                phi_M += phi[i] * M[i, j - 1]
-            for i in range(n):
-                M[i, j] = M[i, j - 1] - K[i] * phi_M + K[i] * heads[j]
-    for i in range(n):
-        M[i, 0] = m[i] - K[i] * phi_m + K[i] * heads[0]
+            s[at + lower(i, j)] = fma(K[i], b[j], fma(b[i], K[j], S[i][j]))
+    for k in range(lags):
+        here, a = to_M + k * n, c[model + 1 + k]
+        column = [fma(a, m[i], s[here + n + i]) if k < lags - 1 else a * m[i] for i in range(n)]
+        rest = c[model + 1 + lags + k] - dot(phi, column)
+        for i in range(n):
+            s[here + i] = fma(K[i], rest, column[i])
+
+
+def remember(s: Any, at: int, phi: Sequence[Any], K: Sequence[Any]) -> None:
+    """Carry Psi (n, n), the share of the starting value that is left, through one update."""
+    n = len(phi)
+    for j in range(n):
+        left = dot(phi, [s[at + n * i + j] for i in range(n)])
+        for i in range(n):
+            s[at + n * i + j] = fma(-K[i], left, s[at + n * i + j])
 
 
 @kernel
@@ -91,7 +78,9 @@ def mean_path(
     (p, n, n) are the noise's E[phi eta] and E[phi phi'] with the plant ``which[k]`` (N,).
     """
     N, n = phi.shape
-    theta = start.copy()
+    theta = np.empty(n)
+    for i in range(n):
+        theta[i] = start[i]
     path = np.empty((N // every, n))
     gain = np.empty(n)
     pull = np.empty(n)
@@ -115,5 +104,6 @@ def mean_path(
                     step += P_d[i, j] * pull[j]
                 theta[i] += step / denominator
         if (k + 1) % every == 0:
-            path[(k + 1) // every - 1] = theta
+            for i in range(n):
+                path[(k + 1) // every - 1, i] = theta[i]
     return path

@@ -1,60 +1,77 @@
 """The compiled heart: constant arrays, state and a block of samples -> new state and evaluations.
 
-One sample, a log and a fleet run through the same `block`. The state of an asset is one row of floats; `Layout` says
-what stands where. Splitting a recording anywhere changes nothing, because everything that is carried from sample to
-sample stands in that row.
+One sample, a log and a fleet run through the same lines (`servoscope.chain`), compiled for the sizes at hand. The state
+of an asset is one row of floats; `Recursion.slices` says what stands where. Splitting a recording anywhere changes
+nothing, because everything that is carried from sample to sample stands in that row.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import itertools
+import os
+from collections import namedtuple
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope import cusum, estimators, propagation
-from servoscope.compiled import around, kernel
-from servoscope.cusum import LAGS, Watch, accumulate, follow
+from servoscope import drive, estimators
+from servoscope.chain import HEAD, SAMPLE, TILE, Chain, Plan, Sizes
+from servoscope.compiled import filled, inlined, kernel, traced
+from servoscope.cusum import LAGS, Watch
+from servoscope.linear import Linear
 from servoscope.plants import FloatArray
-from servoscope.propagation import spread
+from servoscope.straight import coefficients, pattern
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-# counters at the head of the state row
-ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, POWER, STILL, DRIFT, USED_UP, LEVEL, PEAK, CROSSED = range(12)
-HEAD = 12
-ABSURD = 1e100  # no physical signal; its square would overflow and stay in the state for ever
-# what `sense` says of a sample
-MISSING, HELD, USED, BETWEEN = -1, 0, 1, 2
+LANES = {"float64": 16, "float32": 32}  # assets side by side: state and constants stay in the first-level cache
+WIDTH = {"float64": 8, "float32": 16}  # numbers in a vector
+WATCHED = 8  # CUSUMs are counted in such steps, so that few codes serve many baselines
+STEPS = ("tick", "advance", "used", "learn", "prick", "listen", "alarm", "evaluate", "respond", "tell")
+ALONE = ("begin", "advance", "learn", "follow", "forget")  # where neighbours may do something else
+NOTHING = 1e-12  # of the first coefficient of a filter
+WORTH = 200_000  # samples from which a second core pays
+
+
+class View(NamedTuple):
+    """What complete evaluations take; `response` holds Re and Im of E(f).
+
+    `covariance` is that of the baseline (n, n), `origin` (n,) what is said where theta is the baseline's, both in
+    physical units, and `response` has shape (2 F, n).
+    """
+
+    covariance: FloatArray
+    origin: FloatArray
+    response: FloatArray
 
 
 class Constants(NamedTuple):
-    """Everything that a loop and a baseline say, as arrays (scaled: phi / scale, theta * scale).
+    """Everything that a loop and a baseline say, as arrays.
 
-    ``A, B, C, D, X0`` are the filter bank and its steady state per unit input, ``vA ... vX0`` the velocity filter,
-    `codes` the non-linear inputs, `limits` and `deadzone` of u; `weights` and `heads` are the noise's model as
-    `servoscope.propagation.spread` takes it, `lags` of them the autoregression's (heads[0] is its variance), in
-    updates: of every `stride`-th sample; `extra` is the size of the estimator's private state, and `watch` is the
-    sequential test.
+    The recursion's coordinates: phi is `basis`' times the physical one, theta what is left when the baseline's is taken
+    off and the rest divided by `basis` (n, n). With `steady` they are chosen so that P_d is the identity, and P stays
+    there. `theta` is the baseline's in these coordinates, `origin` the same in physical units.
+
+    `bank` and `velocity` are filters, `codes` the non-linear inputs, `limits` and `deadzone` of u; `a` (lags,) and
+    `heads` (lags,) are the noise's model as `servoscope.propagation.spread` takes it, `variance` that of v, in updates:
+    of every `stride`-th sample; `extra` is the size of the estimator's private state, and `watch` is the sequential
+    test.
     """
 
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    X0: FloatArray
-    vA: FloatArray
-    vB: FloatArray
-    vC: FloatArray
-    vD: FloatArray
-    vX0: FloatArray
+    estimator: str
+    steady: bool
+    bank: Linear
+    velocity: Linear
     v_of_r: bool
-    codes: IntArray
-    limits: FloatArray
-    deadzone: FloatArray
+    codes: tuple[int, ...]
+    limits: tuple[float, float]
+    deadzone: tuple[float, float]
     sign_speed: float
     rest_speed: float
     still_speed: float
@@ -62,259 +79,281 @@ class Constants(NamedTuple):
     wait: int
     stride: int
     every: int
+    scale: FloatArray
+    basis: FloatArray
     theta: FloatArray
+    origin: FloatArray
     P_d: FloatArray
     R: float
-    weights: FloatArray
+    a: FloatArray
     heads: FloatArray
-    lags: int
+    variance: float
     memory: float
     extra: int
-    watch: Watch
+    watch: Watch | None
+    view: View | None = None
 
 
-class Layout:
-    """Where things stand in the state row of one asset, and in a row of evaluations.
+def _places(sizes: dict[str, int], begin: int = 0) -> dict[str, int]:
+    ends = begin + np.cumsum(list(sizes.values()))
+    return {name: int(end) - size for (name, size), end in zip(sizes.items(), ends, strict=True)} | {
+        "end": int(ends[-1])
+    }
+
+
+def _shadow(c: Constants) -> Linear:
+    """Return r -> [what the healthy loop has as residual, phi], ready for the sequential test."""
+    w = c.watch
+    assert w is not None
+    first = np.concatenate([[1.0], -w.theta])[None, :]
+    return Linear(w.A, w.B, np.vstack([first @ w.C, w.C[1:]]), np.vstack([first @ w.D, w.D[1:]]))
+
+
+def _order(test: Watch) -> int:
+    """Return the order of the whitening filter, without coefficients that are zero but for rounding."""
+    size = np.maximum(np.abs(test.numerator), np.abs(test.denominator))
+    return int(np.flatnonzero(size > NOTHING)[-1])
+
+
+class Recursion:
+    """The recursion of one asset, or of several that share its structure.
 
     Parameters
     ----------
-    c
-        The constants, which fix the sizes.
+    constants
+        One per asset; all of one structure.
+    single
+        In single precision.
     """
 
-    def __init__(self, c: Constants) -> None:
-        nx, nv, n, p = len(c.A), len(c.vA), len(c.theta), len(c.weights)
-        self.n = n
-        sizes = {
-            "head": HEAD,
-            "x": nx,
-            "xv": nv,
-            "theta": n,
-            "P": n * n,
-            "S": n * n,
-            "M": n * p,
-            "Psi": n * n,
-            "extra": c.extra,
-            "watch": c.watch.size,
-        }
-        ends = np.cumsum(list(sizes.values()))
+    def __init__(self, constants: Sequence[Constants], *, single: bool = False) -> None:
+        self.constants = tuple(constants)
+        first = self.constants[0]
+        self._plan = _plan(self.constants)
+        self.sizes = self._plan.sizes
+        self._type = np.dtype(np.float32 if single else np.float64)
+        to = dict(self._plan.to)
+        names = list(to)
+        spans = {a: slice(HEAD + to[a], HEAD + to[b]) for a, b in itertools.pairwise(names)}
+        lowest = HEAD + to["end"]
+        self.size = lowest + self.sizes.watched + first.extra
         self.slices = {
-            name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)
+            **spans,
+            "cusum": slice(lowest, lowest + self.sizes.watched),
+            "extra": slice(lowest + self.sizes.watched, self.size),
         }
-        self.size = int(ends[-1])
-        self.row = 5 + n + 2 * n * n  # counters, sequential test, theta, S, Psi
+        self._own = len({id(c) for c in self.constants}) > 1
+        table = np.array([_packed(c, self._plan) for c in (self.constants if self._own else (first,))])
+        self._table = table
+        self._lanes = 1 if (len(self.constants) == 1 and not single) or first.extra else LANES[self._type.name]
+        self._blocks = -(-len(self.constants) // self._lanes)
+        self._laid = self._layer()
+        self._code = machine(self._plan, self._lanes, min(self._lanes, WIDTH[self._type.name]), int(self._own))
 
-    def start(self, c: Constants, assets: int) -> FloatArray:
-        """Return the state before the first sample, shape (assets, size): theta at the baseline, P = P_d."""
-        state = np.zeros((assets, self.size))
-        state[:, self.slices["theta"]] = c.theta
-        state[:, self.slices["P"]] = c.P_d.ravel()
-        state[:, self.slices["Psi"]] = np.eye(self.n).ravel()
-        state[:, POWER] = c.heads[0]
+    def _layer(self) -> npt.NDArray[Any]:
+        """Return the constants as the compiled blocks take them, (blocks, rows times lanes)."""
+        if not self._own:
+            return np.ascontiguousarray(self._table, dtype=self._type)
+        lanes = np.minimum(np.arange(self._blocks * self._lanes), len(self._table) - 1)
+        table = self._table[lanes].reshape(self._blocks, self._lanes, -1).swapaxes(1, 2)
+        return np.ascontiguousarray(table.reshape(self._blocks, -1), dtype=self._type)
+
+    def start(self) -> FloatArray:
+        """Return the states before the first sample, shape (assets, size): theta at the baseline, P = P_d."""
+        state = np.zeros((len(self.constants), self.size))
+        n, at = self.sizes.n, self.slices
+        for row, c in zip(state, self.constants, strict=True):
+            row[at["power"]] = c.variance
+            if not self.sizes.steady:
+                row[at["P"]] = c.P_d.ravel()
+        if self.sizes.start:
+            state[:, at["Psi"]] = np.eye(n).ravel()
         return state
 
+    def rows(self, state: FloatArray, samples: int) -> IntArray:
+        """Return the samples, counted from 0 since the start, at whose end a block of so many evaluates."""
+        number, every = int(state[0, SAMPLE]), self.constants[0].every
+        return np.arange(number // every + 1, (number + samples) // every + 1) * every - 1
 
-@kernel
-def sense(
-    c: Constants,
-    s: FloatArray,
-    w: FloatArray,
-    v_out: FloatArray,
-    r: float,
-    u: float,
-    y: float,
-    restart: bool,
-) -> int:
-    """Pass one sample through the filter bank; v_out becomes [eta, phi, z].
+    def run(
+        self,
+        state: FloatArray,
+        r: npt.NDArray[Any],
+        u: npt.NDArray[Any],
+        y: npt.NDArray[Any],
+        restart: BoolArray | None = None,
+    ) -> tuple[FloatArray, npt.NDArray[Any]]:
+        """Feed a block of samples, shape (assets, N); return the new states and evaluations (assets, K, row)."""
+        c = self.constants[0]
+        state = np.ascontiguousarray(state)
+        new = np.empty_like(state)
+        out = np.empty((len(state), len(self.rows(state, r.shape[1])), self.sizes.row), dtype=self._type)
+        flags = np.zeros((0, 0), dtype=np.bool_) if restart is None else restart
+        signals = state, new, r, u, y, flags, c.every, c.stride
 
-    Returns `USED` when the sample may update the estimator, `HELD` when the filters settle, the axis rests or u is
-    dead, `BETWEEN` when the stride leaves it out, and `MISSING` for a NaN: then only the demand to re-arm stays.
-    """
-    s[SAMPLE] += 1.0
-    if not (abs(r) < ABSURD and abs(u) < ABSURD and abs(y) < ABSURD):  # NaN is not below anything either
-        s[ARMED] = 0.0
-        return MISSING
-    nx = c.A.shape[0]
-    nv = c.vA.shape[0]
-    x = s[HEAD : HEAD + nx]
-    xv = s[HEAD + nx : HEAD + nx + nv]
-    arm = restart or s[ARMED] == 0.0
-    source = r if c.v_of_r else y
-    if arm:
-        for i in range(nv):
-            xv[i] = c.vX0[i, 0] * source
-    v = c.vD[0, 0] * source
-    for i in range(nv):
-        v += c.vC[0, i] * xv[i]
-    t0 = c.vA[0, 0] * xv[0] + c.vA[0, 1] * xv[1] + c.vB[0, 0] * source
-    xv[1] = c.vA[1, 0] * xv[0] + c.vA[1, 1] * xv[1] + c.vB[1, 0] * source
-    xv[0] = t0
-    w[0] = r
-    w[1] = min(max(u, c.limits[0]), c.limits[1])
-    w[2] = y
-    for i in range(len(c.codes)):
-        if c.codes[i] == 0:
-            w[3 + i] = 0.0 if abs(v) <= c.sign_speed else (1.0 if v > 0.0 else -1.0)
-        elif c.codes[i] == 1:
-            w[3 + i] = max(v, 0.0)
-        elif c.codes[i] == 2:
-            w[3 + i] = min(v, 0.0)
+        def part(begin: int, end: int) -> None:
+            self._code.block(self._laid, *signals, out, begin, end)
+
+        workers = min(_cores(), self._blocks) if r.size >= WORTH else 1
+        if workers == 1:
+            part(0, self._blocks)
         else:
-            w[3 + i] = 1.0
-    nw = len(w)
-    if arm:
-        s[ARMED] = 1.0
-        s[WAIT] = c.wait
-        for i in range(nx):
-            x[i] = 0.0
-            for j in range(nw):
-                x[i] += c.X0[i, j] * w[j]
-    for i in range(len(v_out)):
-        v_out[i] = 0.0
-        for j in range(nw):
-            v_out[i] += c.D[i, j] * w[j]
-        for j in range(nx):
-            v_out[i] += c.C[i, j] * x[j]
-    new = np.empty(nx)
-    for i in range(nx):
-        new[i] = 0.0
-        for j in range(nw):
-            new[i] += c.B[i, j] * w[j]
-        for j in range(nx):
-            new[i] += c.A[i, j] * x[j]
-    for i in range(nx):
-        x[i] = new[i]
-    # a reversal is short; an axis that has stood longer than the filters remember is at rest
-    s[DRIFT] += (v - s[DRIFT]) / c.wait  # the speed without its noise
-    s[STILL] = s[STILL] + 1.0 if abs(s[DRIFT]) < c.still_speed else 0.0
-    at_rest = s[STILL] > c.wait
-    if at_rest or (c.only_moving and (abs(v) <= c.rest_speed or (c.deadzone[0] <= w[1] <= c.deadzone[1]))):
-        # what enters the filters now has nothing to do with the motion: wait until they have forgotten it
-        s[WAIT] = c.wait
-        return HELD
-    if s[WAIT] > 0.0:
-        s[WAIT] -= 1.0
-        return HELD
-    if c.stride > 1 and s[SAMPLE] % c.stride != 0.0:
-        return BETWEEN
-    return USED
+            edges = np.linspace(0, self._blocks, 4 * workers + 1).astype(int).tolist()
+            with ThreadPoolExecutor(workers) as pool:
+                list(pool.map(part, edges[:-1], edges[1:]))
+        return new, out
+
+    @property
+    def stepper(self) -> tuple[Callable[[FloatArray, FloatArray, float, float, float], bool], FloatArray]:
+        """What takes one sample of the first asset, and its first argument; the second is the state (size,)."""
+        return machine(self._plan, 1, 1, 1).step, np.ascontiguousarray(self._table[0])
+
+    def look(self, state: FloatArray) -> FloatArray:
+        """Return the evaluations of states as they are, shape (assets, row)."""
+        out = np.empty((len(state), self.sizes.row))
+        machine(self._plan, 1, 1, int(self._own)).look(self._table, np.ascontiguousarray(state), out)
+        return out
+
+    def regressors(
+        self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
+    ) -> tuple[FloatArray, IntArray]:
+        """Return [eta, phi, z] of every sample of the first asset (N, rows), and what it is good for (N,)."""
+        out = np.zeros((len(r), self.sizes.rows))  # a missing sample writes nothing
+        ok = np.empty(len(r), dtype=np.int64)
+        machine(self._plan, 1, 1, 1).regress(
+            self._table[0], self.start()[0], r, u, y, restart, self.constants[0].stride, out, ok
+        )
+        return out, ok
 
 
-def _update(*_: Any) -> int:  # the template's placeholder: `block` is built with an estimator in its place
-    return 0
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _block(
-    c: Constants,
-    state: FloatArray,
-    r: FloatArray,
-    u: FloatArray,
-    y: FloatArray,
-    restart: BoolArray,
-    out: FloatArray,
-) -> int:
-    nx = c.A.shape[0]
-    nv = c.vA.shape[0]
-    n = len(c.theta)
-    p = len(c.weights)
-    assets, samples = r.shape
-    w = np.empty(c.B.shape[1])
-    v_out = np.empty(c.C.shape[0])
-    K = np.empty(n)
-    watched = len(c.watch.limits) > 0
-    nxs = c.watch.A.shape[0]
-    shadow = np.empty(1 + n)
-    row = 0
-    for asset in range(assets):
-        s = state[asset]
-        o = HEAD + nx + nv
-        theta = s[o : o + n]
-        P = s[o + n : o + n + n * n].reshape((n, n))
-        o += n + n * n
-        S = s[o : o + n * n].reshape((n, n))
-        M = s[o + n * n : o + n * n + n * p].reshape((n, p))
-        o += n * n + n * p
-        Psi = s[o : o + n * n].reshape((n, n))
-        extra = s[o + n * n : o + n * n + c.extra]
-        xs = s[o + n * n + c.extra : o + n * n + c.extra + nxs]
-        o += n * n + c.extra + nxs
-        filters = (n + 1) * (len(c.watch.numerator) - 1) + n + LAGS
-        test = s[o : o + filters + len(c.watch.limits)]
-        phi = v_out[1 : 1 + n]
-        z = v_out[len(v_out) - n :]
-        row = 0
-        for k in range(samples):
-            arm = restart[asset, k] or s[ARMED] == 0.0
-            if s[SAMPLE] % c.every == 0.0:  # a new evaluation begins
-                s[PEAK] = s[LEVEL]
-                if s[LEVEL] < 1.0:
-                    s[CROSSED] = 0.0
-            ok = sense(c, s, w, v_out, r[asset, k], u[asset, k], y[asset, k], restart[asset, k])
-            if watched and ok != MISSING:
-                follow(c.watch, xs, r[asset, k], arm, shadow)
-            if ok == USED:
-                if watched:
-                    s[USED_UP] += 1.0
-                    s[LEVEL] = accumulate(c.watch, test, v_out[0], phi, shadow, s[USED_UP])
-                    s[PEAK] = max(s[PEAK], s[LEVEL])
-                    if s[LEVEL] >= 1.0 and s[CROSSED] == 0.0:
-                        s[CROSSED] = s[SAMPLE]
-                e = v_out[0]
-                for i in range(n):
-                    e -= phi[i] * theta[i]
-                if _update(theta, P, c.P_d, c.R, c.memory, v_out[0], phi, z, K, extra) == 0:
-                    s[UPDATES] += 1.0
-                    s[POWER] += (e * e - s[POWER]) / c.memory
-                else:
-                    s[SKIPPED] += 1.0
-                spread(c.weights, c.heads, c.lags, K, phi, S, M, Psi)
-            elif ok != BETWEEN:
-                for i in range(n):  # after a gap or a rest the noise is new
-                    for j in range(p):
-                        M[i, j] = 0.0
-                if watched:
-                    s[USED_UP] = 0.0
-                    for i in range(filters):
-                        test[i] = 0.0
-            if s[SAMPLE] % c.every == 0.0:
-                q = out[asset, row]
-                q[0] = s[UPDATES]
-                q[1] = s[SKIPPED]
-                q[2] = s[POWER]
-                q[3] = s[PEAK]
-                q[4] = s[CROSSED]
-                for i in range(n):
-                    q[5 + i] = theta[i]
-                    for j in range(n):
-                        q[5 + n + i * n + j] = S[i, j]
-                        q[5 + n + n * n + i * n + j] = Psi[i, j]
-                row += 1
-    return row
+def structure(c: Constants) -> Hashable:
+    """Return what assets must have in common to be followed side by side."""
+    plan = _plan([c])
+    sizes = plan.sizes._replace(lags=0, memory=0, watched=0, floats=0)
+    return plan.estimator, sizes, plan.bank, c.stride, c.every, c.memory
 
 
-@kernel
-def regressors(
-    c: Constants,
-    state: FloatArray,
-    r: FloatArray,
-    u: FloatArray,
-    y: FloatArray,
-    restart: BoolArray,
-    out: FloatArray,
-    ok: IntArray,
-) -> None:
-    """Write [eta, phi, z] of every sample of one asset to `out` (N, 1 + n [+ n]) and what `sense` says to `ok` (N,)."""
-    w = np.empty(c.B.shape[1])
-    for k in range(len(r)):
-        ok[k] = sense(c, state, w, out[k], r[k], u[k], y[k], restart[k])
+def _plan(constants: Sequence[Constants]) -> Plan:
+    first = constants[0]
+    watched = [c for c in constants if c.watch is not None]
+    shadows = [_shadow(c) for c in watched]
+    n, rows = len(first.basis), len(first.bank.C)
+    nxs = len(shadows[0].A) if shadows else 0
+    memory = max((_order(c.watch) for c in watched if c.watch), default=0)
+    heard = max((len(c.watch.limits) for c in watched if c.watch), default=0)
+    lags = max(len(c.a) for c in constants)
+    speed = 0
+    if first.codes or first.only_moving or first.still_speed > 0.0:
+        speed = 2 if first.v_of_r else 1
+    start = first.view is None
+    frequencies = 0 if first.view is None else len(first.view.response) // 2
+    to = _places(
+        {
+            **{"power": 1, "drift": 1, "level": 1, "peak": 1, "x": len(first.bank.A), "velocity": 2 * bool(speed)},
+            **{"theta": n, "P": 0 if first.steady else n * n, "S": n * (n + 1) // 2, "M": n * lags},
+            **{"Psi": n * n * start, "shadow": nxs, "white": (n + 1) * memory, "psi": (n + LAGS) * bool(nxs)},
+        }
+    )
+    found, seen = pattern([c.bank for c in constants]), pattern(shadows) if shadows else ((), ())
+    entries = [sum(len(row) for part in p for row in part) for p in (found, seen)]
+    names = ("low", "high", "dead_low", "dead_high", "sign_speed", "rest_speed", "still_speed", "wait", "forget")
+    at = _places(
+        {
+            **dict.fromkeys(("every", "stride", *names, "memory", "share", "R", "warm"), 1),
+            **{"velocity": 11, "bank": entries[0], "steady": len(first.bank.A) * first.bank.B.shape[1]},
+            **{"P_d": 0 if first.steady else n * n, "noise": 1 + 2 * lags, "shadow": entries[1], "shadow_steady": nxs},
+            **{"apart": n, "white": 1 + 2 * memory, "prior": 0 if start else n * n, "origin": 0 if start else n},
+            **{"basis": 0 if start else n * n, "response": frequencies * 2 * (n + 1)},
+        }
+    )
+    sizes = Sizes(
+        n=n,
+        rows=rows,
+        inputs=first.bank.B.shape[1],
+        states=len(first.bank.A),
+        speed=speed,
+        gated=first.only_moving,
+        codes=first.codes,
+        lags=lags,
+        shadow=nxs,
+        memory=memory,
+        watched=-(-heard // WATCHED) * WATCHED,
+        steady=first.steady,
+        extra=first.extra,
+        frequencies=frequencies,
+        start=start,
+        row=5 + n + 2 * n * n if start else 4 + n + n * n + 6 * frequencies,
+        floats=to["end"],
+    )
+    return Plan(first.estimator, sizes, tuple(to.items()), tuple((*at.items(), ("tail", at["end"]))), found, seen)
+
+
+def _packed(c: Constants, plan: Plan) -> FloatArray:
+    """Return the constants of one asset as one row."""
+    n, lags, memory, watched, v = plan.sizes.n, plan.sizes.lags, plan.sizes.memory, plan.sizes.watched, c.velocity
+    test, view = c.watch, c.view
+
+    def wide(x: FloatArray, size: int) -> FloatArray:
+        return np.pad(x, (0, size - len(x)))
+
+    shadow = wide(np.zeros(0), dict(plan.at)["white"] - dict(plan.at)["shadow"] + 1 + 2 * memory)
+    members = np.concatenate([np.zeros((n + LAGS) * watched), np.full(watched, np.inf), np.zeros(watched)])
+    if test is not None:
+        system = _shadow(c)
+        apart = np.linalg.solve(c.basis, test.theta / c.scale) - c.theta
+        shadow = np.concatenate(
+            [
+                *(coefficients(plan.shadow, system), test.X0[:, 0], apart, [test.gain]),
+                *(wide(test.numerator[1 : 1 + memory], memory), wide(test.denominator[1 : 1 + memory], memory)),
+            ]
+        )
+        heard = len(test.limits)
+        table = np.zeros((n + LAGS + 2, watched))
+        table[n + LAGS] = np.inf
+        table[:, :heard] = np.vstack([test.changes.T, test.limits, 1.0 / test.limits])
+        members = table.ravel()
+    seen: list[FloatArray] = []
+    if view is not None:
+        E = view.response.reshape(-1, 2, n)
+        parts = [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E]
+        back = np.linalg.inv(c.basis)
+        seen = [(back @ view.covariance @ back.T).ravel(), view.origin, c.basis.ravel(), *parts]
+    counts = [c.every, c.stride]
+    gates = [*c.limits, *c.deadzone, c.sign_speed, c.rest_speed, c.still_speed, c.wait, 1.0 / c.wait]
+    return np.concatenate(
+        [
+            *([float(x) for x in (*counts, *gates, c.memory, 1.0 / c.memory, c.R, test.warm if test else 0)],),
+            *(v.A.ravel(), v.B[:, 0], v.C[0], v.D[0], v.steady[:, 0]),
+            *(coefficients(plan.bank, c.bank), c.bank.steady.ravel(), np.zeros(0) if c.steady else c.P_d.ravel()),
+            *([c.variance], wide(c.a, lags), wide(c.heads, lags), shadow, *seen, members),
+        ]
+    )
 
 
 @functools.cache
-def block(estimator: str) -> Callable[..., int]:
-    """Compile the block function around one estimator.
-
-    The signature is ``block(c, state, r, u, y, restart, out) -> rows``; r, u, y, restart have shape
-    (assets, samples), `state` is changed in place, and `out` (assets, rows, `Layout.row`) receives an evaluation
-    every ``c.every`` samples.
-    """
-    return around(estimators.load(estimator), _block, [propagation, cusum])
+def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
+    """Return the drivers of `servoscope.drive` for a plan, by name; each compiles when it is first called."""
+    estimator, sizes = estimators.load(plan.estimator), plan.sizes
+    steps = Chain(plan, getattr(estimator, "steady", None))
+    to, at = dict(plan.to), dict(plan.at)
+    literals = {x: getattr(sizes, x) for x in ("n", "rows", "row", "floats", "frequencies", "extra", "watched")}
+    literals |= {"columns": sizes.n + 1, "room": sizes.n + 2, "tile": 4 * TILE}
+    literals |= {"lanes": lanes, "width": width, "own": own}
+    names: dict[str, object] = {f"_{name}": number for name, number in literals.items()}
+    names |= {"_to": namedtuple("To", to)(**to), "_at": namedtuple("At", at)(**at), "_update": estimator.update}
+    for step in STEPS:
+        names[f"_{step}"] = traced(getattr(steps, step), width, "" if own else "c")
+    for step in ALONE:
+        names[f"_{step}_one"] = traced(getattr(steps, step))
+    heap = not sizes.steady  # estimators with a P of their own allocate
+    for template in drive.PARTS:
+        names[f"_{template.__name__}"] = inlined(filled(template, names), heap)
+        names["_take"] = names.get("_settled" if sizes.steady else "_refreshed")
+        names["_take_all"] = names.get("_together" if sizes.steady else "_apart")
+        names["_write"] = names.get("_plain" if sizes.start else "_complete")
+    what = repr((plan, lanes, width, own))
+    return SimpleNamespace(**{driver.__name__: kernel(filled(driver, names, what), heap) for driver in drive.DRIVERS})

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from servoscope import estimators
+from servoscope import estimators, straight
+from servoscope.arithmetic import dot, fma
 from servoscope.errors import NotEnoughError
 from servoscope.linear import Linear, taps
 from servoscope.plants import FloatArray
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 LENGTHS = {"fir": 40, "laguerre": 12}  # functions, where a loop file does not say
 RIDGE = 1e-4  # of the mean excitation: what r excites less is not learned, and adds no noise to u_a
 FORGOTTEN = 1e-3  # share of a start-up transient that is let through
+WIDE = 8  # numbers in a vector
 ARMED, WAIT = range(2)  # counters at the head of the state row
 HEAD = 2
 
@@ -52,12 +54,13 @@ class StageOne:
 
 
 class Constants(NamedTuple):
-    """What the compiled stage takes: the functions of r as a linear system (A, B, C, D, steady X0), and the tuning."""
+    """What the compiled stage takes: the functions of r as a linear system, and the tuning.
 
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
+    `functions` are the `straight.coefficients` of the system, X0 its steady state; P_d is filled up with zeros to whole
+    vectors.
+    """
+
+    functions: FloatArray
     X0: FloatArray
     limits: FloatArray
     wait: int
@@ -114,9 +117,14 @@ class Stage:
         system = functions(loop)
         infinite = (-np.inf, np.inf)
         limits = (loop.input_limits or infinite) if loop.input_logged == "before_limiter" else infinite
+        found, P_d = straight.pattern([system]), np.array(tuning.P_d)
         arrays = {
-            **{"A": system.A, "B": system.B, "C": system.C, "D": system.D, "X0": system.steady},
-            **{"limits": limits, "theta": tuning.theta, "P_d": tuning.P_d},
+            **{"functions": straight.coefficients(found, system), "X0": system.steady[:, 0]},
+            **{
+                "limits": limits,
+                "theta": tuning.theta,
+                "P_d": _filled(P_d),
+            },
         }
         self._constants = Constants(
             **{name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()},
@@ -124,18 +132,20 @@ class Stage:
             R=tuning.R,
             memory=loop.monitor.memory * loop.sample_rate,
         )
-        n = len(tuning.theta)
-        extra = estimators.extra(loop.monitor.estimator, n, self._constants.memory)
-        self.size = HEAD + len(system.A) + n + n * n + extra
-        self._block = block(loop.monitor.estimator)
+        n, name = len(tuning.theta), loop.monitor.estimator
+        self._steady = hasattr(estimators.load(name), "steady")
+        self._P = 0 if self._steady else n * n
+        self.size = HEAD + len(system.A) + n + self._P + estimators.extra(name, n, self._constants.memory)
+        self._block = block(name, found)
 
     def start(self) -> FloatArray:
         """Return the state before the first sample, shape (size,)."""
         if not self.size:
             return np.zeros(0)
         c = self._constants
-        used = HEAD + len(c.A) + len(c.theta) + c.P_d.size
-        return np.concatenate([np.zeros(HEAD + len(c.A)), c.theta, c.P_d.ravel(), np.zeros(self.size - used)])
+        P = np.zeros(0) if self._steady else c.P_d[: len(c.theta), : len(c.theta)].ravel()
+        used = np.concatenate([np.zeros(HEAD + len(c.X0)), c.theta, P])
+        return np.pad(used, (0, self.size - len(used)))
 
     def run(self, state: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray) -> FloatArray:
         """Return u_a of a block, shape (N,), and change `state` (size,) in place.
@@ -193,20 +203,57 @@ def tune(loop: Loop, recordings: Sequence[Recording]) -> StageOne | None:
     return StageOne(tuple(theta.tolist()), tuple(tuple(row) for row in P_d.tolist()), R)
 
 
-def _update(*_: Any) -> int:  # the template's placeholder: `block` is built with an estimator in its place
-    return 0
+# what the templates are filled with: sizes, arrays of fixed shape, and as code the functions of r, products of vectors,
+# and how theta is updated
+_states: Any = None
+_padded: Any = None
+_laid: Any = None
+_functions: Any = None
+_products: Any = None
+_column: Any = None
+_steady: Any = None
+_learn: Any = None
+_update: Any = None
 
 
-def _stage_one(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray, u_a: FloatArray) -> None:
-    nx = c.A.shape[0]
+def settled(
+    c: Constants, s: FloatArray, theta: FloatArray, phi: FloatArray, K: FloatArray, sums: FloatArray, eta: float
+) -> None:
+    """Update theta where P stays at P_d: K = P_d phi/(R + phi' P_d phi)."""
+    strength, left = c.R, eta
+    for i in range(WIDE):
+        left -= sums[i]
+        strength += sums[WIDE + i]
+    step = left / strength
+    for i in range(len(theta)):
+        theta[i] += K[i] * step
+
+
+def refreshed(
+    c: Constants, s: FloatArray, theta: FloatArray, phi: FloatArray, K: FloatArray, sums: FloatArray, eta: float
+) -> None:
+    """Update theta and P by any estimator."""
     n = len(c.theta)
-    x = s[HEAD : HEAD + nx]
-    theta = s[HEAD + nx : HEAD + nx + n]
-    P = s[HEAD + nx + n : HEAD + nx + n + n * n].reshape((n, n))
-    extra = s[HEAD + nx + n + n * n :]
-    phi = np.empty(n)
-    K = np.empty(n)
-    new = np.empty(nx)
+    P = s[HEAD + _states + n : HEAD + _states + n + n * n].reshape((n, n))
+    extra = s[HEAD + _states + n + n * n :]
+    _update(theta[:n], P, c.P_d[:n, :n], c.R, c.memory, eta, phi[:n], phi[:n], K[:n], extra)
+
+
+def stage(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray, u_a: FloatArray) -> None:
+    """Write u_a of a block."""
+    n = len(c.theta)
+    x = _laid(s[HEAD : HEAD + _states], 1, 1)
+    weights, P_d = _laid(c.functions, 1, 1), _laid(c.P_d.reshape(c.P_d.size), WIDE, 1)
+    w, phi, K, theta, sums = (
+        np.empty((1, 1)),
+        np.zeros(_padded),
+        np.zeros(_padded),
+        np.zeros(_padded),
+        np.zeros(2 * WIDE),
+    )
+    theta[:n] = s[HEAD + _states : HEAD + _states + n]
+    one, wide, weight, gain = _laid(phi, 1, 1), _laid(phi, WIDE, 1), _laid(theta, WIDE, 1), _laid(K, WIDE, 1)
+    parts = _laid(sums, WIDE, 1)
     for k in range(len(r)):
         u_a[k] = np.nan
         if not (np.isfinite(r[k]) and np.isfinite(u[k])):
@@ -215,30 +262,72 @@ def _stage_one(c: Constants, s: FloatArray, r: FloatArray, u: FloatArray, restar
         if restart[k] or s[ARMED] == 0.0:
             s[ARMED] = 1.0
             s[WAIT] = c.wait
-            for i in range(nx):
-                x[i] = c.X0[i, 0] * r[k]
-        for i in range(n):
-            phi[i] = c.D[i, 0] * r[k]
-            for j in range(nx):
-                phi[i] += c.C[i, j] * x[j]
-        for i in range(nx):
-            new[i] = c.B[i, 0] * r[k]
-            for j in range(nx):
-                new[i] += c.A[i, j] * x[j]
-        for i in range(nx):
-            x[i] = new[i]
+            for i in range(_states):
+                x[i, 0] = c.X0[i] * r[k]
+        w[0, 0] = r[k]
+        _functions(0, weights, x, w, one)
         if s[WAIT] > 0.0:
             s[WAIT] -= 1.0
             continue
-        u_a[k] = 0.0
-        for i in range(n):
-            u_a[k] += phi[i] * theta[i]
-        _update(theta, P, c.P_d, c.R, c.memory, min(max(u[k], c.limits[0]), c.limits[1]), phi, phi, K, extra)
+        if _steady:
+            K[:] = 0.0
+            for j in range(0, _padded, WIDE):
+                _column(0, P_d, one, gain, j)
+        _products(0, wide, weight, gain, parts)
+        total = 0.0
+        for i in range(WIDE):
+            total += sums[i]
+        u_a[k] = total
+        _learn(c, s, theta, phi, K, sums, min(max(u[k], c.limits[0]), c.limits[1]))
+    s[HEAD + _states : HEAD + _states + n] = theta[:n]
 
 
 @functools.cache
-def block(estimator: str) -> Callable[..., None]:
-    """Compile stage 1 around one estimator: ``block(c, state, r, u, restart, u_a)``."""
-    from servoscope.compiled import around
+def block(estimator: str, found: straight.Pattern) -> Callable[..., None]:
+    """Compile stage 1 around one estimator and the functions of r: ``block(c, state, r, u, restart, u_a)``."""
+    from servoscope.compiled import filled, inlined, kernel, laid, traced
 
-    return around(estimators.load(estimator), _stage_one)
+    tools, n = estimators.load(estimator), len(found[0])
+    steady, rows = hasattr(tools, "steady"), _rows(n)
+
+    def functions(c: Any, s: Any, w: Any, v: Any) -> None:
+        for i, number in enumerate(straight.advance(found, c, 0, s, 0, [w[0]])):
+            v[i] = number
+
+    def column(P_d: Any, one: Any, K: Any, j: Any) -> None:
+        """Add so many columns of P_d as a vector is wide, each times its phi, to K."""
+        for i in range(rows):
+            total = K[i]
+            for k in range(WIDE):
+                total = fma(P_d[j * rows + (k * rows + i)], one[j + k], total)
+            K[i] = total
+
+    def products(phi: Any, theta: Any, K: Any, sums: Any) -> None:
+        """Write the products phi' theta and phi' K, in as many parts as a vector is wide."""
+        for place, other in enumerate((theta, K)):
+            sums[place] = dot([phi[i] for i in range(rows)], [other[i] for i in range(rows)])
+
+    names: dict[str, object] = {
+        "_states": len(found[1]),
+        "_padded": rows * WIDE,
+        "_update": tools.update,
+        "_laid": laid,
+        "_steady": steady,
+    }
+    names |= {
+        "_functions": traced(functions),
+        "_products": traced(products, WIDE),
+        "_column": traced(column, WIDE, "one"),
+    }
+    names["_learn"] = inlined(filled(settled if steady else refreshed, names), heap=True)
+    return kernel(filled(stage, names, repr((estimator, found))))
+
+
+def _filled(P_d: FloatArray) -> FloatArray:
+    """Return a matrix filled up with zeros to whole vectors, in both directions."""
+    return np.pad(P_d, (0, _rows(len(P_d)) * WIDE - len(P_d)))
+
+
+def _rows(n: int) -> int:
+    """Return how many vectors n numbers take."""
+    return -(-n // WIDE)

@@ -13,6 +13,7 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from servoscope.baseline import Baseline
+    from servoscope.bench import Result
     from servoscope.inspection import Inspection
     from servoscope.loop import Columns
     from servoscope.readers import ChannelInfo
@@ -221,3 +222,17 @@ def claims(out: Console, found: Sequence[tuple[str, str, str]]) -> None:
     for claim, measured, verdict in found:
         out.print(Text.assemble((verdict, COLOURS[verdict]), f": {claim}"))
         out.print(Padding(Text(measured, style="dim"), INDENT))
+
+
+def speed(out: Console, found: Result) -> None:
+    """Print what was measured of speed: per sample, beside what it is compared with, and single numbers."""
+    table = Table("", "ns per sample", "quartiles", "times", "as long as", "difference", box=None)
+    for figure in found.figures:
+        median, low, high = figure.ns
+        ratio = "" if figure.ratio is None else f"{figure.ratio:.3g}"
+        error = "" if figure.error is None else f"{figure.error:.1g}"
+        table.add_row(figure.name, f"{median:.1f}", f"{low:.1f} to {high:.1f}", ratio, figure.to, error)
+    out.print(table)
+    out.print()
+    for name, number in found.facts.items():
+        out.print(f"{name}: {number:.4g}")

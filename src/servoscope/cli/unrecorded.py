@@ -156,6 +156,24 @@ def reproduce(
 
 
 @app.command()
+def bench(
+    repeats: Annotated[int, typer.Option(metavar="N", min=1, help="Of each measurement; medians count.")] = 9,
+    as_json: AsJson = False,
+) -> None:
+    """Measure how fast it is here, beside the machine's own limits and the other libraries that are installed."""
+    from servoscope import bench as benchmark
+    from servoscope.cli import terminal
+    from servoscope.cli.progress import progress
+
+    with progress(9, 1) as steps:
+        found = benchmark.run(repeats, steps.begin)
+    if as_json:
+        print_json(found.to_dict(), lines=False)
+    else:
+        terminal.speed(terminal.console(), found)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for what it writes.")] = Path(
         "demo-output"

@@ -11,7 +11,10 @@ that P_d was tuned on (nothing in a sliding window, whose length it is). P carri
 residual variance, its P is P/R here.
 
 Optional: ``EXTRA(n, memory)``, the size of a private state that arrives as `extra`, zero at the start (without it,
-`extra` has length zero); and ``EXCEPTIONS``, which of the `CHECKS` that all estimators share it cannot pass, and why.
+`extra` has length zero); ``steady(R, phi) -> K``, the gain where P never leaves P_d once it is there, in coordinates
+in which P_d is the identity (a recursion that starts there needs no P); and ``EXCEPTIONS``, which of the `CHECKS` that
+all estimators share it cannot pass, and why.
+
 A monitor runs with any of them; those without "covariance" and "mean" among their exceptions are the ones whose
 statistic and fault sizes mean what they say under any excitation, the others are for comparison.
 """

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
+from servoscope.arithmetic import dot
 from servoscope.compiled import kernel
 from servoscope.plants import FloatArray
 
 NAME = "akf"
 NEEDS_INSTRUMENT = False
+
+
+def steady(R: Any, phi: Sequence[Any]) -> list[Any]:
+    """Return the gain of a filter that began at P = P_d, for a phi (n) scaled so that P_d is I.
+
+    (11) leaves P = P_d where it is, exactly: what is left of `update` is K = P_d phi/(R + phi' P_d phi).
+    """
+    factor = 1.0 / (R + dot(phi, phi))
+    return [x * factor for x in phi]
 
 
 @kernel

@@ -104,19 +104,16 @@ def regressors(recording: Recording, loop: Loop, delay: float | None = None) -> 
     delay
         In place of the loop's [s].
     """
-    from servoscope.recursion import USED, Layout
-    from servoscope.recursion import regressors as form
+    from servoscope.chain import USED
+    from servoscope.recursion import Recursion
 
     monitor = loop.monitor.model_copy(update={"structure": "svf", "update_when": "always"})
     loop = loop.model_copy(update={"monitor": monitor, "delay": loop.delay if delay is None else delay})
     bank = inverse.build(loop)
     pipeline = Pipeline(loop, bank)
     constants = pipeline.constants(pipeline.blank())._replace(stride=1)  # here, every sample counts
-    rows = np.empty((recording.samples, len(constants.C)))
-    said = np.empty(recording.samples, dtype=np.int64)
-    state = Layout(constants).start(constants, 1)[0]
     u = pipeline.flow(recording.u, recording.y, recording.restart)
-    form(constants, state, recording.r, u, recording.y, recording.restart, rows, said)
+    rows, said = Recursion([constants]).regressors(recording.r, u, recording.y, recording.restart)
     return Regressors(loop, bank, rows[:, 0], rows[:, 1 : 1 + bank.n], said == USED)
 
 

@@ -105,21 +105,20 @@ class ResidualGenerator:
         from_zero
             Start at theta = 0 and P = 100 P_d, to see it converge; otherwise at the healthy estimate.
         """
-        from servoscope.recursion import Layout, block
+        from servoscope.recursion import Recursion
 
         pipeline = self.pipeline
-        c = pipeline.constants(self.tuning)
-        layout = Layout(c)
-        state = layout.start(c, 1)
+        c = pipeline.constants(self.tuning, steady=False)
+        recursion = Recursion([c])
+        state = recursion.start()
         if from_zero:
-            state[:, layout.slices["theta"]] = 0.0
-            state[:, layout.slices["P"]] *= IGNORANT
-        out = np.empty((1, recording.samples // pipeline.every, layout.row))
+            state[:, recursion.slices["theta"]] = -c.theta
+            state[:, recursion.slices["P"]] *= IGNORANT
         r, restart = recording.r, recording.restart
-        signals = (r, pipeline.input(r, recording.u, restart), self.output(recording), restart)
-        block(pipeline.loop.monitor.estimator)(c, state, *(signal[None, :] for signal in signals), out)
-        index = (np.arange(out.shape[1]) + 1) * pipeline.every - 1
-        theta = pipeline.unpack(self.tuning, out[0], index).theta
+        u, y = pipeline.input(r, recording.u, restart), self.output(recording)
+        _, out = recursion.run(state, r[None], u[None], y[None], restart[None])
+        index = recursion.rows(state, recording.samples)
+        theta = pipeline.unpack(c, out[0], index).theta
         H = theta @ pipeline.bank.E(FREQUENCIES).T
         return Course(recording.t[index], theta, H, H - self.nominal)
 

@@ -20,7 +20,7 @@ def at_rest(estimator: str, seed: int) -> tuple[FloatArray, FloatArray]:
 
     At rest the reference stands still; phi still carries the position and the noise.
     """
-    from servoscope.recursion import Layout, block
+    from servoscope.recursion import Recursion
 
     loop = rig(structure="tustin", estimator=estimator, memory=10.0, evaluation_rate=1.0)
     r = PAPER.r()
@@ -28,19 +28,16 @@ def at_rest(estimator: str, seed: int) -> tuple[FloatArray, FloatArray]:
     whole = np.concatenate([moving, np.full(round(RESTING * loop.sample_rate), moving[-1])])
     made = ResidualGenerator.of(loop, PAPER.record(loop, seed + 1000))
     recording = simulate(loop, whole, seed=seed)[0]
-    c = made.pipeline.constants(made.tuning)
-    layout = Layout(c)
-    state = layout.start(c, 1)
-    every = made.pipeline.every
-    run = block(estimator)
-    out = np.empty((1, 1, layout.row))
+    c = made.pipeline.constants(made.tuning, steady=False)
+    recursion = Recursion([c])
+    state = recursion.start()
+    every, n = made.pipeline.every, len(c.theta)
     L = _root(c.P_d)
     sizes = []
     for begin in range(0, recording.samples, every):
         signals = (getattr(recording, name)[None, begin : begin + every] for name in ("r", "u", "y", "restart"))
-        run(c, state, *signals, out)
-        P = state[0, layout.slices["P"]].reshape(layout.n, layout.n)
-        sizes.append(_largest(L, P))
+        state, _ = recursion.run(state, *signals)
+        sizes.append(_largest(L, state[0, recursion.slices["P"]].reshape(n, n)))
     return recording.t[every - 1 :: every], np.array(sizes)
 
 

@@ -77,28 +77,34 @@ def read_csv(path: Path, head: bytes) -> CsvColumns:
         if layout.delimiter == " ":
             # Arrow knows no runs of blanks as one delimiter.
             text = "\n".join(re.sub(r"[ \t]+", " ", line.strip()) for line in text.splitlines())
-        source = io.BytesIO(text.encode())
+        source = text.encode()
     broken: list[tuple[int, int, str]] = []
     comments = 0
 
     def invalid(row: Any) -> str:
-        nonlocal comments
+        nonlocal broken, comments
         if row.text.lstrip().startswith(COMMENTS):
             comments += 1
         else:
             broken.append((row.number, row.actual_columns, row.text))
         return "skip"
 
-    try:
-        table = pc.read_csv(
-            source or path,
-            # Row numbers, which messages name, exist without threads only.
-            read_options=pc.ReadOptions(column_names=layout.names, skip_rows=layout.skipped, use_threads=False),
+    def parse(threads: bool) -> Any:
+        return pc.read_csv(
+            io.BytesIO(source) if source is not None else path,
+            read_options=pc.ReadOptions(column_names=layout.names, skip_rows=layout.skipped, use_threads=threads),
             parse_options=pc.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=invalid),
             convert_options=pc.ConvertOptions(
                 null_values=list(NULLS), strings_can_be_null=True, decimal_point=layout.decimal
             ),
         )
+
+    try:
+        table = parse(True)
+        if broken or comments:
+            # row numbers, which messages name, exist without threads only
+            broken, comments = [], 0
+            table = parse(False)
     except pa.ArrowInvalid as error:
         raise RecordingError(f"{path}: cannot be read as CSV ({' '.join(str(error).split())[:100]})") from None
     if len(broken) > max(1, MOST_BROKEN * table.num_rows):

@@ -103,31 +103,19 @@ def _heights(
     z: FloatArray, run: npt.NDArray[np.int32], width: int, smallest: float, at_edge: float
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
     """Find where `width` samples stand above or below both neighbours: where (n,), and heights (n,)."""
-    count = z.size - width + 1
-    windows = np.lib.stride_tricks.sliding_window_view(z, width)
-    low, high = windows.min(axis=1), windows.max(axis=1)
-    before, after = np.full(count, np.nan), np.full(count, np.nan)
-    same_before = run[: count - 1] == run[1:count]
-    same_after = run[width - 1 : -1] == run[width:]
-    before[1:][same_before] = z[: count - 1][same_before]
-    after[:-1][same_after] = z[width:][same_after]
-    inside = run[:count] == run[width - 1 :]
-    with np.errstate(invalid="ignore"):
-        height = np.maximum(low - np.fmax(before, after), np.fmin(before, after) - high)
-    edge = np.isnan(before) | np.isnan(after)
-    with np.errstate(invalid="ignore"):
-        start = np.flatnonzero(inside & (height > np.where(edge, at_edge, smallest)))
-    return start, height[start]
+    from servoscope.recording.scanning import heights
+
+    start, height = np.empty(z.size, dtype=np.intp), np.empty(z.size)
+    found = heights(z, run, width, smallest, at_edge, start, height)
+    return start[:found], height[:found]
 
 
 def _local_steps(z: FloatArray, start: npt.NDArray[np.intp], width: npt.NDArray[np.intp]) -> FloatArray:
     """Upper quartile of the steps around each place, shape (n,)."""
-    steps = np.abs(np.diff(z))
-    if start.size == 0 or steps.size == 0:
+    if start.size == 0 or z.size < 2:
         return np.zeros(start.size)
-    offsets = np.arange(-NEIGHBOURS, NEIGHBOURS)
-    at = np.where(offsets < 0, start[:, None], start[:, None] + width[:, None]) + offsets
-    # Mirrored at the ends, a spike's own width away, so that one at the end is not compared with itself.
-    at = np.where(at < 0, width[:, None] - at, at)
-    at = np.where(at >= steps.size, 2 * steps.size - 2 - at - width[:, None], at)
-    return np.asarray(np.quantile(steps[np.clip(at, 0, steps.size - 1)], 0.75, axis=1), dtype=np.float64)
+    from servoscope.recording.scanning import local_steps
+
+    quartile = np.empty(start.size)
+    local_steps(z, start, width, NEIGHBOURS, quartile)
+    return quartile

@@ -1,0 +1,177 @@
+"""How the cost of a sample grows with assets, coefficients, FIR length and frequencies, beside the machine's limit.
+
+python benchmarks/growth.py [-o docs/images/growth.png] [--json]
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tables import machine, parser
+
+from servoscope.bench import interleaved, limits
+from servoscope.chain import Chain
+from servoscope.linear import sampled, stack, state_variable_filter
+from servoscope.recursion import Constants, Recursion, View
+from servoscope.twostage import Stage, StageOne
+
+RATE = 100.0
+REPEATS = 9
+
+
+class Tally(float):
+    """A number that counts what is done with numbers of its kind."""
+
+    done = 0
+
+    def _counted(self, other: float, name: str) -> Tally:
+        Tally.done += 1
+        return Tally(getattr(float, name)(self, float(other)))
+
+    for _name in ("__add__", "__radd__", "__sub__", "__rsub__", "__mul__", "__rmul__", "__truediv__", "__rtruediv__"):
+        locals()[_name] = functools.partialmethod(_counted, name=_name)
+
+    def __neg__(self) -> Tally:
+        return Tally(-float(self))
+
+
+def constants(n: int = 4, frequencies: int = 3) -> Constants:
+    """Return the recursion of a loop of n coefficients behind a state-variable filter of order n."""
+    svf = state_variable_filter(10.0, n)
+    bank = stack([sampled(svf, RATE, "zoh").output(np.eye(1, n)), sampled(svf, RATE, "foh")])
+    route = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    system = type(bank)(bank.A, bank.B @ route, bank.C / np.abs(bank.C).max(axis=1)[:, None], bank.D @ route)
+    velocity = sampled(state_variable_filter(25.0, 2), RATE, "foh").output(np.array([[0.0, 1.0]]))
+    rng = np.random.default_rng(0)
+    view = View(np.eye(n), np.zeros(n), rng.standard_normal((2 * frequencies, n)))
+    one, a = np.eye(n), np.array([0.5, 0.1, 0.05, 0.01])
+    return Constants(
+        estimator="akf", steady=True, bank=system, velocity=velocity, v_of_r=False, codes=(),
+        limits=(-np.inf, np.inf), deadzone=(np.inf, -np.inf), sign_speed=0.0, rest_speed=0.0, still_speed=0.0,
+        only_moving=False, wait=20, stride=1, every=10, scale=np.ones(n), basis=one, theta=np.zeros(n),
+        origin=np.zeros(n), P_d=one, R=100.0, a=a, heads=a, variance=1.0, memory=500.0, extra=0, watch=None, view=view,
+    )  # fmt: skip
+
+
+def operations(c: Constants) -> float:
+    """Return how many additions and multiplications one sample takes, its share of an evaluation included."""
+    recursion = Recursion([c])
+    chain = Chain(recursion._plan, lambda R, phi: [x * (1.0 / (R + sum(p * p for p in phi))) for x in phi])
+    row = [Tally(x) for x in recursion._table[0]]
+    s, h = ([Tally(0.1)] * size for size in (recursion.sizes.floats, 8))
+    v, said, q = ([Tally(1.0)] * size for size in (recursion.sizes.rows, 1, recursion.sizes.row))
+    tile = [Tally(0.1)] * 32
+    Tally.done = 0
+    chain.advance(row, s, h, said, v, [], tile, 0, True)
+    chain.learn(row, s, h, v, [], [])
+    each, Tally.done = Tally.done, 0
+    for i in range(recursion.sizes.floats):
+        s[i] = Tally(1.0 + i % 3)
+    chain.evaluate(row, s, h, q)
+    for f in range(recursion.sizes.frequencies):
+        chain.respond(row, s, f, q)
+    return each + Tally.done / c.every
+
+
+def fleet(c: Constants, assets: int, samples: int) -> tuple[Callable[[], object], int]:
+    """Return a job of one core over a fleet, and its samples."""
+    recursion = Recursion([c] * assets)
+    signals = np.random.default_rng(1).standard_normal((3, assets, samples))
+    state, _ = recursion.run(recursion.start(), *signals)
+    return lambda: recursion.run(state, *signals), assets * samples
+
+
+def fir(n: int) -> tuple[Callable[[], object], int]:
+    """Return a job of stage 1 with n taps, and its samples."""
+    from servoscope.bench.running import rig
+
+    loop = rig(two_stage="adaptive", stage_one_length=n)
+    P_d = np.eye(n) * 1e-3
+    stage = Stage(loop, StageOne((0.1,) * n, tuple(tuple(row) for row in P_d.tolist()), 1.0))
+    r, u = np.random.default_rng(1).standard_normal((2, 20_000))
+    restart = np.zeros(20_000, dtype=np.bool_)
+    return lambda: stage.run(stage.start(), r, u, restart), 20_000
+
+
+def main() -> None:
+    """Measure, draw, print."""
+    command = parser(__doc__)
+    command.add_argument("-o", "--output", type=Path, help="also draw it")
+    given = command.parse_args()
+    from servoscope import recursion
+
+    recursion._cores = lambda: 1
+    sweeps: dict[str, dict[int, tuple[Callable[[], object], int]]] = {
+        "assets": {A: fleet(constants(), A, max(100, 100_000 // A)) for A in (1, 4, 16, 64, 1000, 10_000, 100_000)},
+        "coefficients": {n: fleet(constants(n), 1024, 100) for n in range(2, 9)},
+        "frequencies": {F: fleet(constants(4, F), 1024, 100) for F in (1, 3, 10, 30, 100)},
+        "taps of stage 1 (FIR), one log": {n: fir(n) for n in (8, 16, 40, 64, 128)},
+    }
+    jobs: dict[str, Callable[[], object]] = {}
+    burn, count = limits.multiply_adds(200_000)
+    jobs["fma"] = burn
+    for sweep, points in sweeps.items():
+        jobs |= {f"{sweep}={x}": job for x, (job, _) in points.items()}
+    found = interleaved(jobs, REPEATS)
+    per_fma = 1e9 * found["fma"].median / count
+    least = {
+        "assets": {A: operations(constants()) / 2 for A in sweeps["assets"]},
+        "coefficients": {n: operations(constants(n)) / 2 for n in sweeps["coefficients"]},
+        "frequencies": {F: operations(constants(4, F)) / 2 for F in sweeps["frequencies"]},
+        "taps of stage 1 (FIR), one log": {n: n * n + 4 * n for n in sweeps["taps of stage 1 (FIR), one log"]},
+    }
+    result: dict[str, Any] = {"machine": machine(), "ns per multiply-add at the peak, one core": per_fma}
+    for sweep, points in sweeps.items():
+        result[sweep] = {
+            x: {
+                "ns": 1e9 * found[f"{sweep}={x}"].median / samples,
+                "quartiles": [1e9 * q / samples for q in (found[f"{sweep}={x}"].low, found[f"{sweep}={x}"].high)],
+                "limit": least[sweep][x] * per_fma,
+            }
+            for x, (_, samples) in points.items()
+        }
+    if given.output:
+        draw(result, list(sweeps), given.output)
+    if given.json:
+        print(json.dumps(result, indent=1))
+    else:
+        print(machine())
+        for sweep in sweeps:
+            print(f"\n| {sweep} | ns per sample | quartiles | limit |\n| --- | --- | --- | --- |")
+            for x, p in result[sweep].items():
+                print(
+                    f"| {x} | {p['ns']:.1f} | {p['quartiles'][0]:.1f} to {p['quartiles'][1]:.1f} | {p['limit']:.1f} |"
+                )
+
+
+def draw(result: dict[str, Any], sweeps: list[str], path: Path) -> None:
+    """Draw one panel per sweep."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(2, 2, figsize=(9.0, 6.5), layout="constrained")
+    for ax, sweep in zip(axes.flat, sweeps, strict=True):
+        points = result[sweep]
+        x = list(points)
+        ns, limit = ([p[name] for p in points.values()] for name in ("ns", "limit"))
+        low, high = zip(*(p["quartiles"] for p in points.values()), strict=True)
+        ax.plot(x, ns, "o-", label="measured, one core")
+        ax.fill_between(x, low, high, alpha=0.3)
+        ax.plot(x, limit, "k--", label="its multiply-adds at the peak rate")
+        ax.set(xlabel=sweep, ylabel="ns per sample", ylim=(0.0, None))
+        if sweep in ("assets",):
+            ax.set_xscale("log")
+        ax.grid(alpha=0.3)
+    axes[0, 0].legend()
+    figure.savefig(path, dpi=120)
+
+
+if __name__ == "__main__":
+    main()

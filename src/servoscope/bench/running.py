@@ -1,0 +1,266 @@
+"""All measurements of one run: the chain on one log, sample by sample, as a fleet; peers, limits, many simulations."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from servoscope.bench import limits, oracle, peers
+from servoscope.bench.measuring import Figure, Measured, interleaved
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from servoscope.baseline import Baseline
+    from servoscope.loop import Loop
+    from servoscope.recording import Recording
+
+FLEET, SECOND = 10_000, 100  # assets, and samples of each
+LOG = 60_000  # samples
+FEW = 2_000  # samples for what is slow
+STEPS = 20_000
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run found.
+
+    Parameters
+    ----------
+    figures
+        Lines of the table.
+    facts
+        Single numbers: peak and bandwidth, scaling over cores, bytes of state, percentiles of a step, simulations.
+    """
+
+    figures: tuple[Figure, ...]
+    facts: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON takes it."""
+        return {"figures": [asdict(figure) for figure in self.figures], "facts": dict(self.facts)}
+
+
+def rig(**monitor: Any) -> Loop:
+    """Return the reference rig with other monitor settings."""
+    from servoscope.loop import Loop
+
+    content = Loop.load(Path(str(files("servoscope"))) / "examples" / "reference-rig.toml").to_dict()
+    return Loop.from_dict(content | {"monitor": content["monitor"] | monitor})
+
+
+def run(repeats: int = 9, tell: Callable[[str], None] = lambda _: None) -> Result:
+    """Measure everything; about a minute.
+
+    Parameters
+    ----------
+    repeats
+        Of each measurement, in turns; the medians count.
+    tell
+        Hears what comes next.
+    """
+    from servoscope.learning import learn
+    from servoscope.simulation import reference, simulate
+
+    tell("a baseline")
+    loop = rig()
+    recording, _ = simulate(loop, reference("profile", 60.0, loop.sample_rate), seed=1)
+    baseline = learn(loop, [recording])
+    tell("limits of the machine")
+    facts = _limits(repeats)
+    tell("one log")
+    figures = _log(baseline, recording, repeats)
+    tell("two stages")
+    figures += _two_stages(recording, repeats)
+    tell("one sample at a time")
+    facts |= _steps(baseline, recording)
+    tell("a fleet")
+    more, scaling = _fleet(baseline, recording, repeats)
+    figures += more
+    facts |= scaling
+    tell("peers")
+    figures += _peers(baseline, recording, max(3, repeats // 3))
+    tell("a thousand simulations")
+    facts |= monte_carlo(baseline, 1000)
+    return Result(tuple(figures), facts)
+
+
+def _figure(name: str, measured: Measured, samples: int, base: tuple[str, Measured, int] | None = None) -> Figure:
+    ns = tuple(1e9 * x / samples for x in (measured.median, measured.low, measured.high))
+    if base is None:
+        return Figure(name, (ns[0], ns[1], ns[2]))
+    ratio = (base[1].median / base[2]) / (measured.median / samples)
+    return Figure(name, (ns[0], ns[1], ns[2]), 1.0 / ratio, base[0])
+
+
+def _limits(repeats: int) -> dict[str, float]:
+    burn, count = limits.multiply_adds(200_000)
+    copy, moved = limits.copying()
+    found = interleaved({"fma": burn, "copy": copy}, repeats)
+    return {
+        "peak multiply-adds per ns, one core, double": count / found["fma"].median / 1e9,
+        "memory, GB/s read and written, one core": moved / found["copy"].median / 1e9,
+    }
+
+
+def _tiled(recording: Recording, samples: int) -> list[np.ndarray[Any, Any]]:
+    return [np.resize(signal, samples) for signal in (recording.r, recording.u, recording.y)]
+
+
+def _without_test(baseline: Baseline) -> Baseline:
+    return baseline.model_copy(update={"members": ()})
+
+
+def _log(baseline: Baseline, recording: Recording, repeats: int) -> list[Figure]:
+    from servoscope.monitor import Monitor
+    from servoscope.recursion import Recursion
+
+    monitors = {"whole": Monitor(baseline), "bare": Monitor(_without_test(baseline))}
+    signals, few = _tiled(recording, LOG), _tiled(recording, FEW)
+    pipeline = baseline.pipeline()
+    c = pipeline.constants(baseline.tuning)
+    jobs: dict[str, Callable[[], object]] = {
+        name: lambda m=monitor: m.run(m.init(), *signals)  # type: ignore[misc]
+        for name, monitor in monitors.items()
+    }
+    jobs["numpy"] = lambda: oracle.follow(c, few[0], few[1], few[2])
+    found = interleaved(jobs, repeats)
+    theta, S = oracle.follow(c, few[0], few[1], few[2])
+    recursion = Recursion([c])
+    _, rows = recursion.run(recursion.start(), *(signal[None] for signal in few))
+    n = len(theta)
+    ours = rows[0, -1, 5 : 5 + n], rows[0, -1, 5 + n : 5 + n + n * n].reshape(n, n)
+    error = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(ours, (theta, S), strict=True))
+    base = "one log, NumPy, sample by sample", found["numpy"], FEW
+    bare = _figure("one log, without the sequential test", found["bare"], LOG, base)
+    return [
+        _figure(base[0], found["numpy"], FEW),
+        Figure(bare.name, bare.ns, bare.ratio, bare.to, error),
+        _figure("one log, everything", found["whole"], LOG, base),
+    ]
+
+
+def _two_stages(recording: Recording, repeats: int) -> list[Figure]:
+    from servoscope.learning import learn
+    from servoscope.monitor import Monitor
+
+    monitor = Monitor(_without_test(learn(rig(two_stage="adaptive"), [recording])))
+    signals = _tiled(recording, LOG)
+    found = interleaved({"two": lambda: monitor.run(monitor.init(), *signals)}, repeats)
+    return [_figure("one log, two stages, FIR of 40, without the sequential test", found["two"], LOG)]
+
+
+def _steps(baseline: Baseline, recording: Recording) -> dict[str, float]:
+    from servoscope.monitor import Monitor
+
+    monitor = Monitor(baseline)
+    state = monitor.init()
+    samples = list(zip(*(x.tolist() for x in _tiled(recording, STEPS)), strict=True))
+    times = np.empty(STEPS)
+    for k, (r, u, y) in enumerate(samples):
+        begin = time.perf_counter_ns()
+        monitor.step(state, r, u, y)
+        times[k] = time.perf_counter_ns() - begin
+    median, rare = np.percentile(times[100:], [50.0, 99.9])
+    return {
+        "one step from Python, us, median": float(median) / 1e3,
+        "one step from Python, us, 99.9 %": float(rare) / 1e3,
+        "state of an asset, bytes": float(state.nbytes),
+    }
+
+
+@contextmanager
+def _on_one_core() -> Iterator[None]:
+    from servoscope import recursion
+
+    cores = recursion._cores
+    recursion._cores = lambda: 1
+    try:
+        yield
+    finally:
+        recursion._cores = cores
+
+
+def _fleet(baseline: Baseline, recording: Recording, repeats: int) -> tuple[list[Figure], dict[str, float]]:
+    from servoscope.monitor import Monitor
+
+    rng, total = np.random.default_rng(0), FLEET * SECOND
+    begin = rng.integers(0, recording.samples - SECOND, FLEET)
+    at = begin[:, None] + np.arange(SECOND)
+    jobs: dict[str, Callable[[], object]] = {}
+    for precision, number in (("double", np.float64), ("single", np.float32)):
+        signals = [signal[at].astype(number) for signal in (recording.r, recording.u, recording.y)]
+        for what, each in (("without the sequential test", _without_test(baseline)), ("everything", baseline)):
+            monitor = Monitor([each] * FLEET, precision=precision)  # type: ignore[arg-type]
+            state, _ = monitor.run(monitor.init(), *signals)
+            name = f"fleet of {FLEET}, {precision}, {what}"
+
+            def job(m: Any = monitor, s: Any = state, x: Any = signals) -> None:
+                m.run(s, *x)
+
+            def alone(job: Callable[[], None] = job) -> None:
+                with _on_one_core():
+                    job()
+
+            jobs[name] = job
+            jobs[f"{name}, one core"] = alone
+    found = interleaved(jobs, repeats)
+    figures = [_figure(name, measured, total) for name, measured in found.items()]
+    from servoscope.recursion import _cores
+
+    first = next(iter(found))
+    gain = found[f"{first}, one core"].median / found[first].median
+    return figures, {"scaling of a fleet over cores, share of the ideal": gain / _cores(), "cores": float(_cores())}
+
+
+def _peers(baseline: Baseline, recording: Recording, repeats: int) -> list[Figure]:
+    pipeline, tuning = baseline.pipeline(), baseline.tuning
+    g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
+    eta, phi = g.eta[g.ok][:FEW].copy(), np.ascontiguousarray(g.phi[g.ok][:FEW] / tuning.scale)
+    P_d = tuning.P_d * np.outer(tuning.scale, tuning.scale)
+    figures = []
+    for what, jobs in (
+        ("Kalman filter", peers.kalman(eta, phi, P_d, tuning.R, pipeline.memory)),
+        ("least squares", peers.least_squares(eta, phi, pipeline.memory)),
+    ):
+        found = interleaved(jobs, repeats)
+        results = {name: job() for name, job in jobs.items()}
+        base = f"{what}, servoscope", found["servoscope"], FEW
+        for name, measured in found.items():
+            figure = _figure(f"{what}, {name}", measured, FEW, base)
+            error = float(np.abs(results[name] - results["servoscope"]).max() / np.abs(results["servoscope"]).max())
+            figures.append(Figure(figure.name, figure.ns, figure.ratio, figure.to, error))
+    return figures
+
+
+def monte_carlo(baseline: Baseline, count: int, seconds: float = 60.0) -> dict[str, float]:
+    """Simulate closed loops, half of them with a leak, and follow them as one fleet; return times [s] and alarms."""
+    from servoscope.monitor import Monitor
+    from servoscope.simulation import FaultEvent, reference, simulate
+
+    loop = baseline.loop
+    r = reference("profile", seconds, loop.sample_rate)
+    leak = (FaultEvent("C_ie", 1.2, seconds / 2.0),)
+    begin = time.perf_counter()
+    signals = np.empty((3, count, len(r)))
+    for seed in range(count):
+        recording, _ = simulate(loop, r, faults=leak if seed % 2 else (), seed=1000 + seed)
+        signals[:, seed] = recording.r, recording.u, recording.y
+    simulated = time.perf_counter()
+    monitor = Monitor([baseline] * count)
+    _, trace = monitor.run(monitor.init(), *signals)
+    alarms = np.asarray(trace.exceeded.any(axis=1), dtype=np.bool_).reshape(-1)
+    done = time.perf_counter()
+    return {
+        f"{count} simulations of {seconds:g} s, s": simulated - begin,
+        f"{count} simulations followed as a fleet, s": done - simulated,
+        "alarms among those with a leak, share": float(alarms[1::2].mean()),
+        "alarms among the healthy, share": float(alarms[::2].mean()),
+    }

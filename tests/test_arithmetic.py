@@ -1,0 +1,103 @@
+"""Arithmetic that is code or numbers: both agree, and code rounds alike however many lanes go together."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from servoscope import compiled
+from servoscope.arithmetic import dot, fma, larger, lower, root, smaller, where
+from servoscope.compiled import filled, kernel, sources, traced
+from servoscope.linear import Linear
+from servoscope.straight import advance, coefficients, pattern
+
+LANES = 16
+
+
+def mixed(x: Any, y: Any) -> None:
+    """Use every operation once; y becomes functions of x."""
+    a, b, c = x[0], x[1], x[2]
+    y[0] = fma(a, b, c) + 2.0 * a - b / (1.0 + abs(c))
+    y[1] = larger(a, smaller(b, 0.5)) - root(abs(a) + 1.0)
+    y[2] = where(a > b, where(c <= 0.0, where(a >= 0.0, where(b < 1.0, 1.0, 2.0), -1.0), c), 1.0 / (abs(b) + 0.1))
+    y[3] = dot([a, b, c], [c, -a, b])
+
+
+def apply(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any], step: int) -> None:
+    for a in range(0, x.shape[1], step):
+        _part(a, x, y)
+
+
+_part: Any = None
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_code_does_to_lanes_what_python_does_to_numbers(kind: Any) -> None:
+    x = np.random.default_rng(0).standard_normal((3, LANES)).astype(kind)
+    found = []
+    for width in (1, 8, 16):
+        y = np.zeros((4, LANES), dtype=kind)
+        kernel(filled(apply, {"_part": traced(mixed, width)}, f"{width}"), heap=False)(x, y, width)
+        found.append(y)
+    assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2])
+    for a in range(LANES):
+        plain = dict.fromkeys(range(4), 0.0)
+        mixed([float(v) for v in x[:, a]], plain)
+        assert found[0][:, a] == pytest.approx(
+            list(plain.values()), rel=1e-14 if kind is np.float64 else 1e-5, abs=1e-6
+        )
+
+
+def test_a_symmetric_matrix_is_stored_once() -> None:
+    assert sorted({lower(i, j) for i in range(4) for j in range(4)}) == list(range(10))
+    assert lower(1, 3) == lower(3, 1)
+
+
+def test_straight_line_code_leaves_out_zeros_and_nothing_else() -> None:
+    rng = np.random.default_rng(1)
+    A, B, C, D = (rng.standard_normal(s) * (rng.random(s) < 0.5) for s in ((5, 5), (5, 2), (3, 5), (3, 2)))
+    system = Linear(0.4 * A, B, C, D)
+    found = pattern([system])
+    assert len(coefficients(found, system)) == sum(np.count_nonzero(x) for x in (A, B, C, D))
+    x, w = rng.standard_normal(5), rng.standard_normal((20, 2))
+    state = dict(enumerate(x.tolist()))
+    for w_k in w:
+        v = advance(found, coefficients(found, system).tolist(), 0, state, 0, w_k.tolist())
+        assert v == pytest.approx((system.C @ x + system.D @ w_k).tolist())
+        x = system.A @ x + system.B @ w_k
+    assert list(state.values()) == pytest.approx(x.tolist())
+
+
+class TestCache:
+    def test_it_knows_every_file_that_kernels_are_made_of(self) -> None:
+        """Whatever imports what makes kernels is part of the key."""
+        package = Path(compiled.__file__).parent
+        for path in package.rglob("*.py"):
+            imports = [
+                ast.unparse(node) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)
+            ]
+            if any(line.startswith(("from servoscope.compiled", "from servoscope.arithmetic")) for line in imports):
+                text = path.read_bytes()
+                assert b"servoscope.compiled" in text or b"servoscope.arithmetic" in text
+        assert len(sources()) == 12
+
+    def test_without_a_folder_it_compiles_for_this_process(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        import numba
+
+        plain = numba.njit
+
+        def nowhere(**options: Any) -> Any:
+            if options.get("cache"):
+                raise RuntimeError("cannot cache function: no locator available")
+            return plain(**options)
+
+        monkeypatch.setattr(compiled.numba, "njit", nowhere)
+
+        def twice(x: float) -> float:
+            return 2.0 * x
+
+        assert kernel(twice)(3.0) == 6.0
