@@ -128,7 +128,7 @@ def _counted(names: Counter[str]) -> str:
 def _scenario(what: str, kind: str) -> Scenario:
     words, _, foreign = CHANGES[what]
     id_ = f"{'unknown' if foreign else 'mimics'}/{what}-{kind}"
-    return Scenario(id_, f"{words}, {kind}", UNITS, job, (what, kind), lambda w, found: called(w, found, what))
+    return Scenario(id_, f"{words}, {kind}", UNITS, job, (what, kind), partial(called, what=what))
 
 
 TABLES = (
