@@ -23,7 +23,8 @@ def test_random_faults() -> None:
     found = isolation.job(0, "multisine", runs=3)
     (row,) = isolation.scores("multisine", [found])
     assert len(row) == len(isolation.TABLES[0].columns)
-    assert all(len(row) == len(isolation.TABLES[1].columns) for row in isolation.by_size("multisine", [found]))
+    for table, rows in zip(isolation.TABLES[1:], (isolation.isolability, isolation.by_size), strict=True):
+        assert all(len(row) == len(table.columns) for row in rows("multisine", [found]))
     assert all(run["first"] in run["truth"] for run in found["runs"] if "detected" in run)
 
 

@@ -8,14 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 
 import servoscope as ss
-from accuracy.innovations import known
-from accuracy.rig import FAULT_AT, loop, record
+from accuracy.rig import FAULT_AT, baseline, loop
+from servoscope.design import Side, Study, study
 from servoscope.errors import SimulationError
 from servoscope.paper.conditions import SIZES, WORDS
 from servoscope.plants import Fault
-from servoscope.refinement.hypotheses import deviation
-from servoscope.refinement.window import Growth
-from servoscope.simulation import FaultEvent
+from servoscope.simulation import FaultEvent, reference
 
 KINDS = ("profile", "multisine", "trapezoid")
 SECONDS = 60.0  # of a recording; faults begin half-way
@@ -23,9 +21,6 @@ PARAMETERS = tuple(WORDS)
 TABLE_2 = {name: (min(sizes), max(sizes)) for name, sizes in SIZES.items()} | {"beta": (0.005, 0.1)}
 RADII = 0.5, 10.0
 USED = 0.9  # of the logarithms of the ratios that a diagnosis looks at: beyond, a size could not be said
-SEEN = 7.8
-"""Standard deviations of a size that make a radius. One false alarm a year asks for 22 nats of a detector; nine of ten
-runs have collected them when they have 30 on average, with a variance of twice the mean: sqrt(2 30) deviations."""
 
 
 @functools.cache
@@ -35,23 +30,38 @@ def faults() -> dict[str, Fault]:
 
 
 @functools.cache
-def spread(kind: str, parameter: str) -> float:
-    """Return the Cramer-Rao bound of a size's logarithm 30 s after the onset, all else known, as standard deviation."""
-    recording = record(kind, SECONDS, 0, 0)
-    J = known(recording, loop().plant).jacobian(np.zeros(1), (parameter,), Growth(round(FAULT_AT * loop().sample_rate)))
-    return deviation(J)
+def designed(kind: str) -> Study:
+    """Return what `servoscope design` says of the rig under a reference, with 30 s after the onset."""
+    learned = baseline(kind, SECONDS, 0)
+    return study(learned, reference(kind, SECONDS, loop().sample_rate), SECONDS - FAULT_AT)
 
 
-def radius(kind: str, parameter: str) -> float:
-    """Return the size, as logarithm of the ratio, that is seen with 90 % probability within 30 s of its onset."""
-    return SEEN * spread(kind, parameter)
+def side(kind: str, parameter: str, up: bool) -> Side:
+    """Return what it says of one direction of a fault."""
+    found = next(fault for fault in designed(kind).faults.values() if fault.parameter == parameter)
+    return found.up if up else found.down
+
+
+def radius(kind: str, parameter: str, up: bool) -> float:
+    """Return the size, as logarithm of the ratio, that is announced within 30 s with 90 % probability.
+
+    Where no size within the range is, the whole range.
+    """
+    seen = side(kind, parameter, up).detectable
+    return abs(float(np.log(seen if seen is not None else faults()[parameter].ratio_range[up])))
+
+
+def clear(kind: str, parameter: str, ratio: float) -> bool:
+    """Return whether a fault is outside the isolability radius."""
+    return side(kind, parameter, ratio > 1.0).clear(ratio)
 
 
 def small(rng: np.random.Generator, kind: str, parameter: str) -> float:
     """Draw a ratio whose size is log-uniform in radii, up or down."""
     up = bool(rng.integers(2))
     most = USED * abs(float(np.log(faults()[parameter].ratio_range[up])))
-    size = between(rng, RADII[0], min(RADII[1], most / radius(kind, parameter))) * radius(kind, parameter)
+    unit = min(radius(kind, parameter, up), most)
+    size = between(rng, RADII[0], min(RADII[1], most / unit)) * unit
     return float(np.exp(size if up else -size))
 
 

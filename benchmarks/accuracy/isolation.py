@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from accuracy.draws import KINDS, PARAMETERS, SECONDS, large, radius, small
+from accuracy.draws import KINDS, PARAMETERS, SECONDS, clear, designed, large, radius, small
 from accuracy.rig import FAULT_AT, baseline, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import is_named, is_right, percent, seen, told
@@ -25,6 +25,7 @@ BINS = 5  # few cases are left there
 LEAST = 1e-6  # probability that the log score takes for none
 ERROR = 0.05
 DRAWS = 1000
+TIMES = 2.0  # the linear bound, that an isolability radius may be
 
 
 def job(seed: int, kind: str, runs: int = RUNS) -> Numbers:
@@ -36,17 +37,55 @@ def job(seed: int, kind: str, runs: int = RUNS) -> Numbers:
         ratio = small(rng, kind, parameter) if i % 2 else large(rng, parameter)[parameter]
         fault = FaultEvent(parameter, ratio, FAULT_AT)
         run = told(learned, record(kind, SECONDS, seed, 1 + i, (fault,)), [fault])
-        size = abs(float(np.log(ratio))) / radius(kind, parameter)
-        said.append(run | {"radii": float(f"{size:.4g}"), "small": bool(i % 2)})
-    return {"runs": said}
+        size = abs(float(np.log(ratio))) / radius(kind, parameter, ratio > 1.0)
+        place = {"radii": float(f"{size:.4g}"), "small": bool(i % 2), "clear": clear(kind, parameter, ratio)}
+        said.append(run | place)
+    return {"runs": said, "design": radii(kind)}
+
+
+def radii(kind: str) -> Numbers:
+    """Return what the study says of each fault and direction: detectable and isolable ratio, radius over bound."""
+    return {
+        f"{name} {'up' if up else 'down'}": [each.detectable, each.first_isolable, each.times_bound]
+        for name, fault in designed(kind).faults.items()
+        for up, each in ((True, fault.up), (False, fault.down))
+    }
+
+
+def isolability(words: str, found: Sequence[Numbers]) -> list[Row]:
+    """Show the radii that the study computes, and how many of the runs outside and inside were right."""
+    rows = []
+    runs = seen(found)
+    for fault, (detectable, isolable, times) in found[0]["design"].items():
+        own = [run for run in runs if _label(run) == fault]
+        outside, inside = ([run for run in own if run["clear"] is wanted] for wanted in (True, False))
+        mark = "" if times is not None and times <= TIMES else "**"
+        rows.append(
+            (
+                *(words, fault, _ratio(detectable), _ratio(isolable)),
+                f"{mark}{times:.2f}{mark}" if times is not None else "**none**",
+                *(f"{sum(map(is_right, group))} of {len(group)}" for group in (outside, inside)),
+            )
+        )
+    return rows
+
+
+def _label(run: Numbers) -> str:
+    ((name, ratio),) = run["truth"].items()
+    return f"{name} {'up' if ratio > 1.0 else 'down'}"
+
+
+def _ratio(value: float | None) -> str:
+    return "nowhere" if value is None else f"{value:.4g}"
 
 
 def scores(words: str, found: Sequence[Numbers]) -> list[Row]:
     """Show what was right, and how right the probabilities are."""
     everything, runs = [run for unit in found for run in unit["runs"]], seen(found)
     if not runs:
-        return [(words, f"{len(everything)}", "0", *[""] * 6)]
-    right = sum(is_right(run) for run in runs)
+        return [(words, f"{len(everything)}", "0", *[""] * 7)]
+    outside = [run for run in runs if run["clear"]]
+    inside = [run for run in runs if not run["clear"]]
     named = [run for run in runs if run["named"]]
     truths = Counter(next(iter(run["truth"])) for run in runs)
     dummy = truths.most_common(1)[0][1]
@@ -57,7 +96,8 @@ def scores(words: str, found: Sequence[Numbers]) -> list[Row]:
             words,
             f"{len(everything)}",
             f"{len(runs)}",
-            percent(right, len(runs)),
+            percent(sum(map(is_right, outside)), len(outside), low=0.99),
+            percent(sum(map(is_right, inside)), len(inside)),
             percent(sum(is_named(run) for run in named), len(named), low=0.95),
             f"{_log_score(runs):.3f}",
             percent(sum(run["first"] == UNKNOWN for run in runs), len(runs), high=0.02),
@@ -106,13 +146,12 @@ def _log_score(runs: Sequence[Numbers]) -> float:
 
 
 def middling(runs: Sequence[Numbers]) -> list[Numbers]:
-    """Return the runs of those sizes at which the accuracy is middling."""
-    chosen = []
-    for low, high in pairwise(EDGES):
-        inside = [run for run in runs if low <= run["radii"] < high]
-        if inside and MIDDLING[0] <= np.mean([is_right(run) for run in inside]) <= MIDDLING[1]:
-            chosen += inside
-    return chosen
+    """Return the runs of those faults, outside or inside the isolability radius, of which a middling share is right."""
+    groups: dict[tuple[str, bool], list[Numbers]] = {}
+    for run in runs:
+        groups.setdefault((_label(run), run["clear"]), []).append(run)
+    shares = {key: np.mean([is_right(run) for run in group]) for key, group in groups.items()}
+    return [run for key, group in groups.items() if MIDDLING[0] <= shares[key] <= MIDDLING[1] for run in group]
 
 
 def curve_of(runs: Sequence[Numbers], bins: int = BINS) -> Reliability:
@@ -138,10 +177,19 @@ TABLES = (
     Table(
         "isolation",
         (
-            *("reference", "runs", "detected", "first is right", "named is right", "log score"),
+            *("reference", "runs", "detected", "right outside the isolability radius", "right inside"),
+            *("named is right", "log score"),
             *("called unknown", "of middling accuracy", "calibration error", "dummy: right, log score"),
         ),
         tuple(SCENARIOS.values()),
+    ),
+    Table(
+        "isolability",
+        (
+            *("reference", "fault", "detectable ratio", "isolable ratio", "radius over linear bound (2)"),
+            *("right outside", "right inside"),
+        ),
+        tuple(Scenario(s.id, s.words, s.units, s.job, s.arguments, isolability) for s in SCENARIOS.values()),
     ),
     Table(
         "isolation-by-size",

@@ -12,7 +12,7 @@ from accuracy.rig import FAULT_AT, baseline, loop, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from servoscope.paper.conditions import WORDS
 from servoscope.refinement import refine
-from servoscope.refinement.hypotheses import deviation
+from servoscope.refinement.columns import deviation
 from servoscope.refinement.window import Growth, Window
 from servoscope.simulation import FaultEvent
 

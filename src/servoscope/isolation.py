@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault
 from servoscope.errors import SimulationError
 from servoscope.plants import Fault, FloatArray
+from servoscope.posterior import Posterior
 
 GRID = 17  # points along a signature before the minimum is refined
 MISFIT = 1e-3  # probability with which the true fault may fit worse than the limit
@@ -229,15 +229,11 @@ class _Search:
         x = np.array(sorted(self.known))
         J, logdet = np.array([self.known[float(value)] for value in x]).T
         log_weight = -(J + logdet) / 2.0
-        top = float(log_weight.max())
-        # fine enough for a smooth posterior between the points that were simulated
-        dense = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in pairwise(x)]))
-        density = np.exp(np.interp(dense, x, np.maximum(log_weight, top - 1e4)) - top)
-        area = np.concatenate([[0.0], np.cumsum(np.diff(dense) * (density[1:] + density[:-1]) / 2.0)])
-        low, high = np.interp([0.025, 0.975], area / area[-1], dense)
+        posterior = Posterior.of(x, log_weight)
+        low, high = posterior.interval
         low, high = (
             best - np.hypot(best - low, 1.96 * signature.vague),
             best + np.hypot(high - best, 1.96 * signature.vague),
         )
-        evidence = top + float(np.log(area[-1] / (signature.high - signature.low)))
+        evidence = posterior.log_area - float(np.log(signature.high - signature.low))
         return _Fitted(signature, self.known[best][0], evidence, best, float(low), float(high), self.cosine(best))

@@ -11,13 +11,11 @@ from servoscope.cli import arguments
 from servoscope.cli.app import app
 from servoscope.cli.arguments import Source
 from servoscope.cli.options import AsJson, By, ColumnsText, From, LoopFile, Report, To, Trace, Where
-from servoscope.cli.outputs import Outputs, check_output, stem_of
+from servoscope.cli.outputs import REPORTS, TRACES, Outputs, check_output, stem_of
 from servoscope.cli.shell import FAULT, Failures, print_json
 
 if TYPE_CHECKING:
     from servoscope.recording import Recording
-
-REPORTS, TRACES, RECORDINGS = (".html", ".htm"), (".parquet", ".pq"), (".csv", ".parquet", ".pq")
 
 
 @app.command()

@@ -11,7 +11,9 @@ import typer
 from servoscope.errors import OutputError
 from servoscope.output import make_folder
 
-__all__ = ["Outputs", "check_output", "stem_of"]
+__all__ = ["RECORDINGS", "REPORTS", "TRACES", "Outputs", "check_output", "stem_of"]
+
+REPORTS, TRACES, RECORDINGS = (".html", ".htm"), (".parquet", ".pq"), (".csv", ".parquet", ".pq")
 
 
 def check_output(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -11,13 +11,8 @@ from servoscope.cli import arguments
 from servoscope.cli.app import app
 from servoscope.cli.arguments import Source
 from servoscope.cli.options import AsJson, By, ColumnsText, From, LoopFile, To, Where
-from servoscope.cli.outputs import check_output
+from servoscope.cli.outputs import RECORDINGS, REPORTS, check_output
 from servoscope.cli.shell import print_json
-
-if TYPE_CHECKING:
-    pass
-
-REPORTS, TRACES, RECORDINGS = (".html", ".htm"), (".parquet", ".pq"), (".csv", ".parquet", ".pq")
 
 
 @app.command()

@@ -13,6 +13,7 @@ from servoscope.design.information import MISNAMED, bound, confusion, equivalent
 from servoscope.design.scene import Scene
 from servoscope.errors import SimulationError
 from servoscope.plants import Fault, FloatArray
+from servoscope.refinement.columns import solve
 from servoscope.refinement.hypotheses import bounds
 from servoscope.refinement.window import Window
 
@@ -243,12 +244,9 @@ def descended(
     left = window.residual(z, names, growth) - own
     for _ in range(STEPS):
         J = window.jacobian(z, names, growth, slice(first, None))
-        size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-        Q, R = np.linalg.qr(J / size)
-        step = -np.linalg.lstsq(R, Q.T @ left, rcond=None)[0] / size
-        predicted = left + J @ step
-        if not held and predicted @ predicted > NEAR:
-            return z, predicted
+        step, distance = solve(J, left)
+        if not held and distance > NEAR:
+            return z, left + J @ step
         for shorter in SHORTER:
             new = z.copy()
             new[first:] += shorter * step

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from servoscope.design.scene import Scene
 from servoscope.plants import FloatArray
+from servoscope.refinement.columns import unit
 
 MISNAMED = 0.005  # probability of a wrong name at the isolability radius; as much is left for pairs and "unknown"
 SINGULAR = 1e-9  # eigenvalue of a correlation below which two changes are one
@@ -70,7 +71,7 @@ def _open(F: FloatArray) -> BoolArray:
 
 def cosines(columns: FloatArray, others: FloatArray) -> FloatArray:
     """Return the cosines between columns (N, p) and others (N, q), shape (p, q)."""
-    one, other = (x / np.maximum(np.linalg.norm(x, axis=0), 1e-300) for x in (columns, others))
+    one, other = (unit(x)[0] for x in (columns, others))
     return np.asarray(one.T @ other)
 
 

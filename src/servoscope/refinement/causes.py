@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoscope.plants import FloatArray
+from servoscope.refinement.columns import solve
 from servoscope.refinement.goodness import LAGS, traces
 from servoscope.refinement.hypotheses import Fitted, fit
 from servoscope.refinement.outside import outside
@@ -66,7 +66,7 @@ def _at(refined: Refined, growth: Growth) -> tuple[list[Cause], float]:
     """Return all causes for a change at some time, and the sum of squares of no change at all."""
     window, best = refined.window, refined.best.fitted
     healthy = fit(window, [], growth, best.d, [np.zeros(0)], free=True)
-    others = refined.outside if growth == best.growth else outside(window, growth, best)
+    others = refined.outside if growth == best.growth else outside(window, growth, best, refined.louder)
     return [*map(_ratio, others), *_added(window, growth, healthy)], healthy.J
 
 
@@ -90,7 +90,7 @@ def _added(window: Window, growth: Growth, healthy: Fitted) -> Iterator[Cause]:
     )
     for (name, words, unit, factor), column in zip(names, columns.T, strict=True):
         J = np.column_stack([healthy.jacobian, np.append(column, np.zeros(window.nuisances))])
-        step, left = _step(J, healthy.residual)
+        step, left = solve(J, healthy.residual)
         yield Cause(name, words, float(factor * step[-1]), unit, left)
 
 
@@ -105,7 +105,7 @@ def _later(window: Window, growth: Growth, healthy: Fitted) -> Cause:
         last = bench.predictor(window.plant, later_s=samples / rate)
         both = Predictor.of([window.healthy, *(last for _ in growth.shares)])
         e = np.asarray(window.innovations(both, growth), dtype=np.float64)
-        return _step(healthy.jacobian, np.concatenate([e, nothing]))[1]
+        return solve(healthy.jacobian, np.concatenate([e, nothing]))[1]
 
     latest = 1.0 - bench.rest_s * rate
     tried = np.linspace(0.0, latest, TRIED)
@@ -114,10 +114,3 @@ def _later(window: Window, growth: Growth, healthy: Fitted) -> Cause:
     found = minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": 1e-4})
     best = min((float(tried[at]), float(found.x)), key=cost)
     return Cause("delay", "an input that acts later", best / rate, "s", cost(best))
-
-
-def _step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, float]:
-    """Return the unknowns that make ``residual + J step`` smallest, and the sum of squares that is left."""
-    size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    step = -np.linalg.lstsq(J / size, residual, rcond=None)[0] / size
-    return step, float(((residual + J @ step) ** 2).sum())

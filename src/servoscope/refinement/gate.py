@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,9 +33,12 @@ def learn_exact(baseline: Baseline, recordings: Sequence[Recording]) -> Exact | 
     if not loop.plant.has_physics or not loop.plant.linear or loop.plant.extras:
         return None
 
+    known = baseline.model_copy(update={"exact": Exact(noise=noise, misfit=0.0)})
+    whole = [Window.of(known, rec, 0, min(rec.samples, MOST)) for rec in recordings]
+
     def windows(u_std: float, y_std: float) -> list[Window]:
-        known = baseline.model_copy(update={"exact": Exact(noise=Noise(u_std, y_std), misfit=0.0)})
-        return [Window.of(known, rec, 0, min(rec.samples, MOST)) for rec in recordings]
+        heard = Noise(u_std, y_std)
+        return [replace(window, bench=replace(window.bench, noise=heard)) for window in whole]
 
     def parts(x: float) -> tuple[float, float]:
         """Return the sum of squares and of log S, for noise of u exp(x) times as loud as y's in their usual units."""
@@ -46,7 +50,7 @@ def learn_exact(baseline: Baseline, recordings: Sequence[Recording]) -> Exact | 
         squares, volume = parts(x)
         return samples * float(np.log(squares)) + volume
 
-    samples = sum(min(rec.samples, MOST) for rec in recordings)
+    samples = sum(window.samples for window in whole)
     usual = max(noise.u_std / noise.y_std, 1e-3 * float(np.mean([rec.u.std() for rec in recordings])) / noise.y_std)
     if parts(0.0)[0] < SILENT * samples:
         return None

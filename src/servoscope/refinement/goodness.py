@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoscope.plants import FloatArray
+from servoscope.refinement.columns import basis, unit
 from servoscope.refinement.kernels import BoolArray
 from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.window import Growth, Window
@@ -14,7 +15,6 @@ from servoscope.refinement.window import Growth, Window
 LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
 MISFIT = 1e-3  # probability with which a true hypothesis may fit worse than the limit
 SYSTEMATIC = 2e-3  # share of a change that nominal parameters may be off by
-RANK = 1e-7  # of a column's length, below which it says nothing new
 
 
 @dataclass(frozen=True)
@@ -70,26 +70,14 @@ def goodness(Z: FloatArray, jacobian: FloatArray, residual: FloatArray, louder: 
     from scipy import special
 
     Z = np.vstack([Z, np.zeros((len(residual) - len(Z), Z.shape[1]))])
-    Q = _basis(jacobian)
-    Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
-    own = _basis(Z - Q @ (Q.T @ Z))
+    Q = basis(jacobian)
+    Z, _ = unit(Z)
+    own = basis(Z - Q @ (Q.T @ Z))
     dof = own.shape[1]
     left = residual - Q @ (Q.T @ residual)
     statistic = float(((own.T @ left) ** 2).sum()) / louder
     limit = float(special.chdtri(max(dof, 1), MISFIT)) + (SYSTEMATIC * shift) ** 2 / louder
     return Goodness(statistic, dof, limit)
-
-
-def _basis(columns: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of columns, those left out that say nothing new."""
-    from scipy.linalg import qr
-
-    if not columns.shape[1]:
-        return columns
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    keep = size > RANK
-    Q, R, _ = qr(columns[:, keep] / size[keep], mode="economic", pivoting=True)
-    return np.asarray(Q[:, np.abs(np.diag(R)) > RANK])
 
 
 def _later(x: FloatArray, samples: int) -> FloatArray:

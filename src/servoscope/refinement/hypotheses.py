@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
 from servoscope.plants import Fault, FloatArray
+from servoscope.posterior import Posterior
+from servoscope.refinement.columns import deviation, explained
 from servoscope.refinement.window import Growth, Window
 
 STEPS = 12  # of the search, at most
@@ -16,6 +17,7 @@ UNSEEN = 3.0  # standard deviations below which a size is as good as none
 REACH = 5.0  # standard deviations of the size over which its likelihood is integrated
 POINTS = 31
 AT_BOUND = 1e-6
+IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +142,33 @@ def fit(
     return Fitted(tuple(faults), growth, z[:m], z[m:], 2.0 * float(best.cost), C[k:, k:], J, best.fun)
 
 
+def freed(window: Window, fitted: Sequence[Fitted], louder: float, J: float = np.inf) -> list[Fitted]:
+    """Let the healthy parameters follow wherever that may bring a hypothesis within reach of the best one.
+
+    One step of Gauss and Newton says how far each would come.
+
+    Parameters
+    ----------
+    window, fitted
+        What is asked, and the hypotheses so far.
+    louder
+        Variance of the innovations.
+    J
+        Sum of squares of the best one, if it is none of these.
+    """
+    promised = []
+    for f in fitted:
+        jacobian = window.jacobian(np.concatenate([f.d, f.x]), f.names, f.growth)
+        promised.append(f.J - explained(jacobian, f.residual))
+    limit = min(J, *promised) + IN_REACH * louder
+    return [free(window, f) if limit >= promise else f for f, promise in zip(fitted, promised, strict=True)]
+
+
+def free(window: Window, fitted: Fitted) -> Fitted:
+    """Return a hypothesis whose healthy parameters followed too."""
+    return fit(window, fitted.faults, fitted.growth, fitted.d, [fitted.x], free=True)
+
+
 @dataclass(frozen=True)
 class Scale:
     """What a fault's size is measured by before anything is known of it.
@@ -165,17 +194,6 @@ class Scale:
         (low,), (high,) = bounds([self.fault])
         area = np.log1p(-low / self.unseen) + np.log1p(high / self.unseen)
         return np.asarray(-np.log((np.abs(x) + self.unseen) * area))
-
-
-def deviation(J: FloatArray) -> float:
-    """Return the standard deviation of the last unknown of a least-squares problem with Jacobian J (N, k)."""
-    others, own = J[:, :-1], J[:, -1]
-    if others.shape[1]:
-        size = np.maximum(np.linalg.norm(others, axis=0), 1e-300)
-        Q, _ = np.linalg.qr(others / size)
-        own = own - Q @ (Q.T @ own)
-    length = float(np.linalg.norm(own))
-    return 1.0 / length if length > 0.0 else np.inf
 
 
 @dataclass(frozen=True)
@@ -244,11 +262,5 @@ def _along(window: Window, found: Fitted, scale: Scale, louder: float, volume: f
         z = np.append(found.d + follow * (x - best), x)
         J.append(float((window.residual(z, found.names, found.growth) ** 2).sum()))
     log_weight = -0.5 * np.array(J) / louder + scale.log_density(sizes)
-    # smooth between the points that were computed
-    dense = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in pairwise(sizes)]))
-    log_dense = np.interp(dense, sizes, log_weight)
-    top = float(log_dense.max())
-    density = np.exp(log_dense - top)
-    area = np.concatenate([[0.0], np.cumsum(np.diff(dense) * (density[1:] + density[:-1]) / 2.0)])
-    a, b = np.interp([0.025, 0.975], area / area[-1], dense)
-    return Evidence(volume + top + float(np.log(area[-1])), ((float(a), float(b)),))
+    found_at = Posterior.of(sizes, log_weight)
+    return Evidence(volume + found_at.log_area, (found_at.interval,))

@@ -35,15 +35,16 @@ def gains(A: Array, Q: Array, c: Array, r: float, P: Array, K: Array, S: Array) 
             Pc[i] = total
             s += c[i] * total
         S[j] = s
-        moved = 0.0
+        by, settled = 1.0 / s, True
         for i in range(n):
             total = zero
             for k in range(n):
                 total += A[i, k] * Pc[k]
-            K[j, i] = total / s
+            K[j, i] = total * by
             if j > 0:
-                moved = max(moved, abs(K[j, i] - K[j - 1, i]) / (abs(K[j, i]) + 1e-300))
-        if j > n and moved < SETTLED:
+                ratio = abs(K[j, i].real - K[j - 1, i].real)
+                settled = settled and ratio <= SETTLED * abs(K[j, i].real)
+        if j > n and settled:
             for later in range(j + 1, L):
                 S[later] = s
                 for i in range(n):
@@ -77,18 +78,17 @@ def innovations(
     known but for a common factor.
     """
     N, last = len(y), A.shape[1] - 1
-    e, age = np.empty((1, N), A.dtype), ages(restart, S.shape[2])
+    e, age, by = np.empty((1, N), A.dtype), ages(restart, S.shape[2]), inverse(S)
     x, following = np.zeros((1, A.shape[2]), A.dtype), np.zeros(A.shape[2], A.dtype)
     begin, end = min(since, N), min(since + over, N)
     if last == 0:
         begin = N
-    hold(A, b, late, c, K, S, 0, 0, 0, begin, age, u, y, restart, x, following, e, 0)
-    drift(A, b, late, c, K, S, 0, since, over, begin, end, age, u, y, restart, x, following, e, 0)
-    hold(A, b, late, c, K, S, 0, last, max(begin, end), N, age, u, y, restart, x, following, e, 0)
-    volume = 0.0 * A[0, 0, 0, 0]
+    hold(A, b, late, c, K, by, 0, 0, 0, begin, age, u, y, restart, x, following, e, 0)
+    drift(A, b, late, c, K, by, 0, since, over, begin, end, age, u, y, restart, x, following, e, 0)
+    hold(A, b, late, c, K, by, 0, last, max(begin, end), N, age, u, y, restart, x, following, e, 0)
+    louder, volume = volumes(S), 0.0 * A[0, 0, 0, 0]
     for k in range(begin, N):
-        p = last if k >= end else (k - since) * last // over
-        volume += np.log(S[0, p, age[k]] / S[0, 0, age[k]])
+        volume += louder[last if k >= end else (k - since) * last // over, age[k]]
     scaled: Array = e[0] * np.exp(0.5 * volume / N)
     return scaled
 
@@ -105,19 +105,49 @@ def ages(restart: BoolArray, L: int) -> IntArray:
 
 
 @kernel
+def inverse(S: Array) -> Array:
+    """Return 1/sqrt(S), shape (v, p, L); most of a settled gain's are the same."""
+    by: Array = np.empty_like(S)
+    for v in range(S.shape[0]):
+        for p in range(S.shape[1]):
+            for j in range(S.shape[2]):
+                by[v, p, j] = by[v, p, j - 1] if j > 0 and S[v, p, j] == S[v, p, j - 1] else 1.0 / np.sqrt(S[v, p, j])
+    return by
+
+
+@kernel
+def volumes(S: Array) -> Array:
+    """Return log S of the plants of variant 0 relative to the first one's, shape (p, L)."""
+    louder: Array = np.zeros_like(S[0])
+    for p in range(1, S.shape[1]):
+        for j in range(S.shape[2]):
+            if j > 0 and S[0, p, j] == S[0, p, j - 1] and S[0, 0, j] == S[0, 0, j - 1]:
+                louder[p, j] = louder[p, j - 1]
+            else:
+                louder[p, j] = np.log(S[0, p, j] / S[0, 0, j])
+    return louder
+
+
+@kernel
+def begin_again(c: Array, y: float, x: Array) -> None:
+    """Put the state x (n,) where y says at once; the first covariance knows that the rest is open."""
+    reach = 0.0 * x[0]
+    for i in range(len(x)):
+        reach += c[i] * c[i]
+    for i in range(len(x)):
+        x[i] = c[i] * y / reach
+
+
+@kernel
 def hold(
-    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, p: int, begin: int, end: int,
+    A: Array, b: Array, late: Array, c: Array, K: Array, by: Array, v: int, p: int, begin: int, end: int,
     age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
 ) -> None:  # fmt: skip
     """Take variant v through samples begin to end by plant p: its state x[v], its innovations into e[v, k - first]."""
     n = x.shape[1]
     for k in range(begin, end):
-        if restart[k]:  # what y says at once; the first covariance knows that the rest is open
-            reach = 0.0 * x[v, 0]
-            for i in range(n):
-                reach += c[v, p, i] * c[v, p, i]
-            for i in range(n):
-                x[v, i] = c[v, p, i] * y[k] / reach
+        if restart[k]:
+            begin_again(c[v, p], y[k], x[v])
         j, before = age[k], u[k] if restart[k] else u[max(k - 1, 0)]
         error = y[k] - 0.0 * x[v, 0]
         for i in range(n):
@@ -129,12 +159,12 @@ def hold(
             following[i] = total
         for i in range(n):
             x[v, i] = following[i]
-        e[v, k - first] = error / np.sqrt(S[v, p, j])
+        e[v, k - first] = error * by[v, p, j]
 
 
 @kernel
 def drift(
-    A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, since: int, over: int, begin: int, end: int,
+    A: Array, b: Array, late: Array, c: Array, K: Array, by: Array, v: int, since: int, over: int, begin: int, end: int,
     age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
 ) -> None:  # fmt: skip
     """Do as `hold` while the plant drifts through all of them from sample `since` on, over so many samples."""
@@ -144,11 +174,7 @@ def drift(
         p = int(place)
         q, w = p + 1, place - p
         if restart[k]:
-            reach = 0.0 * x[v, 0]
-            for i in range(n):
-                reach += c[v, p, i] * c[v, p, i]
-            for i in range(n):
-                x[v, i] = c[v, p, i] * y[k] / reach
+            begin_again(c[v, p], y[k], x[v])
         j, before = age[k], u[k] if restart[k] else u[max(k - 1, 0)]
         error = y[k] - 0.0 * x[v, 0]
         for i in range(n):
@@ -162,7 +188,7 @@ def drift(
             following[i] = total
         for i in range(n):
             x[v, i] = following[i]
-        e[v, k - first] = error / np.sqrt(S[v, p, j] + w * (S[v, q, j] - S[v, p, j]))
+        e[v, k - first] = error * (by[v, p, j] + w * (by[v, q, j] - by[v, p, j]))
 
 
 @kernel
@@ -199,20 +225,17 @@ def sweep(
     x, following, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, N))
     states = np.zeros((N + 1, V, n))
     before, after = np.zeros((N + 1, V, V + m)), np.zeros((N + 1, V, V + m))
-    louder = np.zeros((last + 1, L))
-    for p in range(last + 1):
-        for j in range(L):
-            louder[p, j] = np.log(S[0, p, j] / S[0, 0, j])
+    louder, by = volumes(S), inverse(S)
     for k in range(N):  # the healthy plant all the way
         for v in range(V):
-            hold(A, b, late, c, K, S, v, 0, k, k + 1, age, u, y, restart, x, following, e, 0)
+            hold(A, b, late, c, K, by, v, 0, k, k + 1, age, u, y, restart, x, following, e, 0)
             for i in range(n):
                 states[k + 1, v, i] = x[v, i]
     add(before, e, 0, 0, N, 0.0, Q)
     for v in range(V):  # and the changed one
         for i in range(n):
             x[v, i] = 0.0
-        hold(A, b, late, c, K, S, v, last, 0, N, age, u, y, restart, x, following, e, 0)
+        hold(A, b, late, c, K, by, v, last, 0, N, age, u, y, restart, x, following, e, 0)
     add(after, e, 0, 0, N, 1.0 / step, Q)
     volume_after = np.zeros(N + 1)
     for k in range(N - 1, -1, -1):
@@ -228,8 +251,8 @@ def sweep(
         for v in range(V):
             for o in range(n):
                 x[v, o] = states[onset, v, o]
-            drift(A, b, late, c, K, S, v, onset, over, onset, end, age, u, y, restart, x, following, e, onset)
-            hold(A, b, late, c, K, S, v, last, end, stop, age, u, y, restart, x, following, e, onset)
+            drift(A, b, late, c, K, by, v, onset, over, onset, end, age, u, y, restart, x, following, e, onset)
+            hold(A, b, late, c, K, by, v, last, end, stop, age, u, y, restart, x, following, e, onset)
         for v in range(V):
             for o in range(V + m):
                 total[0, v, o] = before[onset, v, o] + after[N, v, o] - after[stop, v, o]

@@ -13,7 +13,7 @@ from servoscope.loop import Loop
 from servoscope.noise import Noise
 from servoscope.plants import FloatArray, Plant
 from servoscope.refinement.kernels import Array, BoolArray
-from servoscope.simulation.discretise import discretise
+from servoscope.simulation.discretise import discretise, discretise_anew, split_delay
 
 LONGEST = 1024  # samples after a restart until the gain stays as it is
 LOUD = 3.0  # standard deviations of u that the unknown first state may come from
@@ -90,14 +90,14 @@ class Bench:
         """
         from servoscope.refinement.kernels import gains
 
-        d = discretise(plant.state_space(), self.loop.sample_rate, hold="zoh", delay=self.rest_s + later_s)
+        d = discretise_anew(plant.state_space(), self.loop.sample_rate, "zoh", self.rest_s + later_s)
         A, b, late = d.A * self.scale / self.scale[:, None], d.b_now / self.scale, d.b_late / self.scale
         c = d.c * self.scale * output_gain
         kind = np.result_type(A, b, c)  # one for all: each further mixture would be compiled anew
         A, b, late, c = (np.ascontiguousarray(part, dtype=kind) for part in (A, b, late, c))
         if d.m:  # one sample later than the loop file says
             b, late = late, b
-        Q = self.noise.u_std**2 * (np.outer(b, b) + np.outer(late, late))
+        Q = self.noise.u_std**2 * (b[:, None] * b + late[:, None] * late)
         K, S = np.zeros((LONGEST, len(b)), A.dtype), np.zeros(LONGEST, A.dtype)
         gains(A, Q, c, self.noise.y_std**2, self.first.astype(kind), K, S)
         return Predictor(A[None], b[None], late[None], c[None], K[None], S[None])
@@ -105,13 +105,12 @@ class Bench:
     @property
     def rest_s(self) -> float:
         """Part of the loop file's delay that is no whole sample [s]."""
-        samples = self.loop.delay * self.loop.sample_rate
-        return float(samples - np.floor(samples + 1e-9)) / self.loop.sample_rate
+        return split_delay(self.loop.delay, self.loop.sample_rate)[1] / self.loop.sample_rate
 
     @property
     def whole(self) -> int:
         """Whole samples of the loop file's delay."""
-        return int(np.floor(self.loop.delay * self.loop.sample_rate + 1e-9))
+        return split_delay(self.loop.delay, self.loop.sample_rate)[0]
 
     @cached_property
     def first(self) -> FloatArray:

@@ -12,7 +12,7 @@ from servoscope.baseline import Baseline
 from servoscope.plants import Fault, FloatArray
 from servoscope.recording import Recording
 from servoscope.refinement.goodness import Goodness, goodness, traces
-from servoscope.refinement.hypotheses import Evidence, Fitted, Scale, evidence, fit
+from servoscope.refinement.hypotheses import IN_REACH, Evidence, Fitted, Scale, evidence, fit, free, freed
 from servoscope.refinement.outside import outside
 from servoscope.refinement.since import Since, since
 from servoscope.refinement.starts import Ladder, valleys
@@ -26,7 +26,6 @@ OUTSIDE = 0.01  # and that it is a parameter outside the list of faults
 LOOKS = 4  # for the onset, each with the sizes that fit the one before
 WORTH_A_LOOK = 1.0  # of the sum of squares that a look gained, for another one
 SHARP = 20  # samples of an onset's interval, up to which the step is loud
-IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,11 +143,11 @@ class _Search:
             for one, other in combinations(singles, 2)
         ]
         found, everything = self._settled(found, [*singles, *pairs])
-        if not self._explains(self._best(everything)):
+        if not self._explains(self._heard(everything)):
             # no fault alone is near the truth, nor are the sizes that the pairs started from
             pairs = [self._fit(p.faults, nothing, [p.x, *valleys(self.window, p.faults, self.growth)]) for p in pairs]
             found, everything = self._settled(found, [*singles, *pairs])
-        best = self._best(everything)
+        best = self._heard(everything)
         everything = [self._own(f, best) for f in everything]
         if found.high - found.low <= SHARP and not found.growth.over:
             found, everything = self._sharpened(found, everything)
@@ -156,7 +155,7 @@ class _Search:
 
     def _sharpened(self, found: Since, fitted: Sequence[Fitted]) -> tuple[Since, list[Fitted]]:
         """Move the onset of a loud step sample by sample: its sizes do not follow linearly from one to the next."""
-        best = self._best(fitted)
+        best = self._heard(fitted)
         for step in (4, 2, 1):
             for way in (-step, step):
                 while 0 <= best.growth.since + way <= self.latest:
@@ -173,7 +172,7 @@ class _Search:
 
     def _settled(self, found: Since, fitted: Sequence[Fitted]) -> tuple[Since, list[Fitted]]:
         """Find the onset and the sizes of the best hypothesis in turns if it is a pair, then let the others follow."""
-        best = self._best(fitted)
+        best = self._heard(fitted)
         for _ in range(LOOKS if len(best.faults) > 1 else 0):
             found = self._since(best)
             after = self._again(best, found.growth)
@@ -182,7 +181,7 @@ class _Search:
                 break
         self.growth = found.growth
         everything = self._freed([self._again(f, found.growth) for f in fitted])
-        self._best(everything)
+        self._heard(everything)
         return found, everything
 
     def _explains(self, fitted: Fitted) -> bool:
@@ -203,12 +202,12 @@ class _Search:
         singles = self._singles(Growth(begin), d, ladders)
         for drifts in (False, True):
             for _ in range(LOOKS):
-                before = self._best(singles).J
-                found = self._since(self._best(singles), drifts)
+                best = self._heard(singles)
+                found = self._since(best, drifts)
                 if found.growth == self.growth:
                     break
                 singles = self._singles(found.growth, d, ladders, singles)
-                gained = before - self._best(singles).J
+                gained = best.J - self._heard(singles).J
                 if gained < WORTH_A_LOOK * self.louder:
                     break
         return found, singles
@@ -228,25 +227,18 @@ class _Search:
         return fit(self.window, faults, self.growth, d, starts, free=False)
 
     def _freed(self, fitted: Sequence[Fitted]) -> list[Fitted]:
-        """Let the healthy parameters follow wherever that may bring a hypothesis within reach of the best one.
+        """Let the healthy parameters follow: a second fault that stands in for their error must not outrun the first.
 
-        Under a large fault they matter: a second fault that stands in for their error must not outrun the first alone.
+        Under a large fault they matter.
         """
-        promised = [self._promised(f) for f in fitted]
-        limit = min(promised) + IN_REACH * self.louder
-        freed = [self._free(f) if limit >= J else f for f, J in zip(fitted, promised, strict=True)]
-        best = self._best(freed)
-        return [self._free(f) if self._within(f, best) and not f.is_free else f for f in freed]
-
-    def _promised(self, fitted: Fitted) -> float:
-        """Return the sum of squares that one step of Gauss and Newton promises."""
-        J = self.window.jacobian(np.concatenate([fitted.d, fitted.x]), fitted.names, fitted.growth)
-        Q, _ = np.linalg.qr(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300))
-        return float(fitted.J - ((Q.T @ fitted.residual) ** 2).sum())
+        self.progress()
+        followed = freed(self.window, fitted, self.louder)
+        best = self._heard(followed)
+        return [self._free(f) if self._within(f, best) and not f.is_free else f for f in followed]
 
     def _free(self, fitted: Fitted) -> Fitted:
         self.progress()
-        return fit(self.window, fitted.faults, fitted.growth, fitted.d, [fitted.x], free=True)
+        return free(self.window, fitted)
 
     def _again(self, fitted: Fitted, growth: Growth) -> Fitted:
         if fitted.growth == growth:
@@ -265,7 +257,11 @@ class _Search:
 
     def _best(self, fitted: Sequence[Fitted]) -> Fitted:
         """Return the closest hypothesis; a second fault must be worth its freedom."""
-        best = min(fitted, key=lambda f: f.J + 2.0 * np.log(1.0 / PAIRS) * (len(f.names) - 1) * self.louder)
+        return min(fitted, key=lambda f: f.J + 2.0 * np.log(1.0 / PAIRS) * (len(f.names) - 1) * self.louder)
+
+    def _heard(self, fitted: Sequence[Fitted]) -> Fitted:
+        """Return the closest hypothesis after hearing from it how loud the noise is."""
+        best = self._best(fitted)
         self.louder = best.J / self.window.samples
         return best
 
@@ -277,7 +273,7 @@ class _Search:
         scales = {fault: Scale.of(window, fault, found.growth) for fault in self.faults}
         several = PAIRS if n > 1 else 0.0
         prior = {1: (1.0 - several - OUTSIDE) / n, 2: several / max(n * (n - 1) / 2, 1)}
-        best = self._best(fitted)
+        best = self._heard(fitted)
         top = self._evidence(best, scales)
         told = [
             self._evidence(f, scales)
@@ -289,8 +285,8 @@ class _Search:
         likeliest = int(np.argmax(logs))
         good = self._goodness(fitted[likeliest])
         # unknown: what nothing explains, or what a parameter outside the list explains better
-        others = outside(window, fitted[likeliest].growth, fitted[likeliest])
-        rivals = [self._outside(f) - np.log(len(others) / OUTSIDE) for f in others if self._within(f, best)]
+        others = outside(window, fitted[likeliest].growth, fitted[likeliest], self.louder)
+        rivals = [self._evidence(f, {}).log - np.log(len(others) / OUTSIDE) for f in others if self._within(f, best)]
         nothing = logs[likeliest] + 0.5 * (good.statistic - good.limit)
         logs = np.append(logs, np.logaddexp.reduce([nothing, *rivals]))
         probability = np.exp(logs - logs.max())
@@ -302,11 +298,8 @@ class _Search:
         return Refined(window, hypotheses, tuple(others), float(probability[-1]), good, found, self.louder, self.rough)
 
     def _evidence(self, fitted: Fitted, scales: Mapping[Fault, Scale]) -> Evidence:
-        return evidence(self.window, fitted, [scales[fault] for fault in fitted.faults], self.louder)
-
-    def _outside(self, fitted: Fitted) -> float:
-        scale = Scale.of(self.window, fitted.faults[0], fitted.growth)
-        return evidence(self.window, fitted, [scale], self.louder).log
+        each = [scales.get(fault) or Scale.of(self.window, fault, fitted.growth) for fault in fitted.faults]
+        return evidence(self.window, fitted, each, self.louder)
 
     def _goodness(self, fitted: Fitted) -> Goodness:
         window, growth = self.window, fitted.growth

@@ -75,9 +75,7 @@ class Window:
         prior = np.linalg.inv(np.linalg.cholesky(C)) if len(C) else np.zeros((0, 0))
         bench = Bench.of(baseline.loop, baseline.exact.noise, recording.u)
         u = _delayed(acting(baseline.loop, recording.u), recording.restart, bench.whole)
-        restart = recording.restart[first:end].copy()
-        restart[0] = True
-        return cls(bench, baseline.plant, prior, first, u[first:end].copy(), recording.y[first:end].copy(), restart)
+        return cls(bench, baseline.plant, prior, 0, u, recording.y, recording.restart).cut(first, end)
 
     def cut(self, first: int, end: int) -> Window:
         """Return samples `first` to `end` of it."""

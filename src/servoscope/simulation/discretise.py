@@ -55,12 +55,18 @@ def discretise(
     delay
         Time [s] from u to the plant; any fraction of a sample.
     """
-    return _discretise(*(tuple(map(tuple, each.tolist())) for each in system), sample_rate, hold, delay)
+    return _again(*(tuple(map(tuple, each.tolist())) for each in system), sample_rate, hold, delay)
 
 
 @functools.lru_cache(maxsize=64)  # while signatures are drawn, the healthy plant comes back with every point
-def _discretise(a: Rows, b: Rows, c: Rows, sample_rate: float, hold: str, delay: float) -> Discrete:
+def _again(a: Rows, b: Rows, c: Rows, sample_rate: float, hold: str, delay: float) -> Discrete:
     A, B, C = (np.array(each) for each in (a, b, c))
+    return discretise_anew((A, B, C), sample_rate, hold, delay)
+
+
+def discretise_anew(system: StateSpace, sample_rate: float, hold: str, delay: float) -> Discrete:
+    """Do as `discretise`, without looking whether this plant was seen before: a search never meets one again."""
+    A, B, C = system
     T = 1.0 / sample_rate
     m, rest = split_delay(delay, sample_rate)
     Phi, level, slope = transition(A, B, (1.0 - rest) * T)
@@ -88,10 +94,11 @@ def transition(A: FloatArray, B: FloatArray, duration: float) -> tuple[FloatArra
     exponential of the unbalanced one would lose half of its digits (Van Loan 1978 for the augmented form). Complex
     matrices of complex-step derivatives are taken as they are.
     """
-    from scipy.linalg import expm, matrix_balance
+    from scipy.linalg import expm
+    from scipy.linalg.lapack import dgebal  # `matrix_balance` around it takes as long as all the rest
 
     n = A.shape[0]
-    _, (scale, _) = matrix_balance(A.real, permute=False, separate=True)
+    scale = dgebal(A.real, scale=1, permute=0)[3]
     block = np.zeros((n + 2, n + 2), dtype=np.result_type(A, B))
     block[:n, :n] = A * scale / scale[:, None]
     unit = max(float(np.max(np.abs(B[:, 0] / scale))), np.finfo(np.float64).tiny)
