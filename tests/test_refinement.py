@@ -217,18 +217,22 @@ class TestAnswers:
             assert np.trapezoid(density, x) == pytest.approx(1.0, abs=1e-3)
 
 
-def odd_loop(loop: ss.Loop, *, late: bool = False, gain: float = 1.0, **ratios: float) -> ss.Recording:
+def odd_loop(
+    loop: ss.Loop, *, late: bool = False, gain: float = 1.0, play: float = 0.0, **ratios: float
+) -> ss.Recording:
     """The reference rig sample by sample, with changes at `AT` that no fault of the plant stands for."""
     samples, rng = 4000, np.random.default_rng(7)
     r = reference("multisine", samples / 100.0, 100.0)
     n_u, n_y = 1e-4 * rng.standard_normal(samples), np.sqrt(1e-7) * rng.standard_normal(samples)
     healthy, ill = (discretise(p.state_space(), 100.0) for p in (loop.plant, loop.plant.scaled(ratios)))
-    x, total, before = np.zeros(3), 0.0, 0.0
+    x, total, before, sensor = np.zeros(3), 0.0, 0.0, 0.0
     u, y = np.empty(samples), np.empty(samples)
     for k in range(samples):
         changed = k >= AT * 100
         d = ill if changed else healthy
-        y[k] = (gain if changed else 1.0) * (d.c @ x) + n_y[k]
+        half, moved = play / 2.0 if changed else 0.0, float(d.c @ x)
+        sensor = min(max(sensor, moved - half), moved + half)
+        y[k] = (gain if changed else 1.0) * sensor + n_y[k]
         e = r[k] - y[k]
         total += 5.0 * 0.01 * e
         u[k] = 20.0 * e + total
@@ -240,7 +244,10 @@ def odd_loop(loop: ss.Loop, *, late: bool = False, gain: float = 1.0, **ratios: 
 class TestOutsideTheList:
     @pytest.mark.parametrize(
         ("change", "cause", "value"),
-        [({"late": True}, "delay", 0.01), ({"A_p": 1.1}, "A_p", 1.1), ({"A_p": 0.9}, "A_p", 0.9)],
+        [
+            *(({"late": True}, "delay", 0.01), ({"A_p": 1.1}, "A_p", 1.1), ({"A_p": 0.9}, "A_p", 0.9)),
+            ({"play": 0.002}, "backlash", 0.002),
+        ],
     )
     def test_what_nothing_imitates_is_unknown_and_its_cause_offered(
         self, learned: ss.Baseline, rig_loop: ss.Loop, change: dict[str, float], cause: str, value: float

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoscope.refinement.backlash import backlash
 from servoscope.refinement.columns import solve
 from servoscope.refinement.goodness import LAGS, traces
 from servoscope.refinement.hypotheses import Fitted, fit
@@ -78,12 +79,13 @@ def _ratio(other: Fitted) -> Cause:
 def _added(window: Window, growth: Growth, healthy: Fitted) -> Iterator[Cause]:
     """Try what is no parameter: a later input, backlash, Coulomb friction, offsets."""
     yield _later(window, growth, healthy)
+    gap = backlash(window, growth)
+    yield Cause("backlash", "backlash between actuator and sensor", gap.width, "of y", gap.J)
     predictor = window.predictor(healthy.d, (), np.zeros(0), growth)
     where = np.arange(window.samples) >= growth.since
-    columns = traces(window, predictor, growth, where)[:, 2 * LAGS :]
+    columns = traces(window, predictor, growth, where)[:, 2 * LAGS + 1 :]
     # a disturbance is taken off y to explain it, so its size has the other sign
     names = (
-        ("backlash", "backlash between actuator and sensor", "of y", -2.0),
         ("sensor_offset", "an offset of the sensor of y", "of y", 1.0),
         ("coulomb_friction", "Coulomb friction", "of u", -1.0),
         ("input_offset", "an offset of the input", "of u", 1.0),
