@@ -19,6 +19,7 @@ from servoscope.loop import Loop
 from servoscope.noise import Noise
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
+from servoscope.refinement.columns import basis
 from servoscope.refinement.predictor import Predictor
 from servoscope.refinement.refining import BEFORE_S
 from servoscope.refinement.starts import GRID
@@ -154,7 +155,7 @@ class Scene:
         nuisance = self.jacobian[:, : self.healthy.nuisances]
         if not nuisance.shape[1]:
             return columns
-        Q, _ = np.linalg.qr(nuisance / np.linalg.norm(nuisance, axis=0))
+        Q = basis(nuisance)
         return np.asarray(columns - Q @ (Q.T @ columns))
 
     def _known_before(self) -> FloatArray:
