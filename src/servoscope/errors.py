@@ -8,18 +8,26 @@
         BaselineError            a baseline file is unusable, or of another version
         SimulationError          a simulation that was asked for is impossible
         OutputError              a result cannot be written
+        ConfigError              a service file is wrong, or what it names
+        StoreError               a store cannot be used
+          StoreUnavailable       for now: it is full, locked or down; trying again may help
+        StateError          a saved state is of another version, or torn
 
 Every message names the file, the row or the key, says what is wrong with it and what to do.
 """
 
 __all__ = [
     "BaselineError",
+    "StateError",
+    "ConfigError",
     "LoopError",
     "NotEnoughError",
     "OutputError",
     "RecordingError",
     "ServoscopeError",
     "SimulationError",
+    "StoreError",
+    "StoreUnavailable",
 ]
 
 
@@ -49,3 +57,19 @@ class SimulationError(ServoscopeError):
 
 class OutputError(ServoscopeError):
     """A result cannot be written."""
+
+
+class ConfigError(ServoscopeError):
+    """A service file, or what it names, is wrong."""
+
+
+class StoreError(ServoscopeError):
+    """A store cannot be used."""
+
+
+class StoreUnavailable(StoreError):
+    """A store cannot be used for now: it is full, locked or down."""
+
+
+class StateError(ServoscopeError):
+    """A saved state is of another version, or torn."""
