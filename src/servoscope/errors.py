@@ -8,11 +8,14 @@
         BaselineError            a baseline file is unusable, or of another version
         SimulationError          a simulation that was asked for is impossible
         OutputError              a result cannot be written
+        AlarmError               what an alarm was told to do has no meaning in its state
+        StateError               a saved state is of another version, or damaged
 
 Every message names the file, the row or the key, says what is wrong with it and what to do.
 """
 
 __all__ = [
+    "AlarmError",
     "BaselineError",
     "LoopError",
     "NotEnoughError",
@@ -20,6 +23,7 @@ __all__ = [
     "RecordingError",
     "ServoscopeError",
     "SimulationError",
+    "StateError",
 ]
 
 
@@ -49,3 +53,11 @@ class SimulationError(ServoscopeError):
 
 class OutputError(ServoscopeError):
     """A result cannot be written."""
+
+
+class AlarmError(ServoscopeError):
+    """What an alarm was told to do has no meaning in the state that it is in."""
+
+
+class StateError(ServoscopeError):
+    """A saved state was written by another version, or is damaged."""
