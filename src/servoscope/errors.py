@@ -11,14 +11,15 @@
         ConfigError              a service file is wrong, or what it names
         StoreError               a store cannot be used
           StoreUnavailable       for now: it is full, locked or down; trying again may help
-        StateError          a saved state is of another version, or torn
+        AlarmError               what an alarm was told to do has no meaning in its state
+        StateError               a saved state is of another version, or damaged
 
 Every message names the file, the row or the key, says what is wrong with it and what to do.
 """
 
 __all__ = [
+    "AlarmError",
     "BaselineError",
-    "StateError",
     "ConfigError",
     "LoopError",
     "NotEnoughError",
@@ -26,6 +27,7 @@ __all__ = [
     "RecordingError",
     "ServoscopeError",
     "SimulationError",
+    "StateError",
     "StoreError",
     "StoreUnavailable",
 ]
@@ -60,7 +62,7 @@ class OutputError(ServoscopeError):
 
 
 class ConfigError(ServoscopeError):
-    """A service file, or what it names, is wrong."""
+    """A service file is wrong, or what it names."""
 
 
 class StoreError(ServoscopeError):
@@ -71,5 +73,9 @@ class StoreUnavailable(StoreError):
     """A store cannot be used for now: it is full, locked or down."""
 
 
+class AlarmError(ServoscopeError):
+    """What an alarm was told to do has no meaning in the state that it is in."""
+
+
 class StateError(ServoscopeError):
-    """A saved state is of another version, or torn."""
+    """A saved state was written by another version, or is damaged."""

@@ -46,13 +46,15 @@ class Writer:
     ----------
     store
         Where to.
+    owner
+        Name of the service.
     bound
         How many blocks may wait.
     """
 
-    def __init__(self, store: Store, bound: int) -> None:
-        self._store, self._bound = store, bound
-        self._number = store.last_commit()
+    def __init__(self, store: Store, owner: str, bound: int) -> None:
+        self._store, self._owner, self._bound = store, owner, bound
+        self._number = store.last_commit(owner)
         self._gathered, self._sealed = Commit(), None
         self._stand: dict[str, Callable[[], tuple[dict[str, Any], int]]] = {}
         self._in_doubt = False
@@ -128,8 +130,8 @@ class Writer:
         if time.monotonic() < self._again:
             return None
         try:
-            if not (self._in_doubt and self._store.last_commit() == self._number + 1):
-                self._store.write(self._sealed.batch, self._number + 1)
+            if not (self._in_doubt and self._store.last_commit(self._owner) == self._number + 1):
+                self._store.write(self._sealed.batch, self._owner, self._number + 1)
         except StoreUnavailable:
             self._in_doubt = True
             self._wait = min(max(2.0 * self._wait, FIRST_WAIT_S), LONGEST_WAIT_S)

@@ -12,7 +12,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from servoscope.store import tables
 
-__all__ = ["Batch", "Row"]
+__all__ = ["Batch", "Row", "key_of"]
 
 Row = Mapping[str, Any]
 
@@ -46,14 +46,14 @@ class Batch:
         """Whether there is nothing to write."""
         return not (any(self.rows.values()) or self.checkpoints or self.outcomes or self.deliveries)
 
-    def write(self, connection: sa.Connection, commit: int) -> None:
-        """Write it in the connection's transaction, as commit number `commit`."""
-        connection.execute(tables.meta.update().where(tables.meta.c.key == "commit").values(value=commit))
+    def write(self, connection: sa.Connection, owner: str, commit: int) -> None:
+        """Write it in the connection's transaction, as commit number `commit` of its owner."""
+        _upsert(connection, tables.meta, [{"key": key_of(owner), "value": commit}])
         for name, rows in self.rows.items():
             if rows:
                 connection.execute(tables.TABLES.tables[name].insert(), rows)
         if self.checkpoints:
-            _write_checkpoints(connection, list(self.checkpoints.values()))
+            _upsert(connection, tables.checkpoints, list(self.checkpoints.values()))
         for table, key, changes in (
             (tables.recent, None, [{"of": asset, "below": first} for asset, first in self.keep.items()]),
             (tables.commands, "id", [{"of": id_, "outcome": said} for id_, said in self.outcomes.items()]),
@@ -68,8 +68,14 @@ class Batch:
                 connection.execute(table.update().where(table.c[key] == sa.bindparam("of")), changes)
 
 
-def _write_checkpoints(connection: sa.Connection, rows: list[Row]) -> None:
+def key_of(owner: str) -> str:
+    """Return under which key of `meta` the number of an owner's last commit stands."""
+    return f"commit of {owner}"
+
+
+def _upsert(connection: sa.Connection, table: sa.Table, rows: list[Row]) -> None:
     dialect = postgresql if connection.dialect.name == "postgresql" else sqlite
-    insert = dialect.insert(tables.checkpoints)
-    changed = {name: insert.excluded[name] for name in ("sequence", "state", "status", "at")}
-    connection.execute(insert.on_conflict_do_update(index_elements=["asset"], set_=changed), rows)
+    insert = dialect.insert(table)
+    keys = [column.name for column in table.primary_key]
+    changed = {column.name: insert.excluded[column.name] for column in table.c if column.name not in keys}
+    connection.execute(insert.on_conflict_do_update(index_elements=keys, set_=changed), rows)

@@ -45,7 +45,7 @@ def prepare(connection: sa.Connection, name: str, *, write: bool) -> None:
         if not write:
             raise StoreError(f"{name}: holds no history yet, start it with servoscope run")
         TABLES.create_all(connection)
-        connection.execute(meta.insert(), [{"key": "schema", "value": version()}, {"key": "commit", "value": 0}])
+        connection.execute(meta.insert(), [{"key": "schema", "value": version()}])
         return
     found = connection.execute(sa.select(meta.c.value).where(meta.c.key == "schema")).scalar()
     if not isinstance(found, int) or found > version():

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from servoscope.errors import StoreError
 from servoscope.store import opening, schema, tables
-from servoscope.store.batch import Batch, Row
+from servoscope.store.batch import Batch, Row, key_of
 
 __all__ = ["Store"]
 
@@ -83,13 +83,14 @@ class Store:
         with opening.guarded(self._url), self._engine.begin() as connection:
             yield connection
 
-    def last_commit(self) -> int:
-        """Return the number of the last transaction."""
+    def last_commit(self, owner: str) -> int:
+        """Return the number of an owner's last transaction, 0 before the first."""
+        query = sa.select(tables.meta.c.value).where(tables.meta.c.key == key_of(owner))
         with self._transaction() as connection:
-            return int(connection.execute(sa.select(tables.meta.c.value).where(tables.meta.c.key == "commit")).scalar_one())
+            return int(connection.execute(query).scalar() or 0)
 
-    def write(self, batch: Batch, commit: int) -> None:
-        """Write a batch whole, as commit number `commit`, which is one more than `last_commit`.
+    def write(self, batch: Batch, owner: str, commit: int) -> None:
+        """Write a batch whole, as commit number `commit` of its owner, which is one more than `last_commit`.
 
         A batch whose commit was cut off may or may not be in the store: `last_commit` tells.
 
@@ -101,7 +102,7 @@ class Store:
         if self._claim is not None:
             self._claim.hold()
         with self._transaction() as connection:
-            batch.write(connection, commit)
+            batch.write(connection, owner, commit)
 
     def add(self, table: str, row: Row) -> None:
         """Write one row, for example a command, from any process."""

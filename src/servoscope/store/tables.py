@@ -41,7 +41,7 @@ def _numbered(name: str, *columns: sa.Column[object]) -> sa.Table:
     )
 
 
-meta = sa.Table(  # schema: version of the tables; commit: number of the last transaction
+meta = sa.Table(  # schema: version of the tables; commit of NAME: number of that service's last transaction
     "meta",
     TABLES,
     sa.Column("key", sa.Text, primary_key=True),
