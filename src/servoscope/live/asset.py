@@ -4,32 +4,26 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from servoscope import quality
-from servoscope.alarms import AlarmSettings, Command, Snapshot, Transition, advance, start, status, step
+from servoscope.alarms import AlarmSettings, Command, Snapshot, State, Transition, advance, start, status, step
 from servoscope.baseline import Baseline
 from servoscope.errors import AlarmError, StateError
 from servoscope.live.arrival import arrive
 from servoscope.live.block import Block
 from servoscope.live.checkpoint import Counted, Progress
 from servoscope.live.config import DiagnosisSettings
-from servoscope.live.examining import Told, examine
+from servoscope.live.examining import Examined, Told, examine
 from servoscope.live.judging import Judged, Window, judge
+from servoscope.live.rows import Outcome, Row, transition_row
 from servoscope.live.thinning import gamma, thin
 from servoscope.monitor import Monitor
 
-__all__ = ["Asset", "Following", "Row"]
-
-
-class Row(NamedTuple):
-    """A row for the store: its table and its values."""
-
-    table: str
-    values: dict[str, Any]
+__all__ = ["Asset", "Following"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +57,7 @@ class Asset:
         self._limits = how.quality.limits(self._rate)
         self._definitions = how.alarms.of_asset
         self._window: deque[Block] = deque()
-        self._rows: list[Row] = []
+        self._out = Outcome([], [])
         self.progress: Progress | None = None
 
     def resume(self, progress: Progress, window: Iterable[Block]) -> None:
@@ -79,7 +73,9 @@ class Asset:
                 f"{self.name}: its saved state belongs to another baseline ({progress.baseline}, now "
                 f"{self.baseline.hash}): run --anew {self.name} begins with a new state, behind the samples counted"
             )
-        known = {name: progress.alarms.get(name) or start(self.name, name, progress.counted.t) for name in self._definitions}
+        known = {
+            name: progress.alarms.get(name) or start(self.name, name, progress.counted.t) for name in self._definitions
+        }
         heard = quality.listen(progress.quality, progress.counted.t)
         self.progress, self._window = replace(progress, alarms=known, quality=heard), deque(window)
 
@@ -95,44 +91,68 @@ class Asset:
             alarms={name: start(self.name, name, counted.t) for name in self._definitions},
         )
 
+    def status(self, progress: Progress) -> dict[str, Any]:
+        """Return what people are shown of a progress, as plain values."""
+        judged, findings = progress.judged, quality.standing(progress.quality)
+        verdict = quality.judged(judged.verdict, findings)
+        alarms = [(self._definitions[name], state) for name, state in progress.alarms.items()]
+        ne107 = status(verdict, findings, alarms)
+        return {
+            "verdict": verdict,
+            "summary": judged.summary,
+            "since": judged.since,
+            "onset": judged.onset,
+            "examined": judged.examined,
+            "ne107": ne107.ne107,
+            "reasons": list(ne107.reasons),
+            "quality": findings,
+            "alarms": {
+                name: {"state": state.state.value, "since": state.since, "priority": self._definitions[name].priority}
+                for name, state in progress.alarms.items()
+                if state.state is not State.NORMAL
+            },
+            **progress.shown,
+            "counted": asdict(progress.counted),
+        }
+
     @property
     def keep(self) -> int:
         """The first sequence of the window: samples before it are no longer needed."""
-        return self._window[0].sequence if self._window else 0
+        return self._window[0].sequence if self._window else self._now.counted.sequence + 1
 
-    def take(self, block: Block) -> list[Row] | None:
-        """Process a block; return the rows that it leads to, or None if it was counted before."""
+    def take(self, block: Block) -> Outcome:
+        """Process a block; one that was counted before leads to nothing."""
         if self.progress is None:
             self.begin(Counted(float(block.t[0]), float(block.t[0])))
-        before = self._now
+        before, self._out = self._now, Outcome([], [])
         if block.sequence <= before.counted.sequence:
             self.progress = replace(before, counted=replace(before.counted, repeated=before.counted.repeated + 1))
-            return None
+            return self._out
         self._window.append(block)
-        self._rows = [Row("recent", {"sequence": block.sequence, "samples": block.pack()})]
+        self._out.rows.append(Row("recent", {"sequence": block.sequence, "samples": block.pack()}))
         lost = block.sequence - before.counted.sequence - 1
         if lost:
             words = {"blocks": lost, "after": before.counted.sequence, "before": block.sequence}
-            self._rows.append(Row("audit", {"who": "servoscope", "what": "blocks lost", "document": words}))
+            self._out.rows.append(Row("audit", {"who": "servoscope", "what": "blocks lost", "document": words}))
         self._follow(block, lost)
-        exceeded = bool(self._now.shown.get("exceeded", False))
-        self._judge(exceeded)
+        self._judge()
         self._raise_alarms()
         self._forget()
-        return self._rows
+        return self._out
 
-    def tick(self, elapsed_s: float) -> list[Row]:
+    def tick(self, elapsed_s: float) -> Outcome:
         """Let time pass without a block: so long after the last one, by the asset's clock, silence is an alarm."""
+        self._out = Outcome([], [])
         if self.progress is None:
-            return []
+            return self._out
         progress, now = self.progress, self.progress.counted.t + elapsed_s
         watched, findings = quality.tick(self._limits, progress.quality, now)
-        self.progress, self._rows = replace(progress, quality=watched), []
-        if findings:
+        self.progress = replace(progress, quality=watched)
+        if findings or "silent" in quality.standing(watched):
             self._raise_alarms(now)
-        return self._rows
+        return self._out
 
-    def obey(self, alarm: str, command: Command) -> list[Row]:
+    def obey(self, alarm: str, command: Command) -> Outcome:
         """Carry out an operator's command.
 
         Raises
@@ -142,12 +162,12 @@ class Asset:
         """
         if self.progress is None or alarm not in self._definitions:
             raise AlarmError(f"{self.name}: has no alarm {alarm!r}, only {', '.join(self._definitions)}")
-        progress, self._rows = self.progress, []
+        progress, self._out = self.progress, Outcome([], [])
         state = progress.alarms[alarm]
         state, transitions = step(self._definitions[alarm], state, command, max(state.at, progress.counted.t))
         self.progress = replace(progress, alarms={**progress.alarms, alarm: state})
         self._tell(transitions)
-        return self._rows
+        return self._out
 
     def wanted(self, *, ended: bool = False) -> list[tuple[Window, list[Block]]]:
         """Return the full diagnoses whose windows are complete, or end here, with their samples."""
@@ -156,15 +176,15 @@ class Asset:
         ready = [one for one in self.progress.windows if ended or self.progress.counted.t >= one.until]
         return [(one, [b for b in self._window if b.sequence >= one.first and b.t[0] < one.until]) for one in ready]
 
-    def told(self, window: Window, said: Told) -> list[Row]:
+    def told(self, window: Window, said: Told) -> Outcome:
         """Take the answer to one of `wanted`, once."""
         progress = self._now
         if window not in progress.windows:
-            return []
+            return Outcome([], [])
         self.progress = replace(progress, windows=tuple(one for one in progress.windows if one != window))
         values = {"number": window.number, "t": window.until, "grounds": window.why, **said._asdict()}
         self._forget()
-        return [Row("diagnoses", values)]
+        return Outcome([Row("diagnoses", values)], [])
 
     @property
     def _now(self) -> Progress:
@@ -178,8 +198,8 @@ class Asset:
         self.progress = replace(progress, counted=replace(progress.counted, rows=number))
         return number
 
-    def _add(self, table: str, t: float, **values: Any) -> None:
-        self._rows.append(Row(table, {"number": self._number(), "t": t, **values}))
+    def _add(self, table: str, **values: Any) -> None:
+        self._out.rows.append(Row(table, {"number": self._number(), **values}))
 
     def _follow(self, block: Block, lost: int) -> None:
         """Let monitor and data quality see the samples."""
@@ -224,18 +244,21 @@ class Asset:
         for row in rows:
             self._add("residuals", **row)
 
-    def _judge(self, exceeded: bool) -> None:
+    def _judge(self) -> None:
         """Examine the last minutes if it is time to, and ask for a full diagnosis where that is news."""
         progress, settings = self._now, self.how.diagnosis
         t, before = progress.counted.t, progress.judged.verdict
-        judged, found = judge(
-            progress.judged, settings, t, exceeded, lambda: examine(self.baseline, self.name, self._last(settings.window_s))
-        )
+        exceeded = bool(progress.shown.get("exceeded", False))
+
+        def look() -> Examined:
+            return examine(self.baseline, self.name, self._last(settings.window_s))
+
+        judged, found = judge(progress.judged, settings, t, exceeded, look)
         self.progress = replace(progress, judged=judged)
         if found is None or found.verdict == before:
             return
         told = Told(found.verdict, found.summary, found.onset, found.document or {})
-        self._add("diagnoses", t, grounds="examination", **told._asdict())
+        self._add("diagnoses", t=t, grounds="examination", **told._asdict())
         if found.verdict == "fault":
             window = Window(self._number(), self._last(settings.window_s)[0].sequence, t + settings.after_s, "full")
             self.progress = replace(self._now, windows=(*self._now.windows, window))
@@ -260,12 +283,9 @@ class Asset:
         self._tell(transitions)
 
     def _tell(self, transitions: Sequence[Transition]) -> None:
+        self._out.transitions.extend(transitions)
         for one in transitions:
-            plain = one.to_dict()
-            values = {key: plain[key] for key in ("alarm", "before", "after", "cause", "who")}
-            definition = self._definitions[one.alarm]
-            meaning = {"priority": definition.priority, "event": plain["event"]}
-            self._add("transitions", one.time, **values, document=meaning)
+            self._add("transitions", **transition_row(one, self._definitions[one.alarm]))
 
     def _forget(self) -> None:
         """Let go of samples that no examination needs any more."""

@@ -93,7 +93,7 @@ class Progress:
     judged: Judged
     last: float | None = None
     fed: int = 0
-    thinned: Thinned = Thinned()
+    thinned: Thinned = field(default_factory=Thinned)
     windows: tuple[Window, ...] = ()
     alarms: dict[str, AlarmState] = field(default_factory=dict)
     shown: dict[str, Any] = field(default_factory=dict)

@@ -82,7 +82,9 @@ def examine(baseline: Baseline, name: str, blocks: Sequence[Block]) -> Examined:
         said, _ = judge(x)
         return Examined(said.verdict, said.summary, document=said.model_dump(mode="json"))
     if not x.alarm[-1]:
-        return Examined("undetermined", "Undetermined: a deviation has gone, and is still in the window.", recovering=True)
+        return Examined(
+            "undetermined", "Undetermined: a deviation has gone, and is still in the window.", recovering=True
+        )
     first = 0 if x.alarm.all() else len(x.alarm) - int(np.argmin(x.alarm[::-1]))
     crossed = int(x.estimates.crossed[first]) - 1
     onset = begins + float(recording.t[crossed if crossed >= 0 else int(x.estimates.index[first])])

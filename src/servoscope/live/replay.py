@@ -130,6 +130,11 @@ class Replay:
         self._next: list[tuple[float, int, _Reel, Block]] = []
         self._pace = (0.0, 0.0)
 
+    @property
+    def pace(self) -> float:
+        """How many times as fast as it was recorded."""
+        return self.settings.speed
+
     def open(self, resume: Mapping[str, Resume]) -> None:
         """Begin, or go on where the streams were; the clock of the replay goes on with them, without a rush."""
         now = time.time() if self.settings.start is None else self.settings.start.timestamp()

@@ -17,6 +17,10 @@ class Source(Protocol):
     not acknowledged is offered again after a restart.
     """
 
+    @property
+    def pace(self) -> float:
+        """How fast the clock of the samples runs: 1 for what is measured now; 0 where it waits for whoever asks."""
+
     def open(self, resume: Mapping[str, Resume]) -> None:
         """Begin; streams of assets in `resume` go on after the sequence that it names, others at their beginning."""
 

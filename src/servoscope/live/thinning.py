@@ -1,4 +1,4 @@
-"""Residuals at a resolution that can be kept for years: one row per period, with the largest statistics since the last."""
+"""Residuals at a resolution that can be kept for years: one row per period, with the largest statistics of it."""
 
 from __future__ import annotations
 

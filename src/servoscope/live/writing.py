@@ -1,4 +1,4 @@
-"""Results on their way to the store: gathered, committed together, kept within bounds while the store is unavailable."""
+"""Results on their way to the store: gathered, committed together, kept within bounds while it is unavailable."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from servoscope.errors import StoreUnavailable
-from servoscope.live.asset import Asset, Row
+from servoscope.live.asset import Asset
 from servoscope.live.checkpoint import pack
+from servoscope.live.rows import Row
 from servoscope.store import Batch, Store
 
 __all__ = ["Commit", "Writer"]

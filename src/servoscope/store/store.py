@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy.engine import URL
 
 from servoscope.errors import StoreError
 from servoscope.store import opening, schema, tables
@@ -19,7 +20,7 @@ __all__ = ["Store"]
 class Store:
     """History, checkpoints, commands and outbox; make one with `open`."""
 
-    def __init__(self, url: opening.URL, engine: sa.Engine) -> None:
+    def __init__(self, url: URL, engine: sa.Engine) -> None:
         self._url, self._engine = url, engine
         self._claim: opening.Claim | None = None
 
@@ -154,5 +155,3 @@ class Store:
         """Return what a query finds."""
         with self._transaction() as connection:
             return [dict(row) for row in connection.execute(query).mappings()]
-
-
