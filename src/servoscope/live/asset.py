@@ -211,6 +211,7 @@ class Asset:
         r, u, y = np.where(np.isfinite(signals), signals, np.nan)
         monitor, trace = self._monitor.run(progress.monitor, r, u, y, restart)
         watched, _ = quality.examine(self._limits, progress.quality, block.t, block.r, block.u, block.y)
+        watched, _ = quality.tick(self._limits, watched, arrival.t if np.isfinite(arrival.t) else progress.counted.t)
         at = np.rint(trace.t * self._rate).astype(np.int64) - progress.fed
         thinned, rows = thin(progress.thinned, trace, block.t[arrival.used][at], self.how.residual_every_s)
         shown = progress.shown

@@ -149,15 +149,15 @@ class Replay:
         if block is not None:
             heapq.heappush(self._next, (float(block.t[-1]), order, reel, block))
 
-    def _due(self, t: float) -> float:
+    def _due(self, t: float, now: float) -> float:
         """Return when a time of the replay is reached, by the monotonic clock [s]."""
         begun, first = self._pace
-        return begun + (t - first) / self.settings.speed if self.settings.speed else time.monotonic()
+        return begun + (t - first) / self.settings.speed if self.settings.speed else now
 
     def poll(self, most: int) -> list[Block]:
         """Return the blocks that are due."""
         now, found = time.monotonic(), list[Block]()
-        while self._next and len(found) < most and (due := self._due(self._next[0][0])) <= now:
+        while self._next and len(found) < most and (due := self._due(self._next[0][0], now)) <= now:
             _, order, reel, block = heapq.heappop(self._next)
             found.append(Block(block.asset, block.sequence, block.t, block.r, block.u, block.y, due))
             reel.sequence += 1
@@ -170,7 +170,8 @@ class Replay:
     @property
     def waits(self) -> float:
         """How long until the next block is due [s]."""
-        return max(0.0, self._due(self._next[0][0]) - time.monotonic()) if self._next else math.inf
+        now = time.monotonic()
+        return max(0.0, self._due(self._next[0][0], now) - now) if self._next else math.inf
 
     def close(self) -> None:
         """Stop."""
