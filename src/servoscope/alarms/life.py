@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from servoscope.alarms.conditions import Condition, Snapshot, condition
 from servoscope.alarms.definitions import AlarmDefinition
+from servoscope.alarms.saved import whole
 from servoscope.alarms.states import COMMANDS, LATCHED, Event, Found, State, after
 from servoscope.errors import AlarmError, StateError
 
@@ -81,15 +82,11 @@ class AlarmState:
         StateError
             If it is of another version, or is not whole.
         """
-        names = {each.name for each in fields(cls)}
-        found = plain.get("version")
-        if found != VERSION:
-            raise StateError(
-                f"alarm state of version {found!r}, this servoscope reads {VERSION}: use that which wrote it"
-            )
-        if set(plain) != names | {"version"} or plain["state"] not in set(State):
-            raise StateError("alarm state is not whole: restore it from a copy, or remove it to begin anew")
-        return cls(**{**{name: plain[name] for name in names}, "state": State(plain["state"])})
+        values = whole(plain, cls, VERSION, "alarm state")
+        try:
+            return cls(**{**values, "state": State(values["state"])})
+        except ValueError:
+            raise StateError(f"alarm state {values['state']!r} is unknown: restore it from a copy") from None
 
 
 @dataclass(frozen=True)
@@ -121,6 +118,12 @@ class Transition:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         return {**asdict(self), "before": self.before.value, "after": self.after.value, "event": self.event.value}
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Transition:
+        """Return the transition that `to_dict` wrote."""
+        states = {name: State(plain[name]) for name in ("before", "after")}
+        return cls(**{**plain, **states, "event": Event(plain["event"])})
 
     @property
     def is_new(self) -> bool:
