@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from servoscope.alarms.definitions import PRIORITIES, FloodSettings, Priority
-from servoscope.alarms.life import Transition
+from servoscope.alarms.records import Transition
 from servoscope.alarms.saved import whole
 from servoscope.alarms.states import WAITING
 
