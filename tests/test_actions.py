@@ -279,7 +279,7 @@ GAIN = {
     "nominal": 20.0,
     "exponent": -1.0,
     "min": 10.0,
-    "max": 26.0,
+    "max": 29.0,
     "max_step": 4.0,
     "per_hour": 2,
 }
@@ -297,18 +297,19 @@ def test_a_change_is_off_unless_told_otherwise() -> None:
 def test_a_change_goes_step_by_step_within_its_bounds_and_back_again() -> None:
     settings = gain(mode="recommend")
     state, changes = begin(settings), []
-    ratios = [(0.0, 0.999), (1.0, 0.5), (2.0, 0.5), (3.0, 0.5), (3603.0, None), (3604.0, None), (9e3, None)]
+    ratios = [(0.0, 0.999), (1.0, 0.5), (2.0, 0.5), (3.0, 0.5), (3602.0, 0.5), (7300.0, None), (7301.0, None)]
     for when, ratio in ratios:
         state, change, row = respond("soft", settings, state, "press 1", ratio, when, NOW)
         assert row is None
         changes += [(when, change.previous, change.value, change.target)] if change else []
         state = ToleranceState.from_dict(json.loads(json.dumps(state.to_dict())))
-    # 0.999 is not worth a change; 40 is beyond its bound of 26; the third change within the hour has to wait.
+    # 0.999 is not worth a change; the third change within the hour has to wait; 40 is beyond the bound of 29.
     assert changes == [
         (1.0, 20.0, 24.0, 40.0),
-        (2.0, 24.0, 26.0, 40.0),
-        (3603.0, 26.0, 22.0, 20.0),
-        (3604.0, 22.0, 20.0, 20.0),
+        (2.0, 24.0, 28.0, 40.0),
+        (3602.0, 28.0, 29.0, 40.0),
+        (7300.0, 29.0, 25.0, 20.0),
+        (7301.0, 25.0, 21.0, 20.0),
     ]
 
 
@@ -343,7 +344,7 @@ def test_an_executed_change_goes_through_a_sink_once_with_a_key(tmp_path: Path) 
     [
         ({"value": 21.0}, "give value or exponent"),
         ({"nominal": 30.0}, "nominal: 30 must lie between min and max"),
-        ({"exponent": None, "value": 27.0}, "value: 27 must lie between min and max"),
+        ({"exponent": None, "value": 30.0}, "value: 30 must lie between min and max"),
         ({"mode": "execute"}, "sink: missing"),
         ({"mode": "execute", "sink": "plc"}, "no webhook or command is called 'plc'"),
     ],

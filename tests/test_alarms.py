@@ -169,6 +169,25 @@ def test_shelving_expires_into_what_is_there_by_then() -> None:
         lived(definition(), (1.0, HEALTHY), (10.0, commanded(Event.SHELVE, until=10.0)))
 
 
+def test_what_is_due_happens_in_its_order_however_late() -> None:
+    one = definition(on_delay_s=50.0)
+    shelve = commanded(Event.SHELVE, until=100.0)
+    _, told = lived(one, (1.0, HEALTHY), (10.0, shelve), (90.0, FAULT), (500.0, None))
+    assert [(t.time, t.event) for t in told[1:]] == [(100.0, Event.EXPIRE), (140.0, Event.OCCUR)]
+
+
+def test_settings_may_change_while_an_alarm_lives() -> None:
+    state, _ = lived(definition(on_delay_s=100.0), (10.0, FAULT), (90.0, None))
+    _, (told,) = step(definition(on_delay_s=5.0), state, None, 95.0)
+    assert told.time == 90.0  # what was told until then is not rewritten
+    latched = brought_to(State.LATCHED_ACKNOWLEDGED, definition(latching=True))
+    free, told = latched, []
+    for time, given in ((10.0, FAULT), (11.0, commanded(Event.ACKNOWLEDGE)), (12.0, HEALTHY)):
+        free, transitions = step(definition(latching=False), free, given, time)
+        told += transitions
+    assert (free.state, free.latched) == (State.NORMAL, False)
+
+
 def test_a_latch_survives_everything_but_its_reset() -> None:
     state = brought_to(State.LATCHED_UNACKNOWLEDGED, definition(latching=True))
     for there, back in ((Event.SHELVE, Event.UNSHELVE), (Event.REMOVE, Event.RESTORE)):
@@ -204,8 +223,11 @@ def test_one_alarm_suppresses_another_by_design() -> None:
 
 def test_a_clock_that_is_set_back_takes_running_delays_with_it() -> None:
     one = definition(on_delay_s=10.0)
-    _, told = lived(one, (1e6, FAULT), (1e6 + 4.0, FAULT), (500.0, FAULT), (505.9, None), (506.0, None))
+    state, told = lived(one, (1e6, FAULT), (1e6 + 4.0, FAULT), (500.0, FAULT), (505.9, None), (506.0, None))
     assert [t.time for t in told] == [506.0]
+    state, _ = step(one, state, commanded(Event.SHELVE, until=600.0), 510.0)
+    state, _ = step(one, state, None, 10.0)
+    assert (state.since, state.shelved_until) == (10.0, 100.0)
 
 
 def test_a_state_goes_to_json_and_back_and_another_version_is_refused() -> None:

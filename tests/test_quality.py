@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import NamedTuple
 
 import hypothesis.strategies as st
@@ -14,7 +15,9 @@ from hypothesis import given, settings
 from servoscope.alarms import Snapshot, condition
 from servoscope.alarms.definitions import AlarmSettings
 from servoscope.errors import RecordingError, StateError
+from servoscope.loop import Loop
 from servoscope.quality import KINDS, Finding, QualitySettings, examine, init, judged, listen, standing, tick
+from servoscope.readers import read
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -67,8 +70,9 @@ def test_sound_data_are_sound_moving_or_at_rest(block: Block) -> None:
 
 
 def test_rest_from_the_start_is_sound_whatever_the_sensors() -> None:
-    block = axis(noise=0.0)
-    for y in (np.zeros(6000), np.where(np.arange(6000) % 997 == 0, 0.02, 0.0)):
+    block, k = axis(noise=0.0), np.arange(6000)
+    between_two_steps = np.where(k < 4000, 0.02 * (k % 2), 0.0)
+    for y in (np.zeros(6000), np.where(k % 997 == 0, 0.02, 0.0), between_two_steps):
         assert found(block._replace(r=np.zeros(6000), u=np.zeros(6000), y=y)) == SOUND
 
 
@@ -87,6 +91,12 @@ def test_a_frozen_channel_is_found_while_the_motion_demands_a_change_and_ends_wi
     ]
 
 
+def test_a_controller_at_its_limit_is_not_frozen() -> None:
+    block = axis()
+    block.u[4200:5500] = block.u.max()
+    assert found(block) == SOUND
+
+
 def test_a_sensor_that_is_dead_from_the_start_is_found() -> None:
     assert found(axis()._replace(y=np.zeros(6000))) == [("frozen_y", True), *SOUND]
 
@@ -102,7 +112,7 @@ def test_a_frozen_value_is_found_at_rest_where_the_sensor_is_known_to_be_noisy()
 
 def test_a_spike_does_not_blind_for_long() -> None:
     limits = QualitySettings(window_s=2.0).limits(100.0)
-    block = axis(n=2 * 60 * 200 + 6000)
+    block = axis(noise=0.0, n=2 * 60 * 200 + 6000)
     block.y[100] = 1e6
     block.y[-3000:] = block.y[-3000]
     block.r[-3000:] = np.sin(np.arange(3000) / 100.0)
@@ -253,3 +263,14 @@ def test_blocks_that_do_not_fit_and_states_of_another_version_are_refused() -> N
     for state in (old, init()[:-1]):
         with pytest.raises(StateError, match="another version"):
             tick(LIMITS, state, 0.0)
+
+
+def test_measured_recordings_are_sound_and_a_sensor_frozen_in_one_is_found(shared_data: Path, project: Path) -> None:
+    for name, path in (("emps", "real/emps/DATA_EMPS.mat"), ("eha-pump", "real/eha_pump/exp_data_1_4.csv")):
+        loop = Loop.load(project / "examples" / f"{name}.toml")
+        recording = read(shared_data / path, loop)
+        limits = QualitySettings().limits(loop.sample_rate)
+        block = Block(EPOCH + recording.t, recording.r, recording.u, recording.y.copy())
+        assert found(block, limits) == SOUND
+        block.y[10000:18000] = block.y[10000]
+        assert ("frozen_y", True) in found(block, limits)
