@@ -6,7 +6,7 @@ delivery = deliver(row, settings, now)                      # delivery.again tak
 """
 
 from servoscope.actions.delivery import deliver, signature
-from servoscope.actions.outbox import Delivery, Outgoing, outgoing
+from servoscope.actions.outbox import Delivery, Outgoing, outgoing, outgoing_flood
 from servoscope.actions.settings import ActionSettings, CommandSettings, ToleranceSettings, WebhookSettings
 from servoscope.actions.tolerance import Change, ToleranceState, begin, respond
 
@@ -22,6 +22,7 @@ __all__ = [
     "begin",
     "deliver",
     "outgoing",
+    "outgoing_flood",
     "respond",
     "signature",
 ]

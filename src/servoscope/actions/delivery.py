@@ -69,14 +69,15 @@ def _post(row: Outgoing, sink: WebhookSettings, now: float) -> str:
         stamp = str(int(now))
         headers |= {"X-Servoscope-Timestamp": stamp, "X-Servoscope-Signature": signature(secret, stamp, body)}
     try:
-        # Redirects are not followed: the event goes where the configuration says, or nowhere.
-        answer = httpx.post(sink.url, content=body, headers=headers, timeout=sink.timeout_s, follow_redirects=False)
+        # Redirects are not followed: the event goes where the configuration says, or nowhere. What is answered, beyond
+        # its status, is not read: it might never end.
+        with httpx.stream("POST", sink.url, content=body, headers=headers, timeout=sink.timeout_s) as answer:
+            status, wait = answer.status_code, answer.headers.get("Retry-After", "")
     except (httpx.HTTPError, httpx.InvalidURL) as error:
         raise _Failed(f"{sink.url}: {error or type(error).__name__}") from None
-    if not answer.is_success:
-        wait = answer.headers.get("Retry-After", "")
-        raise _Failed(f"{sink.url}: answered {answer.status_code}", float(wait) if wait.isdecimal() else 0.0)
-    return f"answered {answer.status_code}"
+    if not 200 <= status < 300:
+        raise _Failed(f"{sink.url}: answered {status}", float(wait) if wait.isdecimal() else 0.0)
+    return f"answered {status}"
 
 
 def _secret(sink: WebhookSettings) -> bytes | None:

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from servoscope.actions.settings import ActionSettings, CommandSettings, RetrySettings, WebhookSettings
-from servoscope.alarms import Priority, Transition
+from servoscope.alarms import Notice, Priority, Transition
 
-__all__ = ["Delivery", "Outgoing", "outgoing"]
+__all__ = ["Delivery", "Outgoing", "outgoing", "outgoing_flood"]
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,33 @@ def outgoing(
         if _concerns(sink, transition, priority):
             key = key_of(name, transition.asset, transition.alarm, transition.sequence)
             event = {"key": key, **transition.to_dict(), "priority": priority, "details": dict(details or {})}
+            rows.append(Outgoing(key, name, event, created=now, due=now))
+    return tuple(rows)
+
+
+def outgoing_flood(settings: ActionSettings, notice: Notice, now: float) -> tuple[Outgoing, ...]:
+    """Return the rows for the beginning or the end of a flood: for each sink that is not kept to some alarms or assets.
+
+    Parameters
+    ----------
+    settings
+        What is done about alarms.
+    notice
+        ``flood_begins`` or ``flood_ends``.
+    now
+        As for `outgoing`.
+    """
+    rows = []
+    for name, sink in settings.sinks.items():
+        if sink.alarms is sink.assets is sink.events is None:
+            key = key_of(name, notice.kind, repr(notice.time))
+            event = {
+                "key": key,
+                "event": notice.kind,
+                "time": notice.time,
+                "counted": notice.counted,
+                "peak": notice.peak,
+            }
             rows.append(Outgoing(key, name, event, created=now, due=now))
     return tuple(rows)
 

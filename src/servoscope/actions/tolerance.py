@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from servoscope.actions.outbox import Outgoing, key_of
 from servoscope.actions.settings import ToleranceSettings
-from servoscope.errors import StateError
+from servoscope.alarms.saved import whole
 
 __all__ = ["Change", "ToleranceState", "begin", "respond"]
 
@@ -42,12 +42,8 @@ class ToleranceState:
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> ToleranceState:
         """Return the state that `to_dict` wrote; StateError if it is of another version, or not whole."""
-        if plain.get("version") != VERSION or set(plain) != {each.name for each in fields(cls)} | {"version"}:
-            raise StateError(
-                f"tolerance state of version {plain.get('version')!r}, or not whole: this servoscope reads {VERSION}; "
-                "remove it to begin from nominal"
-            )
-        return cls(plain["value"], tuple(plain["changed"]), plain["sequence"])
+        values = whole(plain, cls, VERSION, "tolerance state")
+        return cls(**{**values, "changed": tuple(values["changed"])})
 
 
 @dataclass(frozen=True)

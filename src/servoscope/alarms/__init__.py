@@ -18,7 +18,8 @@ from servoscope.alarms.definitions import (
     Priority,
 )
 from servoscope.alarms.flood import FloodState, Held, Notice, announce, pass_time
-from servoscope.alarms.life import AlarmState, Command, Transition, advance, start, step
+from servoscope.alarms.life import advance, start, step
+from servoscope.alarms.records import AlarmState, Command, Transition
 from servoscope.alarms.states import COMMANDS, TABLE, Event, State
 from servoscope.alarms.status import Status, status
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from servoscope.complaints import describe
 from servoscope.quality import KINDS
 
 __all__ = ["DEFAULTS", "PRIORITIES", "AlarmDefinition", "AlarmSettings", "FloodSettings", "Ne107", "Priority"]
@@ -15,13 +17,13 @@ NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Text = Annotated[str, Field(strict=True)]
-Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
 
 Source = Literal["verdict", "quality", "statistic", "level", "buffered"]
 Priority = Literal["low", "medium", "high", "critical"]
 Ne107 = Literal["good", "maintenance_required", "out_of_specification", "function_check", "failure"]
 
 PRIORITIES: tuple[Priority, ...] = ("low", "medium", "high", "critical")
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 OWN: tuple[Source, ...] = ("buffered",)  # sources of the service itself
 WORDS: dict[str, tuple[str, ...]] = {"verdict": ("fault", "undetermined"), "quality": KINDS}
 
@@ -178,18 +180,20 @@ class AlarmSettings(_Settings):
     """
 
     flood: FloodSettings = FloodSettings()
-    definitions: dict[Name, AlarmDefinition] = Field(default_factory=dict)
+    definitions: dict[str, AlarmDefinition]
 
     @model_validator(mode="before")
     @classmethod
     def _over_defaults(cls, data: Any) -> Any:
-        if not isinstance(data, Mapping):
+        """Take the section as it is written; each alarm is validated here, so that complaints name its table."""
+        if not isinstance(data, Mapping) or "definitions" in data:
             return data
-        tables = data.get("definitions") or {key: value for key, value in data.items() if key != "flood"}
         laid: dict[str, Any] = {name: dict(default) for name, default in DEFAULTS.items()}
-        for name, table in tables.items():
-            laid[name] = {**laid.get(name, {}), **table} if isinstance(table, Mapping) else table
-        return {"definitions": laid, **({"flood": data["flood"]} if "flood" in data else {})}
+        for name, table in data.items():
+            if name != "flood":
+                laid[name] = {**laid.get(name, {}), **table} if isinstance(table, Mapping) else table
+        section = {key: value for key, value in data.items() if key == "flood"}
+        return {**section, "definitions": {name: _definition(name, table) for name, table in laid.items()}}
 
     @model_validator(mode="after")
     def _suppressed_by_what_there_is(self) -> Self:
@@ -203,9 +207,22 @@ class AlarmSettings(_Settings):
     @property
     def of_asset(self) -> dict[str, AlarmDefinition]:
         """The alarms that each asset has, by name."""
-        return {name: one for name, one in self.definitions.items() if one.enabled and one.source not in OWN}
+        there = {name: one for name, one in self.definitions.items() if one.enabled and one.source not in OWN}
+        # What suppresses stands before what is suppressed, so that both happen in the same step.
+        return dict(sorted(there.items(), key=lambda item: bool(item[1].suppressed_when)))
 
     @property
     def of_service(self) -> dict[str, AlarmDefinition]:
         """The alarms that the service has of itself, by name."""
         return {name: one for name, one in self.definitions.items() if one.enabled and one.source in OWN}
+
+
+def _definition(name: str, table: Any) -> AlarmDefinition:
+    if not NAME.fullmatch(name):
+        raise ValueError(f"{name!r} is no name for an alarm: a letter, then letters, digits, _ and -")
+    if not isinstance(table, Mapping):
+        raise ValueError(f"{name}: {table!r} is not a table of settings")
+    try:
+        return AlarmDefinition.model_validate(table)
+    except ValidationError as error:
+        raise ValueError(f"{name}.{describe(error, AlarmDefinition)}") from None

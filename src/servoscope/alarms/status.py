@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import NamedTuple, get_args
 
 from servoscope.alarms.definitions import AlarmDefinition, Ne107
-from servoscope.alarms.life import AlarmState
+from servoscope.alarms.records import AlarmState
 from servoscope.alarms.states import LATCHED, State
 
 __all__ = ["OF_QUALITY", "Status", "status"]

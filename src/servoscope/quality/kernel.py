@@ -17,7 +17,8 @@ WAITING, SILENT, FROZEN_Y, FROZEN_U, GAP, JITTER, RATE, CLOCK = range(len(KINDS)
 R, U, Y, E = range(4)
 
 MOST = 12  # findings that one sample can tell
-LONG = 1.5  # samples: a longer step is a gap
+LONG = 1.5  # samples: a longer step is no jitter
+LATE = 10.0  # samples: so long a step does not tell a rate
 BACK = -0.5  # samples: a step further back is a clock that was set, and not jitter
 EPOCH = 60  # windows after which old ranges are forgotten, and with them a spike
 SHARE = 0.1  # of its range: who moves by less has not moved
@@ -71,7 +72,7 @@ def look(
         elif np.isfinite(t[k]):
             s.missing += 1.0
         s.samples += 1.0
-        share = s.missing / (s.missing + limits.window)
+        share = _missing(limits, s)
         if share > limits.missing and s.stands[GAP] == 0.0:
             n = _tell(s, GAP, True, now, share, limits.missing, told, n)
         if s.samples >= limits.window:
@@ -83,18 +84,23 @@ def look(
 def _step(limits: Limits, s: Any, t: float, told: FloatArray, n: int) -> int:
     """Judge the step to a time stamp."""
     step = t - s.t
+    periods = np.rint(step / limits.period)
+    far = step > limits.silent_s and s.stands[SILENT] == 0.0
     if s.count == 0.0:
         s.since[WAITING] = t
-    elif step > LONG * limits.period and (step <= limits.silent_s or s.stands[SILENT] != 0.0):
-        s.missing += np.rint(step / limits.period) - 1.0
-    elif step > LONG * limits.period or step <= BACK * limits.period:
-        # So long a silence would have been noticed: it is the clock that jumped.
+    elif far or step <= BACK * limits.period:
+        # A silence as long as that would have been noticed: it is the clock that jumped.
         s.jumps += 1.0
         n = _tell(s, CLOCK, True, t, step, limits.silent_s, told, n)
     else:
-        s.steps += 1.0
-        s.span += step
-        s.jittery += abs(step - limits.period) > limits.jitter
+        # A stamp that is late makes one step longer and the next one shorter: in whole periods the two make up.
+        s.missing += periods - 1.0
+        if periods < LATE:
+            s.span += step
+            s.periods += periods
+        if step <= LONG * limits.period:
+            s.steps += 1.0
+            s.jittery += abs(step - limits.period) > limits.jitter
     s.count += 1.0
     s.t = t
     return n
@@ -200,20 +206,27 @@ def _meanwhile(lowest_highest: FloatArray, x: float, anew: bool) -> None:
 
 
 @inlined
+def _missing(limits: Limits, s: Any) -> float:
+    """Return the share of the window that is missing, if no more is until its end."""
+    missing = max(s.missing, 0.0)
+    return float(missing / (missing + limits.window))
+
+
+@inlined
 def _window(limits: Limits, s: Any, t: float, told: FloatArray, n: int) -> int:
     """Judge a complete window, and begin the next."""
     # What is found ends at half of its limit, so that it does not come and go.
-    if s.stands[GAP] != 0.0 and s.missing / (s.missing + s.samples) < 0.5 * limits.missing:
-        n = _tell(s, GAP, False, t, s.missing / (s.missing + s.samples), limits.missing, told, n)
+    if s.stands[GAP] != 0.0 and _missing(limits, s) < 0.5 * limits.missing:
+        n = _tell(s, GAP, False, t, _missing(limits, s), limits.missing, told, n)
     if s.stands[CLOCK] != 0.0 and s.jumps == 0.0:
         n = _tell(s, CLOCK, False, t, 0.0, limits.silent_s, told, n)
     if s.steps >= 0.5 * limits.window:  # fewer say nothing, good or bad
         n = _judged(s, JITTER, s.jittery / s.steps, limits.jittery, t, told, n)
-        rate = s.steps * limits.period / s.span if s.span > 0.0 else 2.0
-        n = _judged(s, RATE, rate - 1.0, limits.rate_error, t, told, n)
+        if s.jittery <= limits.jittery * s.steps and s.span > 0.0:  # stamps that jitter do not tell a rate
+            n = _judged(s, RATE, s.periods * limits.period / s.span - 1.0, limits.rate_error, t, told, n)
         if s.stands[WAITING] != 0.0:
             n = _tell(s, WAITING, False, t, 0.0, 0.0, told, n)
-    s.samples, s.steps, s.span, s.jittery, s.missing, s.jumps = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    s.samples, s.steps, s.jittery, s.periods, s.span, s.missing, s.jumps = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     s.windows += 1.0
     if s.windows >= EPOCH and s.values > 0.0:
         s.windows = 0.0

@@ -18,11 +18,13 @@ LAYOUT = np.dtype(
         ("listens", np.float64),
         ("heard", np.float64),
         ("heard_at", np.float64),
-        # the window: samples; steps of about one sample and their sum [s]; those that jitter; missing samples; jumps
+        # the window: samples; steps of about one sample, and those that jitter; whole periods in a span [s], for the
+        # rate; missing samples; jumps
         ("samples", np.float64),
         ("steps", np.float64),
-        ("span", np.float64),
         ("jittery", np.float64),
+        ("periods", np.float64),
+        ("span", np.float64),
         ("missing", np.float64),
         ("jumps", np.float64),
         # r, u and y: samples so far, the last ones, how long each has stayed the same [samples], smallest change
