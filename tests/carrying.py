@@ -1,4 +1,4 @@
-"""Services that are killed: a warm process from which each next one is forked, so that a kill costs a tenth of a second.
+"""Services that are killed: a warm process from which each next one is forked, so that a kill costs 0.1 s.
 
     python tests/carrying.py WHOLE CUT
 

@@ -10,7 +10,6 @@ from typing import Any
 from servoscope import actions
 from servoscope.actions import ActionSettings, Outgoing, ToleranceState
 from servoscope.alarms import (
-    AlarmDefinition,
     AlarmSettings,
     AlarmState,
     Command,
@@ -93,33 +92,33 @@ class Announcer:
         """Take transitions of an asset, in the order of time; return rows for outbox and audit."""
         rows: list[Row] = []
         for one in transitions:
-            definition = self._alarms.definitions[one.alarm]
-            self._flood, notices = announce(self._alarms.flood, self._flood, one, definition.priority)
-            rows += [row for notice in notices if notice.kind != "alarm" for row in self._noted(notice)]
-            if not one.is_new or any(notice.kind == "alarm" for notice in notices):
-                rows += self._sent(one, definition, details, now)
+            priority = self._alarms.definitions[one.alarm].priority
+            self._flood, notices = announce(self._alarms.flood, self._flood, one, priority)
+            rows += self._sent(notices, details, now)
         return rows
 
-    def _sent(
-        self, one: Transition, definition: AlarmDefinition, details: Mapping[str, Any], now: float
-    ) -> Iterable[Row]:
-        advice = {
-            "consequence": definition.consequence,
-            "operator_action": definition.operator_action,
-            "response_time_s": definition.response_time_s,
-        }
-        found = actions.outgoing(self._settings, one, definition.priority, now, {**advice, **details})
-        return map(posted, found)
-
-    def _noted(self, notice: Notice) -> Iterable[Row]:
-        words = {"t": notice.time, "counted": notice.counted, "peak": notice.peak}
-        held = [{"asset": one.asset, "alarm": one.alarm, "t": one.time, "count": one.count} for one in notice.held]
-        yield Row("audit", {"who": "servoscope", "what": notice.kind, "document": {**words, "held": held}})
-
-    def pass_time(self, t: float) -> list[Row]:
+    def pass_time(self, t: float, now: float) -> list[Row]:
         """Let time pass by the clock of the samples: a flood may end."""
         self._flood, notices = pass_time(self._alarms.flood, self._flood, t)
-        return [row for notice in notices for row in self._noted(notice)]
+        return self._sent(notices, {}, now)
+
+    def _sent(self, notices: Iterable[Notice], details: Mapping[str, Any], now: float) -> list[Row]:
+        rows: list[Row] = []
+        for notice in notices:
+            if notice.transition is None or notice.priority is None:  # of a flood
+                words = {"t": notice.time, "counted": notice.counted, "peak": notice.peak}
+                rows.append(Row("audit", {"who": "servoscope", "what": notice.kind, "document": words}))
+                rows += map(posted, actions.outgoing_flood(self._settings, notice, now))
+                continue
+            definition = self._alarms.definitions[notice.transition.alarm]
+            advice = {
+                "consequence": definition.consequence,
+                "operator_action": definition.operator_action,
+                "response_time_s": definition.response_time_s,
+            }
+            found = actions.outgoing(self._settings, notice.transition, notice.priority, now, {**advice, **details})
+            rows += map(posted, found)
+        return rows
 
     def watch(self, buffered: float, now: float) -> Outcome:
         """Take how full the buffer is, as a share, and let the service's own alarms follow."""

@@ -105,6 +105,8 @@ def _assets(config: Config) -> dict[str, Asset]:
                 points = ", ".join(baseline.points)
                 raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
         assets[name] = Asset(name, *shared[path, point], how)
+    for asset in {id(one.baseline): one for one in assets.values()}.values():
+        asset.warm()
     return assets
 
 

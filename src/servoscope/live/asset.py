@@ -60,6 +60,12 @@ class Asset:
         self._out = Outcome([], [])
         self.progress: Progress | None = None
 
+    def warm(self) -> None:
+        """Make the machine code that blocks need, so that the first one does not wait for it."""
+        nothing = np.full(2, np.nan)
+        self._monitor.run(self._monitor.init(), nothing, nothing, nothing)
+        quality.examine(self._limits, quality.init(), np.arange(2.0), nothing, nothing, nothing)
+
     def resume(self, progress: Progress, window: Iterable[Block]) -> None:
         """Go on from a checkpoint.
 

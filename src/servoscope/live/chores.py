@@ -52,7 +52,7 @@ class Chores:
         assets = [asset.progress.counted.t for asset in self._of.assets.values() if asset.progress is not None]
         writer.add(announcer.name, own.rows)
         writer.add(announcer.name, announcer.tell(own.transitions, {}, now))
-        writer.add(announcer.name, announcer.pass_time(max(assets, default=0.0)))
+        writer.add(announcer.name, announcer.pass_time(max(assets, default=0.0), now))
 
     def _take_deliveries(self) -> None:
         """Note how deliveries went."""

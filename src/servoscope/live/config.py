@@ -121,8 +121,8 @@ class Config(Settings):
     store: StoreSettings = StoreSettings()
     diagnosis: DiagnosisSettings = DiagnosisSettings()
     quality: QualitySettings = QualitySettings()
-    alarms: AlarmSettings = Field(default_factory=AlarmSettings)
-    actions: ActionSettings = Field(default_factory=ActionSettings)
+    alarms: AlarmSettings = Field(default_factory=lambda: AlarmSettings.model_validate({}))
+    actions: ActionSettings = ActionSettings()
     sources: Annotated[dict[Name, ReplaySettings], Field(min_length=1)]
     assets: Annotated[dict[Name, AssetSettings], Field(min_length=1)]
     _folder: Path = PrivateAttr(default=Path())

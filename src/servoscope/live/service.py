@@ -211,6 +211,6 @@ class Service:
             if self.writer.unavailable_since is not None and time.monotonic() > deadline:
                 blocks = self.writer.waiting
                 raise StoreUnavailable(
-                    f"{self.store.name}: still unavailable; {blocks} blocks are not stored, the sources offer them again"
+                    f"{self.store.name}: still unavailable; {blocks} blocks are not stored, sources offer them again"
                 )
             time.sleep(0.0 if self.writer.unavailable_since is None else LONGEST_PAUSE_S)

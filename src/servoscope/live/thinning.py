@@ -53,9 +53,10 @@ def thin(state: Thinned, trace: Trace, t: FloatArray, every_s: float) -> tuple[T
 
 
 def gamma(trace: Trace, k: int) -> list[list[float | None]]:
-    """Return the iFRF's residual at evaluation k: frequency [Hz], real and imaginary part; None where it is unknown."""
-    residual = trace.ifrf.H[k] - trace.ifrf_expected.H[k]
-    return [
-        [float(f), *(float(part) if math.isfinite(part) else None for part in (H.real, H.imag))]
-        for f, H in zip(trace.ifrf.frequencies, residual, strict=True)
-    ]
+    """Return the iFRF's residual at evaluation k, per frequency.
+
+    Each is [frequency in Hz, real part, imaginary part, magnitude of the healthy iFRF]; None where it is unknown.
+    """
+    healthy = trace.ifrf_expected.H[k]
+    numbers = [trace.ifrf.frequencies, *(f(trace.ifrf.H[k] - healthy) for f in (np.real, np.imag)), np.abs(healthy)]
+    return [[x if math.isfinite(x) else None for x in row] for row in np.stack(numbers, axis=1).tolist()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -105,10 +106,18 @@ class Store:
         with self._transaction() as connection:
             batch.write(connection, owner, commit)
 
-    def add(self, table: str, row: Row) -> None:
-        """Write one row, for example a command, from any process."""
+    def ask(self, command: Row) -> int:
+        """Write down what an operator wants, from any process; return its id."""
+        row = {"at": time.time(), **command}
         with self._transaction() as connection:
-            connection.execute(tables.TABLES.tables[table].insert(), [row])
+            return int(connection.execute(tables.commands.insert().returning(tables.commands.c.id), row).scalar_one())
+
+    def outcome(self, command: int) -> str | None:
+        """Return what became of a command; None while nobody has carried it out."""
+        query = sa.select(tables.commands.c.outcome).where(tables.commands.c.id == command)
+        with self._transaction() as connection:
+            found = connection.execute(query).scalar()
+        return None if found is None else str(found)
 
     def checkpoints(self, assets: Sequence[str] | None = None) -> dict[str, Row]:
         """Return the newest checkpoint of these assets, or of all, by name; without those that have none."""

@@ -67,7 +67,7 @@ residuals = _numbered(
     "residuals",
     sa.Column("statistic", sa.Double, nullable=False),  # the largest since the row before, over its limit
     sa.Column("level", sa.Double, nullable=False),
-    sa.Column("residual", sa.JSON, nullable=False),  # gamma per monitored frequency: [Hz, real, imaginary]
+    sa.Column("residual", sa.JSON, nullable=False),  # per frequency: [Hz, real, imaginary, healthy |H|]
 )
 diagnoses = _numbered(
     "diagnoses",
