@@ -228,3 +228,13 @@ def test_a_flood_holds_low_priorities_and_tells_them_at_its_end() -> None:
     assert [n.transition.asset for n in notices if n.transition] == ["asset 10", "asset 11", "asset 13"]
     assert notices[-1].transition == gone
     assert flood == FloodState(recent=(10.0, 11.0, 12.0, 13.0))
+
+
+def test_a_flood_is_counted_whatever_the_order_that_assets_tell_it_in() -> None:
+    flood, kinds = FloodState(), []
+    for k in (9, 3, 8, 0, 1, 7, 2, 6, 5, 4, 10):
+        states = State.NORMAL, State.UNACKNOWLEDGED
+        one = Transition(50.0 * k, f"asset {k}", "fault", 1, *states, Event.OCCUR, "", "system")
+        flood, notices = announce(FloodSettings(), flood, one, "low")
+        kinds += [notice.kind for notice in notices]
+    assert kinds == ["alarm"] * 10 + ["flood_begins"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
 import pytest
@@ -62,6 +63,14 @@ def test_the_table_is_the_transition_list() -> None:
     expected = transition_list()
     assert len(expected) == len(State) * len(Event) * len(get_args(Found)) == 9 * 12 * 4
     assert {key: after(key[0], key[1], key[2]) for key in expected} == expected  # type: ignore[arg-type]
+
+
+def test_the_page_has_the_same_table(project: Path) -> None:
+    page = (project / "docs" / "alarms.md").read_text(encoding="utf-8")
+    section = page.split("\n## Life-cycle\n")[1].split("\n## ")[0]
+    _, *rows = [line for line in section.splitlines() if line.startswith("| ")]
+    cells = [[cell.strip() or "." for cell in row.split("|")[2:-1]] for row in rows]
+    assert cells == [row.split()[1:] for row in LIST.strip().splitlines()[1:]]
 
 
 DAY = 86400.0

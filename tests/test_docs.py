@@ -120,6 +120,17 @@ def test_every_key_of_the_loop_file_is_documented() -> None:
     assert not missing, f"not in docs/reference/loop-file.md: {', '.join(missing)}"
 
 
+def test_every_key_of_alarms_data_quality_and_actions_is_documented() -> None:
+    from servoscope import actions, alarms, quality
+
+    text = (REFERENCE.parent / "alarms.md").read_text() + (REFERENCE.parent / "how-to" / "actions.md").read_text()
+    models = [alarms.AlarmDefinition, alarms.FloodSettings, quality.QualitySettings, actions.RetrySettings]
+    models += [actions.WebhookSettings, actions.CommandSettings, actions.ToleranceSettings]
+    keys = {key for model in models for key in model.model_fields}
+    missing = [key for key in sorted(keys) if not re.search(rf"[`\n ]{key}( = [^`\n]*)?[`\n]|`{key}`", text)]
+    assert not missing, f"not in docs/alarms.md or docs/how-to/actions.md: {', '.join(missing)}"
+
+
 @pytest.mark.parametrize("name", servoscope.__all__)
 def test_every_public_name_is_documented(name: str) -> None:
     assert has_line(page("python.md"), name), f"{name} is not in docs/reference/python.md"

@@ -7,7 +7,13 @@ delivery = deliver(row, settings, now)                      # delivery.again tak
 
 from servoscope.actions.delivery import deliver, signature
 from servoscope.actions.outbox import Delivery, Outgoing, outgoing, outgoing_flood
-from servoscope.actions.settings import ActionSettings, CommandSettings, ToleranceSettings, WebhookSettings
+from servoscope.actions.settings import (
+    ActionSettings,
+    CommandSettings,
+    RetrySettings,
+    ToleranceSettings,
+    WebhookSettings,
+)
 from servoscope.actions.tolerance import Change, ToleranceState, begin, respond
 
 __all__ = [
@@ -16,6 +22,7 @@ __all__ = [
     "CommandSettings",
     "Delivery",
     "Outgoing",
+    "RetrySettings",
     "ToleranceSettings",
     "ToleranceState",
     "WebhookSettings",

@@ -101,7 +101,7 @@ class Notice:
 def announce(
     settings: FloodSettings, state: FloodState, transition: Transition, priority: Priority
 ) -> tuple[FloodState, tuple[Notice, ...]]:
-    """Take one transition of any asset's alarm, in the order of time, and say what operators are told.
+    """Take one transition of any asset's alarm, about in the order of time, and say what operators are told.
 
     Parameters
     ----------
@@ -146,7 +146,8 @@ def pass_time(settings: FloodSettings, state: FloodState, time: float) -> tuple[
     time
         Now (epoch, s).
     """
-    recent = tuple(one for one in state.recent if time - settings.period_s < one <= time)
+    # Assets tell their transitions one after the other: what is a little ahead counts, a clock that was set does not.
+    recent = tuple(one for one in state.recent if abs(time - one) < settings.period_s)
     if state.since is None:
         return replace(state, recent=recent, counted=0, peak=0), ()
     if len(recent) >= settings.ends_below:

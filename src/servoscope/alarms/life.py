@@ -82,8 +82,9 @@ def advance(
     new, told = dict(states), list[Transition]()
     for name, definition in definitions.items():
         active = tuple(other for other, one in new.items() if one.active)
-        seen = None if given is None else replace(given, alarms=active)
-        new[name], transitions = step(definition, new[name], seen, time)
+        if given is not None and given.alarms != active:
+            given = replace(given, alarms=active)
+        new[name], transitions = step(definition, new[name], given, time)
         told += transitions
     return new, tuple(sorted(told, key=lambda one: one.time))
 
