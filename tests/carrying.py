@@ -1,9 +1,9 @@
 """Services that are killed: a warm process from which each next one is forked, so that a kill costs 0.1 s.
 
-    python tests/carrying.py WHOLE CUT
+    python tests/carrying.py WARM
 
-runs the service of the first file to its end, and reads lines from stdin: each starts the service of the second file
-once more and prints its process id; when it ends, its exit code.
+runs the service of this file to its end, and reads lines from stdin, each the name of a file: its service is started
+and its process id printed; when it has ended, its exit code.
 """
 
 from __future__ import annotations
@@ -19,25 +19,26 @@ from types import TracebackType
 class Carrier:
     """Starts services from a warm process; a context manager."""
 
-    def __init__(self, whole: Path, cut: Path) -> None:
-        self._configs = whole, cut
+    def __init__(self, warm: Path) -> None:
+        self._warm = warm
 
     def __enter__(self) -> Carrier:
-        command = [sys.executable, __file__, *map(str, self._configs)]
+        command = [sys.executable, __file__, str(self._warm)]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
+        for stream in (self._process.stdin, self._process.stdout):
+            assert stream is not None
+            stream.close()
         self._process.wait(30)
 
-    def start(self) -> int:
-        """Start the service; return its process id."""
+    def start(self, config: Path) -> int:
+        """Start the service of a file; return its process id."""
         assert self._process.stdin is not None
-        self._process.stdin.write("\n")
+        self._process.stdin.write(f"{config}\n")
         self._process.stdin.flush()
         return int(self._read())
 
@@ -57,7 +58,7 @@ class Carrier:
         return line
 
 
-def carry(whole: Path, cut: Path) -> None:
+def carry(warm: Path) -> None:
     """Run one service from beginning to end, which warms all up, and fork another one per line of stdin.
 
     Its process id is printed when it is about to take its first block.
@@ -68,11 +69,11 @@ def carry(whole: Path, cut: Path) -> None:
     from servoscope.live.service import Service
 
     logs.set_up("error")
-    Service(Config.load(whole), assemble(Config.load(whole))).run()
-    for _ in sys.stdin:
+    Service(Config.load(warm), assemble(Config.load(warm))).run()
+    for line in sys.stdin:
         child = os.fork()
         if not child:
-            settings = Config.load(cut)
+            settings = Config.load(line.strip())
             service = Service(settings, assemble(settings))
             print(os.getpid(), flush=True)
             service.run()
@@ -81,4 +82,4 @@ def carry(whole: Path, cut: Path) -> None:
 
 
 if __name__ == "__main__":
-    carry(Path(sys.argv[1]), Path(sys.argv[2]))
+    carry(Path(sys.argv[1]))

@@ -30,9 +30,10 @@ def set_up(level: str, stream: TextIO | None = None) -> None:
     """Send the logs of this process to a stream, by default stderr."""
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(_Lines())
-    LOGGER.handlers[:] = [handler]
     LOGGER.setLevel(level.upper())
-    LOGGER.propagate = False
+    for logger in (LOGGER, logging.getLogger("psycopg")):  # the driver tells of lost connections on its own
+        logger.handlers[:] = [handler]
+        logger.propagate = False
 
 
 def log(level: str, event: str, **fields: object) -> None:

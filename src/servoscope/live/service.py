@@ -48,7 +48,8 @@ class Service:
         self.courier = Courier(self.store, config.actions)
         self._looks = ThreadPoolExecutor(1, "full-diagnosis")
         self._looking: dict[tuple[str, Window], Future[Told]] = {}
-        self._heard: dict[str, float] = {}
+        self._listened = 0.0  # s: that it has been ready to hear; being busy, or full, is no silence of a sensor
+        self._heard: dict[str, float] = {}  # when it last heard of each asset, by that clock
         self._chores = Chores(self)
         self._next_commit = self._next_chores = 0.0
         self._stopping = False
@@ -96,7 +97,10 @@ class Service:
         self.writer.add(self.config.name, [Row("audit", {"who": "servoscope", "what": what, "document": words})])
 
     def _turn(self) -> None:
-        self.beat = now = time.monotonic()
+        before, self.beat = self.beat, time.monotonic()
+        now = self.beat
+        if self.writer.room:
+            self._listened += min(now - before, 2.0 * LONGEST_PAUSE_S)
         for source in self._sources.values():
             for block in source.poll(min(AT_ONCE, self.writer.room)):
                 self._take(block)
@@ -111,7 +115,7 @@ class Service:
 
     def _take(self, block: Block) -> None:
         asset = self.assets[block.asset]
-        self._heard[block.asset] = time.monotonic()
+        self._heard[block.asset] = self._listened
         try:
             outcome = asset.take(block)
         except ServoscopeError as error:  # one asset's trouble must not stop the others
@@ -154,9 +158,8 @@ class Service:
 
     def _listen(self) -> None:
         """Let time pass for assets that nothing is heard of, as fast as their samples' clock runs."""
-        now = time.monotonic()
         for name, asset in self.assets.items():
-            silence = now - self._heard.setdefault(name, now)
+            silence = self._listened - self._heard.setdefault(name, self._listened)
             pace = self._sources[self.config.assets[name].source].pace
             if silence >= CHORES_EVERY_S and not self._exhausted:
                 self.tell(asset, outcome := asset.tick(silence * pace))
