@@ -23,7 +23,7 @@ import sqlalchemy as sa
 import halls
 from carrying import Carrier
 from halls import RESULTS, asked, hall
-from servers import Postgres, programs
+from reliability.servers import Postgres, programs
 from servoscope.errors import StoreError
 from servoscope.live.assembling import assemble
 from servoscope.live.config import Config

@@ -1,4 +1,4 @@
-"""A PostgreSQL server of the tests' own: made in a folder, on loopback, started, stopped, crashed."""
+"""A PostgreSQL server of its own for tests and benchmarks: on loopback, started, stopped, crashed."""
 
 from __future__ import annotations
 
