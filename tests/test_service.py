@@ -19,11 +19,11 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from reliability.servers import Postgres, programs
 
 import halls
 from carrying import Carrier
 from halls import RESULTS, asked, hall
-from reliability.servers import Postgres, programs
 from servoscope.errors import StoreError
 from servoscope.live.assembling import assemble
 from servoscope.live.config import Config

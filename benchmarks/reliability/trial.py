@@ -107,7 +107,7 @@ class Trial:
             time.sleep(0.25)
             now = time.monotonic()
             counted = self._look(calm=now > quiet_from)
-            if self._disturbances and now > due and counted < self._calm:
+            if self._disturbances and now > due and 0.0 < counted < self._calm:
                 self._disturb(self._chance.choice(self._disturbances))
                 quiet_from, due = time.monotonic() + CALM_S, time.monotonic() + self._wait()
         self.measured.seconds = time.monotonic() - begun
