@@ -222,10 +222,12 @@ class Asset:
         thinned, rows = thin(progress.thinned, trace, block.t[arrival.used][at], self.how.residual_every_s)
         shown = progress.shown
         if at.size:
+            excess = np.nan_to_num(trace.statistic / trace.threshold)
             shown = {
                 "t": float(block.t[arrival.used][at[-1]]),
-                "statistic": float(np.nan_to_num(trace.statistic[-1] / trace.threshold)),
+                "statistic": float(excess[-1]),
                 "level": float(trace.level[-1]),
+                "peaks": [float(excess.max()), float(trace.level.max())],  # of the block: what alarms go by
                 "residual": gamma(trace, -1),
                 "exceeded": bool(trace.exceeded[-1]),
             }
@@ -278,11 +280,12 @@ class Asset:
         """Tell the alarms what is known now."""
         progress = self._now
         judged, findings = progress.judged, tuple(quality.standing(progress.quality))
+        peaks = progress.shown.get("peaks", (None, None))
         seen = Snapshot(
             verdict=quality.judged(judged.verdict, findings),
             quality=findings,
-            statistic=progress.shown.get("statistic"),
-            level=progress.shown.get("level"),
+            statistic=peaks[0],
+            level=peaks[1],
             cause=judged.summary,
         )
         alarms, transitions = advance(self._definitions, progress.alarms, seen, progress.counted.t if t is None else t)
