@@ -162,7 +162,7 @@ class TestJudging:
 
     def test_quiet_assets_are_looked_at_now_and_then(self) -> None:
         state, found = judge(Judged(due=50.0), self.settings, 51.0, False, lambda: Examined("healthy", "fine"))
-        assert found is not None and (state.verdict, state.since, state.due) == ("healthy", 51.0, 151.0)
+        assert found is not None and (state.verdict, state.since, state.due) == ("healthy", 51.0, 200.0)
 
     def test_after_a_deviation_the_window_has_to_pass(self) -> None:
         gone = Examined("undetermined", "gone", recovering=True)

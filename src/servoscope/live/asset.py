@@ -18,7 +18,7 @@ from servoscope.live.block import Block
 from servoscope.live.checkpoint import Counted, Progress
 from servoscope.live.config import DiagnosisSettings
 from servoscope.live.examining import Examined, Told, examine
-from servoscope.live.judging import Judged, Window, judge
+from servoscope.live.judging import Judged, Window, judge, phase_of
 from servoscope.live.rows import Outcome, Row, transition_row
 from servoscope.live.thinning import gamma, thin
 from servoscope.monitor import Monitor
@@ -93,7 +93,7 @@ class Asset:
             counted=counted,
             monitor=self._monitor.init(),
             quality=quality.init(),
-            judged=Judged(due=counted.t + self.how.diagnosis.window_s, since=counted.t),
+            judged=Judged(due=counted.t + self.how.diagnosis.window_s * (1.0 + phase_of(self.name)), since=counted.t),
             alarms={name: start(self.name, name, counted.t) for name in self._definitions},
         )
 
@@ -262,7 +262,7 @@ class Asset:
         def look() -> Examined:
             return examine(self.baseline, self.name, self._last(settings.window_s))
 
-        judged, found = judge(progress.judged, settings, t, exceeded, look)
+        judged, found = judge(progress.judged, settings, t, exceeded, look, phase_of(self.name))
         self.progress = replace(progress, judged=judged)
         if found is None or found.verdict == before:
             return
