@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import halls
 from servoscope.alarms import AlarmSettings, Command, Event, State
-from servoscope.errors import AlarmError, ConfigError, StateError
+from servoscope.errors import AlarmError, ConfigError, RecordingError, StateError
 from servoscope.live import checkpoint
 from servoscope.live.arrival import arrive
 from servoscope.live.asset import Asset, Following
@@ -203,6 +203,27 @@ class TestAsset:
         (lost,) = told
         assert lost.values["document"] == {"blocks": 3, "after": 7, "before": 11}
         assert followed.progress is not None and followed.progress.counted.lost == 3
+
+    def test_what_is_no_block_is_refused(self) -> None:
+        followed, block = asset(), blocks(halls.recorded(1))[0]
+        nothing = block.t[:0]
+        for wrong in (
+            replace(block, t=nothing, r=nothing, u=nothing, y=nothing),
+            replace(block, y=block.y[1:]),
+            replace(block, t=np.full(50, math.nan)),
+        ):
+            with pytest.raises(RecordingError, match="press: block 0: t, r, u, y must have one length"):
+                followed.take(wrong)
+        assert followed.progress is None
+
+    def test_a_clock_that_is_set_back_keeps_neither_samples_nor_verdicts_waiting(self) -> None:
+        followed = asset()
+        for k, block in enumerate(blocks(halls.recorded(1, seconds=600.0))):
+            followed.take(replace(block, t=block.t - (3600.0 if k >= 200 else 0.0)))
+        assert followed.progress is not None
+        assert len(followed._window) <= 2 * 40 / 0.5 + 1
+        assert followed.progress.judged.examined is not None
+        assert followed.progress.judged.examined < BEGAN - 3000.0
 
     def test_what_is_no_number_does_no_harm(self) -> None:
         followed, cut = asset(), blocks(halls.recorded(1))[:40]

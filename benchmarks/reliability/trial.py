@@ -103,6 +103,17 @@ class Trial:
         """Run; the service ends by itself when its recordings have ended."""
         begun = time.monotonic()
         self._start()
+        try:
+            self._follow(begun)
+        finally:
+            self._process.kill()
+            self._process.wait()
+            self._log.close()
+        self.measured.seconds = time.monotonic() - begun
+        return self.measured
+
+    def _follow(self, begun: float) -> None:
+        """Look at it, and disturb it, until it has ended."""
         quiet_from, due, turns = begun + CALM_S, begun + self._wait(), itertools.cycle(self._disturbances)
         while self._alive():
             time.sleep(0.25)
@@ -111,9 +122,6 @@ class Trial:
             if self._disturbances and now > due and 0.0 < counted < self._calm:
                 self._disturb(next(turns))
                 quiet_from, due = time.monotonic() + CALM_S, time.monotonic() + self._wait()
-        self.measured.seconds = time.monotonic() - begun
-        self._log.close()
-        return self.measured
 
     def _wait(self) -> float:
         return self._chance.uniform(0.5, 1.5) * self._every

@@ -92,6 +92,8 @@ def judge(
     Judged, Examined or None
         The new state, and the examination if there was one.
     """
+    if state.examined is not None and t < state.examined:  # the clock was set back
+        state = replace(state, due=t, retry=t)
     disagrees = exceeded != (state.verdict == "fault")
     if not disagrees:
         state = replace(state, doubts=0)
