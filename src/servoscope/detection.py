@@ -15,6 +15,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 SECONDS_PER_YEAR = 365.25 * 86400.0
 POWER = 0.9  # probability with which a promised change is seen
+REACH = 40.0  # memories before an alarm in which its onset is looked for first
+NEGLIGIBLE = 1e-9  # probability that it came earlier
 
 
 def threshold(
@@ -159,22 +161,19 @@ def onset(
     last
         Last sample that `faulty` speaks for.
     """
-    # u itself changes at once, where u_a of stage 1 has to learn the change first
-    single = replace(pipeline, stage_one=None)
-    g = single.regression(recording.r, recording.u, recording.y, recording.restart)
-    used = np.flatnonzero(g.ok[: last + 1])
-    phi = g.phi[used]
-    changed = phi @ (faulty - healthy)
-    noise = tuning.noise.autoregression()  # a short memory: what surrounds each candidate is computed anew
-    costs = _change_costs(g.eta[used] - phi @ healthy, changed, noise.a, _onset_of_filters(pipeline))
-    scale = 2.0 * noise.variance * max(1.0, float(estimates.power[-1]))
-    # a change between two updates shows at the later one
-    at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
-    log_likelihood = -costs[at_update] / scale
-    weight = np.exp(log_likelihood - log_likelihood.max())
-    share = np.cumsum(weight) / weight.sum()
-    likely = int(np.argmax(log_likelihood))
-    low, high = np.searchsorted(share, [0.025, 0.975])
+    reach = round(REACH * pipeline.memory * pipeline.stride)
+    while True:
+        begin = max(until - reach, 0) // pipeline.stride * pipeline.stride
+        near = recording.rows(slice(begin, min(last, until + reach) + 1))
+        likelihood = _likelihood(pipeline, tuning, near, float(estimates.power[-1]), healthy, faulty, until - begin)
+        weight = np.exp(likelihood - likelihood.max())
+        share = np.cumsum(weight) / weight.sum()
+        likely = int(np.argmax(likelihood))
+        if not begin or share[(until - begin) // 2] < NEGLIGIBLE:
+            break
+        reach *= 2  # the change may have come earlier
+    low, high = (begin + int(k) for k in np.searchsorted(share, [0.025, 0.975]))
+    likely += begin
     # what the filters leave of a step is known only about, so neither end is surer than half their settling time
     blur = pipeline.bank.wait / (2.0 * recording.sample_rate)
     t = recording.t
@@ -184,6 +183,30 @@ def onset(
         min(float(t[min(high, until)]) + blur, float(t[until])),
         likely,
     )
+
+
+def _likelihood(
+    pipeline: Pipeline,
+    tuning: Tuning,
+    recording: Recording,
+    power: float,
+    healthy: FloatArray,
+    faulty: FloatArray,
+    until: int,
+) -> FloatArray:
+    """Return the logarithm of the likelihood of a change at each of the samples up to `until`, but for a constant."""
+    # u itself changes at once, where u_a of stage 1 has to learn the change first
+    single = replace(pipeline, stage_one=None)
+    g = single.regression(recording.r, recording.u, recording.y, recording.restart)
+    used = np.flatnonzero(g.ok)
+    phi = g.phi[used]
+    changed = phi @ (faulty - healthy)
+    noise = tuning.noise.autoregression()  # a short memory: what surrounds each candidate is computed anew
+    costs = _change_costs(g.eta[used] - phi @ healthy, changed, noise.a, _onset_of_filters(pipeline))
+    scale = 2.0 * noise.variance * max(1.0, power)
+    # a change between two updates shows at the later one
+    at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
+    return np.asarray(-costs[at_update] / scale)
 
 
 def _onset_of_filters(pipeline: Pipeline) -> FloatArray:

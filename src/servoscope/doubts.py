@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from servoscope import spool
 from servoscope.detection import noncentrality, required_noncentrality
 from servoscope.diagnosis import Warning
 from servoscope.examination import MOST_REFUSED, Examination
@@ -20,9 +21,11 @@ def seen_by(x: Examination) -> dict[str, tuple[float, float]]:
     directions = fault_directions(x.baseline.loop, x.baseline.plant, x.tuning.theta)
     rows = np.array([directions[parameter] for parameter in promised])
     best = np.zeros(len(rows))
-    if len(rows) and x.ready.any():
-        ok = x.ready
-        best = noncentrality(x.covariance[ok], x.estimates.Psi[ok], rows).max(axis=0)
+    for at in spool.pieces(0, x.evaluations) if len(rows) else ():
+        ok = x.estimates.updates[at] > 0
+        if ok.any():
+            best = np.maximum(best, noncentrality(x.covariance(at)[ok], x.estimates.Psi[at][ok], rows).max(axis=0))
+        spool.release(x.estimates.S, x.estimates.Psi)
     needed = required_noncentrality(x.pipeline.bank.n, x.baseline.limit)
     smallest = (float(np.sqrt(needed / one)) if one > 0.0 else np.inf for one in best)
     return dict(zip(promised, zip(smallest, promised.values(), strict=True), strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from servoscope import digits
 from servoscope.detection import Onset
 from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault, Mimic, Refit, Warning
 from servoscope.examination import Examination
-from servoscope.refinement import Hypothesis, Refined, causes, refine
+from servoscope.refinement import MOST, Hypothesis, Refined, causes, refine
 
 WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
 APART = 3.0  # standard deviations between two sizes that are called different
@@ -21,7 +22,10 @@ def refit(x: Examination, since: Onset, announced: int, last: int, progress: Cal
     exact = x.baseline.exact
     if exact is None or exact.misfit > 1.0:
         return None
-    return refine(x.baseline, x.recording, since.sample, announced, last, progress)
+    begin = max(since.sample - MOST, 0)
+    near = x.recording.rows(slice(begin, since.sample + MOST))
+    found = refine(x.baseline, near, since.sample - begin, announced - begin, last - begin, progress)
+    return replace(found, window=replace(found.window, first=found.window.first + begin))
 
 
 def candidates_of(refined: Refined) -> tuple[Candidate, ...]:

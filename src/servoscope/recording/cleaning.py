@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -69,6 +70,16 @@ class Recording:
         """From the first row to one sample after the last [s], gaps included."""
         return float(self.t[-1] - self.t[0]) + 1.0 / self.sample_rate
 
+    @property
+    def columns(self) -> tuple[npt.NDArray[Any], ...]:
+        """All that has one value per row."""
+        return self.t, self.r, self.u, self.y, self.restart, self.run
+
+    def rows(self, rows: slice) -> Recording:
+        """Return some rows as they stand here, without defects; nothing is copied."""
+        t, r, u, y, restart, run = (column[rows] for column in self.columns)
+        return replace(self, t=t, r=r, u=u, y=y, restart=restart, run=run, defects=())
+
     def part(self, from_s: float, to_s: float) -> Recording:
         """Return the rows with from_s <= t < to_s and the defects that overlap them.
 
@@ -77,23 +88,15 @@ class Recording:
         RecordingError
             If there are none.
         """
-        inside = (self.t >= from_s) & (self.t < to_s)
-        if not inside.any():
+        first, end = np.searchsorted(self.t, [from_s, to_s])
+        if first >= end:
             span = f"{self.t[0]:g} to {self.t[-1]:g} s"
             raise RecordingError(f"{self.name}: nothing from {from_s:g} to {to_s:g} s, it spans {span}")
-        restart = self.restart[inside].copy()
+        found = self.rows(slice(first, end))
+        restart = found.restart.copy()
         restart[0] = True
-        run = self.run[inside]
-        return replace(
-            self,
-            t=self.t[inside],
-            r=self.r[inside],
-            u=self.u[inside],
-            y=self.y[inside],
-            restart=restart,
-            run=np.asarray(run - run[0], dtype=np.int32),
-            defects=tuple(d for d in self.defects if d.to_s >= from_s and d.from_s < to_s),
-        )
+        defects = tuple(d for d in self.defects if d.to_s >= from_s and d.from_s < to_s)
+        return replace(found, restart=restart, run=found.run - found.run[0], defects=defects)
 
 
 def with_defects(recording: Recording, *more: Defect) -> Recording:
