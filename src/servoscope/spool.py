@@ -6,7 +6,7 @@ import math
 import mmap
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import IO, Any
 
 import numpy as np
@@ -14,9 +14,10 @@ import numpy.typing as npt
 
 from servoscope.errors import OutputError
 
-__all__ = ["ROWS", "Growing", "empty", "pieces", "release"]
+__all__ = ["ROWS", "Growing", "copied", "empty", "pieces", "release", "some", "where", "without"]
 
 ROWS = 1 << 16  # rows that are worked on at a time: a handful of columns of them fit into a core's cache
+MANY = 1 << 20  # rows that tell a scale
 LARGE = 1 << 26  # bytes from which an array is kept in a file
 
 
@@ -51,9 +52,43 @@ def release(*arrays: npt.NDArray[Any]) -> None:
             base.madvise(mmap.MADV_DONTNEED)
 
 
-def pieces(first: int, end: int) -> Iterator[slice]:
-    """Return the pieces in which rows `first` to `end` are worked on."""
-    return (slice(begin, min(begin + ROWS, end)) for begin in range(first, end, ROWS))
+def pieces(first: int, end: int, *columns: npt.NDArray[Any]) -> Iterator[slice]:
+    """Yield the pieces in which rows `first` to `end` are worked on; the columns are released after each of them."""
+    for begin in range(first, end, ROWS):
+        yield slice(begin, min(begin + ROWS, end))
+        release(*columns)
+
+
+def copied(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return a copy of a column."""
+    copy = empty(column.shape, column.dtype)
+    for rows in pieces(0, column.size, column, copy):
+        copy[rows] = column[rows]
+    return copy
+
+
+def some(rows: int) -> list[slice]:
+    """Return stretches, evenly spread, of about a million of so many rows: they tell scales as well as all do."""
+    every = -(-rows // MANY)
+    return list(pieces(0, rows))[::every] if every > 1 else [slice(0, rows)]
+
+
+def where(first: int, end: int, test: Callable[[slice], npt.NDArray[np.bool_]]) -> npt.NDArray[np.intp]:
+    """Return which of rows `first` to `end` pass a test of pieces."""
+    found = [rows.start + np.flatnonzero(test(rows)) for rows in pieces(first, end)]
+    return np.concatenate([np.empty(0, dtype=np.intp), *found])
+
+
+def without(column: npt.NDArray[Any], dropped: npt.NDArray[np.intp]) -> npt.NDArray[Any]:
+    """Return a column without some of its rows, which are in order; the column itself where there are none."""
+    if not dropped.size:
+        return column
+    rest = empty((column.size - dropped.size,), column.dtype)
+    for rows in pieces(0, column.size, column, rest):
+        begin, end = np.searchsorted(dropped, [rows.start, rows.stop])
+        kept = np.delete(column[rows], dropped[begin:end] - rows.start)
+        rest[rows.start - begin : rows.start - begin + kept.size] = kept
+    return rest
 
 
 class Growing:
