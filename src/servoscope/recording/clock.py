@@ -83,11 +83,13 @@ def arrange(t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: float | 
     begins = np.empty(0, dtype=np.intp)
     if marks is not None:
         begins = spool.where(1, t.size, lambda rows: np.asarray(marks[rows] != marks[_before(rows)]))
-    t, begins = spool.without(t, lost), _moved_up(begins, lost)
+    t = spool.without(t, lost)
+    begins = _moved_up(begins, lost, t.size)
     period, backwards = _check_direction(t, begins, name)
     wild = _wild(t, begins, backwards, period)
     if wild.size:
-        t, begins = spool.without(t, wild), _moved_up(begins, wild)
+        t = spool.without(t, wild)
+        begins = _moved_up(begins, wild, t.size)
         backwards = _backwards(t)
     begins = _split(t, begins, backwards, period)
     t, order = _in_order(t, begins, np.setdiff1d(backwards, begins))
@@ -127,9 +129,12 @@ def _within(t: FloatArray, begins: Index, rows: slice) -> FloatArray:
     return np.asarray(np.delete(_steps(t, rows), begins[first:last] - rows.start))
 
 
-def _moved_up(begins: Index, dropped: Index) -> Index:
-    """Return where runs begin without some rows."""
-    return np.unique(begins - np.searchsorted(dropped, begins)) if dropped.size else begins
+def _moved_up(begins: Index, dropped: Index, left: int) -> Index:
+    """Return where runs begin, but for the first, when rows have been dropped and so many are left."""
+    if not dropped.size:
+        return begins
+    begins = np.unique(begins - np.searchsorted(dropped, begins))
+    return np.asarray(begins[(begins > 0) & (begins < left)])
 
 
 def _backwards(t: FloatArray) -> Index:
