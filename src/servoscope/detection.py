@@ -91,12 +91,27 @@ def whiten(covariance: FloatArray, deviation: FloatArray) -> FloatArray:
     deviation
         Shape (K, n) or (K, n, m).
     """
-    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), np.finfo(float).tiny))
     n = covariance.shape[-1]
-    correlation = covariance / (size[..., :, None] * size[..., None, :]) + 1e-12 * np.eye(n)
-    columns = deviation[..., None] if deviation.ndim == covariance.ndim - 1 else deviation
-    white = np.linalg.solve(np.linalg.cholesky(correlation), columns / size[..., :, None])
-    return np.asarray(white[..., 0] if deviation.ndim == covariance.ndim - 1 else white)
+    # columns of many evaluations at a time: LAPACK takes longer to begin than a matrix of this size takes
+    C = np.ascontiguousarray(np.moveaxis(covariance, 0, -1))
+    columns = np.moveaxis(deviation if deviation.ndim == 3 else deviation[..., None], 0, -1)
+    size = np.sqrt(np.maximum(np.array([C[i, i] for i in range(n)]), np.finfo(float).tiny))
+    L: dict[tuple[int, int], FloatArray] = {}
+    white = np.empty(columns.shape)
+    for i in range(n):
+        for j in range(i + 1):
+            left = C[i, j] / (size[i] * size[j]) + (1e-12 if i == j else 0.0)
+            for k in range(j):
+                left -= L[i, k] * L[j, k]
+            if i == j and not (left > 0.0).all():
+                raise np.linalg.LinAlgError("a covariance is not positive definite")
+            L[i, j] = np.sqrt(left) if i == j else left / L[j, j]
+        rest = columns[i] / size[i]
+        for k in range(i):
+            rest -= L[i, k] * white[k]
+        white[i] = rest / L[i, i]
+    white = np.moveaxis(white, -1, 0)
+    return np.asarray(white[..., 0] if deviation.ndim == 2 else white)
 
 
 def statistic(theta: FloatArray, expected: FloatArray, covariance: FloatArray) -> FloatArray:

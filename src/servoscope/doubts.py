@@ -21,11 +21,10 @@ def seen_by(x: Examination) -> dict[str, tuple[float, float]]:
     directions = fault_directions(x.baseline.loop, x.baseline.plant, x.tuning.theta)
     rows = np.array([directions[parameter] for parameter in promised])
     best = np.zeros(len(rows))
-    for at in spool.pieces(0, x.evaluations) if len(rows) else ():
+    for at in spool.pieces(0, x.evaluations, x.estimates.S, x.estimates.Psi) if len(rows) else ():
         ok = x.estimates.updates[at] > 0
         if ok.any():
             best = np.maximum(best, noncentrality(x.covariance(at)[ok], x.estimates.Psi[at][ok], rows).max(axis=0))
-        spool.release(x.estimates.S, x.estimates.Psi)
     needed = required_noncentrality(x.pipeline.bank.n, x.baseline.limit)
     smallest = (float(np.sqrt(needed / one)) if one > 0.0 else np.inf for one in best)
     return dict(zip(promised, zip(smallest, promised.values(), strict=True), strict=True))

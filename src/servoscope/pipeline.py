@@ -289,6 +289,8 @@ class Pipeline:
         """Turn rows of a recursion, shape (K, row), into estimates in physical units."""
         n, basis = self.bank.n, c.basis
         theta, S, Psi = np.split(rows[:, 5:], [n, n + n * n], axis=1)
+        # basis S basis' and basis Psi/basis, row by row of many evaluations at a time
+        both, from_left = np.kron(basis, basis), np.kron(basis, np.linalg.inv(basis).T)
         return Estimates(
             index=index,
             updates=rows[:, 0],
@@ -297,8 +299,8 @@ class Pipeline:
             level=rows[:, 3],
             crossed=rows[:, 4],
             theta=c.origin + theta @ basis.T,
-            S=basis @ S.reshape(-1, n, n) @ basis.T,
-            Psi=basis @ Psi.reshape(-1, n, n) @ np.linalg.inv(basis),
+            S=(S @ both.T).reshape(-1, n, n),
+            Psi=(Psi @ from_left.T).reshape(-1, n, n),
         )
 
 

@@ -236,11 +236,19 @@ class Undisturbed:
         since = self._onsets - self._samples  # in samples of this piece
         inside = (since >= 0) & (since < len(kept))
         edges = np.where(inside, kept[np.clip(since, 0, len(kept) - 1)], np.where(since < 0, 0, len(r)))
-        u, _, y = self._simulation.advance(np.searchsorted(edges, np.arange(len(r)), side="right") - 1, r)
+        u, _, y = self._simulation.advance(_in_turn(edges, len(r)), r)
         self._samples += len(kept)
-        which = np.searchsorted(since, np.arange(len(kept)), side="right") - 1
+        which = _in_turn(since, len(kept))
         r, u, y = (course.of_kept(x) for x in (r, u, y))
         return self._regressing.advance(r, u, y, restart), which
+
+
+def _in_turn(edges: IntArray, samples: int) -> IntArray:
+    """Return which stretch each sample belongs to, shape (N,), of those that begin at the edges, the first before 0."""
+    which = np.zeros(samples, dtype=np.int64)
+    for edge in edges[1:]:
+        which[max(edge, 0) :] += 1
+    return which
 
 
 class Walk:

@@ -18,7 +18,7 @@ __all__ = ["ROWS", "Growing", "copied", "empty", "pieces", "release", "some", "w
 
 ROWS = 1 << 16  # rows that are worked on at a time: a handful of columns of them fit into a core's cache
 MANY = 1 << 20  # rows that tell a scale
-LARGE = 1 << 26  # bytes from which an array is kept in a file
+LARGE = 1 << 24  # bytes from which an array is kept in a file
 
 
 def empty(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
@@ -73,9 +73,11 @@ def some(rows: int) -> list[slice]:
     return list(pieces(0, rows))[::every] if every > 1 else [slice(0, rows)]
 
 
-def where(first: int, end: int, test: Callable[[slice], npt.NDArray[np.bool_]]) -> npt.NDArray[np.intp]:
-    """Return which of rows `first` to `end` pass a test of pieces."""
-    found = [rows.start + np.flatnonzero(test(rows)) for rows in pieces(first, end)]
+def where(
+    test: Callable[[slice], npt.NDArray[np.bool_]], *columns: npt.NDArray[Any], first: int = 0
+) -> npt.NDArray[np.intp]:
+    """Return which rows of columns, from the `first` on, pass a test of pieces."""
+    found = [rows.start + np.flatnonzero(test(rows)) for rows in pieces(first, columns[0].size, *columns)]
     return np.concatenate([np.empty(0, dtype=np.intp), *found])
 
 
@@ -109,7 +111,7 @@ class Growing:
         """
         self._parts.append(part)
         self._held += part.nbytes
-        if self._held >= (LARGE if self._file is None else LARGE // 16):
+        if self._held >= (LARGE if self._file is None else LARGE // 8):
             self._spill()
 
     def whole(self, dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:

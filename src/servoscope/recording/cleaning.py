@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import numpy as np
@@ -116,7 +115,7 @@ def clean(
 
 
 def _not_finite(x: FloatArray) -> Index:
-    return spool.where(0, x.size, lambda rows: ~np.isfinite(x[rows]))
+    return spool.where(lambda rows: ~np.isfinite(x[rows]), x)
 
 
 def _before_dropping(rows: Index, dropped: Index) -> Index:
@@ -126,7 +125,7 @@ def _before_dropping(rows: Index, dropped: Index) -> Index:
 
 def _numbered(run: IntArray) -> tuple[IntArray, BoolArray]:
     """Return the runs that are left, counted from 0, and where one begins, both (N,)."""
-    begins = np.append(0, spool.where(1, run.size, lambda rows: run[rows] != run[rows.start - 1 : rows.stop - 1]))
+    begins = np.append(0, spool.where(lambda rows: run[rows] != run[rows.start - 1 : rows.stop - 1], run, first=1))
     numbered, restart = spool.empty((run.size,), np.int32), spool.empty((run.size,), np.bool_)
     for rows in spool.pieces(0, run.size, run, numbered, restart):
         numbered[rows] = np.searchsorted(begins, np.arange(rows.start, rows.stop), side="right") - 1
@@ -193,7 +192,7 @@ def _repeats(t: FloatArray, run: IntArray, period: float) -> Index:
         before = slice(rows.start - 1, rows.stop - 1)
         return np.asarray((t[rows] - t[before] < clock.SAME * period) & (run[rows] == run[before]))
 
-    return spool.where(1, t.size, test)
+    return spool.where(test, t, run, first=1)
 
 
 def _spikes(
@@ -201,15 +200,11 @@ def _spikes(
 ) -> tuple[Index, list[str]]:
     in_r = find_spikes(r, run, share=SPIKE_SHARES["r"])
 
-    @functools.cache
-    def excused() -> BoolArray:
-        """Mark where a controller kicks u because r steps; spikes of r itself are no steps."""
-        mask = spool.empty((r.size,), np.bool_)
-        steps = steps_in(spool.without(r, in_r), spool.without(run, in_r))
-        mask[:] = False
-        at = spool.where(0, steps.size, lambda rows: steps[rows])
-        mask[_before_dropping(at, in_r)] = True
-        return np.asarray(mask)
+    sound, runs = spool.without(r, in_r), spool.without(run, in_r)
+
+    def excused(rows: Index) -> BoolArray:
+        """Return where a controller kicks u because r steps; spikes of r itself are no steps."""
+        return steps_in(sound, runs, rows - np.searchsorted(in_r, rows)) & ~np.isin(rows, in_r)
 
     in_u = find_spikes(u, run, share=SPIKE_SHARES["u"], excused=excused)
     in_y = find_spikes(y, run, share=SPIKE_SHARES["y"])
@@ -241,7 +236,7 @@ def _saturation(t: FloatArray, u: FloatArray, limits: tuple[float, float] | None
     slack = 0.0 if limits is None else 1e-6 * (high - low)
     notes = []
     for sign, value in ((1.0, high), (-1.0, low)):
-        touching = spool.where(0, u.size, lambda rows, s=sign, v=value: s * (u[rows] - v) >= -slack)  # type: ignore[misc]
+        touching = spool.where(lambda rows, s=sign, v=value: s * (u[rows] - v) >= -slack, u)  # type: ignore[misc]
         if limits is None:
             lengths = [rows.size for rows in together(touching)]
             # Resting at 0, or moving between two values only, is not a limit.

@@ -54,7 +54,7 @@ def gaps(t: FloatArray, run: IntArray, period: float) -> Index:
     def test(rows: slice) -> npt.NDArray[np.bool_]:
         return np.asarray((_steps(t, rows) > (GAP + 1e-6) * period) & (run[rows] == run[_before(rows)]))
 
-    return spool.where(1, t.size, test) - 1
+    return spool.where(test, t, run, first=1) - 1
 
 
 def arrange(t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: float | None, name: str) -> Axis:
@@ -77,12 +77,12 @@ def arrange(t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: float | 
         If the time axis runs backwards or in disorder, is too coarse or irregular, or the rate is not the
         expected one.
     """
-    lost = spool.where(0, t.size, lambda rows: ~np.isfinite(t[rows]))
+    lost = spool.where(lambda rows: ~np.isfinite(t[rows]), t)
     if t.size - lost.size < 2:
         raise RecordingError(f"{name}: the time column holds no numbers, choose another")
     begins = np.empty(0, dtype=np.intp)
     if marks is not None:
-        begins = spool.where(1, t.size, lambda rows: np.asarray(marks[rows] != marks[_before(rows)]))
+        begins = spool.where(lambda rows: np.asarray(marks[rows] != marks[_before(rows)]), marks, first=1)
     t = spool.without(t, lost)
     begins = _moved_up(begins, lost, t.size)
     period, backwards = _check_direction(t, begins, name)
@@ -139,7 +139,7 @@ def _moved_up(begins: Index, dropped: Index, left: int) -> Index:
 
 def _backwards(t: FloatArray) -> Index:
     """Return the rows whose stamp is earlier than the one before."""
-    return spool.where(1, t.size, lambda rows: _steps(t, rows) < 0.0)
+    return spool.where(lambda rows: _steps(t, rows) < 0.0, t, first=1)
 
 
 def _check_direction(t: FloatArray, begins: Index, name: str) -> tuple[float, Index]:
@@ -166,7 +166,9 @@ def _check_direction(t: FloatArray, begins: Index, name: str) -> tuple[float, In
 
 
 def _some_steps(t: FloatArray, begins: Index) -> FloatArray:
-    return np.concatenate([_within(t, begins, rows) for rows in spool.some(t.size)])
+    some = np.concatenate([_within(t, begins, rows) for rows in spool.some(t.size)])
+    spool.release(t)
+    return some
 
 
 def _wild(t: FloatArray, begins: Index, backwards: Index, period: float) -> Index:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +29,11 @@ _NOWHERE = np.empty(0, dtype=np.intp)
 
 
 def find_spikes(
-    x: FloatArray, run: npt.NDArray[np.int32], *, share: float, excused: Callable[[], BoolArray] | None = None
+    x: FloatArray,
+    run: npt.NDArray[np.int32],
+    *,
+    share: float,
+    excused: Callable[[Index], BoolArray] = lambda rows: np.zeros(rows.size, dtype=np.bool_),
 ) -> Index:
     """Find isolated spikes of at most ten samples.
 
@@ -46,7 +51,7 @@ def find_spikes(
     share
         Smallest height of a spike, as a share of the signal's range.
     excused
-        Samples that may jump, for example u where the reference steps: a mask (N,), asked for when it is needed.
+        Tells which of some samples may jump, for example u where the reference steps.
 
     Returns
     -------
@@ -54,29 +59,31 @@ def find_spikes(
     """
     spikes = np.empty(0, dtype=np.intp)
     for _ in range(PASSES):  # spikes hide others: range and neighbours are taken again without those found
-        z, runs = spool.without(x, spikes), spool.without(run, spikes)
-        found = _one_pass(z, runs, share, lambda: None if excused is None else spool.without(excused(), spikes))  # noqa: B023
+        z, runs, before = spool.without(x, spikes), spool.without(run, spikes), spikes - np.arange(spikes.size)
+
+        def logged(rows: Index, before: Index = before) -> Index:
+            return np.asarray(rows + np.searchsorted(before, rows, side="right"))
+
+        found = logged(_one_pass(z, runs, share, lambda rows, logged=logged: excused(logged(rows))))  # type: ignore[misc]
         if not found.size:
             break
-        spikes = np.union1d(spikes, found + np.searchsorted(spikes - np.arange(spikes.size), found, side="right"))
+        spikes = np.union1d(spikes, found)
     return spikes
 
 
-def steps_in(r: FloatArray, run: npt.NDArray[np.int32]) -> BoolArray:
-    """Mark the samples, shape (N,), at which a controller may kick: where r steps or a run starts."""
-    low, high = (float(x) for x in _range(r)) if r.size else (0.0, 0.0)
-    smallest = STEP_SHARE * (high - low)
-    jumps = spool.where(1, r.size, lambda rows: np.abs(_steps(r, rows)) > smallest) if high > low else _NOWHERE
-    local = _local_steps(r, jumps, np.zeros_like(jumps))
-    starts = spool.where(1, run.size, lambda rows: run[rows] != run[rows.start - 1 : rows.stop - 1])
-    mask = spool.empty((r.size,), np.bool_)
-    for rows in spool.pieces(0, r.size, mask):
-        mask[rows] = False
-    loud = jumps[np.abs(r[jumps] - r[jumps - 1]) > LOCAL * local]
+def steps_in(r: FloatArray, run: npt.NDArray[np.int32], rows: Index) -> BoolArray:
+    """Return at which of some rows (n,) a controller may kick: where r steps or a run starts, shape (n,)."""
+    low, high = _range(r)
+    kicked = np.zeros(rows.size, dtype=np.bool_)
     for offset in range(-1, REACTION + 1):
-        at = np.concatenate([loud, [0][: r.size], starts]).astype(np.intp) + offset
-        mask[at[(at >= 0) & (at < r.size)]] = True
-    return np.asarray(mask)
+        at = rows - offset
+        inside = (at >= 0) & (at < r.size)
+        starts = inside & ((at == 0) | (run[np.where(inside, at, 0)] != run[np.where(inside, at - 1, 0)]))
+        at = np.where(inside, np.maximum(at, 1), 1)
+        step = np.abs(r[at] - r[at - 1])
+        loud = (step > STEP_SHARE * (high - low)) & (step > LOCAL * _local_steps(r, at, np.zeros_like(at)))
+        kicked |= starts | (inside & (rows > offset) & loud)
+    return kicked
 
 
 def _range(x: FloatArray) -> tuple[float, float]:
@@ -84,55 +91,53 @@ def _range(x: FloatArray) -> tuple[float, float]:
     return min(low for low, _ in each), max(high for _, high in each)
 
 
+def _before(x: npt.NDArray[Any], rows: slice) -> npt.NDArray[Any]:
+    return x[rows.start - 1 : rows.stop - 1]
+
+
 def _steps(x: FloatArray, rows: slice) -> FloatArray:
-    return np.asarray(x[rows] - x[rows.start - 1 : rows.stop - 1])
+    return np.asarray(x[rows] - _before(x, rows))
 
 
-def _one_pass(
-    z: FloatArray, run: npt.NDArray[np.int32], share: float, excused: Callable[[], BoolArray | None]
-) -> Index:
+def _one_pass(z: FloatArray, run: npt.NDArray[np.int32], share: float, excused: Callable[[Index], BoolArray]) -> Index:
     if z.size < 2 * NEIGHBOURS:
         return _NOWHERE
     some = spool.some(z.size)
     span = float(np.subtract(*np.quantile(np.concatenate([z[rows] for rows in some]), [0.99, 0.01])))
     moving = np.abs(np.concatenate([np.diff(z[rows]) for rows in some]))
     moving = moving[moving > 0.0]
-    largest = max(float(np.abs(_steps(z, rows)).max()) for rows in spool.pieces(1, z.size, z))
+    spool.release(z)
     quantum = float(np.median(moving)) if moving.size > NEIGHBOURS else 0.0
+    modest, enormous = max(share * span, QUANTUM * quantum), ENORMOUS * span
+    least = min(modest, enormous) if span > 0.0 else modest
+    # a spike is entered by a high step, or stands where a run starts
+    entered = spool.where(
+        lambda rows: (np.abs(_steps(z, rows)) > least) | (run[rows] != _before(run, rows)), z, run, first=1
+    )
+    entered = np.append(0, entered)
     for width in range(1, WIDEST + 1):
-        smallest = max(share * span, QUANTUM * quantum) if width <= MODEST_WIDEST else ENORMOUS * span
         if width > MODEST_WIDEST and span == 0.0:
             break
-        if largest <= smallest:
-            continue  # no step is high enough to enter such a spike
-        start, height = _heights(z, run, width, smallest, ENORMOUS * span if span > 0.0 else np.inf)
-        free = excused() if start.size else None
-        if free is not None:
-            start, height = start[~free[start]], height[~free[start]]
+        smallest = modest if width <= MODEST_WIDEST else enormous
+        start, height = _heights(z, run, entered, width, smallest, enormous if span > 0.0 else np.inf)
         # The spike itself takes two steps of its surroundings; a quartile does not notice.
-        far = height > LOCAL * _local_steps(z, start, np.full(start.size, width))
-        if far.any():
+        start = start[height > LOCAL * _local_steps(z, start, np.full(start.size, width))]
+        start = start[~excused(start)]
+        if start.size:
             # narrow ones first: what lies between two of them looks like a wide one of the other sign
-            return np.unique(start[far] + np.arange(width)[:, None])
+            return np.unique(start + np.arange(width)[:, None])
     return _NOWHERE
 
 
 def _heights(
-    z: FloatArray, run: npt.NDArray[np.int32], width: int, smallest: float, at_edge: float
+    z: FloatArray, run: npt.NDArray[np.int32], at: Index, width: int, smallest: float, at_edge: float
 ) -> tuple[Index, FloatArray]:
-    """Find where `width` samples stand above or below both neighbours: where (n,), and heights (n,)."""
+    """Find at which places `width` samples stand above or below both neighbours: where (n,), and heights (n,)."""
     from servoscope.recording.scanning import heights
 
-    each: list[tuple[Index, FloatArray]] = []
-    for rows in spool.pieces(0, z.size, z, run):
-        begin = max(rows.start - 1, 0)  # a neighbour before, and as many samples as a spike has and a neighbour after
-        near = slice(begin, rows.stop + width)
-        start, height = np.empty(z[near].size, dtype=np.intp), np.empty(z[near].size)
-        found = heights(z[near], run[near], width, smallest, at_edge, start, height)
-        start, height = start[:found] + begin, height[:found]
-        own = (start >= rows.start) & (start < rows.stop)
-        each.append((start[own], height[own]))
-    return np.concatenate([start for start, _ in each]), np.concatenate([height for _, height in each])
+    start, height = np.empty(at.size, dtype=np.intp), np.empty(at.size)
+    found = heights(z, run, at, width, smallest, at_edge, start, height)
+    return start[:found], height[:found]
 
 
 def _local_steps(z: FloatArray, start: Index, width: Index) -> FloatArray:
