@@ -67,6 +67,8 @@ def delayed(exceeded: BoolArray, on: int, off: int) -> BoolArray:
     on, off
         In evaluations (on-delay and off-delay of ISA-18.2).
     """
+    if not exceeded.any():
+        return exceeded
     k = np.arange(len(exceeded))
     calm = np.maximum.accumulate(np.where(exceeded, -1, k))  # last evaluation below the limit
     raised = exceeded & (k - calm > on)

@@ -74,8 +74,7 @@ def trace(x: Examination, meant: Meaning | None, at: slice | None = None) -> Tra
     theta, covariance, expected = shape((K, n)), shape((K, n, n)), shape((K, n))
     seen, healthy = (Response(f, shape((K, F), np.complex128), shape((K, F, 2, 2))) for _ in range(2))
     ill = _ill(x, meant, at)
-    for k in range(0, K, AT_ONCE):
-        rows = slice(k, min(k + AT_ONCE, K))
+    for rows in spool.pieces(0, K, e.S, e.Psi, e.theta, x.expected, at_once=AT_ONCE):
         part = slice(at.start + rows.start, at.start + rows.stop)
         told = _unbiased(x, meant, part, *(None if each is None else each[rows] for each in ill))
         theta[rows], covariance[rows], expected[rows] = told

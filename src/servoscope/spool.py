@@ -52,10 +52,11 @@ def release(*arrays: npt.NDArray[Any]) -> None:
             base.madvise(mmap.MADV_DONTNEED)
 
 
-def pieces(first: int, end: int, *columns: npt.NDArray[Any]) -> Iterator[slice]:
+def pieces(first: int, end: int, *columns: npt.NDArray[Any], at_once: int | None = None) -> Iterator[slice]:
     """Yield the pieces in which rows `first` to `end` are worked on; the columns are released after each of them."""
-    for begin in range(first, end, ROWS):
-        yield slice(begin, min(begin + ROWS, end))
+    rows = at_once or ROWS
+    for begin in range(first, end, rows):
+        yield slice(begin, min(begin + rows, end))
         release(*columns)
 
 

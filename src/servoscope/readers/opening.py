@@ -16,7 +16,7 @@ from servoscope.readers.tables import Table
 
 __all__ = ["SUFFIXES", "Opened", "open_file"]
 
-ROWS = 1 << 18  # of a Parquet file that are read at a time
+ROWS = 1 << 16  # of a Parquet file that are read at a time
 BUFFER = 1 << 20  # bytes of each of its columns
 
 SUFFIXES = {
@@ -149,7 +149,7 @@ def _parquet(path: Path) -> Opened:
         first = 1
         try:
             # neither read_table nor a memory map: the one imports pandas, the other takes the file for memory
-            with pq.ParquetFile(path, buffer_size=BUFFER) as file:
+            with pq.ParquetFile(path, buffer_size=BUFFER, pre_buffer=False) as file:
                 for batch in file.iter_batches(ROWS, columns=list(wanted)):
                     columns = {name: pa.chunked_array([batch.column(name)]) for name in wanted}
                     yield Table(path.name, columns, first)

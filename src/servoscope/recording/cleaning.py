@@ -181,7 +181,7 @@ def _scatter(x: FloatArray, other: FloatArray | None = None) -> float:
     """Return the standard deviation of x, or of its difference from another signal."""
     total = squares = 0.0
     about = float(x[0] if other is None else x[0] - other[0])
-    for rows in spool.pieces(0, x.size, x):
+    for rows in spool.pieces(0, x.size, x, x if other is None else other):
         off = x[rows] - about if other is None else x[rows] - other[rows] - about
         total, squares = total + float(off.sum()), squares + float(off @ off)
     return float(np.sqrt(max(squares / x.size - (total / x.size) ** 2, 0.0)))

@@ -25,6 +25,7 @@ NEIGHBOURS = 20  # samples on either side that say what is normal here
 STEP_SHARE = 0.02  # of the reference's range: smaller steps do not make u kick
 REACTION = 3  # samples in which u may kick after a step of r
 PASSES = 30
+PLACES = 512  # that are looked at together: each of them brings the pages around it into memory
 _NOWHERE = np.empty(0, dtype=np.intp)
 
 
@@ -75,14 +76,14 @@ def steps_in(r: FloatArray, run: npt.NDArray[np.int32], rows: Index) -> BoolArra
     """Return at which of some rows (n,) a controller may kick: where r steps or a run starts, shape (n,)."""
     low, high = _range(r)
     kicked = np.zeros(rows.size, dtype=np.bool_)
-    for offset in range(-1, REACTION + 1):
-        at = rows - offset
-        inside = (at >= 0) & (at < r.size)
-        starts = inside & ((at == 0) | (run[np.where(inside, at, 0)] != run[np.where(inside, at - 1, 0)]))
-        at = np.where(inside, np.maximum(at, 1), 1)
-        step = np.abs(r[at] - r[at - 1])
-        loud = (step > STEP_SHARE * (high - low)) & (step > LOCAL * _local_steps(r, at, np.zeros_like(at)))
-        kicked |= starts | (inside & (rows > offset) & loud)
+    for places in spool.pieces(0, rows.size, r, run, at_once=PLACES):
+        for offset in range(-1, REACTION + 1):
+            at = rows[places] - offset
+            inside = (at > 0) & (at < r.size)
+            at = np.where(inside, at, 1)
+            step = np.abs(r[at] - r[at - 1])
+            loud = (step > STEP_SHARE * (high - low)) & (step > LOCAL * _local_steps(r, at, np.zeros_like(at)))
+            kicked[places] |= (inside & (loud | (run[at] != run[at - 1]))) | (rows[places] == offset)
     return kicked
 
 
@@ -135,9 +136,10 @@ def _heights(
     """Find at which places `width` samples stand above or below both neighbours: where (n,), and heights (n,)."""
     from servoscope.recording.scanning import heights
 
-    start, height = np.empty(at.size, dtype=np.intp), np.empty(at.size)
-    found = heights(z, run, at, width, smallest, at_edge, start, height)
-    return start[:found], height[:found]
+    start, height, count = np.empty(at.size, dtype=np.intp), np.empty(at.size), 0
+    for places in spool.pieces(0, at.size, z, run, at_once=PLACES):
+        count += heights(z, run, at[places], width, smallest, at_edge, start[count:], height[count:])
+    return start[:count], height[:count]
 
 
 def _local_steps(z: FloatArray, start: Index, width: Index) -> FloatArray:
@@ -147,5 +149,6 @@ def _local_steps(z: FloatArray, start: Index, width: Index) -> FloatArray:
     from servoscope.recording.scanning import local_steps
 
     quartile = np.empty(start.size)
-    local_steps(z, start, width, NEIGHBOURS, quartile)
+    for places in spool.pieces(0, start.size, z, at_once=PLACES):
+        local_steps(z, start[places], width[places], NEIGHBOURS, quartile[places])
     return quartile
