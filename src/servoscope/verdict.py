@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,10 +26,12 @@ from servoscope.examination import Examination
 from servoscope.isolation import isolate
 from servoscope.meaning import Meaning, meaning, trace
 from servoscope.reasons import reasons
-from servoscope.refinement import Refined
 from servoscope.refit import candidates_of, disagreements, onset_of, refit, said
 from servoscope.sentence import summary
 from servoscope.steady import isolation_inputs
+
+if TYPE_CHECKING:
+    from servoscope.refinement import Refined
 
 SURE = 0.95  # probability from which a fault is named
 

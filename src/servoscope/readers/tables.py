@@ -80,7 +80,6 @@ def number_column(table: Table, name: str, what: str) -> FloatArray:
         If a cell holds text; it names row, column and text.
     """
     import pyarrow as pa
-    import pyarrow.compute as pc
 
     column = table.columns[name]
     kind = column.type
@@ -93,11 +92,12 @@ def number_column(table: Table, name: str, what: str) -> FloatArray:
     try:
         if pa.types.is_boolean(kind):
             column = column.cast(pa.int8())
-        numbers = pc.cast(column, pa.float64(), safe=False)
+        if not pa.types.is_float64(kind):  # Arrow's functions take a while to import
+            column = column.cast(pa.float64(), safe=False)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
         raise RecordingError(f"{table.name}: {what}: column {name!r} holds {kind}, not numbers") from None
-    # neither to_numpy nor a needless fill: both import pandas where they find it, a fifth of a second
-    chunks = (pc.fill_null(numbers, np.nan) if numbers.null_count else numbers).chunks
+    # not to_numpy: it imports pandas where it finds it, a fifth of a second
+    chunks = (column.fill_null(np.nan) if column.null_count else column).chunks
     return np.concatenate([np.zeros(0), *(np.from_dlpack(chunk) for chunk in chunks if len(chunk))])
 
 
