@@ -69,19 +69,19 @@ def mean_path(
     S: FloatArray,
     P_d: FloatArray,
     R: float,
-    start: FloatArray,
+    theta: FloatArray,
+    number: int,
     every: int,
 ) -> FloatArray:
     """Follow the mean of theta_hat at P = P_d for noise-free regressors plus the noise's moments, shape (K, n).
 
     ``theta += (P_d z (eta - phi' theta) + P_d (c - S theta)) / (R + phi' P_d z + tr(P_d S))``; c (p, n) and S
-    (p, n, n) are the noise's E[phi eta] and E[phi phi'] with the plant ``which[k]`` (N,).
+    (p, n, n) are the noise's E[phi eta] and E[phi phi'] with the plant ``which[k]`` (N,). `theta` (n,) is carried on in
+    place, and `number` is how many samples were before these.
     """
     N, n = phi.shape
-    theta = np.empty(n)
-    for i in range(n):
-        theta[i] = start[i]
-    path = np.empty((N // every, n))
+    before = number // every
+    path = np.empty(((number + N) // every - before, n))
     gain = np.empty(n)
     pull = np.empty(n)
     for k in range(N):
@@ -103,7 +103,7 @@ def mean_path(
                 for j in range(n):
                     step += P_d[i, j] * pull[j]
                 theta[i] += step / denominator
-        if (k + 1) % every == 0:
+        if (number + k + 1) % every == 0:
             for i in range(n):
-                path[(k + 1) // every - 1, i] = theta[i]
+                path[(number + k + 1) // every - 1 - before, i] = theta[i]
     return path

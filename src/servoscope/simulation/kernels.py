@@ -1,4 +1,8 @@
-"""The compiled inner loops: PI controller and plant, sample by sample; importing this file imports numba."""
+"""The compiled inner loops: PI controller and plant, sample by sample; importing this file imports numba.
+
+What a loop carries from one piece to the next stands in one row of floats, zero before the first sample: the
+controller's sum, the number of the last plant (counted from 1), the plant's state and what acted on it last.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,8 @@ from servoscope.compiled import kernel
 from servoscope.plants import FloatArray
 
 IntArray = npt.NDArray[np.int64]
+
+TOTAL, LAST, HEAD = 0, 1, 2  # places in the row; the plant's state follows the head
 
 
 class Settings(NamedTuple):
@@ -59,25 +65,26 @@ def control(
 @kernel
 def run_linear(
     A: FloatArray, b_next: FloatArray, b_now: FloatArray, b_late: FloatArray, c: FloatArray,
-    which: IntArray, settings: Settings, r: FloatArray, n_u: FloatArray, n_y: FloatArray,
+    which: IntArray, settings: Settings, r: FloatArray, n_u: FloatArray, n_y: FloatArray, s: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Run the closed loop of linear plants; which[k] names the plant from sample k to k + 1.
 
     Shapes: A (p, n, n), b_next, b_now, b_late, c (p, n); which, r, n_u, n_y (N,). Returns u, u after the
-    limits, what acts on the plant, and y without noise, each (N,). All start at rest at zero.
+    limits, what acts on the plant, and y without noise, each (N,), and carries s (HEAD + n + m + 2,) on.
     """
     N, n, m = r.size, A.shape[1], settings.m
-    u, limited, acting, y = np.empty(N), np.empty(N), np.empty(N), np.empty(N)
-    x, fresh = np.zeros(n), np.zeros(n)
-    total = 0.0
+    u, limited, acting, y = np.empty(N), np.empty(N), np.empty(N + m + 2), np.empty(N)
+    x, fresh, past = s[HEAD : HEAD + n], np.zeros(n), m + 2
+    acting[:past] = s[HEAD + n :]
+    total, last = s[TOTAL], int(s[LAST])
     for k in range(N):
-        p = which[max(k - 1, 0)]
+        p = which[k - 1] if k > 0 else max(last - 1, 0)
         free = 0.0
         share = 0.0
-        if k > 0:
-            ahead = acting[k - m] if 0 < m <= k else 0.0
-            now = acting[k - 1 - m] if k - 1 - m >= 0 else 0.0
-            late = acting[k - 2 - m] if k - 2 - m >= 0 else 0.0
+        if k > 0 or last > 0:
+            ahead = acting[past + k - m] if m > 0 else 0.0
+            now = acting[past + k - 1 - m]
+            late = acting[past + k - 2 - m]
             for i in range(n):
                 value = b_next[p, i] * ahead + b_now[p, i] * now + b_late[p, i] * late
                 for j in range(n):
@@ -86,37 +93,44 @@ def run_linear(
                 free += c[p, i] * value
                 if m == 0:
                     share += c[p, i] * b_next[p, i]
-        u[k], limited[k], acting[k], total = control(settings, r[k], n_u[k], n_y[k], free, share, total)
+        u[k], limited[k], drive, total = control(settings, r[k], n_u[k], n_y[k], free, share, total)
+        acting[past + k] = drive
         for i in range(n):
-            x[i] = fresh[i] + b_next[p, i] * acting[k] if m == 0 and k > 0 else fresh[i]
-        y[k] = free + share * acting[k]
-    return u, limited, acting, y
+            x[i] = fresh[i] + b_next[p, i] * drive if m == 0 and (k > 0 or last > 0) else fresh[i]
+        y[k] = free + share * drive
+    s[TOTAL] = total
+    s[LAST] = which[N - 1] + 1 if N else last
+    s[HEAD + n :] = acting[N:]
+    return u, limited, acting[past:], y
 
 
 @kernel
 def run_axis(
-    motion: Motion, which: IntArray, settings: Settings, r: FloatArray, n_u: FloatArray, n_y: FloatArray
+    motion: Motion, which: IntArray, settings: Settings, r: FloatArray, n_u: FloatArray, n_y: FloatArray, s: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Run the closed loop of axes with friction; arguments and results as in `run_linear`.
+    """Run the closed loop of axes with friction; arguments and results as in `run_linear`, the plant's state has n = 2.
 
     Friction is semi-implicit: the force that would stop the axis within the sub-step is applied if it is
     below the Coulomb friction, and then the axis sticks; otherwise the whole Coulomb friction is. So it
     stops without chatter.
     """
     N, m = r.size, settings.m
-    u, limited, acting, y = np.empty(N), np.empty(N), np.empty(N), np.empty(N)
-    position, speed, total = 0.0, 0.0, 0.0
+    u, limited, acting, y = np.empty(N), np.empty(N), np.empty(N + m + 2), np.empty(N)
+    past = m + 2
+    acting[:past] = s[HEAD + 2 :]
+    position, speed, total = s[HEAD], s[HEAD + 1], s[TOTAL]
     for k in range(N):
         y[k] = position
-        u[k], limited[k], acting[k], total = control(settings, r[k], n_u[k], n_y[k], position, 0.0, total)
+        u[k], limited[k], acting[past + k], total = control(settings, r[k], n_u[k], n_y[k], position, 0.0, total)
         p = which[k]
-        now = acting[k - m] if k - m >= 0 else 0.0
-        late = acting[k - 1 - m] if k - 1 - m >= 0 else 0.0
+        now, late = acting[past + k - m], acting[past + k - 1 - m]
         for step in range(motion.steps):
             arrived = (step + 0.5) / motion.steps >= settings.rest
             drive = motion.gain[p] * (now if arrived else late) - motion.offset[p]
             position, speed = _advance(motion, p, position, speed, drive)
-    return u, limited, acting, y
+    s[HEAD], s[HEAD + 1], s[TOTAL] = position, speed, total
+    s[HEAD + 2 :] = acting[N:]
+    return u, limited, acting[past:], y
 
 
 @kernel
