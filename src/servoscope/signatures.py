@@ -271,7 +271,10 @@ class Walk:
         tuning, number = self._tuning, self._samples
         self._samples += len(which)
         P_d, R, every = tuning.P_d, tuning.R, self._pipeline.every
-        return mean_path(g.eta, g.phi, g.z, g.ok, which, *self._moments, P_d, R, self._theta, number, every)
+        path = np.empty((self._samples // every - number // every, len(P_d)))
+        room = np.empty((2, len(P_d)))
+        mean_path(g.eta, g.phi, g.z, g.ok, which, *self._moments, P_d, R, self._theta, number, every, room, path)
+        return path
 
 
 def in_turn(plant: Plant, ill: Plant | None, since: int) -> tuple[list[Plant], list[int]]:

@@ -204,7 +204,7 @@ class Simulation:
         for each, what in zip(discrete, called, strict=True):
             check_stable(loop, each, what)
         self._unlimited = loop.input_logged != "after_limiter"
-        self._run: Callable[..., tuple[FloatArray, FloatArray, FloatArray, FloatArray]]
+        self._run: Callable[..., object]
         if not loop.plant.linear:
             from servoscope.simulation.rig import nonlinear
 
@@ -214,11 +214,11 @@ class Simulation:
             self._run = lambda which, *signals: kernels.run_axis(motion, which, settings, *signals)
         else:
             A, b_next, b_now, b_late, c = (np.stack([each[i] for each in discrete]) for i in range(5))
-            states = c.shape[1]
+            states, room = c.shape[1], np.zeros(c.shape[1])
             self._run = lambda which, *signals: kernels.run_linear(
-                A, b_next, b_now, b_late, c, which, settings, *signals
+                A, b_next, b_now, b_late, c, room, which, settings, *signals
             )
-        self._state = np.zeros(kernels.HEAD + states + settings.m + 2)
+        self._state, self._acted = np.zeros(kernels.HEAD + states), np.zeros(settings.m + 2)
 
     def advance(
         self, which: npt.NDArray[np.int64], r: FloatArray, n_u: FloatArray | None = None, n_y: FloatArray | None = None
@@ -229,8 +229,12 @@ class Simulation:
         """
         nothing = np.zeros(r.size)
         noises = [nothing if noise is None else noise for noise in (n_u, n_y)]
-        u, limited, acting, y = self._run(which, r, *noises, self._state)
-        return (u if self._unlimited else limited), acting, y
+        u, limited, y = np.empty((3, r.size))
+        acting = np.concatenate([self._acted, nothing])
+        self._run(which, r, *noises, self._state, u, limited, acting, y)
+        past = self._acted.size
+        self._acted = acting[r.size :]
+        return (u if self._unlimited else limited), acting[past:], y
 
 
 def settings_of(loop: Loop) -> Settings:

@@ -196,21 +196,22 @@ def simulate_rig(
     settings = settings._replace(low=max(settings.low, -limit), high=min(settings.high, limit))
     supply, leakage, friction, beta = parameters.values()
     rows = np.column_stack([_flow_gain(plant, supply), 1.0 / supply, leakage, friction, 2.0 * beta / plant.V_o])
-    state = np.zeros(HEAD + 5 + settings.m + 2)
-    physics = _physics(plant, rig, loop, rows)
-    u, limited, acting, y, measured, p_L, spool = run_rig(physics, settings, rows, r, n_u, n_y, state)
+    physics, past = _physics(plant, rig, loop, rows), settings.m + 2
+    u, limited, y = np.empty((3, r.size))
+    acting = np.zeros(past + r.size)
+    state = np.zeros(HEAD + 5)
+    measured, p_L, spool = run_rig(physics, settings, rows, r, n_u, n_y, state, u, limited, acting, y)
+    acting = acting[past:]
     recording = recorded(loop, r, limited if loop.input_logged == "after_limiter" else u, measured)
     ratios = {name: values[plan.which] for name, values in plan.ratios.items()}
     theta = np.array([each.theta() for each in plan.plants])[plan.which]
     return recording, RigTruth(t, y, acting, ratios, theta, events, plant, p_L, spool, temperature, parameters)
 
 
-def nonlinear(
-    loop: Loop, plants: Sequence[Plant], settings: Settings
-) -> Callable[..., tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
+def nonlinear(loop: Loop, plants: Sequence[Plant], settings: Settings) -> Callable[..., object]:
     """Return what runs the closed loop of actuators with the valve law and the Coulomb friction of their loop file.
 
-    It takes which, r, n_u, n_y and the state, as `servoscope.simulation.kernels.run_linear` does, and returns the same.
+    It takes which, r, n_u, n_y, the state, and what `servoscope.simulation.kernels.run_linear` writes.
 
     Raises
     ------
@@ -226,7 +227,7 @@ def nonlinear(
     root = first.valve_law == "square-root"
     rig = replace(Rig.ideal(), load_pressure_flow=root, coulomb=first.coulomb, static=first.coulomb)
     physics = _physics(first, rig, loop, rows)
-    return lambda which, *signals: run_rig(physics, settings, rows[which], *signals)[:4]
+    return lambda which, *signals: run_rig(physics, settings, rows[which], *signals)
 
 
 def _check_hold(loop: Loop) -> None:

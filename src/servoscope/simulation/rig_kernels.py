@@ -82,19 +82,18 @@ def advance(p: Physics, row: FloatArray, x: FloatArray, drive: float, duration: 
 
 @kernel
 def run_rig(
-    p: Physics, settings: Settings, rows: FloatArray, r: FloatArray, n_u: FloatArray, n_y: FloatArray, s: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Run the closed loop of the rig, and carry s (HEAD + 5 + m + 2,) on: see `servoscope.simulation.kernels`.
+    p: Physics, settings: Settings, rows: FloatArray, r: FloatArray, n_u: FloatArray, n_y: FloatArray, s: FloatArray,
+    u: FloatArray, limited: FloatArray, acting: FloatArray, y: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Run the closed loop of the rig, and carry s (HEAD + 5,) on: see `servoscope.simulation.kernels`.
 
     ``rows`` (N, 5) holds flow gain, 1/p_s, leakage, viscous friction and 1/capacity from each sample to the next; r,
-    n_u, n_y have shape (N,). Returns u, u after the limits, what acts on the valve before the delay, y, y as measured,
-    load pressure and spool, each (N,).
+    n_u, n_y have shape (N,). Writes u, u after the limits, what acts on the valve before the delay (m + 2 + N,), and y;
+    returns y as measured, load pressure and spool, each (N,).
     """
     N, m = r.size, settings.m
-    u, limited, acting, y = np.empty(N), np.empty(N), np.empty(N + m + 2), np.empty(N)
     measured, pressure, spool = np.empty(N), np.empty(N), np.empty(N)
     x, room, past = s[HEAD : HEAD + 5], np.empty((5, 5)), m + 2
-    acting[:past] = s[HEAD + 5 :]
     total = s[TOTAL]
     for k in range(N):
         y[k], pressure[k], spool[k] = x[0], x[2], x[3]
@@ -110,5 +109,4 @@ def run_rig(
         if p.valve == 0.0:
             x[3], x[4] = now, 0.0
     s[TOTAL] = total
-    s[HEAD + 5 :] = acting[N:]
-    return u, limited, acting[past:], y, measured, pressure, spool
+    return measured, pressure, spool
