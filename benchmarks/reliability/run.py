@@ -45,6 +45,7 @@ CALM = 0.25  # share of the run at the end that is left in peace
 EVERY_S = 25.0  # mean time between disturbances
 FULL_DAY = 24.0 * 200
 DISK_MB = 256
+BUSY = 1.0  # load from which times mean little
 
 
 def trial(name: str, fleet_of: tuple[int, float, float], every_s: float, seed: int = 1) -> dict[str, Any]:
@@ -186,7 +187,9 @@ def markdown(found: list[dict[str, Any]]) -> str:
     words = " **Reduced: not the whole day of 200 assets yet.**" if reduced else ""
     machines = "; ".join(sorted({one["machine"] for one in found}))
     loads = ", ".join(f"{one['settings']['load']:g}" for one in found)
-    words += f" Load of the machine by other work, before each: {loads}; quiet is below 0.5."
+    words += f" Load of the machine by other work, before each: {loads}."
+    if any(one["settings"]["load"] > BUSY for one in found):
+        words += " **So recovery and latency say more of that work than of the service.**"
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + f"\n\n{machines}.{words}"
 
 
