@@ -70,6 +70,8 @@ class Fleet:
         Items that cost themselves: (asset, day, why).
     unlearned
         By asset or group: why it has no baseline, or which healthy days could not be used.
+    late
+        By asset: rows of a stream that came too late and were left out.
     """
 
     assets: tuple[Known, ...]
@@ -78,6 +80,7 @@ class Fleet:
     states: dict[str, dict[str, str]]
     failed: tuple[tuple[str, str, str], ...]
     unlearned: dict[str, str]
+    late: dict[str, int]
 
     @property
     def accepted(self) -> tuple[Cause, ...]:
@@ -98,6 +101,7 @@ def known(
     groups: Mapping[str, Mapping[str, str]],
     unlearned: Mapping[str, str],
     prior: Prior = PRIOR,
+    late: Mapping[str, int] | None = None,
 ) -> Fleet:
     """Put together what a fleet's results say.
 
@@ -111,6 +115,8 @@ def known(
         What could not be learned.
     prior
         What is assumed before looking.
+    late
+        By asset: rows of a stream that came too late.
     """
     by_day: dict[str, dict[str, Entry]] = {}
     by_asset: dict[str, dict[str, Entry]] = {}
@@ -129,7 +135,7 @@ def known(
     assets.sort(key=lambda one: (rank.index(one.state), -one.probability, one.asset))
     failed = [(e["asset"], e["day"], str(e["error"])) for e in entries if e["status"] == FAILED]
     since = tuple(_since(cause, found) for cause in now)
-    return Fleet(tuple(assets), tuple(now), since, states, tuple(failed), dict(unlearned))
+    return Fleet(tuple(assets), tuple(now), since, states, tuple(failed), dict(unlearned), dict(late or {}))
 
 
 def _causes(entries: Sequence[Entry], groups: Mapping[str, Mapping[str, str]], prior: Prior) -> list[Cause]:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
 
 from servoscope.fleet.knowledge import COMMON, FAILED, Fleet, Known
 from servoscope.fleet.rows import MICRO
-from servoscope.output import atomic_write
+from servoscope.output import atomic_write, make_folder
 from servoscope.report.document import KINDS, framed
 from servoscope.report.sheets import cell, section, table
 from servoscope.report.wording import DASH, clock_time, count, probability, size_of, symbol
 
-__all__ = ["page", "write"]
+__all__ = ["headline", "page", "write_knowledge"]
 
 MOST_ROWS = 300  # of a table: a page is read by people
 MOST_DAYS = 60  # of the picture of days
@@ -27,31 +28,24 @@ TONES = {
 }
 
 
-def write(path: str | Path, fleet: Fleet, lake: str) -> None:
-    """Write the report; nothing half-written stays behind.
-
-    Parameters
-    ----------
-    path
-        The HTML file.
-    fleet
-        What is known.
-    lake
-        Where the recordings are.
+def write_knowledge(output: Path, fleet: Fleet, lake: str) -> None:
+    """Write fleet.json and report.html into a folder; nothing half-written stays behind.
 
     Raises
     ------
     OutputError
-        If the file cannot be written.
+        If a file cannot be written.
     """
-    atomic_write(path, page(fleet, lake).encode("utf-8", errors="replace"))
+    make_folder(output)
+    atomic_write(output / "fleet.json", json.dumps(fleet.to_dict(), indent=1, allow_nan=False).encode() + b"\n")
+    atomic_write(output / "report.html", page(fleet, lake).encode("utf-8", errors="replace"))
 
 
 def page(fleet: Fleet, lake: str) -> str:
-    """Return the page that `write` writes; it needs nothing from outside."""
+    """Return report.html; it needs nothing from outside."""
     kind = "fault" if fleet.accepted or fleet.count("fault") else "healthy"
     sections = (_header(fleet, lake), _verdict(fleet, kind), _common(fleet), _ill(fleet), _changed(fleet), _days(fleet))
-    return framed(f"Fleet: {lake}", kind, (*sections, _failed(fleet), _unlearned(fleet)))
+    return framed(f"Fleet: {lake}", kind, (*sections, _failed(fleet), _unlearned(fleet), _late(fleet)))
 
 
 def _header(fleet: Fleet, lake: str) -> str:
@@ -202,6 +196,16 @@ def _unlearned(fleet: Fleet) -> str:
     ]
     why = "Assets or groups without a baseline, or with healthy days that could not be used for it."
     return section("Not learned", why, table(("Asset or group", "Why"), rows) + _more(len(fleet.unlearned)), "long")
+
+
+def _late(fleet: Fleet) -> str:
+    if not fleet.late:
+        return ""
+    total = count(sum(fleet.late.values()))
+    most = sorted(fleet.late.items(), key=lambda pair: -pair[1])[:MOST_ROWS]
+    rows = [f'<tr><th scope="row">{escape(asset)}</th>{cell(count(n))}</tr>' for asset, n in most]
+    why = f"{total} rows came after the watermark had passed them, and were left out."
+    return section("Late rows", why, table(("Asset", "*Rows"), rows) + _more(len(fleet.late)), "long")
 
 
 def _more(total: int) -> str:

@@ -15,7 +15,7 @@ from servoscope.plants import FloatArray
 from servoscope.readers.columns import find_channel, parse_combination
 from servoscope.readers.tables import UNITS, Table, number_column
 
-__all__ = ["Rows", "clock_of", "names_of", "rows_of"]
+__all__ = ["Rows", "clock_of", "names_of", "rows_of", "signals_of"]
 
 MICRO = 1e6
 
@@ -99,25 +99,35 @@ def names_of(columns: Columns, known: Sequence[str], where: str) -> list[str]:
 
 
 def rows_of(table: Table, columns: Columns) -> Rows:
-    """Return the signals of a table; rows without a time are left out.
+    """Return the rows of a table; those without a time are left out.
 
     Raises
     ------
     RecordingError, LoopError
         If the columns cannot be used.
     """
-    known = list(table.columns)
-    signals = []
+    t_us, known = clock_of(table, columns)
+    rows = Rows(t_us, *signals_of(table, columns))
+    return rows if known.all() else rows[known]
+
+
+def signals_of(table: Table, columns: Columns) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return r, u and y of a table, shape (N,) each.
+
+    Raises
+    ------
+    RecordingError, LoopError
+        If the columns cannot be used.
+    """
+    known, signals = list(table.columns), []
     for key in ("reference", "input", "output"):
-        where = f"{table.name}: [columns] {key}"
-        mix = parse_combination(getattr(columns, key), known, where)
+        mix = parse_combination(getattr(columns, key), known, f"{table.name}: [columns] {key}")
         total = np.full(table.rows, mix.constant)
         for name, factor in mix.factors.items():
             total += factor * number_column(table, name, f"[columns] {key}")
         signals.append(total)
-    t_us, known_time = clock_of(table, columns)
-    rows = Rows(t_us, *signals)
-    return rows if known_time.all() else rows[known_time]
+    r, u, y = signals
+    return r, u, y
 
 
 def clock_of(table: Table, columns: Columns) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
@@ -138,5 +148,5 @@ def clock_of(table: Table, columns: Columns) -> tuple[npt.NDArray[np.int64], npt
         there = np.isfinite(seconds) & (np.abs(seconds) < 9e12)
         return np.round(np.where(there, seconds, 0.0) * MICRO).astype(np.int64), there
     missing = np.asarray(column.is_null().to_numpy(zero_copy_only=False), dtype=bool)
-    whole = pc.cast(column, pa.timestamp("us"), safe=False).cast(pa.int64()).fill_null(0)
+    whole = pc.cast(column, pa.timestamp("us", column.type.tz), safe=False).cast(pa.int64()).fill_null(0)
     return np.concatenate([np.zeros(0, np.int64), *(np.asarray(chunk) for chunk in whole.chunks)]), ~missing

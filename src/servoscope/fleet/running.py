@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +9,17 @@ from typing import Any
 from urllib.parse import quote
 
 from servoscope.errors import BaselineError
+from servoscope.fleet.baselines import baseline_file
 from servoscope.fleet.common import PRIOR, Prior
 from servoscope.fleet.following import WINDOW
 from servoscope.fleet.journal import journal
 from servoscope.fleet.knowledge import Fleet, known
 from servoscope.fleet.lake import Item, Lake
 from servoscope.fleet.local import Engine
-from servoscope.fleet.tasks import Examine, Learn, baseline_file
+from servoscope.fleet.tables import KINDS, row
+from servoscope.fleet.tasks import Examine, Learn
 from servoscope.loop import Columns, Loop
-from servoscope.output import atomic_write, make_folder
+from servoscope.output import make_folder
 from servoscope.writers import write_table
 
 __all__ = ["Plan", "Progress", "run"]
@@ -173,34 +174,15 @@ def _learned(
 def _write(plan: Plan, fleet: Fleet, entries: Sequence[Mapping[str, Any]]) -> None:
     from servoscope.fleet import pages
 
-    write_table(plan.output / "diagnoses.parquet", table(entries, fleet))
-    atomic_write(plan.output / "fleet.json", json.dumps(fleet.to_dict(), indent=1, allow_nan=False).encode() + b"\n")
-    pages.write(plan.output / "report.html", fleet, plan.lake.where)
+    write_table(plan.output / "diagnoses.parquet", _table(entries, fleet))
+    pages.write_knowledge(plan.output, fleet, plan.lake.where)
 
 
-def table(entries: Sequence[Mapping[str, Any]], fleet: Fleet) -> dict[str, Any]:
-    """Return the results as columns, one row per item."""
+def _table(entries: Sequence[Mapping[str, Any]], fleet: Fleet) -> dict[str, Any]:
+    """Return the results as columns, one row per item; `state` is the fleet's word on each."""
     import pyarrow as pa
 
-    rows = [_row(entry, fleet.states[entry["asset"]][entry["day"]]) for entry in entries]
-    kinds = {"text": pa.string(), "number": pa.float64(), "whole": pa.int64()}
-    return {name: pa.array([row[name] for row in rows], kinds[kind]) for name, kind in COLUMNS.items()}
-
-
-COLUMNS = {
-    **dict.fromkeys(("asset", "day", "status", "error", "state", "verdict", "fault", "parameter"), "text"),
-    **dict.fromkeys(("ratio", "low", "high", "probability", "peak"), "number"),
-    **dict.fromkeys(("first_us", "last_us", "alarm_us", "samples", "gaps", "missing", "repeats"), "whole"),
-    **dict.fromkeys(("summary", "diagnosis"), "text"),
-}
-
-
-def _row(entry: Mapping[str, Any], state: str) -> dict[str, Any]:
-    said = entry.get("diagnosis", {})
-    fault: Mapping[str, Any] = next(iter(said.get("faults") or ()), {})
-    low, high = fault.get("interval", (None, None))
-    told = {"state": state, "low": low, "high": high, "fault": fault.get("name")}
-    told |= {name: fault.get(name) for name in ("parameter", "ratio")}
-    told |= {name: said.get(name) for name in ("verdict", "probability", "summary")}
-    told["diagnosis"] = json.dumps(said) if said else None
-    return {name: told[name] if name in told else entry.get(name) for name in COLUMNS}
+    kinds = {"string": pa.string(), "double": pa.float64(), "long": pa.int64()}
+    rows = [row(entry) for entry in entries]
+    states = pa.array([fleet.states[entry["asset"]][entry["day"]] for entry in entries], pa.string())
+    return {"state": states} | {name: pa.array([one[name] for one in rows], kinds[k]) for name, k in KINDS.items()}

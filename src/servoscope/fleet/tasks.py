@@ -9,7 +9,6 @@ import io
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from servoscope.baseline import Baseline
 from servoscope.errors import NotEnoughError, ServoscopeError
+from servoscope.fleet.baselines import follower_of_file
 from servoscope.fleet.following import Evaluated, Follower, Memory, State
 from servoscope.fleet.lake import Item
 from servoscope.fleet.reading import blocks
@@ -25,7 +25,7 @@ from servoscope.loop import Columns, Loop
 from servoscope.output import atomic_write, make_folder
 from servoscope.recording import Recording, clean
 
-__all__ = ["Examine", "Learn", "baseline_file", "columns_of", "examined", "follower", "traces"]
+__all__ = ["Examine", "Learn", "columns_of", "examined", "traces"]
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Examine:
         try:
             if self.baseline is None:
                 raise ServoscopeError(f"no baseline: {self.why}")
-            one = follower(self.baseline, self.assets, self.window_s)
+            one = follower_of_file(self.baseline, self.assets, self.window_s)
             state, parts = _followed(one, blocks(self.item.files, columns_of(one.baseline, self.columns)))
             if self.trace is not None and parts:
                 make_folder(Path(self.trace).parent)
@@ -146,18 +146,6 @@ class Examine:
         except Exception as error:  # garbage in one item must not cost another
             found = {"status": "failed", "error": _told(error)}
         return {"asset": self.item.asset, "day": self.item.day, "stamp": self.item.stamp, **found}
-
-
-def baseline_file(folder: str | Path, name: str) -> str:
-    """Return the file of a baseline; characters that no file system likes are written as numbers."""
-    plain = "".join(c if c.isalnum() or c in "-_." else f"%{ord(c):02X}" for c in name)
-    return f"{folder}/{plain}.json"
-
-
-@lru_cache(maxsize=64)
-def follower(baseline: str, assets: int, window_s: float) -> Follower:
-    """Return the follower of a baseline's file; machines are made once per process."""
-    return Follower(Baseline.load(baseline).shared(assets), window_s)
 
 
 def columns_of(baseline: Baseline, columns: Columns | None) -> Columns:
