@@ -223,8 +223,9 @@ class Follower:
             diagnosis, trace = examine(self.baseline, recording)
         except ServoscopeError as error:
             return {"error": str(error).removeprefix("window: ")}
-        said = json.loads(diagnosis.model_dump_json(exclude={"recording"}))
-        return {"diagnosis": said, "evidence": asdict(evidence_of(self.baseline, trace))}
+        evidence = json.dumps(asdict(evidence_of(self.baseline, trace)))
+        said = diagnosis.model_dump_json(exclude={"recording"})
+        return {"diagnosis": json.loads(said), "evidence": json.loads(evidence)}
 
     def _nothing(self) -> Evaluated:
         n = len(self.baseline.names)
