@@ -200,7 +200,7 @@ class Killer(Examine):
 
 
 def test_a_task_that_kills_its_process_costs_itself_only(lake: Path) -> None:
-    tasks = [Killer(item, None, "", 1, None, 1.0, None) for item in Lake.open(str(lake)).items]
+    tasks = [Killer(item, None, "", 1, None, 1.0, None) for item in Lake.open(str(lake)).items[2:5]]
     found = {task.key: result["status"] for task, result in local(2)(tasks)}
     assert found == {task.key: "failed" if task.item.asset == lakes.ILL else "examined" for task in tasks}
 

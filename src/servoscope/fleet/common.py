@@ -3,9 +3,10 @@
 Each member a of a group brings evidence on the sizes of its faults, score y_a and information J_a (`evidence`): a
 change s of the logarithm of parameter f is exp(s y_af - s^2 J_aff / 2) times as likely as none. Two hypotheses:
 
-    each for itself   a member is healthy with probability 1 - pi, or has one fault, f ~ uniform, s ~ N(0, tau^2)
-    common            one f and one s ~ N(0, tau^2) for all; the size of a member is N(s, (kappa s)^2); and besides that
-                      each may have a fault of its own, as above
+    common            one f and one s ~ N(0, tau^2) for all; the size of a member is N(s, (kappa s)^2); besides that
+                      each has a fault of its own with probability pi, of any f and s ~ N(0, tau^2)
+    each for itself   the same with s ~ N(0, delta^2) and delta small: baselines that were learned together err
+                      together, and a warm day moves all; what is that small is no cause
 
 Their marginal likelihoods are integrals over one s, done by quadrature: no optimum, no asymptotics. A group whose
 common cause is accepted is explained; its members do not count for another group, such as the site they belong to.
@@ -26,7 +27,8 @@ __all__ = ["PRIOR", "Cause", "Prior", "causes", "individual"]
 
 ACCEPTED = 0.95  # probability from which a common cause is named and its members are explained
 FEWEST = 3  # members of a group: two may coincide
-SIZES = np.concatenate([-np.geomspace(2.5, 1e-3, 600), np.geomspace(1e-3, 2.5, 600)])  # of log ratios, for quadrature
+HALF = np.geomspace(1e-5, 2.5, 700)
+SIZES = np.concatenate([-HALF[::-1], [0.0], HALF])  # of logarithms of ratios, for quadrature
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,15 @@ class Prior:
         tau: standard deviation of the logarithm of a parameter's ratio under a fault.
     scatter
         kappa: relative scatter of a common change among members.
+    drift
+        delta: standard deviation of the logarithm of a ratio that members share without a cause.
     """
 
     fault: float = 0.02
     common: float = 0.01
     size: float = 0.3
     scatter: float = 0.15
+    drift: float = 0.01
 
 
 PRIOR = Prior()
@@ -139,14 +144,12 @@ def _judged(key: str, group: str, assets: list[str], evidence: list[Evidence], p
     if not names:
         return -np.inf, Cause(key, group, tuple(assets), (0.0,) * len(assets), 0.0, "", 0.0, 1.0, (1.0, 1.0))
     arrays = [_arrays(evidence[i]) for i in alike]
-    apart = sum(_member(*each, prior) for each in arrays)
     each = [_common(*one, prior) for one in arrays]
     together = np.sum([np.logaddexp(*both) for both in each], axis=0)  # log-likelihood of (f, s), shape (m, sizes)
-    step = np.gradient(SIZES) / (prior.size * np.sqrt(2.0 * np.pi))
-    posterior = together - 0.5 * (SIZES / prior.size) ** 2 + np.log(step)
+    posterior = together + _log_prior(prior.size)
     by_parameter = _log_sum(posterior)
-    evident = _log_sum(by_parameter)
-    odds = np.log(prior.common) - np.log1p(-prior.common) + evident - np.log(len(names)) - apart
+    evident, apart = _log_sum(by_parameter), _log_sum(_log_sum(together + _log_prior(prior.drift)))
+    odds = np.log(prior.common) - np.log1p(-prior.common) + evident - apart
     best = int(np.argmax(by_parameter))
     share = np.cumsum(np.exp(posterior[best] - by_parameter[best]))
     low, median, high = (float(np.exp(np.interp(q, share, SIZES))) for q in (0.025, 0.5, 0.975))
@@ -171,10 +174,10 @@ def _own(score: FloatArray, information: FloatArray, size: float) -> FloatArray:
     return np.asarray(-0.5 * np.log1p(size**2 * J) + 0.5 * score**2 * size**2 / (1.0 + size**2 * J))
 
 
-def _member(score: FloatArray, information: FloatArray, prior: Prior) -> float:
-    """Return the log marginal likelihood of a member by itself, over healthy."""
-    own = np.log(prior.fault) + _log_mean(_own(score, information, prior.size))
-    return float(np.logaddexp(np.log1p(-prior.fault), own))
+def _log_prior(size: float) -> FloatArray:
+    """Return the log probability of each point of the quadrature under N(0, size^2)."""
+    log = np.log(np.gradient(SIZES)) - 0.5 * (SIZES / size) ** 2
+    return np.asarray(log - _log_sum(log))
 
 
 def _common(score: FloatArray, information: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
