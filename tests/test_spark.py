@@ -150,7 +150,7 @@ def day_of(lake: Path, asset: str, day: int) -> pa.Table:
 
 def the_next_day(folder: Path) -> None:
     """Let one row come that ends all days before."""
-    at = pa.array([datetime.datetime(2026, 11, 3)], pa.timestamp("us"))
+    at = pa.array([datetime.datetime(2026, 11, 3, 0, 1)], pa.timestamp("us"))
     put(folder, "next", "P0", pa.table({"t": at, "r": [0.0], "u": [0.0], "y": [0.0]}), 99)
 
 
