@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from servoscope.simulation import FaultEvent
 
 __all__ = [
+    "Engines",
     "Rigs",
     "Source",
     "check_length",
@@ -36,6 +37,13 @@ __all__ = [
 ]
 
 MOST_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
+
+
+class Engines(StrEnum):
+    """What carries the work of ``fleet``."""
+
+    local = "local"
+    spark = "spark"
 
 
 class Rigs(StrEnum):

@@ -1,0 +1,143 @@
+"""Where a stream comes from and where its results go: sources by configuration, batches written once, the report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from servoscope.errors import RecordingError, ServoscopeError
+from servoscope.fleet.common import PRIOR, Prior
+from servoscope.fleet.knowledge import Fleet, known
+from servoscope.fleet.pages import write_knowledge
+from servoscope.fleet.rows import names_of
+from servoscope.fleet.streaming import SCHEMA
+from servoscope.loop import Columns
+
+if TYPE_CHECKING:
+    from pyspark.sql import DataFrame, SparkSession
+    from pyspark.sql.streaming import StreamingQuery
+
+__all__ = ["files", "kafka", "report", "results", "start", "wait"]
+
+
+def files(session: SparkSession, folder: str, columns: Columns, options: Mapping[str, str] | None = None) -> DataFrame:
+    """Return a stream of the Parquet files that come into a folder, as they come.
+
+    The first file says which columns there are; ``asset=...`` in the names of folders is a column too.
+
+    Raises
+    ------
+    RecordingError
+        If there is no file yet, or it lacks a column.
+    """
+    from pyspark.errors import AnalysisException
+
+    try:
+        # names of assets such as 007 are no numbers
+        session.conf.set("spark.sql.sources.partitionColumnTypeInference.enabled", "false")
+        schema = session.read.parquet(folder).schema
+    except AnalysisException as error:
+        raise RecordingError(f"{folder}: holds no Parquet file yet ({str(error).splitlines()[0][:100]})") from None
+    names_of(columns, schema.names, folder)
+    return session.readStream.schema(schema).options(**(options or {})).parquet(folder)
+
+
+def kafka(session: SparkSession, _: str, columns: Columns, options: Mapping[str, str]) -> DataFrame:
+    """Return a stream of JSON objects from Kafka, with ``asset``, a time in seconds since 1970, and the signals.
+
+    Parameters
+    ----------
+    session
+        With Spark's package for Kafka.
+    columns
+        Where the signals stand; each is one column of its own, not a sum.
+    options
+        Of Spark's source, such as ``kafka.bootstrap.servers`` and ``subscribe``.
+    """
+    from pyspark.sql import functions as F
+
+    names = [columns.time or "t", columns.reference, columns.input, columns.output]
+    schema = ", ".join(["asset string", *(f"`{name.strip('`')}` double" for name in names)])
+    raw = session.readStream.format("kafka").options(**options).load()
+    return raw.select(F.from_json(raw["value"].cast("string"), schema).alias("row")).select("row.*")
+
+
+def start(
+    followed: DataFrame, output: str | Path, *, checkpoint: str | Path | None = None, every_s: float | None = 60.0
+) -> StreamingQuery:
+    """Start a stream whose results are Parquet, each micro-batch in a folder of its own, `results` / batch=N.
+
+    A batch that is done again after a crash replaces its folder with the same content: nothing is lost or doubled.
+
+    Parameters
+    ----------
+    followed
+        What `follow` returned.
+    output
+        Folder or URL for results.
+    checkpoint
+        Folder or URL for checkpoints; None: beside the results.
+    every_s
+        Seconds between micro-batches; None: what there is is done, and the stream ends.
+    """
+
+    def write(batch: DataFrame, number: int) -> None:
+        folder = f"{output}/results/batch={number:09d}"
+        batch.write.mode("overwrite").partitionBy("kind").parquet(folder)
+
+    writer = followed.writeStream.foreachBatch(write).outputMode("append")
+    writer = writer.option("checkpointLocation", str(checkpoint or f"{output}/checkpoint"))
+    trigger: dict[str, Any] = {"availableNow": True} if every_s is None else {"processingTime": f"{every_s:g} seconds"}
+    return writer.trigger(**trigger).start()
+
+
+def results(session: SparkSession, output: str | Path) -> DataFrame:
+    """Return all results that a stream has written."""
+    return (
+        session.read.schema(f"{SCHEMA}, batch long")
+        .option("basePath", f"{output}/results")
+        .parquet(f"{output}/results/batch=*")
+    )
+
+
+def wait(query: StreamingQuery) -> None:
+    """Wait for the end of a stream; interrupting it is one.
+
+    Raises
+    ------
+    ServoscopeError
+        If it failed.
+    """
+    from pyspark.errors import StreamingQueryException
+
+    try:
+        query.awaitTermination()
+    except KeyboardInterrupt:
+        query.stop()
+    except StreamingQueryException as error:
+        raise ServoscopeError(f"the stream stopped: {' '.join(str(error).split())[:300]}") from None
+
+
+def report(
+    session: SparkSession,
+    output: Path,
+    groups: Mapping[str, Mapping[str, str]],
+    lake: str,
+    prior: Prior = PRIOR,
+) -> Fleet:
+    """Write fleet.json and report.html from what a stream has found, and return it.
+
+    Raises
+    ------
+    OutputError
+        If they cannot be written.
+    """
+    found = results(session, output)
+    entries = [json.loads(row.result) for row in found.where("kind = 'item'").select("result").collect()]
+    counted = found.where("kind = 'late'").groupBy("asset").sum("late").collect()
+    late = {asset: int(count) for asset, count in counted}
+    fleet = known(sorted(entries, key=lambda entry: (entry["asset"], entry["day"])), groups, {}, prior, late)
+    write_knowledge(output, fleet, lake)
+    return fleet

@@ -1,0 +1,172 @@
+"""Spark carries the work: tasks on executors that read the lake themselves, and DataFrames of rows, keyed by asset."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from servoscope.baseline import Baseline
+from servoscope.errors import ServoscopeError
+from servoscope.fleet.baselines import Baselines
+from servoscope.fleet.following import WINDOW
+from servoscope.fleet.local import Engine, Result, Task, died
+from servoscope.fleet.passing import examined_days
+from servoscope.fleet.rows import names_of
+from servoscope.fleet.tables import KINDS, row
+from servoscope.loop import Columns
+
+if TYPE_CHECKING:
+    from pyspark.sql import DataFrame, SparkSession
+
+__all__ = ["diagnose", "session", "spark"]
+
+WAVE = 8  # tasks per core that are handed out at once; their results are on disk before the next ones begin
+
+
+def session(master: str | None = None, **settings: str) -> SparkSession:
+    """Return the session that there is, or start one.
+
+    Parameters
+    ----------
+    master
+        Such as ``local[2]`` or ``spark://host:7077``; None: what the environment says.
+    settings
+        Of Spark, with ``__`` for dots.
+
+    Raises
+    ------
+    ServoscopeError
+        If PySpark is not installed, or there is no Java.
+    """
+    os.environ.setdefault("PYSPARK_PYTHON", sys.executable)  # or workers run another Python than this
+    try:
+        from pyspark.errors import PySparkException
+        from pyspark.sql import SparkSession
+    except ImportError:
+        raise ServoscopeError("Spark needs the extra: pip install 'servoscope[spark]', and Java 17") from None
+    builder = SparkSession.builder.appName("servoscope")
+    if master is not None:
+        builder = builder.master(master)
+    # times of day are UTC everywhere; one thread of linear algebra per worker, as on one machine
+    fixed = {"spark__sql__session__timeZone": "UTC", "spark__executorEnv__OPENBLAS_NUM_THREADS": "1"}
+    for key, value in (fixed | settings).items():
+        builder = builder.config(key.replace("__", "."), value)
+    try:
+        return builder.getOrCreate()
+    except (PySparkException, FileNotFoundError) as error:
+        raise ServoscopeError(
+            f"Spark does not start, is there a Java 17? ({' '.join(str(error).split())[:120]})"
+        ) from None
+
+
+def spark(found: SparkSession) -> Engine:
+    """Return the engine whose tasks run on a cluster; each is one task of Spark, which tries it again elsewhere.
+
+    The lake and the output folder must be where all executors see them; rows do not pass through Spark.
+    """
+
+    def run(tasks: Sequence[Task]) -> Iterator[Result]:
+        step = max(1, WAVE * found.sparkContext.defaultParallelism)
+        for i in range(0, len(tasks), step):
+            wave = tasks[i : i + step]
+            try:
+                yield from zip(wave, _results(found, wave), strict=True)
+            except Exception as error:
+                if not _lost(error):
+                    raise
+                for task in wave:  # one of them kills its executor: alone, it takes no other with it
+                    yield task, _alone(found, task)
+
+    return run
+
+
+def _results(found: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]]:
+    import pyarrow as pa
+
+    def work(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+        for batch in batches:
+            for i in batch.column(0).to_pylist():
+                yield pa.RecordBatch.from_pydict({"i": [i], "result": [json.dumps(wave[i].run())]})
+
+    done = found.range(0, len(wave), 1, len(wave)).mapInArrow(work, "i long, result string").collect()
+    return [json.loads(each.result) for each in sorted(done, key=lambda each: each.i)]
+
+
+def _alone(found: SparkSession, task: Task) -> dict[str, Any]:
+    try:
+        return _results(found, [task])[0]
+    except Exception as error:
+        if not _lost(error):
+            raise
+        return died(task)
+
+
+def _lost(error: Exception) -> bool:
+    """Return whether a task of Spark failed as often as it may, and not Spark itself."""
+    return "stage failure" in str(error)
+
+
+def diagnose(
+    frame: DataFrame,
+    baselines: Baseline | Mapping[str, Baseline] | str | Path,
+    *,
+    columns: Columns | None = None,
+    by: str = "asset",
+    assets: int | None = None,
+    window_s: float = WINDOW,
+) -> DataFrame:
+    """Follow and diagnose every asset's day in a DataFrame of rows; bit for bit what the local engine finds.
+
+    Rows are shuffled by asset, sorted by time, and pass through the workers in Arrow batches of any size, with a window
+    of them in memory.
+
+    Parameters
+    ----------
+    frame
+        With the columns ``asset``, those of the signals, and, if wanted, ``day``; without it a day is that of UTC.
+    baselines
+        One for all, one by asset, or a folder with NAME.json that all workers see.
+    columns
+        Where the signals stand; None: where the baseline's loop says.
+    by
+        Column whose value names the baseline.
+    assets
+        How many assets share the budget of false alarms; None: as many as there are in the frame.
+    window_s
+        Seconds of raw rows that a diagnosis sees.
+
+    Returns
+    -------
+    pyspark.sql.DataFrame
+        One row per asset and day: the columns of diagnoses.parquet, with ``result`` as JSON.
+
+    Raises
+    ------
+    RecordingError, LoopError
+        If a column is missing.
+    BaselineError
+        If there is no baseline.
+    """
+    import pyarrow as pa
+
+    count = assets if assets is not None else frame.select("asset").distinct().count()
+    known = Baselines.of(baselines, max(count, 1), window_s)
+    mapping = columns if columns is not None else known.any().loop.columns
+    signals = names_of(mapping, frame.columns, "the DataFrame")
+    keys = list(dict.fromkeys(["asset", by, *(["day"] if "day" in frame.columns else [])]))
+    rows = frame.select(*(frame[key].cast("string") for key in keys), *(name for name in signals if name not in keys))
+    rows = rows.where(rows[signals[0]].isNotNull())
+    order = [*keys, signals[0]]
+
+    def work(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+        kinds = {"string": pa.string(), "double": pa.float64(), "long": pa.int64()}
+        schema = pa.schema([(name, kinds[kind]) for name, kind in KINDS.items()])
+        for entry in examined_days(batches, keys, by, mapping, known.follower):
+            yield pa.RecordBatch.from_pylist([row(entry)], schema)
+
+    sorted_rows = rows.repartition("asset").sortWithinPartitions(*order)
+    return sorted_rows.mapInArrow(work, ", ".join(f"{name} {kind}" for name, kind in KINDS.items()))
