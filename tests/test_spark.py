@@ -32,9 +32,8 @@ from servoscope.fleet.lake import Lake
 from servoscope.fleet.local import local
 from servoscope.fleet.tasks import Examine
 
-pytest.importorskip("pyspark", reason="PySpark is not installed: pip install 'servoscope[spark]'")
-if shutil.which("java") is None:
-    pytest.skip("there is no Java: scripts/install-test-servers installs it", allow_module_level=True)
+# one session for all of them, so one process of the test runner
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("spark")]
 
 SOURCES = str(Path(fleet.__file__).parents[2])
 MASTER = "local[1,2]"  # one core; a task may fail once
@@ -57,6 +56,9 @@ BATCH += ("spark.sql.execution.arrow.transformWithStateInPandas.maxRecordsPerBat
 
 @pytest.fixture(scope="module")
 def session() -> Iterator[Any]:
+    pytest.importorskip("pyspark", reason="PySpark is not installed: pip install 'servoscope[spark]'")
+    if shutil.which("java") is None:
+        pytest.skip("there is no Java: scripts/install-test-servers installs it")
     os.environ["PYTHONPATH"] = os.pathsep.join([SOURCES, str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     found = engines.session(MASTER, **{key.replace(".", "__"): value for key, value in SMALL.items()})
     yield found
@@ -162,7 +164,7 @@ def followed(session: Any, plan: Plan, folder: Path, output: Path) -> None:
         try:
             return sinks.wait(sinks.start(stream, output, every_s=None))
         except ServoscopeError as error:
-            # Spark gives a new Python ten seconds to start, which a busy machine may not; the stream goes on where it was
+            # Spark gives a new Python ten seconds to start; on a busy machine that may take another try
             if "failed to connect back" not in str(error) or not left:
                 raise
 
