@@ -19,7 +19,7 @@ demo: $(STAMP)  ## simulate a rig, break it, diagnose it; the report goes to dem
 	$(BIN)/servoscope demo -o demo-output
 
 test: lint      ## everything that must pass: format, lint, types, tests (REQUIRE_ALL=1: no test may skip)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 lint: $(STAMP)  ## format, lint and types, without changing a file
 	$(BIN)/python -m ruff format --check $(CODE)

@@ -29,6 +29,8 @@ from servoscope.loop import Columns
 from servoscope.monitor import diagnose
 from servoscope.recording import Recording
 
+pytestmark = pytest.mark.xdist_group("lake")  # its fixtures are made once
+
 
 @pytest.fixture(scope="module")
 def lake(tmp_path_factory: pytest.TempPathFactory) -> Path:

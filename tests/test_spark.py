@@ -24,6 +24,7 @@ import pytest
 
 import lakes
 from servoscope import fleet
+from servoscope.errors import ServoscopeError
 from servoscope.fleet import Plan, sinks, streaming
 from servoscope.fleet import spark as engines
 from servoscope.fleet.baselines import Baselines
@@ -31,9 +32,8 @@ from servoscope.fleet.lake import Lake
 from servoscope.fleet.local import local
 from servoscope.fleet.tasks import Examine
 
-pytest.importorskip("pyspark", reason="PySpark is not installed: pip install 'servoscope[spark]'")
-if shutil.which("java") is None:
-    pytest.skip("there is no Java: scripts/install-test-servers installs it", allow_module_level=True)
+# one session for all of them, so one process of the test runner
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("spark")]
 
 SOURCES = str(Path(fleet.__file__).parents[2])
 MASTER = "local[1,2]"  # one core; a task may fail once
@@ -56,6 +56,9 @@ BATCH += ("spark.sql.execution.arrow.transformWithStateInPandas.maxRecordsPerBat
 
 @pytest.fixture(scope="module")
 def session() -> Iterator[Any]:
+    pytest.importorskip("pyspark", reason="PySpark is not installed: pip install 'servoscope[spark]'")
+    if shutil.which("java") is None:
+        pytest.skip("there is no Java: scripts/install-test-servers installs it")
     os.environ["PYTHONPATH"] = os.pathsep.join([SOURCES, str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     found = engines.session(MASTER, **{key.replace(".", "__"): value for key, value in SMALL.items()})
     yield found
@@ -154,10 +157,16 @@ def the_next_day(folder: Path) -> None:
     put(folder, "next", "P0", pa.table({"t": at, "r": [0.0], "u": [0.0], "y": [0.0]}), 99)
 
 
-def followed(session: Any, plan: Plan, folder: Path, output: Path, files: int = 100) -> None:
-    frame = sinks.files(session, str(folder), lakes.loop().columns, {"maxFilesPerTrigger": str(files)})
+def followed(session: Any, plan: Plan, folder: Path, output: Path) -> None:
+    frame = sinks.files(session, str(folder), lakes.loop().columns)
     stream = streaming.follow(frame, plan.output / "baselines", assets=4, by="supply")
-    sinks.wait(sinks.start(stream, output, every_s=None))
+    for left in (2, 1, 0):
+        try:
+            return sinks.wait(sinks.start(stream, output, every_s=None))
+        except ServoscopeError as error:
+            # Spark gives a new Python ten seconds to start; on a busy machine that may take another try
+            if "failed to connect back" not in str(error) or not left:
+                raise
 
 
 def items_of(session: Any, output: Path) -> dict[tuple[str, str], dict[str, Any]]:
@@ -231,20 +240,21 @@ def test_a_killed_driver_goes_on_from_its_checkpoint_and_late_rows_are_counted(
     ]
     settings = SMALL | {key: "7" for key in BATCH}
     submit = " ".join(f"--conf '{key}={value}'" for key, value in settings.items()) + " pyspark-shell"
-    driver = subprocess.Popen(
-        [sys.executable, "-m", "servoscope", *words],
-        env={**os.environ, "PYSPARK_SUBMIT_ARGS": submit, "PYTHONPATH": os.environ["PYTHONPATH"]},
-        start_new_session=True,
-        stderr=subprocess.DEVNULL,
-    )
-    until = time.monotonic() + 240.0
-    while time.monotonic() < until and driver.poll() is None:
-        if (tmp_path / "out" / "results" / "batch=000000001" / "_SUCCESS").exists():
+    for _ in range(3):  # as above: a busy machine may need another try
+        driver = subprocess.Popen(
+            [sys.executable, "-m", "servoscope", *words],
+            env={**os.environ, "PYSPARK_SUBMIT_ARGS": submit},
+            start_new_session=True,
+            stderr=subprocess.DEVNULL,
+        )
+        half_way = tmp_path / "out" / "results" / "batch=000000001" / "_SUCCESS"
+        while driver.poll() is None and not half_way.exists():
+            time.sleep(0.02)
+        if driver.poll() is None:
             break
-        time.sleep(0.02)
-    assert driver.poll() is None
     os.killpg(driver.pid, signal.SIGKILL)
     driver.wait()
+    assert half_way.exists() and not items_of(session, tmp_path / "out")
 
     set_batches(session, 10_000)
     session.conf.set("spark.sql.shuffle.partitions", "3")  # the checkpoint's number stays

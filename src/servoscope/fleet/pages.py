@@ -56,7 +56,8 @@ def _header(fleet: Fleet, lake: str) -> str:
 
 def _verdict(fleet: Fleet, kind: str) -> str:
     title, icon = KINDS[kind]
-    facts = [(state, fleet.count(state)) for state in ("healthy", "fault", COMMON, "undetermined", FAILED)]
+    states = ("healthy", "fault", COMMON, "undetermined", FAILED)
+    facts = [(state, n) for state in states if (n := fleet.count(state)) or state == "healthy"]
     lines = (
         '<div class="verdict">',
         f'<p class="kind"><svg viewBox="0 0 24 24" aria-hidden="true">{icon}</svg>{title}</p>',
@@ -216,4 +217,6 @@ def _time(t_us: int | None) -> str:
     if t_us is None:
         return DASH
     seconds = t_us / MICRO
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S}" if seconds > LEAST else clock_time(seconds)
+    return (
+        f"{datetime.fromtimestamp(round(seconds), UTC):%Y-%m-%d %H:%M:%S}" if seconds > LEAST else clock_time(seconds)
+    )
