@@ -15,15 +15,16 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from reliability.servers import Postgres, programs
 
 import halls
 from carrying import Carrier
 from halls import RESULTS, asked, hall
-from reliability.servers import Postgres, programs
 from servoscope.errors import StoreError
 from servoscope.live.assembling import assemble
 from servoscope.live.config import Config
@@ -195,6 +196,38 @@ def test_one_store_has_one_writer(folder: Path) -> None:
         assemble(Config.load(folder / "claimed.toml"))
     first.store.close()
     assemble(Config.load(folder / "claimed.toml")).store.close()
+
+
+def test_a_webhook_is_told_once_and_after_a_restart(folder: Path) -> None:
+    heard: list[tuple[str, dict[str, object]]] = []
+
+    class Desk(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            heard.append((self.headers["Idempotency-Key"], json.loads(body)))
+            self.send_response(503 if len(heard) == 1 else 204)  # it has to be asked twice
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    desk = HTTPServer(("127.0.0.1", 0), Desk)
+    threading.Thread(target=desk.serve_forever, daemon=True).start()
+    try:
+        url = f"http://127.0.0.1:{desk.server_address[1]}"
+        more = f'[actions.retry]\nfirst_s = 0.1\n[actions.webhook.desk]\nurl = "{url}"'
+        config = hall(folder, "hook", more=more)
+        service_of(config).run()  # it ends while the second try is not due, perhaps
+        deadline = time.monotonic() + 30.0
+        while asked(config, "SELECT 1 FROM outbox WHERE due IS NOT NULL") and time.monotonic() < deadline:
+            service_of(config).run()
+        ((key, first), (again, event)) = heard
+        assert key == again and first == event
+        assert (event["asset"], event["alarm"], event["after"]) == ("press", "fault", "unacknowledged")
+        assert asked(config, "SELECT key, attempts, outcome FROM outbox") == [(key, 2, "answered 204")]
+    finally:
+        desk.shutdown()
+        desk.server_close()
 
 
 def test_health_and_metrics(folder: Path) -> None:

@@ -62,7 +62,7 @@ def check(fleet: Fleet, config: Path, compared: list[str]) -> Found:
         rows += len(numbers)
         misnumbered += len(set(range(1, counted["rows"] + 1)).symmetric_difference(numbers))
         misnumbered += len(numbers) - len(set(numbers))
-    calm = fleet.config("calm", "calm.sqlite", "", compared, speed=0.0)
+    calm = fleet.config("calm", "calm.sqlite", "", compared, 0.0)
     settings = Config.load(calm)
     Service(settings, assemble(settings)).run()
     again = opened(calm)

@@ -16,8 +16,7 @@ from servoscope.simulation import FaultEvent, reference, simulate
 LOOP = Path(__file__).parents[2] / "src/servoscope/examples/reference-rig.toml"
 MINUTES = 10  # of each recording
 LEAKS_AT = 300  # s into the recording with a fault
-SPEED = 60.0  # times as fast as measured
-BLOCK_S = 30.0  # at that speed as many blocks per second as 120 assets deliver that send one each second
+BLOCK_S = 30.0  # of a block: of 200 assets, 40 times as fast, 267 come per second
 HEALTHY = 4  # different recordings
 
 
@@ -29,13 +28,14 @@ class Fleet:
     ----------
     folder
         Where its recordings and service files are.
-    assets, hours
-        How many, for how long (simulated).
+    assets, hours, speed
+        How many, for how long (simulated), at how many times the true speed.
     """
 
     folder: Path
     assets: int
     hours: float
+    speed: float
 
     @property
     def rounds(self) -> int:
@@ -67,7 +67,7 @@ class Fleet:
         writers.write(self.folder / "leaky.csv", simulate(loop, r, faults=leak, seed=HEALTHY)[0])
         nominal(loop).save(self.folder / "baseline.json")
 
-    def config(self, name: str, store: str, listen: str, assets: list[str], *, speed: float = SPEED) -> Path:
+    def config(self, name: str, store: str, listen: str, assets: list[str], speed: float) -> Path:
         """Write a service file."""
         lines = [
             'name = "fleet"',

@@ -1,6 +1,6 @@
 """Let the service run through a day of 200 assets in minutes, disturb it, and write docs/reliability.md.
 
-    python benchmarks/reliability/run.py [sqlite|postgresql ...] [--hours 24] [--assets 200] [--render]
+    python benchmarks/reliability/run.py [sqlite|postgresql ...] [--hours 24] [--assets 200] [--speed 40] [--render]
 
 Everything is on this machine: the full disk is a file system in memory, and the database a server of its own, on
 loopback. --render writes the tables from the results that are there; together with names, after running them.
@@ -13,6 +13,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -30,7 +31,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from tables import machine  # noqa: E402
 
 from reliability.checks import check  # noqa: E402
-from reliability.fleet import BLOCK_S, SPEED, Fleet  # noqa: E402
+from reliability.fleet import BLOCK_S, Fleet  # noqa: E402
 from reliability.servers import Postgres, programs  # noqa: E402
 from reliability.trial import Disturbance, Measured, Trial, quantile  # noqa: E402
 from servoscope.live import logs  # noqa: E402
@@ -46,24 +47,24 @@ FULL_DAY = 24.0 * 200
 DISK_MB = 512
 
 
-def trial(name: str, hours: float, assets: int, every_s: float, seed: int = 1) -> dict[str, Any]:
-    """Run one trial and return what was measured, ready for JSON."""
+def trial(name: str, fleet_of: tuple[int, float, float], every_s: float, seed: int = 1) -> dict[str, Any]:
+    """Run one trial, of so many assets, hours and times the true speed; return what was measured, ready for JSON."""
     with workplace() as (folder, disk):
-        fleet = Fleet(folder, assets, hours)
+        fleet = Fleet(folder, *fleet_of)
         fleet.make()
         port = free_port()
         blocks = sum(blocks for blocks, *_ in fleet.expected().values())
         with database(name, disk) as (url, disturbances):
-            config = fleet.config("fleet", url, f"127.0.0.1:{port}", fleet.names)
+            config = fleet.config("fleet", url, f"127.0.0.1:{port}", fleet.names, fleet.speed)
             measured = Trial(config, port, disturbances, every_s, CALM, blocks, seed).run()
-            compared = fleet.names[:: max(1, assets // COMPARED)]
+            compared = fleet.names[:: max(1, fleet.assets // COMPARED)]
             found = check(fleet, config, compared)
     return {"name": name, "machine": machine(), "settings": settings_of(fleet, seed), **told(measured), **asdict(found)}
 
 
 def settings_of(fleet: Fleet, seed: int) -> dict[str, Any]:
     """Return what a trial was made with."""
-    return {"hours": fleet.hours, "assets": fleet.assets, "speed": SPEED, "block_s": BLOCK_S, "seed": seed}
+    return {"hours": fleet.hours, "assets": fleet.assets, "speed": fleet.speed, "block_s": BLOCK_S, "seed": seed}
 
 
 def told(measured: Measured) -> dict[str, Any]:
@@ -214,15 +215,17 @@ def main() -> None:
     command.add_argument("names", nargs="*", metavar="NAME", help=f"trials: {', '.join(TRIALS)}; default: all")
     command.add_argument("--hours", type=float, default=24.0, help="simulated hours")
     command.add_argument("--assets", type=int, default=200, help="assets")
+    command.add_argument("--speed", type=float, default=40.0, help="times true speed")
     command.add_argument("--every", type=float, default=EVERY_S, help="mean time between disturbances, in s")
     command.add_argument("--render", action="store_true", help="write docs/reliability.md from the results")
     given = command.parse_args()
     if strange := set(given.names) - set(TRIALS):
         command.error(f"{min(strange)}: no such trial, choose from {', '.join(TRIALS)}")
     logs.set_up("error")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # disks are unmounted and servers stopped then
     if given.names or not given.render:
         for name in given.names or TRIALS:
-            found = trial(name, given.hours, given.assets, given.every)
+            found = trial(name, (given.assets, given.hours, given.speed), given.every)
             RESULTS.mkdir(exist_ok=True)
             atomic_write(RESULTS / f"{name}.json", (json.dumps(found, indent=1) + "\n").encode())
             print(json.dumps(found, indent=1))

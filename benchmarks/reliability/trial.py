@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import random
@@ -70,7 +71,7 @@ class Trial:
     port
         Where it answers.
     disturbances
-        One of them happens at a time, by chance.
+        They happen in turns, at moments by chance.
     every_s
         Mean time between them; there are none in the last part.
     calm_share
@@ -102,17 +103,25 @@ class Trial:
         """Run; the service ends by itself when its recordings have ended."""
         begun = time.monotonic()
         self._start()
-        quiet_from, due = begun + CALM_S, begun + self._wait()
+        try:
+            self._follow(begun)
+        finally:
+            self._process.kill()
+            self._process.wait()
+            self._log.close()
+        self.measured.seconds = time.monotonic() - begun
+        return self.measured
+
+    def _follow(self, begun: float) -> None:
+        """Look at it, and disturb it, until it has ended."""
+        quiet_from, due, turns = begun + CALM_S, begun + self._wait(), itertools.cycle(self._disturbances)
         while self._alive():
             time.sleep(0.25)
             now = time.monotonic()
             counted = self._look(calm=now > quiet_from)
-            if self._disturbances and now > due and counted < self._calm:
-                self._disturb(self._chance.choice(self._disturbances))
+            if self._disturbances and now > due and 0.0 < counted < self._calm:
+                self._disturb(next(turns))
                 quiet_from, due = time.monotonic() + CALM_S, time.monotonic() + self._wait()
-        self.measured.seconds = time.monotonic() - begun
-        self._log.close()
-        return self.measured
 
     def _wait(self) -> float:
         return self._chance.uniform(0.5, 1.5) * self._every

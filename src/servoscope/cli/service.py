@@ -93,20 +93,18 @@ def watch(
     """Show assets as they are now: verdict, since when, residuals, alarms; read from the store."""
     from servoscope.cli import terminal, watching
 
-    opened = open_store(store)
-    if once or as_json:
-        found = opened.statuses(asset)
-        if as_json:
-            print_json(list(found.values()), lines=False)
-        else:
-            terminal.console().print(watching.assets(found))
-        return
-    from rich.live import Live
+    opened, out = open_store(store), terminal.console()
+    if as_json:
+        print_json(list(opened.statuses(asset).values()), lines=False)
+    elif once:
+        out.print(watching.page(opened.statuses(asset), out.width))
+    else:
+        from rich.live import Live
 
-    with Live(watching.assets(opened.statuses(asset)), console=terminal.console(), auto_refresh=False) as live:
-        while True:
-            time.sleep(every)
-            live.update(watching.assets(opened.statuses(asset)), refresh=True)
+        with Live(console=out, auto_refresh=False) as live:
+            while True:
+                live.update(watching.page(opened.statuses(asset), out.width), refresh=True)
+                time.sleep(every)
 
 
 @app.command()

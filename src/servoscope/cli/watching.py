@@ -8,12 +8,15 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from servoscope.cli.terminal import COLOURS, span
 
-__all__ = ["alarm_rows", "assets", "rows"]
+__all__ = ["alarm_rows", "page", "rows"]
+
+WIDE = 110  # columns of a terminal, and 9 for each frequency
 
 NE107 = {
     "good": "green",
@@ -29,43 +32,60 @@ def clock(t: float | None) -> str:
     return "-" if t is None else datetime.fromtimestamp(t, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def assets(statuses: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return a table of assets: verdict, since when, statistics over their limits, residuals, alarms."""
-    services = {name: row for name, row in statuses.items() if row["status"].get("service")}
-    followed = {name: row for name, row in statuses.items() if name not in services}
+def assets(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
+    """Return a table of assets: verdict, since when, residuals, alarms; on a wide terminal more of each."""
+    followed = {name: row for name, row in statuses.items() if not row["status"].get("service")}
     frequencies = sorted({f for row in followed.values() for f, *_ in row["status"].get("residual", ())})
+    wide = width >= WIDE + 9 * len(frequencies)
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("asset", "verdict", "since (UTC)", "T²/limit", "level"):
-        table.add_column(name, justify="right" if name in ("T²/limit", "level") else "left", no_wrap=name != "verdict")
+    for name in ("asset", "verdict", "since (UTC)", *(("T²/limit", "test") if wide else ())):
+        table.add_column(name, justify="right" if name in ("T²/limit", "test") else "left", no_wrap=True)
     for f in frequencies:
-        table.add_column(f"|γ|/|H| {f:g} Hz", justify="right")
-    for name in ("NE 107", "alarms", "last sample", "stored"):
-        table.add_column(name)
+        table.add_column(f"γ {f:g} Hz", justify="right", no_wrap=True)
+    table.add_column("alarms", overflow="fold")
+    for name in ("NE 107", "last sample", "stored") if wide else ():
+        table.add_column(name, no_wrap=True)
     now = time.time()
     for name, row in followed.items():
         status = row["status"]
         residual = {f: (real, imaginary, healthy) for f, real, imaginary, healthy in status.get("residual", ())}
+        tests = number(status.get("statistic")), number(status.get("level"))
+        ne107 = Text(status["ne107"].replace("_", " "), NE107.get(status["ne107"], ""))
+        more = ne107, clock(status["counted"]["t"]), f"{span(max(0.0, now - row['at']))} ago"
         table.add_row(
             name,
             Text(status["verdict"], COLOURS.get(status["verdict"], "")),
             clock(status["since"]),
-            number(status.get("statistic")),
-            number(status.get("level")),
+            *(tests if wide else ()),
             *(share(residual.get(f)) for f in frequencies),
-            Text(status["ne107"].replace("_", " "), NE107.get(status["ne107"], "")),
-            ", ".join(f"{alarm} {one['state'].replace('_', ' ')}" for alarm, one in status["alarms"].items()) or "-",
-            clock(status["counted"]["t"]),
-            f"{span(max(0.0, now - row['at']))} ago",
+            standing(status["alarms"]),
+            *(more if wide else ()),
         )
-    for name, row in services.items():
-        flood, alarms = row["status"]["flood"], row["status"]["alarms"]
-        told = [
-            f"{alarm} {one['state'].replace('_', ' ')}" for alarm, one in alarms.items() if one["state"] != "normal"
-        ]
-        told += [f"flood since {clock(flood['since'])}, {flood['held']} held"] if flood["since"] is not None else []
-        blanks = [""] * (len(table.columns) - 5)
-        table.add_row(Text(name, "dim"), Text("service", "dim"), *blanks, ", ".join(told) or "-", "", "")
     return table
+
+
+def services(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line for each service that has something to say of itself."""
+    lines = []
+    for name, row in statuses.items():
+        if not row["status"].get("service"):
+            continue
+        flood, alarms = row["status"]["flood"], standing(row["status"]["alarms"])
+        told = [alarms] if alarms != "-" else []
+        told += [f"flood since {clock(flood['since'])}, {flood['held']} held"] if flood["since"] is not None else []
+        lines += [f"{name}: {', '.join(told)}"] if told else []
+    return lines
+
+
+def page(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Group:
+    """Return all of it."""
+    return Group(assets(statuses, width), *services(statuses))
+
+
+def standing(alarms: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the alarms that are not normal."""
+    told = [f"{name} {one['state'].replace('_', ' ')}" for name, one in alarms.items() if one["state"] != "normal"]
+    return ", ".join(told) or "-"
 
 
 def number(value: float | None) -> str:

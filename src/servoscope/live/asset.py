@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from servoscope import quality
-from servoscope.alarms import AlarmSettings, Command, Snapshot, State, Transition, advance, start, status, step
+from servoscope.alarms import AlarmSettings, Command, Snapshot, Transition, advance, start, step
 from servoscope.baseline import Baseline
 from servoscope.errors import AlarmError, StateError
 from servoscope.live.arrival import arrive
@@ -18,9 +18,10 @@ from servoscope.live.block import Block
 from servoscope.live.checkpoint import Counted, Progress
 from servoscope.live.config import DiagnosisSettings
 from servoscope.live.examining import Examined, Told, examine
-from servoscope.live.judging import Judged, Window, judge
+from servoscope.live.judging import Judged, Window, judge, phase_of
 from servoscope.live.numbering import Place, place
 from servoscope.live.rows import Outcome, Row, transition_row
+from servoscope.live.showing import status_of
 from servoscope.live.thinning import gamma, thin
 from servoscope.monitor import Monitor
 
@@ -94,34 +95,13 @@ class Asset:
             counted=counted,
             monitor=self._monitor.init(),
             quality=quality.init(),
-            judged=Judged(due=counted.t + self.how.diagnosis.window_s, since=counted.t),
+            judged=Judged(due=counted.t + self.how.diagnosis.window_s * (1.0 + phase_of(self.name)), since=counted.t),
             alarms={name: start(self.name, name, counted.t) for name in self._definitions},
         )
 
     def status(self, progress: Progress) -> dict[str, Any]:
         """Return what people are shown of a progress, as plain values."""
-        judged, findings = progress.judged, quality.standing(progress.quality)
-        verdict = quality.judged(judged.verdict, findings)
-        alarms = [(self._definitions[name], state) for name, state in progress.alarms.items()]
-        ne107 = status(verdict, findings, alarms)
-        return {
-            "verdict": verdict,
-            "summary": judged.summary,
-            "since": judged.since,
-            "onset": judged.onset,
-            "faults": judged.faults,
-            "examined": judged.examined,
-            "ne107": ne107.ne107,
-            "reasons": list(ne107.reasons),
-            "quality": findings,
-            "alarms": {
-                name: {"state": state.state.value, "since": state.since, "priority": self._definitions[name].priority}
-                for name, state in progress.alarms.items()
-                if state.state is not State.NORMAL
-            },
-            **progress.shown,
-            "counted": asdict(progress.counted),
-        }
+        return status_of(progress, self._definitions)
 
     @property
     def keep(self) -> int:
@@ -129,10 +109,17 @@ class Asset:
         return self._window[0].sequence if self._window else self._now.counted.blocks
 
     def take(self, block: Block) -> Outcome:
-        """Process a block; one that was counted before leads to nothing."""
+        """Process a block; one that was counted before leads to nothing.
+
+        Raises
+        ------
+        RecordingError
+            If it is no block: empty, without time, or of signals of different lengths.
+        """
+        began = block.begins()
         found = place(self.progress.counted if self.progress is not None else None, block)
         if self.progress is None:
-            self.begin(Counted(float(block.t[0]), float(block.t[0]), stream=block.stream))
+            self.begin(Counted(began, began, stream=block.stream))
         counted, self._out = self._now.counted, Outcome([], [])
         if found is None:
             self.progress = replace(self._now, counted=replace(counted, repeated=counted.repeated + 1))
@@ -184,7 +171,9 @@ class Asset:
         """Return the full diagnoses whose windows are complete, or end here, with their samples."""
         if self.progress is None:
             return []
-        ready = [one for one in self.progress.windows if ended or self.progress.counted.t >= one.until]
+        t, after = self.progress.counted.t, self.how.diagnosis.after_s
+        # complete, or never to be: the clock was set back
+        ready = [one for one in self.progress.windows if ended or not one.until - after <= t < one.until]
         return [(one, [b for b in self._window if b.sequence >= one.first and b.t[0] < one.until]) for one in ready]
 
     def told(self, window: Window, said: Told) -> Outcome:
@@ -231,10 +220,12 @@ class Asset:
         thinned, rows = thin(progress.thinned, trace, block.t[arrival.used][at], self.how.residual_every_s)
         shown = progress.shown
         if at.size:
+            excess = np.nan_to_num(trace.statistic / trace.threshold)
             shown = {
                 "t": float(block.t[arrival.used][at[-1]]),
-                "statistic": float(np.nan_to_num(trace.statistic[-1] / trace.threshold)),
+                "statistic": float(excess[-1]),
                 "level": float(trace.level[-1]),
+                "peaks": [float(excess.max()), float(trace.level.max())],  # of the block: what alarms go by
                 "residual": gamma(trace, -1),
                 "exceeded": bool(trace.exceeded[-1]),
             }
@@ -270,7 +261,7 @@ class Asset:
         def look() -> Examined:
             return examine(self.baseline, self.name, self._last(settings.window_s))
 
-        judged, found = judge(progress.judged, settings, t, exceeded, look)
+        judged, found = judge(progress.judged, settings, t, exceeded, look, phase_of(self.name))
         self.progress = replace(progress, judged=judged)
         if found is None or found.verdict == before:
             return
@@ -288,11 +279,12 @@ class Asset:
         """Tell the alarms what is known now."""
         progress = self._now
         judged, findings = progress.judged, tuple(quality.standing(progress.quality))
+        peaks = progress.shown.get("peaks", (None, None))
         seen = Snapshot(
             verdict=quality.judged(judged.verdict, findings),
             quality=findings,
-            statistic=progress.shown.get("statistic"),
-            level=progress.shown.get("level"),
+            statistic=peaks[0],
+            level=peaks[1],
             cause=judged.summary,
         )
         alarms, transitions = advance(self._definitions, progress.alarms, seen, progress.counted.t if t is None else t)
@@ -305,9 +297,12 @@ class Asset:
             self._add("transitions", **transition_row(one, self._definitions[one.alarm]))
 
     def _forget(self) -> None:
-        """Let go of samples that no examination needs any more."""
-        progress = self._now
+        """Let go of samples that no examination needs any more; of a clock that was set back as well."""
+        progress, window_s = self._now, self.how.diagnosis.window_s
         first = min((window.first for window in progress.windows), default=None)
-        oldest = progress.counted.t - self.how.diagnosis.window_s
-        while self._window and self._window[0].t[-1] <= oldest and (first is None or self._window[0].sequence < first):
-            self._window.popleft()
+        held = sum(block.t.size for block in self._window)
+        while self._window and (first is None or self._window[0].sequence < first):
+            old = self._window[0].t[-1] <= progress.counted.t - window_s
+            if not old and held <= 2.0 * window_s * self._rate:
+                return
+            held -= self._window.popleft().t.size

@@ -55,6 +55,19 @@ class Block:
     stream: int = 0
     kept: bool = False
 
+    def begins(self) -> float:
+        """Return the time of its first sample that has one.
+
+        Raises
+        ------
+        RecordingError
+            If it is no block: empty, without time, or of signals of different lengths.
+        """
+        known = np.flatnonzero(np.isfinite(self.t)) if self.t.ndim == 1 else np.zeros(0, dtype=np.intp)
+        if not known.size or any(signal.shape != self.t.shape for signal in (self.r, self.u, self.y)):
+            raise RecordingError(f"{self.asset}: block {self.sequence}: t, r, u, y must have one length, t a number")
+        return float(self.t[known[0]])
+
     @property
     def signals(self) -> FloatArray:
         """t, r, u and y as rows, shape (4, N)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -155,6 +156,13 @@ def unpack(packed: bytes, asset: str) -> Progress:
         fed=plain["fed"],
         thinned=Thinned(**plain["thinned"]),
         windows=tuple(Window(**window) for window in plain["windows"]),
-        alarms={name: AlarmState.from_dict(state) for name, state in plain["alarms"].items()},
+        alarms=_alarms(plain["alarms"], asset),
         shown=plain["shown"],
     )
+
+
+def _alarms(plain: Mapping[str, Any], asset: str) -> dict[str, AlarmState]:
+    try:
+        return {name: AlarmState.from_dict(state) for name, state in plain.items()}
+    except StateError as error:
+        raise StateError(f"{asset}: {error}; or run --anew {asset}") from None

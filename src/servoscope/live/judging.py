@@ -8,6 +8,8 @@ between them doubles. A new fault, and its end, are looked at in full some secon
 
 from __future__ import annotations
 
+import math
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,7 +17,7 @@ from typing import Any
 from servoscope.live.config import DiagnosisSettings
 from servoscope.live.examining import Examined
 
-__all__ = ["Judged", "Window", "judge"]
+__all__ = ["Judged", "Window", "judge", "phase_of"]
 
 FIRST_DOUBT_S = 1.0  # until a disagreement is examined for the second time
 
@@ -59,8 +61,18 @@ class Judged:
     faults: list[dict[str, Any]] = field(default_factory=list)
 
 
+def phase_of(asset: str) -> float:
+    """Return where in the period an asset's examinations lie, 0 to 1: so that a fleet's are spread over it."""
+    return zlib.crc32(asset.encode()) / 2.0**32
+
+
 def judge(
-    state: Judged, settings: DiagnosisSettings, t: float, exceeded: bool, look: Callable[[], Examined]
+    state: Judged,
+    settings: DiagnosisSettings,
+    t: float,
+    exceeded: bool,
+    look: Callable[[], Examined],
+    phase: float = 0.0,
 ) -> tuple[Judged, Examined | None]:
     """Carry the verdict to a time.
 
@@ -76,12 +88,16 @@ def judge(
         Whether the recursion is above a limit.
     look
         Examines the last minutes.
+    phase
+        Of `phase_of`.
 
     Returns
     -------
     Judged, Examined or None
         The new state, and the examination if there was one.
     """
+    if state.examined is not None and t < state.examined:  # the clock was set back
+        state = replace(state, due=t, retry=t)
     disagrees = exceeded != (state.verdict == "fault")
     if not disagrees:
         state = replace(state, doubts=0)
@@ -94,7 +110,11 @@ def judge(
         wait = min(FIRST_DOUBT_S * 2.0**state.doubts, settings.every_s)
         state = replace(state, doubts=min(state.doubts + 1, 30), retry=t + wait)
     since = state.since if found.verdict == state.verdict else t
-    due = t + (min(settings.window_s, settings.every_s) if found.recovering else settings.every_s)
+    every = settings.every_s
+    # the asset's own next turn, half a period away at least
+    due = every * (math.floor((t + every / 2.0) / every - phase) + 1.0 + phase)
+    if found.recovering:
+        due = min(due, t + settings.window_s)
     return (
         replace(
             state,

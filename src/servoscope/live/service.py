@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import Any
 
 from servoscope import __version__
@@ -15,9 +15,10 @@ from servoscope.live.block import Block
 from servoscope.live.chores import Chores
 from servoscope.live.config import Config
 from servoscope.live.delivering import Courier
-from servoscope.live.examining import Told, diagnose_in_full
+from servoscope.live.examining import Told
 from servoscope.live.judging import Window
 from servoscope.live.logs import log
+from servoscope.live.looking import Looker
 from servoscope.live.metrics import Metrics
 from servoscope.live.rows import Outcome, Row
 from servoscope.live.writing import Writer
@@ -47,7 +48,7 @@ class Service:
         self.writer = Writer(self.store, config.name, config.service.buffer)
         self.metrics = Metrics(self)
         self.courier = Courier(self.store, config.actions)
-        self._looks = ThreadPoolExecutor(1, "full-diagnosis")
+        self._looker = Looker()
         self._looking: dict[tuple[str, Window], Future[Told]] = {}
         self._listened = 0.0  # s: that it has been ready to hear; being busy, or full, is no silence of a sensor
         self._heard: dict[str, float] = {}  # when it last heard of each asset, by that clock
@@ -88,7 +89,7 @@ class Service:
             self._finish()
         finally:
             self.courier.stop()
-            self._looks.shutdown(wait=False, cancel_futures=True)
+            self._looker.close()
             for source in self.sources.values():
                 source.close()
             for outlet in self._outlets.values():
@@ -147,8 +148,7 @@ class Service:
         for asset in self.assets.values():
             for window, blocks in asset.wanted(ended=ended):
                 if (asset.name, window) not in self._looking:
-                    job = self._looks.submit(diagnose_in_full, asset.baseline, asset.name, blocks)
-                    self._looking[asset.name, window] = job
+                    self._looking[asset.name, window] = self._looker.submit(asset.baseline, asset.name, blocks)
         for (name, window), job in list(self._looking.items()):
             if not job.done():
                 continue

@@ -57,13 +57,12 @@ class Writer:
     def __init__(self, store: Store, owner: str, bound: int) -> None:
         self._store, self._owner, self._bound = store, owner, bound
         self._number = store.last_commit(owner)
-        self._gathered, self._sealed = Commit(), None
+        self._gathered = Commit()
+        self._sealed: Commit | None = None  # on its way: nothing joins it any more
         self._stand: dict[str, Callable[[], tuple[dict[str, Any], int]]] = {}
         self._in_doubt = False
         self._wait = self._again = 0.0
         self.unavailable_since: float | None = None  # [UTC s]
-
-    _sealed: Commit | None
 
     @property
     def waiting(self) -> int:

@@ -70,6 +70,8 @@ def engine_of(url: URL, *, patience: float = PATIENCE) -> sa.Engine:
     if url.get_backend_name() == "sqlite":
         engine = sa.create_engine(url, connect_args={"timeout": patience})
         sa.event.listen(engine, "connect", _set_up_sqlite)
+        # the driver itself begins late, and ends a transaction before it changes a table
+        sa.event.listen(engine, "begin", lambda connection: connection.exec_driver_sql("BEGIN"))
         return engine
     options = "-c statement_timeout=60s -c lock_timeout=5s"
     arguments = {"connect_timeout": 5, "application_name": "servoscope", "options": options, "tcp_user_timeout": 10000}
@@ -83,6 +85,7 @@ def _set_up_sqlite(connection: sqlite3.Connection, _: object) -> None:
     # readers never wait for the writer; FULL, because what has been acknowledged must survive a power cut
     for pragma in ("journal_mode = WAL", "synchronous = FULL", "journal_size_limit = 67108864"):
         connection.execute(f"PRAGMA {pragma}")
+    connection.isolation_level = None
 
 
 @contextmanager
