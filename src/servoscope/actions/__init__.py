@@ -10,7 +10,6 @@ from servoscope.actions.outbox import Delivery, Outgoing, outgoing, outgoing_flo
 from servoscope.actions.settings import (
     ActionSettings,
     CommandSettings,
-    MessageSettings,
     RetrySettings,
     ToleranceSettings,
     WebhookSettings,
@@ -22,7 +21,6 @@ __all__ = [
     "Change",
     "CommandSettings",
     "Delivery",
-    "MessageSettings",
     "Outgoing",
     "RetrySettings",
     "ToleranceSettings",

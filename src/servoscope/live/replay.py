@@ -14,7 +14,6 @@ import numpy as np
 from pydantic import AwareDatetime
 
 from servoscope.live.block import Block, Resume
-from servoscope.live.refusals import Refusal
 from servoscope.live.settings import NotNegative, Seconds, Settings
 from servoscope.loop import Loop
 from servoscope.readers import read
@@ -40,7 +39,7 @@ class ReplaySettings(Settings):
         Time of the first sample; None: when the service first ran.
     """
 
-    kind: Literal["replay"] = "replay"
+    kind: Literal["replay"]
     speed: NotNegative = 1.0
     block: Seconds = 1.0
     repeat: bool = False
@@ -131,8 +130,6 @@ class Replay:
         self._next: list[tuple[float, int, _Reel, Block]] = []
         self._pace = (0.0, 0.0)
 
-    up = True
-
     @property
     def pace(self) -> float:
         """How many times as fast as it was recorded."""
@@ -167,12 +164,8 @@ class Replay:
             self._advance(order, reel)
         return found
 
-    def acknowledge(self, asset: str, blocks: int) -> None:
+    def acknowledge(self, asset: str, sequence: int) -> None:
         """Do nothing: a file is still there after a restart."""
-
-    def refused(self) -> list[Refusal]:
-        """Return nothing: files are checked when they are read."""
-        return []
 
     @property
     def waits(self) -> float:
