@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.chain import ABSURD, ARMED, BETWEEN, HEAD, MISSING, SAMPLE, TILE, USED
-from servoscope.compiled import laid, local
+from servoscope.chain import ABSURD, ARMED, BETWEEN, HEAD, MISSING, SAMPLE, TILE, USED, WATCHED
+from servoscope.compiled import LINE, ahead, laid, local
 from servoscope.plants import FloatArray
 
 BoolArray = npt.NDArray[np.bool_]
@@ -29,11 +29,18 @@ _columns: Any = None
 _frequencies: Any = None
 _extra: Any = None
 _watched: Any = None
+_handed: Any = None
 _room: Any = None
 _tile: Any = None
 _lanes: Any = None
 _width: Any = None
+_several: Any = None
 _own: Any = None
+_glided: Any = None
+_renew: Any = None
+_weigh: Any = None
+_calm: Any = None
+_glide: Any = None
 _tick: Any = None
 _begin_one: Any = None
 _advance: Any = None
@@ -43,7 +50,7 @@ _learn: Any = None
 _learn_one: Any = None
 _follow_one: Any = None
 _forget_one: Any = None
-_prick: Any = None
+_note: Any = None
 _listen: Any = None
 _alarm: Any = None
 _evaluate: Any = None
@@ -55,6 +62,12 @@ _take: Any = None
 _take_all: Any = None
 _write: Any = None
 _sample: Any = None
+_stretch: Any = None
+_fetch: Any = None
+_put: Any = None
+_unpack: Any = None
+_pack: Any = None
+_turn: Any = None
 
 
 def enter(
@@ -130,21 +143,19 @@ def sample(
     c: FloatArray,
     s: FloatArray,
     h: FloatArray,
-    g: FloatArray,
     tile: FloatArray,
     i: int,
     turn: bool,
-    first: bool,
     v: FloatArray,
     shadow: FloatArray,
     e: FloatArray,
     said: FloatArray,
     extra: FloatArray,
 ) -> None:
-    """Take sample i of the tile in all lanes."""
+    """Take sample i of the tile in all lanes, whatever it is."""
     whole = True
     for a in range(0, _lanes, _width):
-        whole &= _tick(a, s, h, tile, i, first)
+        whole &= _tick(a, h, tile, i)
     used = True
     if _lanes > 1 and whole:
         for a in range(0, _lanes, _width):
@@ -162,14 +173,80 @@ def sample(
                 _take(c, s, h, a, v, shadow, e, extra)
             elif said[0, a] != BETWEEN:
                 _forget_one(a, s, h)
-    if _watched:
+
+
+def gliding(
+    c: FloatArray, s: FloatArray, h: FloatArray, tile: FloatArray, begin: int, end: int, e: FloatArray, w: Any, when: Any
+) -> bool:
+    """Take samples of the tile, from `begin` to `end`, in all lanes if there is nothing odd about any of them; return whether."""
+    for a in range(_lanes):
+        e[0, a] = e[1, a] = 0.0
+    calm = True
+    for a in range(0, _lanes, _width):
+        _weigh(a, e, tile, begin, end)
+        calm &= _calm(a, h, e)
+    if calm:
         for a in range(0, _lanes, _width):
-            _prick(a, c, h, said, e)
-        for j in range(_watched):
+            _glide(a, c, s, h, w, when, tile, begin, end)
+    return calm
+
+
+def never(
+    c: FloatArray, s: FloatArray, h: FloatArray, tile: FloatArray, begin: int, end: int, e: FloatArray, w: Any, when: Any
+) -> bool:
+    """Leave all samples to `sample`: an axis may rest at any of them, or an estimator has a P of its own."""
+    return False
+
+
+def stretch(
+    c: FloatArray,
+    s: FloatArray,
+    h: FloatArray,
+    g: FloatArray,
+    tile: FloatArray,
+    begin: int,
+    end: int,
+    turn: int,
+    stride: int,
+    first: bool,
+    v: FloatArray,
+    shadow: FloatArray,
+    e: FloatArray,
+    said: FloatArray,
+    extra: FloatArray,
+) -> None:
+    """Take samples of the tile, from `begin` to `end`, in all lanes; with `first`, an evaluation begins with them."""
+    w = local(c, _handed, _lanes)
+    when = local(h, TILE, _lanes)
+    if first:
+        for a in range(0, _lanes, _width):
+            _renew(a, s, h)
+    if not (stride == 1 and _glided(c, s, h, tile, begin, end, e, w, when)):
+        for i in range(begin, end):
+            turn += 1
+            _sample(c, s, h, tile, i, turn == stride, v, shadow, e, said, extra)
+            if turn == stride:
+                turn = 0
+            if _watched:
+                for a in range(0, _lanes, _width):
+                    _note(a, c, s, h, said, e, w, when, i)
+    if not _watched:
+        return
+    top = local(c, TILE, _several)
+    for i in range(begin, end):
+        for a in range(_several):
+            top[i, a] = 0.0
+    if _lanes > 1:
+        for j in range(0, _watched, WATCHED):
             for a in range(0, _lanes, _width):
-                _listen(a, c, s, g, e, j)
-        for a in range(0, _lanes, _width):
-            _alarm(a, s, h, said, e)
+                _listen(a, c[_at.tail + j :], g[j:], w, top, begin, end)
+    else:
+        _listen(0, laid(c[_at.tail :], _several, 1), laid(g, _several, 1), laid(w, _several, 0), top, begin, end)
+        for i in range(begin, end):
+            for j in range(1, _several):
+                top[i, 0] = max(top[i, 0], top[i, j])
+    for a in range(0, _lanes, _width):
+        _alarm(a, s, h, top, when, begin, end)
 
 
 def complete(c: FloatArray, s: FloatArray, h: FloatArray, q: FloatArray) -> None:
@@ -185,6 +262,69 @@ def plain(c: FloatArray, s: FloatArray, h: FloatArray, q: FloatArray) -> None:
     """Write to q, for a diagnosis, what the recursion itself knows."""
     for a in range(0, _lanes, _width):
         _tell(a, s, h, q)
+
+
+def unpack(row: FloatArray, s: FloatArray, h: FloatArray, g: FloatArray, a: int) -> None:
+    """Put the state of an asset into lane a."""
+    for i in range(HEAD):
+        h[i, a] = row[i]
+    for i in range(_floats):
+        s[i, a] = row[HEAD + i]
+    for i in range(_watched):
+        g[i, a] = row[HEAD + _floats + i]
+
+
+def pack(row: FloatArray, s: FloatArray, h: FloatArray, g: FloatArray, a: int) -> None:
+    """Put lane a into the state of an asset."""
+    for i in range(HEAD):
+        row[i] = h[i, a]
+    for i in range(_floats):
+        row[HEAD + i] = s[i, a]
+    for i in range(_watched):
+        row[HEAD + _floats + i] = g[i, a]
+
+
+def fetch(
+    r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray, first: int, k: int, tile: FloatArray
+) -> None:
+    """Put the samples from k on into the tile, as many as it holds, of the assets from `first` on."""
+    assets, samples = r.shape
+    if _lanes > 1 and first + _lanes <= assets and k + TILE <= samples:
+        for j in range(0, TILE, _width):
+            for a in range(0, _lanes, _width):
+                _turn(r, first + a, k + j, tile, j, a)
+                _turn(u, first + a, k + j, tile, TILE + j, a)
+                _turn(y, first + a, k + j, tile, 2 * TILE + j, a)
+        for a in range(_lanes):
+            for j in range(k + TILE, k + 2 * TILE, LINE // 8):
+                ahead(r, first + a, j)
+                ahead(u, first + a, j)
+                ahead(y, first + a, j)
+    else:
+        for a in range(_lanes):
+            asset = min(first + a, assets - 1)
+            for i in range(min(TILE, samples - k)):
+                tile[i, a], tile[TILE + i, a] = r[asset, k + i], u[asset, k + i]
+                tile[2 * TILE + i, a] = y[asset, k + i]
+    if restart.shape[0]:
+        for a in range(_lanes):
+            asset = min(first + a, assets - 1)
+            for i in range(min(TILE, samples - k)):
+                tile[3 * TILE + i, a] = restart[asset, k + i]
+
+
+def put(q: FloatArray, out: FloatArray, first: int, column: int) -> None:
+    """Write the evaluations of all lanes to out (assets, ...), from asset `first` and a column on."""
+    assets = out.shape[0]
+    if _lanes > 1 and _row >= _width and first + _lanes <= assets:
+        for a in range(0, _lanes, _width):
+            for i in range(0, _row, _width):
+                j = min(i, _row - _width)
+                _turn(q, j, a, out, first + a, column + j)
+    else:
+        for a in range(min(_lanes, assets - first)):
+            for i in range(_row):
+                out[first + a, column + i] = q[i, a]
 
 
 def block(
@@ -206,67 +346,43 @@ def block(
     `constants` (blocks, rows times lanes) has one row if all share it, `restart` none where no sample restarts.
     """
     assets, samples = r.shape
+    private = HEAD + _floats + _watched
+    s = local(constants, _floats, _lanes)
+    h = local(state, HEAD, _lanes)
+    g = local(constants, _watched, _lanes)
+    tile = local(constants, _tile, _lanes)
+    v = local(constants, _rows, _lanes)
+    shadow = local(constants, _columns, _lanes)
+    e = local(constants, 2, _lanes)
+    said = local(state, 1, _lanes)
+    q = local(constants, _row, _lanes)
     for b in range(begin, end):
         c = laid(constants[b if _own else 0], _lanes, _own)
-        s = local(constants, _floats, _lanes)
-        h = local(state, HEAD, _lanes)
-        g = local(constants, _watched, _lanes)
-        tile = local(constants, _tile, _lanes)
-        v = local(constants, _rows, _lanes)
-        shadow = local(constants, _columns, _lanes)
-        e = local(constants, 3, _lanes)
-        said = local(state, 1, _lanes)
-        q = local(constants, _row, _lanes)
-        lowest = HEAD + _floats + _watched
         for a in range(_lanes):
             asset = min(b * _lanes + a, assets - 1)
-            for i in range(HEAD):
-                h[i, a] = state[asset, i]
-            for i in range(_floats):
-                s[i, a] = state[asset, HEAD + i]
-            for i in range(_watched):
-                g[i, a] = state[asset, HEAD + _floats + i]
+            _unpack(state[asset], s, h, g, a)
             for i in range(_extra):
-                new[asset, lowest + i] = state[asset, lowest + i]
+                new[asset, private + i] = state[asset, private + i]
             for i in range(3 * TILE, _tile):
                 tile[i, a] = 0.0
-        extra = new[b * _lanes, lowest : lowest + _extra]
+        extra = new[b * _lanes, private : private + _extra]
         number = int(state[0, SAMPLE])
-        since, turn, row = number % every, number % stride, 0
-        for k in range(samples):
-            if k % TILE == 0:
-                for a in range(_lanes):
-                    asset = min(b * _lanes + a, assets - 1)
-                    for i in range(min(TILE, samples - k)):
-                        tile[i, a] = r[asset, k + i]
-                        tile[TILE + i, a] = u[asset, k + i]
-                        tile[2 * TILE + i, a] = y[asset, k + i]
-                    if restart.shape[0]:
-                        for i in range(min(TILE, samples - k)):
-                            tile[3 * TILE + i, a] = restart[asset, k + i]
-            turn += 1
-            _sample(c, s, h, g, tile, k % TILE, turn == stride, since == 0, v, shadow, e, said, extra)
-            since += 1
-            if turn == stride:
-                turn = 0
+        since, turn, row, k, window = number % every, number % stride, 0, 0, -TILE
+        while k < samples:
+            count = min(TILE, samples - k, every - since)
+            if k + count > window + TILE:
+                window = max(0, min(k, samples - TILE))
+                _fetch(r, u, y, restart, b * _lanes, window, tile)
+            i = k - window
+            _stretch(c, s, h, g, tile, i, i + count, turn, stride, since == 0, v, shadow, e, said, extra)
+            k, since, turn = k + count, since + count, (turn + count) % stride
             if since == every:
                 since = 0
                 _write(c, s, h, q)
-                for a in range(_lanes):
-                    asset = b * _lanes + a
-                    if asset < assets:
-                        for i in range(_row):
-                            out[asset, row, i] = q[i, a]
+                _put(q, out, b * _lanes, row * _row)
                 row += 1
-        for a in range(_lanes):
-            asset = b * _lanes + a
-            if asset < assets:
-                for i in range(HEAD):
-                    new[asset, i] = h[i, a]
-                for i in range(_floats):
-                    new[asset, HEAD + i] = s[i, a]
-                for i in range(_watched):
-                    new[asset, HEAD + _floats + i] = g[i, a]
+        for a in range(min(_lanes, assets - b * _lanes)):
+            _pack(new[b * _lanes + a], s, h, g, a)
 
 
 def step(constants: FloatArray, state: FloatArray, r: float, u: float, y: float) -> bool:
@@ -279,25 +395,15 @@ def step(constants: FloatArray, state: FloatArray, r: float, u: float, y: float)
     tile = local(state, _tile, 1)
     v = local(state, _rows, 1)
     shadow = local(state, _columns, 1)
-    e = local(state, 3, 1)
+    e = local(state, 2, 1)
     said = local(state, 1, 1)
-    lowest = HEAD + _floats + _watched
-    for i in range(HEAD):
-        h[i, 0] = state[i]
-    for i in range(_floats):
-        s[i, 0] = state[HEAD + i]
-    for i in range(_watched):
-        g[i, 0] = state[HEAD + _floats + i]
+    private = HEAD + _floats + _watched
+    _unpack(state, s, h, g, 0)
     tile[0, 0], tile[TILE, 0], tile[2 * TILE, 0], tile[3 * TILE, 0] = r, u, y, 0.0
     number = int(state[SAMPLE])
-    turn, first = (number + 1) % stride == 0, number % every == 0
-    _sample(c, s, h, g, tile, 0, turn, first, v, shadow, e, said, state[lowest : lowest + _extra])
-    for i in range(HEAD):
-        state[i] = h[i, 0]
-    for i in range(_floats):
-        state[HEAD + i] = s[i, 0]
-    for i in range(_watched):
-        state[HEAD + _floats + i] = g[i, 0]
+    extra = state[private : private + _extra]
+    _stretch(c, s, h, g, tile, 0, 1, number % stride, stride, number % every == 0, v, shadow, e, said, extra)
+    _pack(state, s, h, g, 0)
     return (number + 1) % every == 0
 
 
@@ -307,11 +413,9 @@ def look(constants: FloatArray, state: FloatArray, out: FloatArray) -> None:
         c = laid(constants[asset if _own else 0], 1, 1)
         s = local(state, _floats, 1)
         h = local(state, HEAD, 1)
+        g = local(state, _watched, 1)
         q = local(state, _row, 1)
-        for i in range(HEAD):
-            h[i, 0] = state[asset, i]
-        for i in range(_floats):
-            s[i, 0] = state[asset, HEAD + i]
+        _unpack(state[asset], s, h, g, 0)
         _write(c, s, h, q)
         for i in range(_row):
             out[asset, i] = q[i, 0]
@@ -332,14 +436,12 @@ def regress(
     c = laid(constants, 1, 1)
     s = local(constants, _floats, 1)
     h = local(constants, HEAD, 1)
+    g = local(constants, _watched, 1)
     v = local(constants, _rows, 1)
     tile = local(constants, _tile, 1)
     shadow = local(constants, _columns, 1)
     said = local(constants, 1, 1)
-    for i in range(HEAD):
-        h[i, 0] = state[i]
-    for i in range(_floats):
-        s[i, 0] = state[HEAD + i]
+    _unpack(state, s, h, g, 0)
     for k in range(len(r)):
         tile[0, 0], tile[TILE, 0], tile[2 * TILE, 0], tile[3 * TILE, 0] = r[k], u[k], y[k], restart[k]
         _enter(c, s, h, said, 0, tile, 0, (k + 1) % stride == 0, v, shadow)
@@ -349,5 +451,5 @@ def regress(
                 out[k, i] = v[i, 0]
 
 
-PARTS = (enter, settled, refreshed, together, apart, sample, complete, plain)  # each calls only those before it
+PARTS = (enter, settled, refreshed, together, apart, sample, gliding, never, stretch, unpack, pack, fetch, put, complete, plain)  # each calls only those before it
 DRIVERS = (block, step, look, regress)

@@ -20,11 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope import drive, estimators
-from servoscope.chain import HEAD, SAMPLE, TILE, Chain, Plan, Sizes
-from servoscope.compiled import filled, inlined, kernel, traced
+from servoscope.chain import HEAD, SAMPLE, TILE, WATCHED, Chain, Plan, Sizes
+from servoscope.compiled import filled, inlined, kernel, traced, turning
 from servoscope.cusum import LAGS, Watch
 from servoscope.linear import Linear
 from servoscope.plants import FloatArray
+from servoscope.readout import Readout
 from servoscope.straight import coefficients, pattern
 
 IntArray = npt.NDArray[np.int64]
@@ -32,8 +33,9 @@ BoolArray = npt.NDArray[np.bool_]
 
 LANES = {"float64": 16, "float32": 32}  # assets side by side: state and constants stay in the first-level cache
 WIDTH = {"float64": 8, "float32": 16}  # numbers in a vector
-WATCHED = 8  # CUSUMs are counted in such steps, so that few codes serve many baselines
-STEPS = ("tick", "advance", "used", "learn", "prick", "listen", "alarm", "evaluate", "respond", "tell")
+SAID = ("evaluate", "respond", "tell")
+STEPS = ("renew", "calm", "tick", "advance", "used", "learn", "note")
+LOOPS = {"weigh": "e", "glide": "sh", "alarm": "sh"}  # steps that run over the samples of a tile, and what they keep
 ALONE = ("begin", "advance", "learn", "follow", "forget")  # where neighbours may do something else
 NOTHING = 1e-12  # of the first coefficient of a filter
 WORTH = 200_000  # samples from which a second core pays
@@ -192,7 +194,7 @@ class Recursion:
         signals = state, new, r, u, y, flags, c.every, c.stride
 
         def part(begin: int, end: int) -> None:
-            self._code.block(self._laid, *signals, out, begin, end)
+            self._code.block(self._laid, *signals, out.reshape(len(out), -1), begin, end)
 
         workers = min(_cores(), self._blocks) if r.size >= WORTH else 1
         if workers == 1:
@@ -301,7 +303,7 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
         return np.pad(x, (0, size - len(x)))
 
     shadow = wide(np.zeros(0), dict(plan.at)["white"] - dict(plan.at)["shadow"] + 1 + 2 * memory)
-    members = np.concatenate([np.zeros((n + LAGS) * watched), np.full(watched, np.inf), np.zeros(watched)])
+    members = np.zeros((n + LAGS + 1, watched))
     if test is not None:
         system = _shadow(c)
         apart = np.linalg.solve(c.basis, test.theta / c.scale) - c.theta
@@ -311,11 +313,7 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
                 *(wide(test.numerator[1 : 1 + memory], memory), wide(test.denominator[1 : 1 + memory], memory)),
             ]
         )
-        heard = len(test.limits)
-        table = np.zeros((n + LAGS + 2, watched))
-        table[n + LAGS] = np.inf
-        table[:, :heard] = np.vstack([test.changes.T, test.limits, 1.0 / test.limits])
-        members = table.ravel()
+        members[:, : len(test.limits)] = np.vstack([test.changes.T / test.limits, -0.5 * test.limits])
     seen: list[FloatArray] = []
     if view is not None:
         E = view.response.reshape(-1, 2, n)
@@ -329,7 +327,7 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
             *([float(x) for x in (*counts, *gates, c.memory, 1.0 / c.memory, c.R, test.warm if test else 0)],),
             *(v.A.ravel(), v.B[:, 0], v.C[0], v.D[0], v.steady[:, 0]),
             *(coefficients(plan.bank, c.bank), c.bank.steady.ravel(), np.zeros(0) if c.steady else c.P_d.ravel()),
-            *([c.variance], wide(c.a, lags), wide(c.heads, lags), shadow, *seen, members),
+            *([c.variance], wide(c.a, lags), wide(c.heads, lags), shadow, *seen, members.ravel()),
         ]
     )
 
@@ -338,15 +336,23 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
 def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
     """Return the drivers of `servoscope.drive` for a plan, by name; each compiles when it is first called."""
     estimator, sizes = estimators.load(plan.estimator), plan.sizes
-    steps = Chain(plan, getattr(estimator, "steady", None))
+    steps, readout = Chain(plan, getattr(estimator, "steady", None), lanes == 1), Readout(plan)
     to, at = dict(plan.to), dict(plan.at)
+    several = WATCHED if lanes == 1 else lanes  # CUSUMs of one asset go side by side, or those of several assets
     literals = {x: getattr(sizes, x) for x in ("n", "rows", "row", "floats", "frequencies", "extra", "watched")}
-    literals |= {"columns": sizes.n + 1, "room": sizes.n + 2, "tile": 4 * TILE}
-    literals |= {"lanes": lanes, "width": width, "own": own}
+    literals |= {"columns": sizes.n + 1, "room": sizes.n + 2, "tile": 4 * TILE, "handed": (sizes.n + LAGS + 1) * TILE}
+    literals |= {"lanes": lanes, "width": width, "own": own, "several": several}
     names: dict[str, object] = {f"_{name}": number for name, number in literals.items()}
     names |= {"_to": namedtuple("To", to)(**to), "_at": namedtuple("At", at)(**at), "_update": estimator.update}
+    shared = "" if own else "c"
     for step in STEPS:
-        names[f"_{step}"] = traced(getattr(steps, step), width, "" if own else "c")
+        names[f"_{step}"] = traced(getattr(steps, step), width, shared)
+    for step, kept in LOOPS.items():
+        names[f"_{step}"] = traced(getattr(steps, step), width, shared, kept)
+    names["_listen"] = traced(steps.listen, min(several, max(width, WATCHED)), "w" if lanes == 1 else shared, "g")
+    names["_turn"] = turning(width)
+    for step in SAID:
+        names[f"_{step}"] = traced(getattr(readout, step), width, shared)
     for step in ALONE:
         names[f"_{step}_one"] = traced(getattr(steps, step))
     heap = not sizes.steady  # estimators with a P of their own allocate
@@ -354,6 +360,7 @@ def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
         names[f"_{template.__name__}"] = inlined(filled(template, names), heap)
         names["_take"] = names.get("_settled" if sizes.steady else "_refreshed")
         names["_take_all"] = names.get("_together" if sizes.steady else "_apart")
+        names["_glided"] = names.get("_never" if sizes.speed or not sizes.steady else "_gliding")
         names["_write"] = names.get("_plain" if sizes.start else "_complete")
     what = repr((plan, lanes, width, own))
     return SimpleNamespace(**{driver.__name__: kernel(filled(driver, names, what), heap) for driver in drive.DRIVERS})
