@@ -48,7 +48,7 @@ def constants(n: int = 4, frequencies: int = 3) -> Constants:
     system = type(bank)(bank.A, bank.B @ route, bank.C / np.abs(bank.C).max(axis=1)[:, None], bank.D @ route)
     velocity = sampled(state_variable_filter(25.0, 2), RATE, "foh").output(np.array([[0.0, 1.0]]))
     rng = np.random.default_rng(0)
-    view = View(np.eye(n), np.zeros(n), rng.standard_normal((2 * frequencies, n)))
+    view = View(np.eye(n), np.zeros(n), rng.standard_normal((2 * frequencies, n)), RATE)
     one, a = np.eye(n), np.array([0.5, 0.1, 0.05, 0.01])
     return Constants(
         estimator="akf", steady=True, bank=system, velocity=velocity, v_of_r=False, codes=(),

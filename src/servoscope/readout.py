@@ -5,6 +5,7 @@ Said in `servoscope.arithmetic`, as `servoscope.chain` is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -44,7 +45,7 @@ class Readout:
         q[0] = h[UPDATES]
         q[1] = where(h[UPDATES] > 0.0, dot(white, white), 0.0)
         q[2] = s[self.to.peak]
-        q[3] = h[CROSSED]
+        q[3] = where(h[CROSSED] > 0.0, (h[CROSSED] - 1.0) / c[at.rate], math.nan)
         basis = [[c[at.basis + n * i + j] for j in range(n)] for i in range(n)]
         for i, row in enumerate(basis):
             q[4 + i] = c[at.origin + i] + dot(row, d)

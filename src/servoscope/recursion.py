@@ -45,12 +45,13 @@ class View(NamedTuple):
     """What complete evaluations take; `response` holds Re and Im of E(f).
 
     `covariance` is that of the baseline (n, n), `origin` (n,) what is said where theta is the baseline's, both in
-    physical units, and `response` has shape (2 F, n).
+    physical units, `response` has shape (2 F, n), and `rate` is that of the samples [Hz].
     """
 
     covariance: FloatArray
     origin: FloatArray
     response: FloatArray
+    rate: float
 
 
 class Constants(NamedTuple):
@@ -269,7 +270,7 @@ def _plan(constants: Sequence[Constants]) -> Plan:
             **{"velocity": 11, "bank": entries[0], "steady": len(first.bank.A) * first.bank.B.shape[1]},
             **{"P_d": 0 if first.steady else n * n, "noise": 1 + 2 * lags, "shadow": entries[1], "shadow_steady": nxs},
             **{"apart": n, "white": 1 + 2 * memory, "prior": 0 if start else n * n, "origin": 0 if start else n},
-            **{"basis": 0 if start else n * n, "response": frequencies * 2 * (n + 1)},
+            **{"basis": 0 if start else n * n, "rate": 0 if start else 1, "response": frequencies * 2 * (n + 1)},
         }
     )
     sizes = Sizes(
@@ -314,12 +315,12 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
             ]
         )
         members[:, : len(test.limits)] = np.vstack([test.changes.T / test.limits, -0.5 * test.limits])
-    seen: list[FloatArray] = []
+    seen: list[Any] = []
     if view is not None:
         E = view.response.reshape(-1, 2, n)
         parts = [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E]
         back = np.linalg.inv(c.basis)
-        seen = [(back @ view.covariance @ back.T).ravel(), view.origin, c.basis.ravel(), *parts]
+        seen = [(back @ view.covariance @ back.T).ravel(), view.origin, c.basis.ravel(), [view.rate], *parts]
     counts = [c.every, c.stride]
     gates = [*c.limits, *c.deadzone, c.sign_speed, c.rest_speed, c.still_speed, c.wait, 1.0 / c.wait]
     return np.concatenate(
