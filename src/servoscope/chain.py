@@ -218,6 +218,13 @@ class Chain:
             best = larger(best, g[j])
         top[i] = best
 
+    def highest(self, top: Any, i: Any) -> None:
+        """Gather the largest of neighbouring CUSUMs of one asset in the first of them."""
+        found = [top[i * WATCHED + j] for j in range(WATCHED)]
+        while len(found) > 1:
+            found = [larger(a, b) for a, b in zip(found[::2], found[1::2], strict=True)]
+        top[i * WATCHED] = found[0]
+
     def alarm(self, s: Any, h: Any, top: Any, when: Any, i: Any) -> None:
         """Note how high the largest CUSUM is, and when one passes its limit."""
         level, number = top[i], when[i]

@@ -15,7 +15,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-from servoscope.arithmetic import Index, Truth
+from servoscope.arithmetic import Index, Number, Truth
 from servoscope.lanes import Kept, Rows, lanes_of, turned
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound="Callable[..., object]")
 
 LINE = 64  # bytes: a vector must not straddle two cache lines
+ALIGNED = 4  # bytes: all that is known of where a number stands
 
 
 @functools.cache
@@ -194,37 +195,51 @@ def laid(typing: Any, flat: Any, lanes: Any, own: Any) -> Any:
 
 
 def turning(width: int) -> Callable[..., None]:
-    """Return ``turn(x, i, j, y, k, l)``, which copies a square of a matrix into another one of the same precision.
+    """Return ``turn(x, i, j, y, k, l)``, which copies a square of a matrix, turned, into another matrix.
 
-    Rows i, i + 1, ... of x from column j on, `width` of both, become columns l, l + 1, ... of y from row k on. The
-    numbers of a row are neighbours, and nothing is checked.
+    Rows i, i + 1, ... of x from column j on, `width` of both, become columns l, l + 1, ... of y from row k on, rounded
+    to its precision. The numbers of a row are neighbours, and nothing is checked.
     """
 
     def turn(typing: Any, x: Any, i: Any, j: Any, y: Any, k: Any, l: Any) -> Any:  # noqa: E741
         def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            kinds, kind = signature.args, ir.VectorType(context.get_data_type(x.dtype), width)
-            size = context.get_abi_sizeof(kind.element)
-
-            def places(which: int) -> list[Any]:
-                array = make_array(kinds[which])(context, builder, values[which])
-                row, column = values[which + 1], values[which + 2]
-                firsts = [
-                    cgutils.get_item_pointer(
-                        context, builder, kinds[which], array, (builder.add(row, row.type(n)), column)
-                    )
-                    for n in range(width)
-                ]
-                return [builder.bitcast(first, kind.as_pointer()) for first in firsts]
-
-            rows = [builder.load(place, align=size) for place in places(0)]
-            for column, place in zip(turned(builder, rows), places(3), strict=True):
-                builder.store(column, place, align=size)
+            given: list[Any] = []
+            for which in (0, 3):
+                kind = signature.args[which]
+                array = make_array(kind)(context, builder, values[which])
+                first = cgutils.get_item_pointer(context, builder, kind, array, values[which + 1 : which + 3])
+                byte = ir.IntType(8).as_pointer()
+                given += [builder.bitcast(first, byte), cgutils.unpack_tuple(builder, array.strides)[0]]
+            kinds = [context.get_data_type(each.dtype) for each in (x, y)]
+            builder.call(_turner(builder.module, width, kinds, [number.type for number in given]), given)
             return context.get_dummy_value()
 
         return types.void(x, types.intp, types.intp, y, types.intp, types.intp), code
 
     made: Callable[..., None] = intrinsic(turn)
     return made
+
+
+def _turner(module: Any, width: int, kinds: Sequence[Any], arguments: Sequence[Any]) -> Any:
+    """Return the function that turns a square, called and never inlined: loops around it are unrolled otherwise."""
+    name = f"servoscope_turn_{width}_" + "_".join(kind.intrinsic_name for kind in kinds)
+    if name in module.globals:
+        return module.globals[name]
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), arguments), name)
+    function.linkage = "internal"
+    function.attributes.add("noinline")
+    builder = ir.IRBuilder(function.append_basic_block())
+    places: list[list[Any]] = []
+    for which, kind in enumerate(kinds):
+        first, stride = function.args[2 * which : 2 * which + 2]
+        rows = [builder.gep(first, [builder.mul(stride, stride.type(n))]) for n in range(width)]
+        places.append([builder.bitcast(row, ir.VectorType(kind, width).as_pointer()) for row in rows])
+    found = turned(builder, [builder.load(place, align=ALIGNED) for place in places[0]])
+    for column, place in zip(found, places[1], strict=True):
+        like = Number(builder, ir.Constant(ir.VectorType(kinds[1], width), ir.Undefined))
+        builder.store(like.like(Number(builder, column)), place, align=ALIGNED)
+    builder.ret_void()
+    return function
 
 
 @intrinsic

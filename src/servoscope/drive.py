@@ -19,55 +19,62 @@ BoolArray = npt.NDArray[np.bool_]
 
 # what the templates are filled with: sizes, places, lanes and how many of them go together, and the steps of the chain:
 # each for as many lanes as go together, or (`_one`) for a single one
-_to: Any = None
-_at: Any = None
-_n: Any = None
-_floats: Any = None
-_rows: Any = None
-_row: Any = None
-_columns: Any = None
-_frequencies: Any = None
-_extra: Any = None
-_watched: Any = None
-_handed: Any = None
-_room: Any = None
-_tile: Any = None
-_lanes: Any = None
-_width: Any = None
-_several: Any = None
-_own: Any = None
-_glided: Any = None
-_renew: Any = None
-_weigh: Any = None
-_calm: Any = None
-_glide: Any = None
-_tick: Any = None
-_begin_one: Any = None
 _advance: Any = None
 _advance_one: Any = None
-_used: Any = None
-_learn: Any = None
-_learn_one: Any = None
+_alarm: Any = None
+_at: Any = None
+_begin_one: Any = None
+_calm: Any = None
+_columns: Any = None
+_enter: Any = None
+_evaluate: Any = None
+_extra: Any = None
+_fetch: Any = None
+_fetch_each: Any = None
+_floats: Any = None
 _follow_one: Any = None
 _forget_one: Any = None
-_note: Any = None
+_frequencies: Any = None
+_glide: Any = None
+_glided: Any = None
+_handed: Any = None
+_highest: Any = None
+_lanes: Any = None
+_learn: Any = None
+_learn_one: Any = None
 _listen: Any = None
-_alarm: Any = None
-_evaluate: Any = None
+_n: Any = None
+_note: Any = None
+_own: Any = None
+_pack: Any = None
+_pack_each: Any = None
+_put: Any = None
+_put_each: Any = None
+_renew: Any = None
 _respond: Any = None
-_tell: Any = None
-_update: Any = None
-_enter: Any = None
+_room: Any = None
+_row: Any = None
+_rows: Any = None
+_sample: Any = None
+_several: Any = None
+_size: Any = None
+_square: Any = None
+_stretch: Any = None
 _take: Any = None
 _take_all: Any = None
-_write: Any = None
-_sample: Any = None
-_stretch: Any = None
-_fetch: Any = None
-_put: Any = None
-_unpack: Any = None
-_pack: Any = None
+_tell: Any = None
+_tick: Any = None
+_tile: Any = None
+_to: Any = None
 _turn: Any = None
+_unpack: Any = None
+_unpack_each: Any = None
+_update: Any = None
+_used: Any = None
+_watched: Any = None
+_weigh: Any = None
+_width: Any = None
+_write: Any = None
 
 
 def enter(
@@ -194,7 +201,7 @@ def gliding(
 def never(
     c: FloatArray, s: FloatArray, h: FloatArray, tile: FloatArray, begin: int, end: int, e: FloatArray, w: Any, when: Any
 ) -> bool:
-    """Leave all samples to `sample`: an axis may rest at any of them, or an estimator has a P of its own."""
+    """Leave all samples to `sample`: for one lane, axes that may rest at any of them, estimators with a P of their own."""
     return False
 
 
@@ -243,8 +250,7 @@ def stretch(
     else:
         _listen(0, laid(c[_at.tail :], _several, 1), laid(g, _several, 1), laid(w, _several, 0), top, begin, end)
         for i in range(begin, end):
-            for j in range(1, _several):
-                top[i, 0] = max(top[i, 0], top[i, j])
+            _highest(0, laid(top, 1, 1), i)
     for a in range(0, _lanes, _width):
         _alarm(a, s, h, top, when, begin, end)
 
@@ -264,67 +270,98 @@ def plain(c: FloatArray, s: FloatArray, h: FloatArray, q: FloatArray) -> None:
         _tell(a, s, h, q)
 
 
-def unpack(row: FloatArray, s: FloatArray, h: FloatArray, g: FloatArray, a: int) -> None:
-    """Put the state of an asset into lane a."""
-    for i in range(HEAD):
-        h[i, a] = row[i]
-    for i in range(_floats):
-        s[i, a] = row[HEAD + i]
-    for i in range(_watched):
-        g[i, a] = row[HEAD + _floats + i]
+def unpack(state: FloatArray, first: int, s: FloatArray, h: FloatArray, g: FloatArray) -> None:
+    """Put the states of assets, from `first` on, into the lanes; the last asset fills the lanes that are left."""
+    for a in range(_lanes):
+        row = state[min(first + a, len(state) - 1)]
+        for i in range(HEAD):
+            h[i, a] = row[i]
+        for i in range(_floats):
+            s[i, a] = row[HEAD + i]
+        for i in range(_watched):
+            g[i, a] = row[HEAD + _floats + i]
 
 
-def pack(row: FloatArray, s: FloatArray, h: FloatArray, g: FloatArray, a: int) -> None:
-    """Put lane a into the state of an asset."""
-    for i in range(HEAD):
-        row[i] = h[i, a]
-    for i in range(_floats):
-        row[HEAD + i] = s[i, a]
-    for i in range(_watched):
-        row[HEAD + _floats + i] = g[i, a]
+def pack(s: FloatArray, h: FloatArray, g: FloatArray, state: FloatArray, first: int) -> None:
+    """Put the lanes into the states of assets, from `first` on."""
+    for a in range(min(_lanes, len(state) - first)):
+        row = state[first + a]
+        for i in range(HEAD):
+            row[i] = h[i, a]
+        for i in range(_floats):
+            row[HEAD + i] = s[i, a]
+        for i in range(_watched):
+            row[HEAD + _floats + i] = g[i, a]
 
 
-def fetch(
-    r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray, first: int, k: int, tile: FloatArray
-) -> None:
+def fetch(r: FloatArray, u: FloatArray, y: FloatArray, first: int, k: int, tile: FloatArray) -> None:
     """Put the samples from k on into the tile, as many as it holds, of the assets from `first` on."""
-    assets, samples = r.shape
-    if _lanes > 1 and first + _lanes <= assets and k + TILE <= samples:
-        for j in range(0, TILE, _width):
-            for a in range(0, _lanes, _width):
-                _turn(r, first + a, k + j, tile, j, a)
-                _turn(u, first + a, k + j, tile, TILE + j, a)
-                _turn(y, first + a, k + j, tile, 2 * TILE + j, a)
-        for a in range(_lanes):
-            for j in range(k + TILE, k + 2 * TILE, LINE // 8):
-                ahead(r, first + a, j)
-                ahead(u, first + a, j)
-                ahead(y, first + a, j)
-    else:
-        for a in range(_lanes):
-            asset = min(first + a, assets - 1)
-            for i in range(min(TILE, samples - k)):
-                tile[i, a], tile[TILE + i, a] = r[asset, k + i], u[asset, k + i]
-                tile[2 * TILE + i, a] = y[asset, k + i]
-    if restart.shape[0]:
-        for a in range(_lanes):
-            asset = min(first + a, assets - 1)
-            for i in range(min(TILE, samples - k)):
-                tile[3 * TILE + i, a] = restart[asset, k + i]
+    for a in range(_lanes):
+        asset = min(first + a, len(r) - 1)
+        for i in range(min(TILE, r.shape[1] - k)):
+            tile[i, a], tile[TILE + i, a], tile[2 * TILE + i, a] = r[asset, k + i], u[asset, k + i], y[asset, k + i]
 
 
 def put(q: FloatArray, out: FloatArray, first: int, column: int) -> None:
-    """Write the evaluations of all lanes to out (assets, ...), from asset `first` and a column on."""
-    assets = out.shape[0]
-    if _lanes > 1 and _row >= _width and first + _lanes <= assets:
+    """Write the evaluations of the lanes to out (assets, ...), from asset `first` and a column on."""
+    for a in range(min(_lanes, len(out) - first)):
+        for i in range(_row):
+            out[first + a, column + i] = q[i, a]
+
+
+def unpack_squares(state: FloatArray, first: int, s: FloatArray, h: FloatArray, g: FloatArray) -> None:
+    """Do as `unpack`, in squares where all lanes are taken."""
+    if first + _lanes > len(state):
+        _unpack_each(state, first, s, h, g)
+        return
+    for a in range(0, _lanes, HEAD):
+        _square(state, first + a, 0, h, 0, a)
+        for i in range(0, _floats, HEAD):
+            j = min(i, _floats - HEAD)
+            _square(state, first + a, HEAD + j, s, j, a)
+        for i in range(0, _watched, HEAD):
+            _square(state, first + a, HEAD + _floats + i, g, i, a)
+
+
+def pack_squares(s: FloatArray, h: FloatArray, g: FloatArray, state: FloatArray, first: int) -> None:
+    """Do as `pack`, in squares where all lanes are taken."""
+    if first + _lanes > len(state):
+        _pack_each(s, h, g, state, first)
+        return
+    for a in range(0, _lanes, HEAD):
+        _square(h, 0, a, state, first + a, 0)
+        for i in range(0, _floats, HEAD):
+            j = min(i, _floats - HEAD)
+            _square(s, j, a, state, first + a, HEAD + j)
+        for i in range(0, _watched, HEAD):
+            _square(g, i, a, state, first + a, HEAD + _floats + i)
+
+
+def fetch_squares(r: FloatArray, u: FloatArray, y: FloatArray, first: int, k: int, tile: FloatArray) -> None:
+    """Do as `fetch`, in squares where all lanes and the whole tile are taken; the next tile is fetched ahead."""
+    if first + _lanes > len(r) or k + TILE > r.shape[1]:
+        _fetch_each(r, u, y, first, k, tile)
+        return
+    for j in range(0, TILE, _width):
         for a in range(0, _lanes, _width):
-            for i in range(0, _row, _width):
-                j = min(i, _row - _width)
-                _turn(q, j, a, out, first + a, column + j)
-    else:
-        for a in range(min(_lanes, assets - first)):
-            for i in range(_row):
-                out[first + a, column + i] = q[i, a]
+            _turn(r, first + a, k + j, tile, j, a)
+            _turn(u, first + a, k + j, tile, TILE + j, a)
+            _turn(y, first + a, k + j, tile, 2 * TILE + j, a)
+    for a in range(first, first + _lanes):
+        for j in range(k + TILE, k + 2 * TILE, LINE // 8):
+            ahead(r, a, j)
+            ahead(u, a, j)
+            ahead(y, a, j)
+
+
+def put_squares(q: FloatArray, out: FloatArray, first: int, column: int) -> None:
+    """Do as `put`, in squares where all lanes are taken."""
+    if first + _lanes > len(out):
+        _put_each(q, out, first, column)
+        return
+    for a in range(0, _lanes, _width):
+        for i in range(0, _row, _width):
+            _turn(q, min(i, _row - _width), a, out, first + a, column + min(i, _row - _width))
 
 
 def block(
@@ -358,13 +395,12 @@ def block(
     q = local(constants, _row, _lanes)
     for b in range(begin, end):
         c = laid(constants[b if _own else 0], _lanes, _own)
+        _unpack(state, b * _lanes, s, h, g)
         for a in range(_lanes):
-            asset = min(b * _lanes + a, assets - 1)
-            _unpack(state[asset], s, h, g, a)
-            for i in range(_extra):
-                new[asset, private + i] = state[asset, private + i]
             for i in range(3 * TILE, _tile):
                 tile[i, a] = 0.0
+        for i in range(_extra):
+            new[b, private + i] = state[b, private + i]
         extra = new[b * _lanes, private : private + _extra]
         number = int(state[0, SAMPLE])
         since, turn, row, k, window = number % every, number % stride, 0, 0, -TILE
@@ -372,7 +408,11 @@ def block(
             count = min(TILE, samples - k, every - since)
             if k + count > window + TILE:
                 window = max(0, min(k, samples - TILE))
-                _fetch(r, u, y, restart, b * _lanes, window, tile)
+                _fetch(r, u, y, b * _lanes, window, tile)
+                if restart.shape[0]:
+                    for a in range(_lanes):
+                        for j in range(min(TILE, samples)):
+                            tile[3 * TILE + j, a] = restart[min(b * _lanes + a, assets - 1), window + j]
             i = k - window
             _stretch(c, s, h, g, tile, i, i + count, turn, stride, since == 0, v, shadow, e, said, extra)
             k, since, turn = k + count, since + count, (turn + count) % stride
@@ -381,8 +421,7 @@ def block(
                 _write(c, s, h, q)
                 _put(q, out, b * _lanes, row * _row)
                 row += 1
-        for a in range(min(_lanes, assets - b * _lanes)):
-            _pack(new[b * _lanes + a], s, h, g, a)
+        _pack(s, h, g, new, b * _lanes)
 
 
 def step(constants: FloatArray, state: FloatArray, r: float, u: float, y: float) -> bool:
@@ -398,12 +437,13 @@ def step(constants: FloatArray, state: FloatArray, r: float, u: float, y: float)
     e = local(state, 2, 1)
     said = local(state, 1, 1)
     private = HEAD + _floats + _watched
-    _unpack(state, s, h, g, 0)
+    row = laid(state, _size, 1)
+    _unpack(row, 0, s, h, g)
     tile[0, 0], tile[TILE, 0], tile[2 * TILE, 0], tile[3 * TILE, 0] = r, u, y, 0.0
     number = int(state[SAMPLE])
     extra = state[private : private + _extra]
     _stretch(c, s, h, g, tile, 0, 1, number % stride, stride, number % every == 0, v, shadow, e, said, extra)
-    _pack(state, s, h, g, 0)
+    _pack(s, h, g, row, 0)
     return (number + 1) % every == 0
 
 
@@ -415,7 +455,7 @@ def look(constants: FloatArray, state: FloatArray, out: FloatArray) -> None:
         h = local(state, HEAD, 1)
         g = local(state, _watched, 1)
         q = local(state, _row, 1)
-        _unpack(state[asset], s, h, g, 0)
+        _unpack(state, asset, s, h, g)
         _write(c, s, h, q)
         for i in range(_row):
             out[asset, i] = q[i, 0]
@@ -441,7 +481,7 @@ def regress(
     tile = local(constants, _tile, 1)
     shadow = local(constants, _columns, 1)
     said = local(constants, 1, 1)
-    _unpack(state, s, h, g, 0)
+    _unpack(state, 0, s, h, g)
     for k in range(len(r)):
         tile[0, 0], tile[TILE, 0], tile[2 * TILE, 0], tile[3 * TILE, 0] = r[k], u[k], y[k], restart[k]
         _enter(c, s, h, said, 0, tile, 0, (k + 1) % stride == 0, v, shadow)
@@ -451,5 +491,8 @@ def regress(
                 out[k, i] = v[i, 0]
 
 
-PARTS = (enter, settled, refreshed, together, apart, sample, gliding, never, stretch, unpack, pack, fetch, put, complete, plain)  # each calls only those before it
+# each calls only those before it
+PARTS = (enter, settled, refreshed, together, apart, sample, gliding, never, stretch, complete, plain)
+MOVES = (unpack, pack, fetch, put)
+SQUARES = (unpack_squares, pack_squares, fetch_squares, put_squares)  # the same, for many lanes
 DRIVERS = (block, step, look, regress)

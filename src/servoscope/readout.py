@@ -71,12 +71,20 @@ class Readout:
             q[i] = number
 
     def _covariance(self, c: Any, s: Any) -> list[list[Any]]:
-        n = range(self.size.n)
-        return [[s[self.to.S + lower(i, j)] + c[self.at.prior + self.size.n * i + j] for j in n] for i in n]
+        n, found = self.size.n, [[None] * self.size.n for _ in range(self.size.n)]
+        for i, j in _below(n):
+            found[i][j] = found[j][i] = s[self.to.S + lower(i, j)] + c[self.at.prior + n * i + j]
+        return found
 
     def _turned(self, E: Sequence[Sequence[Any]], Cov: Sequence[Sequence[Any]], q: Any, at: Any) -> None:
         """Write E Cov E' to q[at:], row by row."""
         halves = [[dot(row, column) for column in Cov] for row in E]
-        for i, half in enumerate(halves):
-            for j, row in enumerate(E):
-                q[at + (len(E) * i + j)] = dot(half, row)
+        for i, j in _below(len(E)):
+            q[at + (len(E) * i + j)] = dot(halves[i], E[j])
+            if i != j:
+                q[at + (len(E) * j + i)] = q[at + (len(E) * i + j)]
+
+
+def _below(n: int) -> list[tuple[int, int]]:
+    """Return the places of a lower triangle, diagonal included."""
+    return [(i, j) for i in range(n) for j in range(i + 1)]

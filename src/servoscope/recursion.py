@@ -24,6 +24,7 @@ from servoscope.chain import HEAD, SAMPLE, TILE, WATCHED, Chain, Plan, Sizes
 from servoscope.compiled import filled, inlined, kernel, traced, turning
 from servoscope.cusum import LAGS, Watch
 from servoscope.linear import Linear
+from servoscope.memory import Memory
 from servoscope.plants import FloatArray
 from servoscope.readout import Readout
 from servoscope.straight import coefficients, pattern
@@ -145,6 +146,7 @@ class Recursion:
             "cusum": slice(lowest, lowest + self.sizes.watched),
             "extra": slice(lowest + self.sizes.watched, self.size),
         }
+        self._memory = Memory()
         self._own = len({id(c) for c in self.constants}) > 1
         table = np.array([_packed(c, self._plan) for c in (self.constants if self._own else (first,))])
         self._table = table
@@ -189,8 +191,8 @@ class Recursion:
         """Feed a block of samples, shape (assets, N); return the new states and evaluations (assets, K, row)."""
         c = self.constants[0]
         state = np.ascontiguousarray(state)
-        new = np.empty_like(state)
-        out = np.empty((len(state), len(self.rows(state, r.shape[1])), self.sizes.row), dtype=self._type)
+        new = self._memory.empty(state.shape, state.dtype)
+        out = self._memory.empty((len(state), len(self.rows(state, r.shape[1])), self.sizes.row), self._type)
         flags = np.zeros((0, 0), dtype=np.bool_) if restart is None else restart
         signals = state, new, r, u, y, flags, c.every, c.stride
 
@@ -224,7 +226,7 @@ class Recursion:
         out = np.zeros((len(r), self.sizes.rows))  # a missing sample writes nothing
         ok = np.empty(len(r), dtype=np.int64)
         machine(self._plan, 1, 1, 1).regress(
-            self._table[0], self.start()[0], r, u, y, restart, self.constants[0].stride, out, ok
+            self._table[0], self.start(), r, u, y, restart, self.constants[0].stride, out, ok
         )
         return out, ok
 
@@ -342,6 +344,7 @@ def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
     several = WATCHED if lanes == 1 else lanes  # CUSUMs of one asset go side by side, or those of several assets
     literals = {x: getattr(sizes, x) for x in ("n", "rows", "row", "floats", "frequencies", "extra", "watched")}
     literals |= {"columns": sizes.n + 1, "room": sizes.n + 2, "tile": 4 * TILE, "handed": (sizes.n + LAGS + 1) * TILE}
+    literals["size"] = HEAD + sizes.floats + sizes.watched + sizes.extra
     literals |= {"lanes": lanes, "width": width, "own": own, "several": several}
     names: dict[str, object] = {f"_{name}": number for name, number in literals.items()}
     names |= {"_to": namedtuple("To", to)(**to), "_at": namedtuple("At", at)(**at), "_update": estimator.update}
@@ -350,18 +353,25 @@ def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
         names[f"_{step}"] = traced(getattr(steps, step), width, shared)
     for step, kept in LOOPS.items():
         names[f"_{step}"] = traced(getattr(steps, step), width, shared, kept)
+    names["_highest"] = traced(steps.highest)
     names["_listen"] = traced(steps.listen, min(several, max(width, WATCHED)), "w" if lanes == 1 else shared, "g")
-    names["_turn"] = turning(width)
+    names |= {"_turn": turning(width), "_square": turning(HEAD)}
     for step in SAID:
         names[f"_{step}"] = traced(getattr(readout, step), width, shared)
     for step in ALONE:
         names[f"_{step}_one"] = traced(getattr(steps, step))
     heap = not sizes.steady  # estimators with a P of their own allocate
+    for move, square in zip(drive.MOVES, drive.SQUARES, strict=True):
+        each = inlined(filled(move, names), heap)
+        names[f"_{move.__name__}_each"] = each
+        fits = lanes > 1 and min(sizes.row, sizes.floats) >= width
+        names[f"_{move.__name__}"] = inlined(filled(square, names), heap) if fits else each
     for template in drive.PARTS:
         names[f"_{template.__name__}"] = inlined(filled(template, names), heap)
         names["_take"] = names.get("_settled" if sizes.steady else "_refreshed")
         names["_take_all"] = names.get("_together" if sizes.steady else "_apart")
-        names["_glided"] = names.get("_never" if sizes.speed or not sizes.steady else "_gliding")
+        calm = (lanes > 1 or sizes.watched) and sizes.steady and not sizes.speed
+        names["_glided"] = names.get("_gliding" if calm else "_never")
         names["_write"] = names.get("_plain" if sizes.start else "_complete")
     what = repr((plan, lanes, width, own))
     return SimpleNamespace(**{driver.__name__: kernel(filled(driver, names, what), heap) for driver in drive.DRIVERS})
