@@ -63,8 +63,8 @@ class Chain:
     """The steps of one sample for the sizes of a plan.
 
     c are constants, s the state, h its counters, v the regressors [eta, phi, z], `shadow` those of the healthy loop, e
-    the whitened residual, w and `when` what the sequential test takes of the samples of a tile, g its CUSUMs; the places
-    of the plan say what stands where. With `alone`, neighbouring CUSUMs of one asset are lanes for `listen`.
+    the whitened residual, w and `when` what the sequential test takes of the samples of a tile, g its CUSUMs; the
+    places of the plan say what stands where. With `alone`, neighbouring CUSUMs of one asset are lanes for `listen`.
     """
 
     def __init__(self, plan: Plan, steady: Any, alone: bool = False) -> None:
@@ -86,8 +86,8 @@ class Chain:
 
     def calm(self, h: Any, e: Any) -> Truth:
         """Return whether nothing is odd about samples that were weighed: all of them update the estimator."""
-        known: Truth = (e[0] < ABSURD) & (e[1] <= 0.0)  # NaN is not below anything
-        return known & (h[ARMED] > 0.0) & (h[WAIT] <= 0.0)
+        calm: Truth = (e[0] < ABSURD) & (e[1] <= 0.0) & (h[ARMED] > 0.0) & (h[WAIT] <= 0.0)  # NaN is below nothing
+        return calm
 
     def glide(self, c: Any, s: Any, h: Any, w: Any, when: Any, tile: Any, i: Any) -> None:
         """Take a sample of calm ones; what `advance` and `learn` do, without their exceptions."""

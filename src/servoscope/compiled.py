@@ -129,9 +129,7 @@ def traced(
         def looped(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             *found, begin, end = given(context, builder, signature, values)
             before = builder.block
-            found = [
-                Kept(each, before) if name in kept else each for name, each in zip(arguments, found, strict=False)
-            ]
+            found = [Kept(each, before) if name in kept else each for name, each in zip(arguments, found, strict=False)]
             with cgutils.for_range_slice(builder, begin.value, end.value, begin.value.type(1)) as (index, _):
                 function(*found, Index(builder, index))
                 flush([each for each in found if not isinstance(each, Kept)])
@@ -201,7 +199,7 @@ def turning(width: int) -> Callable[..., None]:
     to its precision. The numbers of a row are neighbours, and nothing is checked.
     """
 
-    def turn(typing: Any, x: Any, i: Any, j: Any, y: Any, k: Any, l: Any) -> Any:  # noqa: E741
+    def turn(typing: Any, x: Any, i: Any, j: Any, y: Any, k: Any, l: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             given: list[Any] = []
             for which in (0, 3):
