@@ -16,7 +16,7 @@ from servoscope.readout import Readout
 
 SAID = ("evaluate", "respond", "tell")
 STEPS = ("renew", "calm", "tick", "advance", "used", "learn", "note")
-LOOPS = {"weigh": "e", "glide": "sh", "alarm": "sh"}  # steps that run over the samples of a tile, and what they keep
+LOOPS = {"weigh": ("e",), "glide": ("s", "h"), "alarm": ("s", "h")}  # over the samples of a tile; what they keep
 ALONE = ("begin", "advance", "learn", "follow", "forget")  # where neighbours may do something else
 
 
@@ -39,7 +39,7 @@ def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
     for step, kept in LOOPS.items():
         names[f"_{step}"] = traced(getattr(steps, step), width, shared, kept)
     names["_highest"] = traced(steps.highest)
-    names["_listen"] = traced(steps.listen, min(several, max(width, WATCHED)), "w" if lanes == 1 else shared, "g")
+    names["_listen"] = traced(steps.listen, WATCHED if lanes == 1 else width, "w" if lanes == 1 else shared, ("g",))
     names |= {"_turn": turning(width), "_square": turning(HEAD)}
     for step in SAID:
         names[f"_{step}"] = traced(getattr(readout, step), width, shared)
