@@ -1,4 +1,4 @@
-"""How the cost of a sample grows with assets, coefficients, FIR length and frequencies, beside the machine's limit.
+"""How the cost of a sample grows with assets, coefficients, FIR length and frequencies, beside the machine's limits.
 
 python benchmarks/growth.py [-o docs/images/growth.png] [--json]
 """
@@ -15,8 +15,9 @@ import numpy as np
 from tables import machine, parser
 
 from servoscope.bench import interleaved, limits
-from servoscope.chain import Chain
+from servoscope.chain import TILE, Chain
 from servoscope.linear import sampled, stack, state_variable_filter
+from servoscope.readout import Readout
 from servoscope.recursion import Constants, Recursion, View
 from servoscope.twostage import Stage, StageOne
 
@@ -48,7 +49,7 @@ def constants(n: int = 4, frequencies: int = 3) -> Constants:
     system = type(bank)(bank.A, bank.B @ route, bank.C / np.abs(bank.C).max(axis=1)[:, None], bank.D @ route)
     velocity = sampled(state_variable_filter(25.0, 2), RATE, "foh").output(np.array([[0.0, 1.0]]))
     rng = np.random.default_rng(0)
-    view = View(np.eye(n), np.zeros(n), rng.standard_normal((2 * frequencies, n)))
+    view = View(np.eye(n), np.zeros(n), rng.standard_normal((2 * frequencies, n)), RATE)
     one, a = np.eye(n), np.array([0.5, 0.1, 0.05, 0.01])
     return Constants(
         estimator="akf", steady=True, bank=system, velocity=velocity, v_of_r=False, codes=(),
@@ -65,17 +66,27 @@ def operations(c: Constants) -> float:
     row = [Tally(x) for x in recursion._table[0]]
     s, h = ([Tally(0.1)] * size for size in (recursion.sizes.floats, 8))
     v, said, q = ([Tally(1.0)] * size for size in (recursion.sizes.rows, 1, recursion.sizes.row))
-    tile = [Tally(0.1)] * 32
+    tile = [Tally(0.1)] * (4 * TILE)
     Tally.done = 0
     chain.advance(row, s, h, said, v, [], tile, 0, True)
     chain.learn(row, s, h, v, [], [])
     each, Tally.done = Tally.done, 0
     for i in range(recursion.sizes.floats):
         s[i] = Tally(1.0 + i % 3)
-    chain.evaluate(row, s, h, q)
+    readout = Readout(recursion._plan)
+    readout.evaluate(row, s, h, q)
     for f in range(recursion.sizes.frequencies):
-        chain.respond(row, s, f, q)
+        readout.respond(row, s, f, q)
     return each + Tally.done / c.every
+
+
+def moved(c: Constants, samples: int) -> float:
+    """Return how many bytes one sample reads and writes, its share of an evaluation and of the state included.
+
+    What is written is read before, by the processor, to fill the cache's lines.
+    """
+    recursion = Recursion([c])
+    return 8.0 * (3 + 2 * recursion.sizes.row / c.every + 3 * recursion.size / samples)
 
 
 def fleet(c: Constants, assets: int, samples: int) -> tuple[Callable[[], object], int]:
@@ -106,47 +117,48 @@ def main() -> None:
     from servoscope import recursion
 
     recursion._cores = lambda: 1
-    sweeps: dict[str, dict[int, tuple[Callable[[], object], int]]] = {
-        "assets": {A: fleet(constants(), A, max(100, 100_000 // A)) for A in (1, 4, 16, 64, 1000, 10_000, 100_000)},
-        "coefficients": {n: fleet(constants(n), 1024, 100) for n in range(2, 9)},
-        "frequencies": {F: fleet(constants(4, F), 1024, 100) for F in (1, 3, 10, 30, 100)},
-        "taps of stage 1 (FIR), one log": {n: fir(n) for n in (8, 16, 40, 64, 128)},
+    taps = "taps of stage 1 (FIR), one log"
+    loops = {
+        "assets": {A: (constants(), A, max(100, 100_000 // A)) for A in (1, 4, 16, 64, 1000, 10_000, 100_000)},
+        "coefficients": {n: (constants(n), 1024, 100) for n in range(2, 9)},
+        "frequencies": {F: (constants(4, F), 1024, 100) for F in (1, 3, 10, 30, 100)},
     }
-    jobs: dict[str, Callable[[], object]] = {}
     burn, count = limits.multiply_adds(200_000)
-    jobs["fma"] = burn
-    for sweep, points in sweeps.items():
-        jobs |= {f"{sweep}={x}": job for x, (job, _) in points.items()}
+    copy, copied = limits.copying()
+    jobs: dict[str, Callable[[], object]] = {"fma": burn, "copy": copy}
+    samples, least, bytes_ = {}, {}, {}
+    for sweep, points in loops.items():
+        for x, (c, assets, length) in points.items():
+            jobs[f"{sweep}={x}"], samples[sweep, x] = fleet(c, assets, length)
+            least[sweep, x], bytes_[sweep, x] = operations(c) / 2, moved(c, length)
+    for n in (8, 16, 40, 64, 128):
+        jobs[f"{taps}={n}"], samples[taps, n] = fir(n)
+        least[taps, n], bytes_[taps, n] = n * n + 4 * n, 3 * 8.0
     found = interleaved(jobs, REPEATS)
-    per_fma = 1e9 * found["fma"].median / count
-    least = {
-        "assets": {A: operations(constants()) / 2 for A in sweeps["assets"]},
-        "coefficients": {n: operations(constants(n)) / 2 for n in sweeps["coefficients"]},
-        "frequencies": {F: operations(constants(4, F)) / 2 for F in sweeps["frequencies"]},
-        "taps of stage 1 (FIR), one log": {n: n * n + 4 * n for n in sweeps["taps of stage 1 (FIR), one log"]},
+    per_fma, per_byte = 1e9 * found["fma"].processor / count, 1e9 * found["copy"].processor / copied
+    result: dict[str, Any] = {
+        "machine": machine(),
+        "ns per multiply-add at the peak, one core": per_fma,
+        "ns per byte through memory, one core": per_byte,
     }
-    result: dict[str, Any] = {"machine": machine(), "ns per multiply-add at the peak, one core": per_fma}
-    for sweep, points in sweeps.items():
-        result[sweep] = {
-            x: {
-                "ns": 1e9 * found[f"{sweep}={x}"].median / samples,
-                "quartiles": [1e9 * q / samples for q in (found[f"{sweep}={x}"].low, found[f"{sweep}={x}"].high)],
-                "limit": least[sweep][x] * per_fma,
-            }
-            for x, (_, samples) in points.items()
+    for (sweep, x), number in samples.items():
+        result.setdefault(sweep, {})[x] = {
+            "ns": 1e9 * found[f"{sweep}={x}"].processor / number,
+            "multiply-adds": least[sweep, x] * per_fma,
+            "memory": bytes_[sweep, x] * per_byte,
         }
+    sweeps = [*loops, taps]
     if given.output:
-        draw(result, list(sweeps), given.output)
+        draw(result, sweeps, given.output)
     if given.json:
         print(json.dumps(result, indent=1))
-    else:
-        print(machine())
-        for sweep in sweeps:
-            print(f"\n| {sweep} | ns per sample | quartiles | limit |\n| --- | --- | --- | --- |")
-            for x, p in result[sweep].items():
-                print(
-                    f"| {x} | {p['ns']:.1f} | {p['quartiles'][0]:.1f} to {p['quartiles'][1]:.1f} | {p['limit']:.1f} |"
-                )
+        return
+    print(machine())
+    print(f"{1.0 / per_fma:.1f} multiply-adds per ns, {1.0 / per_byte:.1f} GB/s")
+    for sweep in sweeps:
+        print(f"\n| {sweep} | ns per sample | its multiply-adds | its bytes |\n| --- | --- | --- | --- |")
+        for x, p in result[sweep].items():
+            print(f"| {x} | {p['ns']:.1f} | {p['multiply-adds']:.1f} | {p['memory']:.1f} |")
 
 
 def draw(result: dict[str, Any], sweeps: list[str], path: Path) -> None:
@@ -160,11 +172,12 @@ def draw(result: dict[str, Any], sweeps: list[str], path: Path) -> None:
     for ax, sweep in zip(axes.flat, sweeps, strict=True):
         points = result[sweep]
         x = list(points)
-        ns, limit = ([p[name] for p in points.values()] for name in ("ns", "limit"))
-        low, high = zip(*(p["quartiles"] for p in points.values()), strict=True)
-        ax.plot(x, ns, "o-", label="measured, one core")
-        ax.fill_between(x, low, high, alpha=0.3)
-        ax.plot(x, limit, "k--", label="its multiply-adds at the peak rate")
+        for name, line, label in (
+            ("ns", "o-", "measured, one core"),
+            ("multiply-adds", "k--", "its multiply-adds at the peak rate"),
+            ("memory", "k:", "its bytes through memory"),
+        ):
+            ax.plot(x, [p[name] for p in points.values()], line, label=label)
         ax.set(xlabel=sweep, ylabel="ns per sample", ylim=(0.0, None))
         if sweep in ("assets",):
             ax.set_xscale("log")

@@ -11,7 +11,7 @@ import pytest
 
 from servoscope import compiled
 from servoscope.arithmetic import dot, fma, larger, lower, root, smaller, where
-from servoscope.compiled import filled, kernel, sources, traced
+from servoscope.compiled import filled, kernel, sources, traced, turning
 from servoscope.linear import Linear
 from servoscope.straight import advance, coefficients, pattern
 
@@ -50,6 +50,47 @@ def test_code_does_to_lanes_what_python_does_to_numbers(kind: Any) -> None:
         assert found[0][:, a] == pytest.approx(
             list(plain.values()), rel=1e-14 if kind is np.float64 else 1e-5, abs=1e-6
         )
+
+
+def running(s: Any, x: Any, i: Any) -> None:
+    """Add sample i to a sum, and to that sum's sum."""
+    s[0] = s[0] + x[i]
+    s[2] = s[2] + s[0] * s[1]
+
+
+def run_over(s: np.ndarray[Any, Any], x: np.ndarray[Any, Any], begin: int, end: int, step: int) -> None:
+    for a in range(0, x.shape[1], step):
+        _part(a, s, x, begin, end)
+
+
+@pytest.mark.parametrize("width", [1, 8])
+def test_a_loop_leaves_what_its_steps_would(width: int) -> None:
+    """Rows that it keeps in registers are read before it and stored behind it; a loop of no steps changes nothing."""
+    rng = np.random.default_rng(0)
+    x, s = rng.standard_normal((5, LANES)), rng.standard_normal((3, LANES))
+    run = kernel(filled(run_over, {"_part": traced(running, width, kept=("s",))}, f"kept {width}"), heap=False)
+    expected = s.copy()
+    for begin, end in ((1, 4), (2, 2), (4, 5)):
+        for i in range(begin, end):
+            expected[0] += x[i]
+            expected[2] += expected[0] * expected[1]
+        run(s, x, begin, end, width)
+        assert np.array_equal(s, expected)
+
+
+@pytest.mark.parametrize("kinds", [("f8", "f8"), ("f8", "f4"), ("f4", "f8"), ("f4", "f4")])
+@pytest.mark.parametrize("width", [8, 16])
+def test_a_square_is_turned_and_rounded(width: int, kinds: tuple[str, str]) -> None:
+    x = np.random.default_rng(0).standard_normal((20, 30)).astype(kinds[0])
+    y = np.zeros((30, 40), dtype=kinds[1])
+
+    def turn(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> None:
+        _part(x, 3, 5, y, 7, 11)
+
+    kernel(filled(turn, {"_part": turning(width)}, f"{width}"), heap=False)(x, y)
+    expected = np.zeros_like(y)
+    expected[7 : 7 + width, 11 : 11 + width] = x[3 : 3 + width, 5 : 5 + width].T
+    assert np.array_equal(y, expected)
 
 
 def test_a_symmetric_matrix_is_stored_once() -> None:

@@ -14,6 +14,7 @@ from servoscope.diagnosis import Trace
 from servoscope.errors import BaselineError
 from servoscope.learning import learn
 from servoscope.loop import Loop
+from servoscope.memory import Memory
 from servoscope.monitor import Monitor
 from servoscope.recursion import LANES
 from servoscope.simulation import FaultEvent, reference, simulate
@@ -140,6 +141,20 @@ class TestSingle:
             split, trace = monitor.run(split, r[:, cut], u[:, cut], y[:, cut], restart[:, cut])
             parts.append(trace.statistic)
         assert np.array_equal(state, split) and np.array_equal(whole.statistic, np.concatenate(parts, axis=1))
+
+
+def test_memory_is_used_again_only_when_nobody_holds_it() -> None:
+    memory, shape, kind = Memory(), (512, 512), np.dtype(np.float64)
+    first = memory.empty(shape, kind)
+    first[:] = 1.0
+    view = first[3:, ::2].T
+    del first
+    second = memory.empty(shape, kind)
+    second[:] = 2.0
+    assert (view == 1.0).all()
+    where = view.__array_interface__["data"][0] - 3 * 512 * 8
+    del view
+    assert memory.empty(shape, kind).__array_interface__["data"][0] == where
 
 
 def test_the_state_of_an_asset_takes_no_more_than_a_kibibyte() -> None:

@@ -169,7 +169,7 @@ class TestGaps:
         assert np.array_equal(g.eta[200:], fresh.eta) and np.array_equal(g.phi[200:], fresh.phi)
 
 
-NOWHERE = View(np.eye(4), np.zeros(4), np.zeros((2, 4)))  # of no baseline, at one frequency
+NOWHERE = View(np.eye(4), np.zeros(4), np.zeros((2, 4)), 100.0)  # of no baseline, at one frequency
 
 _LEARNED: dict[int, Baseline] = {}
 

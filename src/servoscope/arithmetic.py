@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Index", "Number", "Rows", "Truth", "dot", "fma", "larger", "lower", "root", "smaller", "where"]
+__all__ = ["Index", "Number", "Truth", "dot", "fma", "larger", "lower", "root", "smaller", "where"]
 
 QUIET = ("nnan", "nsz")  # no NaN comes this far; without that no maximum could be vectorised
 
@@ -145,77 +145,6 @@ class Index:
         return Index(self.builder, self.builder.mul(self.value, self._of(other)))
 
     __rmul__ = __mul__
-
-
-class Rows:
-    """One lane, or several neighbours, of an array (rows, lanes); where `shared`, all lanes are one.
-
-    A row is read once, and what was written is stored by `flush`. Rows whose number is itself
-    computed are read and stored at once; they must not be among the others.
-    """
-
-    def __init__(self, context: Any, builder: Any, kind: Any, array: Any, lane: Any, width: int, shared: bool) -> None:
-        self._context, self._builder, self._kind, self._array, self._lane = context, builder, kind, array, lane
-        self._width, self._shared = width, shared
-        self._known: dict[int, Number] = {}
-        self._written: set[int] = set()
-
-    def _place(self, row: int | Index) -> Any:
-        from llvmlite import ir
-        from numba.core import cgutils, types
-
-        number = row.value if isinstance(row, Index) else self._context.get_constant(types.intp, row)
-        place = cgutils.get_item_pointer(self._context, self._builder, self._kind, self._array, (number, self._lane))
-        if self._width == 1 or self._shared:
-            return place
-        element = self._context.get_data_type(self._kind.dtype)
-        return self._builder.bitcast(place, ir.VectorType(element, self._width).as_pointer())
-
-    def _load(self, row: int | Index) -> Number:
-        width = self._context.get_abi_sizeof(self._context.get_data_type(self._kind.dtype))
-        one = self._builder.load(self._place(row), align=width)
-        if self._width > 1 and self._shared:
-            one = lanes_of(self._builder, one, self._width)
-        return Number(self._builder, one)
-
-    def _store(self, number: Number, row: int | Index) -> None:
-        width = self._context.get_abi_sizeof(self._context.get_data_type(self._kind.dtype))
-        self._builder.store(number.value, self._place(row), align=width)
-
-    def __getitem__(self, row: int | Index) -> Number:
-        if isinstance(row, Index):
-            return self._load(row)
-        if row not in self._known:
-            self._known[row] = self._load(row)
-        return self._known[row]
-
-    def __setitem__(self, row: int | Index, number: Any) -> None:
-        from llvmlite import ir
-
-        element = self._context.get_data_type(self._kind.dtype)
-        kind = element if self._width == 1 else ir.VectorType(element, self._width)
-        as_stored = Number(self._builder, Number(self._builder, ir.Constant(kind, ir.Undefined)).like(number))
-        if isinstance(row, Index):
-            self._store(as_stored, row)
-            return
-        self._known[row] = as_stored
-        self._written.add(row)
-
-    def flush(self) -> None:
-        """Store what was written."""
-        for row in sorted(self._written):
-            self._store(self._known[row], row)
-
-
-def lanes_of(builder: Any, one: Any, width: int) -> Any:
-    """Return a value as a vector of so many."""
-    from llvmlite import ir
-
-    if width == 1:
-        return one
-    several, index = ir.Constant(ir.VectorType(one.type, width), ir.Undefined), ir.IntType(32)
-    alone = builder.insert_element(several, one, index(0))
-    return builder.shuffle_vector(alone, several, ir.Constant(ir.VectorType(index, width), [index(0)] * width))
 
 
 def _symbol(*numbers: Any) -> Number | None:

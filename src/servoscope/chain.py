@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from servoscope import straight
-from servoscope.arithmetic import Truth, dot, fma, larger, lower, root, smaller, where
+from servoscope.arithmetic import Truth, dot, fma, larger, smaller, where
 from servoscope.cusum import CLIP, LAGS, grown, whitened
 from servoscope.propagation import remember, spread
 from servoscope.straight import Pattern
@@ -19,12 +19,11 @@ from servoscope.straight import Pattern
 # counters at the head of a state row
 ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, STILL, USED_UP, CROSSED = range(8)
 HEAD = 8
+WATCHED = 8  # CUSUMs are counted in such steps, so that few codes serve many baselines
 # what is said of a sample
 MISSING, HELD, USED, BETWEEN = -1.0, 0.0, 1.0, 2.0
 ABSURD = 1e100  # no physical signal; its square would overflow and stay in the state for ever
-TILE = 8  # samples that are fetched together: a cache line of each signal
-TINY = 1e-30  # no variance is smaller; a number of single precision, too
-WHITE, LARGEST, COUNTS = range(3)  # of the sequential test: whitened residual, largest CUSUM, whether it counts
+TILE = 16  # samples that are fetched together, at most
 
 
 class Sizes(NamedTuple):
@@ -64,19 +63,47 @@ class Chain:
     """The steps of one sample for the sizes of a plan.
 
     c are constants, s the state, h its counters, v the regressors [eta, phi, z], `shadow` those of the healthy loop, e
-    what the sequential test works with, q an evaluation; the places of the plan say what stands where.
+    the whitened residual, w and `when` what the sequential test takes of the samples of a tile, g its CUSUMs; the
+    places of the plan say what stands where. With `alone`, neighbouring CUSUMs of one asset are lanes for `listen`.
     """
 
-    def __init__(self, plan: Plan, steady: Any) -> None:
+    def __init__(self, plan: Plan, steady: Any, alone: bool = False) -> None:
         self.size, self.to, self.at = plan.sizes, SimpleNamespace(**dict(plan.to)), SimpleNamespace(**dict(plan.at))
-        self._bank, self._shadow, self._steady = plan.bank, plan.shadow, steady
+        self._bank, self._shadow, self._steady, self.alone = plan.bank, plan.shadow, steady, alone
 
-    def tick(self, s: Any, h: Any, tile: Any, i: Any, first: Any) -> Truth:
-        """Count a sample, and begin a new evaluation with its first; return whether there is nothing odd about it."""
-        h[SAMPLE] = h[SAMPLE] + 1.0
+    def renew(self, s: Any, h: Any) -> None:
+        """Begin a new evaluation."""
         if self.size.shadow:
-            h[CROSSED] = where(first & (s[self.to.level] < 1.0), 0.0, h[CROSSED])
-            s[self.to.peak] = where(first, s[self.to.level], s[self.to.peak])
+            level = s[self.to.level]
+            h[CROSSED] = where(level < 1.0, 0.0, h[CROSSED])
+            s[self.to.peak] = level
+
+    def weigh(self, e: Any, tile: Any, i: Any) -> None:
+        """Add up how large samples are, and how many restart."""
+        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
+        e[0] = e[0] + ((abs(r) + abs(u)) + abs(y))
+        e[1] = e[1] + tile[i + 3 * TILE]
+
+    def calm(self, h: Any, e: Any) -> Truth:
+        """Return whether nothing is odd about samples that were weighed: all of them update the estimator."""
+        calm: Truth = (e[0] < ABSURD) & (e[1] <= 0.0) & (h[ARMED] > 0.0) & (h[WAIT] <= 0.0)  # NaN is below nothing
+        return calm
+
+    def glide(self, c: Any, s: Any, h: Any, w: Any, when: Any, tile: Any, i: Any) -> None:
+        """Take a sample of calm ones; what `advance` and `learn` do, without their exceptions."""
+        h[SAMPLE] = h[SAMPLE] + 1.0
+        x = self._inputs(c, tile[i], tile[i + TILE], tile[i + 2 * TILE], None)
+        v = straight.advance(self._bank, c, self.at.bank, s, self.to.x, x)
+        shadow = straight.advance(self._shadow, c, self.at.shadow, s, self.to.shadow, x)
+        e: dict[int, Any] = {}
+        self.learn(c, s, h, v, shadow, e)
+        if self.size.shadow:
+            self._hand_over(s, e, h[USED_UP] > c[self.at.warm], w, i)
+            when[i] = h[SAMPLE]
+
+    def tick(self, h: Any, tile: Any, i: Any) -> Truth:
+        """Count a sample; return whether there is nothing odd about it."""
+        h[SAMPLE] = h[SAMPLE] + 1.0
         r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
         whole = (abs(r) < ABSURD) & (abs(u) < ABSURD) & (abs(y) < ABSURD)
         sound: Truth = whole & (tile[i + 3 * TILE] <= 0.0) & (h[ARMED] > 0.0)
@@ -175,75 +202,36 @@ class Chain:
             for i in range(count):
                 s[begin + i] = 0.0
 
-    def prick(self, c: Any, h: Any, said: Any, e: Any) -> None:
-        """Get ready to listen: the CUSUMs count once the whitening filter has forgotten where it began."""
-        e[LARGEST] = 0.0
-        e[COUNTS] = where(self.used(said) & (h[USED_UP] > c[self.at.warm]), 1.0, 0.0)
+    def note(self, c: Any, s: Any, h: Any, said: Any, e: Any, w: Any, when: Any, i: Any) -> None:
+        """Hand a sample over to the sequential test; it counts once the whitening filter has forgotten its start."""
+        used = self.used(said)
+        self._hand_over(s, e, used & (h[USED_UP] > c[self.at.warm]), w, i)
+        when[i] = where(used, h[SAMPLE], 0.0)
 
-    def listen(self, c: Any, s: Any, g: Any, e: Any, j: Any) -> None:
-        """Add the whitened residual to CUSUM j."""
-        columns, count = self.size.n + LAGS, self.size.watched
-        weights = [c[j + (self.at.tail + count * i)] for i in range(columns)]
-        limit, inverse = (c[j + (self.at.tail + count * (columns + i))] for i in range(2))
-        new = grown(weights, [s[self.to.psi + i] for i in range(columns)], e[WHITE], g[j], limit)
-        new = where(e[COUNTS] > 0.0, new, g[j])
-        g[j] = new
-        e[LARGEST] = larger(e[LARGEST], new * inverse)
+    def listen(self, c: Any, g: Any, w: Any, top: Any, i: Any) -> None:
+        """Add the whitened residual of sample i to some CUSUMs, which stand in g; c begins with their weights."""
+        columns, each = self.size.n + LAGS, self.size.watched // WATCHED if self.alone else WATCHED
+        count = each if self.alone else self.size.watched
+        psi, white, best = [w[i * (columns + 1) + k] for k in range(columns)], w[i * (columns + 1) + columns], top[i]
+        for j in range(each):
+            g[j] = grown([c[j + count * k] for k in range(columns)], psi, white, g[j], c[j + count * columns])
+            best = larger(best, g[j])
+        top[i] = best
 
-    def alarm(self, s: Any, h: Any, said: Any, e: Any) -> None:
+    def highest(self, top: Any, i: Any) -> None:
+        """Gather the largest of neighbouring CUSUMs of one asset in the first of them."""
+        found = [top[i * WATCHED + j] for j in range(WATCHED)]
+        while len(found) > 1:
+            found = [larger(a, b) for a, b in zip(found[::2], found[1::2], strict=True)]
+        top[i * WATCHED] = found[0]
+
+    def alarm(self, s: Any, h: Any, top: Any, when: Any, i: Any) -> None:
         """Note how high the largest CUSUM is, and when one passes its limit."""
-        used, level = self.used(said), e[LARGEST]
+        level, number = top[i], when[i]
+        used = number > 0.0
         s[self.to.peak] = where(used, larger(s[self.to.peak], level), s[self.to.peak])
         s[self.to.level] = where(used, level, s[self.to.level])
-        h[CROSSED] = where(used & (level >= 1.0) & (h[CROSSED] <= 0.0), h[SAMPLE], h[CROSSED])
-
-    def evaluate(self, c: Any, s: Any, h: Any, q: Any) -> None:
-        """Write one complete evaluation but for the frequency response, in physical units.
-
-        T^2 = d' Cov^-1 d by Cholesky's factor of Cov = S + that of the baseline, where d is theta minus the baseline's.
-        """
-        n, at = self.size.n, self.at
-        d = [s[self.to.theta + i] for i in range(n)]
-        Cov = self._covariance(c, s)
-        G: list[list[Any]] = [[] for _ in range(n)]
-        white: list[Any] = []
-        for j in range(n):
-            column = [Cov[i][j] for i in range(j, n)]
-            rest = d[j]
-            if j:
-                column = [x - dot(G[j + i], G[j]) for i, x in enumerate(column)]
-                rest = rest - dot(G[j], white)
-            inverse = 1.0 / root(larger(column[0], TINY))
-            white.append(rest * inverse)
-            for i, x in enumerate(column):
-                G[j + i].append(x * inverse)
-        q[0] = h[UPDATES]
-        q[1] = where(h[UPDATES] > 0.0, dot(white, white), 0.0)
-        q[2] = s[self.to.peak]
-        q[3] = h[CROSSED]
-        basis = [[c[at.basis + n * i + j] for j in range(n)] for i in range(n)]
-        for i, row in enumerate(basis):
-            q[4 + i] = c[at.origin + i] + dot(row, d)
-        self._turned(basis, Cov, q, 4 + n)
-
-    def respond(self, c: Any, s: Any, f: Any, q: Any) -> None:
-        """Write Re H, Im H at frequency f and their covariance (2, 2) behind the rest of the evaluation."""
-        n = self.size.n
-        begin, end = f * (2 * (n + 1)) + self.at.response, f * 6 + (4 + n + n * n)
-        E = [[c[begin + (n * part + j)] for j in range(n)] for part in range(2)]
-        for part in range(2):
-            q[end + part] = c[begin + (2 * n + part)] + dot(E[part], [s[self.to.theta + j] for j in range(n)])
-        self._turned(E, self._covariance(c, s), q, end + 2)
-
-    def tell(self, s: Any, h: Any, q: Any) -> None:
-        """Write what the recursion itself knows, for a diagnosis, in its own coordinates."""
-        n = self.size.n
-        numbers = [h[UPDATES], h[SKIPPED], s[self.to.power], s[self.to.peak], h[CROSSED]]
-        numbers += [s[self.to.theta + i] for i in range(n)]
-        numbers += [s[self.to.S + lower(i, j)] for i in range(n) for j in range(n)]
-        numbers += [s[self.to.Psi + i] for i in range(n * n)]
-        for i, number in enumerate(numbers):
-            q[i] = number
+        h[CROSSED] = where(used & (level >= 1.0) & (h[CROSSED] <= 0.0), number, h[CROSSED])
 
     def _speed(self, c: Any, s: Any, source: Any) -> Any:
         k = self.at.velocity  # A (2, 2), B, C, D, steady state
@@ -280,16 +268,12 @@ class Chain:
         for i in range(n):
             s[to.psi + i] = whitened(c, self.at.white, s, to.white + (1 + i) * memory, memory, shadow[1 + i])
         residual = v[0] - shadow[0] - dot([c[self.at.apart + i] for i in range(n)], phi)
-        e[WHITE] = smaller(larger(whitened(c, self.at.white, s, to.white, memory, residual), -CLIP), CLIP)
+        e[0] = smaller(larger(whitened(c, self.at.white, s, to.white, memory, residual), -CLIP), CLIP)
         h[USED_UP] = h[USED_UP] + 1.0
 
-    def _covariance(self, c: Any, s: Any) -> list[list[Any]]:
-        n = range(self.size.n)
-        return [[s[self.to.S + lower(i, j)] + c[self.at.prior + self.size.n * i + j] for j in n] for i in n]
-
-    def _turned(self, E: Sequence[Sequence[Any]], Cov: Sequence[Sequence[Any]], q: Any, at: Any) -> None:
-        """Write E Cov E' to q[at:], row by row."""
-        halves = [[dot(row, column) for column in Cov] for row in E]
-        for i, half in enumerate(halves):
-            for j, row in enumerate(E):
-                q[at + (len(E) * i + j)] = dot(half, row)
+    def _hand_over(self, s: Any, e: Any, counts: Truth, w: Any, i: Any) -> None:
+        """Write columns and residual of sample i to w; no CUSUM moves where all of them are zero."""
+        columns = self.size.n + LAGS
+        for k in range(columns):
+            w[i * (columns + 1) + k] = where(counts, s[self.to.psi + k], 0.0)
+        w[i * (columns + 1) + columns] = where(counts, e[0], 0.0)

@@ -18,14 +18,16 @@ from numba.core.runtime import rtsys
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-from servoscope.arithmetic import Index, Rows, Truth, lanes_of
+from servoscope.arithmetic import Index, Number, Truth
+from servoscope.lanes import Kept, Rows, lanes_of, turned
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
 F = TypeVar("F", bound="Callable[..., object]")
 
 LINE = 64  # bytes: a vector must not straddle two cache lines
+ALIGNED = 4  # bytes: all that is known of where a number stands
 
 
 @functools.cache
@@ -96,35 +98,56 @@ def filled(template: Callable[..., Any], names: Mapping[str, object], what: str 
     return function
 
 
-def traced(function: Callable[..., Truth | None], width: int = 1, shared: str = "") -> Callable[..., bool]:
+def traced(
+    function: Callable[..., Truth | None], width: int = 1, shared: str = "", kept: Sequence[str] = ()
+) -> Callable[..., bool]:
     """Return what kernels call as ``part(lane, ...)`` for a function of `servoscope.arithmetic`.
 
     Arrays (rows, lanes) arrive as `width` lanes of them from `lane` on, integers as numbers of rows, booleans as
     conditions; `shared` is the argument whose lanes are all one. The function runs once, with symbols, and
     leaves straight-line code of vectors. What it returns holds in all lanes, or does not.
+
+    With `kept`, names of arguments, that code is in a loop: the last argument runs from one number of two, by which it
+    is called, up to the other, and these arrays stay in registers meanwhile.
     """
     arguments = tuple(inspect.signature(function).parameters)
 
     def part(typing: Any, lane: Any, *kinds: Any) -> Any:
-        def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            given: list[Any] = []
-            passed = cgutils.unpack_tuple(builder, values[1])
-            for name, kind, value in zip(arguments, signature.args[1], passed, strict=True):
+        def given(context: Any, builder: Any, signature: Any, values: Any) -> list[Any]:
+            found: list[Any] = []
+            for kind, value in zip(signature.args[1], cgutils.unpack_tuple(builder, values[1]), strict=True):
                 if isinstance(kind, types.Array):
                     array = make_array(kind)(context, builder, value)
-                    given.append(Rows(context, builder, kind, array, values[0], width, name == shared))
+                    one = arguments[len(found)] == shared
+                    found.append(Rows(context, builder, kind, array, values[0], width, one))
                 elif isinstance(kind, types.Boolean):
-                    given.append(Truth(builder, lanes_of(builder, builder.trunc(value, ir.IntType(1)), width)))
+                    found.append(Truth(builder, lanes_of(builder, builder.trunc(value, ir.IntType(1)), width)))
                 else:
-                    given.append(Index(builder, value))
-            said = function(*given)
-            for each in given:
+                    found.append(Index(builder, value))
+            return found
+
+        def flush(found: Sequence[Any]) -> None:
+            for each in found:
                 if isinstance(each, Rows):
                     each.flush()
-            holds = ir.IntType(1)(1) if said is None else said.everywhere
-            return holds
 
-        return types.boolean(lane, types.StarArgTuple(kinds)), emit  # type: ignore[attr-defined]  # it has
+        def once(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            found = given(context, builder, signature, values)
+            said = function(*found)
+            flush(found)
+            return ir.IntType(1)(1) if said is None else said.everywhere
+
+        def looped(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            *found, begin, end = given(context, builder, signature, values)
+            before = builder.block
+            found = [Kept(each, before) if name in kept else each for name, each in zip(arguments, found, strict=False)]
+            with cgutils.for_range_slice(builder, begin.value, end.value, begin.value.type(1)) as (index, _):
+                function(*found, Index(builder, index))
+                flush([each for each in found if not isinstance(each, Kept)])
+            flush([each for each in found if isinstance(each, Kept)])
+            return ir.IntType(1)(1)
+
+        return types.boolean(lane, types.StarArgTuple(kinds)), looped if kept else once  # type: ignore[attr-defined]
 
     made: Callable[..., bool] = intrinsic(part)
     return made
@@ -178,3 +201,67 @@ def laid(typing: Any, flat: Any, lanes: Any, own: Any) -> Any:
         return _fixed(context, builder, kind, source.data, (rows, count), (columns * width, apart * width))
 
     return kind(flat, lanes, own), code
+
+
+def turning(width: int) -> Callable[..., None]:
+    """Return ``turn(x, i, j, y, k, l)``, which copies a square of a matrix, turned, into another matrix.
+
+    Rows i, i + 1, ... of x from column j on, `width` of both, become columns l, l + 1, ... of y from row k on, rounded
+    to its precision. The numbers of a row are neighbours, and nothing is checked.
+    """
+
+    def turn(typing: Any, x: Any, i: Any, j: Any, y: Any, k: Any, l: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            given: list[Any] = []
+            for which in (0, 3):
+                kind = signature.args[which]
+                array = make_array(kind)(context, builder, values[which])
+                first = cgutils.get_item_pointer(context, builder, kind, array, values[which + 1 : which + 3])
+                byte = ir.IntType(8).as_pointer()
+                given += [builder.bitcast(first, byte), cgutils.unpack_tuple(builder, array.strides)[0]]
+            kinds = [context.get_data_type(each.dtype) for each in (x, y)]
+            builder.call(_turner(builder.module, width, kinds, [number.type for number in given]), given)
+            return context.get_dummy_value()
+
+        return types.void(x, types.intp, types.intp, y, types.intp, types.intp), code
+
+    made: Callable[..., None] = intrinsic(turn)
+    return made
+
+
+def _turner(module: Any, width: int, kinds: Sequence[Any], arguments: Sequence[Any]) -> Any:
+    """Return the function that turns a square, called and never inlined: loops around it are unrolled otherwise."""
+    name = f"servoscope_turn_{width}_" + "_".join(kind.intrinsic_name for kind in kinds)
+    if name in module.globals:
+        return module.globals[name]
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), arguments), name)
+    function.linkage = "internal"
+    function.attributes.add("noinline")
+    builder = ir.IRBuilder(function.append_basic_block())
+    places: list[list[Any]] = []
+    for which, kind in enumerate(kinds):
+        first, stride = function.args[2 * which : 2 * which + 2]
+        rows = [builder.gep(first, [builder.mul(stride, stride.type(n))]) for n in range(width)]
+        places.append([builder.bitcast(row, ir.VectorType(kind, width).as_pointer()) for row in rows])
+    found = turned(builder, [builder.load(place, align=ALIGNED) for place in places[0]])
+    for column, place in zip(found, places[1], strict=True):
+        like = Number(builder, ir.Constant(ir.VectorType(kinds[1], width), ir.Undefined))
+        builder.store(like.like(Number(builder, column)), place, align=ALIGNED)
+    builder.ret_void()
+    return function
+
+
+@intrinsic
+def ahead(typing: Any, x: Any, i: Any, j: Any) -> Any:
+    """Fetch element (i, j) of an array, which need not exist, into the cache."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        array = make_array(signature.args[0])(context, builder, values[0])
+        place = cgutils.get_item_pointer(context, builder, signature.args[0], array, values[1:])
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+        builder.call(fetch, [builder.bitcast(place, byte), number(0), number(3), number(1)])
+        return context.get_dummy_value()
+
+    return types.void(x, types.intp, types.intp), code

@@ -76,7 +76,10 @@ def whitened(c: Any, model: int, s: Any, at: int, memory: int, x: Any) -> Any:
     return y * c[model]
 
 
-def grown(weights: Sequence[Any], psi: Sequence[Any], e: Any, g: Any, limit: Any) -> Any:
-    """Return a CUSUM g after one more whitened residual e, whose change would shift it by weights' psi."""
+def grown(weights: Sequence[Any], psi: Sequence[Any], e: Any, g: Any, half: Any) -> Any:
+    """Return a CUSUM g, in units of its limit h, after one more whitened residual e.
+
+    A change would shift e by m = h weights' psi, and the likelihood ratio grows by m e - m^2/2; `half` is -h/2.
+    """
     shift = dot(weights, psi)
-    return smaller(larger(fma(shift, fma(shift, -0.5, e), g), 0.0), limit * CAP)
+    return smaller(larger(fma(shift, fma(shift, half, e), g), 0.0), CAP)

@@ -173,6 +173,13 @@ class Monitor:
         self.pipeline = self._followed[0].pipeline
         self._narrow = precision == "single"
         self._groups = self._grouped()
+        healthy = [each.healthy for each in self._followed]
+        self._of_baselines = {
+            "expected": _once([each.origin for each in self._followed]),
+            "H": _once([each.H for each in healthy]),
+            "covariance of H": _once([each.covariance for each in healthy]),
+        }
+        self._limits = np.array([each.limit for each in self.baselines])[:, None]
         self._head = max(each.head for each in self._followed)  # where the state of stage 2 begins
         self._size = self._head + max(recursion.size for _, recursion in self._groups)
         self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
@@ -323,40 +330,38 @@ class Monitor:
 
     def _trace(self, out: npt.NDArray[Any], index: npt.NDArray[np.int64]) -> Trace:
         """Name what stands in complete evaluations (assets, K, row)."""
-        n, frequencies = len(self._followed[0].origin), self.loop.monitor.frequencies
-        shape, F = out.shape[:2], len(frequencies)
-        H = out[..., 4 + n + n * n :].reshape(*shape, F, 6)
-
-        def of_baseline(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
-            """Return what an asset's baseline says, the same at all times."""
-            own = np.array(values) if len({id(value) for value in values}) > 1 else np.array(values[:1])
-            return np.broadcast_to(own[:, None], (*shape, *own.shape[1:]))
-
+        n, f = len(self._followed[0].origin), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)
+        shape = out.shape[:2]
+        H = out[..., 4 + n + n * n :].reshape(*shape, len(f), 6)
+        seen = H[..., :2].view(np.result_type(out, np.complex64))[..., 0], H[..., 2:].reshape(*shape, len(f), 2, 2)
         columns: dict[str, Any] = {
             "theta": out[..., 4 : 4 + n],
             "covariance": out[..., 4 + n : 4 + n + n * n].reshape(*shape, n, n),
-            "expected": of_baseline([each.origin for each in self._followed]),
             "statistic": out[..., 1],
             "level": out[..., 2],
-            "crossed": np.where(out[..., 3] > 0.0, (out[..., 3] - 1.0) / self.loop.sample_rate, np.nan),
+            "crossed": out[..., 3],
             "ready": out[..., 0] > 0.0,
         }
-        pairs = np.ascontiguousarray(H[..., :2])
-        seen = pairs.view(np.result_type(pairs, np.complex64))[..., 0], H[..., 2:].reshape(*shape, F, 2, 2)
-        healthy = [of_baseline([getattr(each.healthy, x) for each in self._followed]) for x in ("H", "covariance")]
-        threshold: Any = np.array([each.limit for each in self.baselines])[:, None]
+        for name, values in self._of_baselines.items():
+            columns[name] = np.broadcast_to(values[:, None], (*shape, *values.shape[1:]))
+        threshold: Any = self._limits
         if not self.fleet:
             columns = {name: values[0] for name, values in columns.items()}
-            seen, healthy, threshold = (seen[0][0], seen[1][0]), [x[0] for x in healthy], self.baselines[0].limit
-        f = np.asarray(frequencies, dtype=np.float64)
+            seen, threshold = (seen[0][0], seen[1][0]), self.baselines[0].limit
+        expected = Response(f, columns.pop("H"), columns.pop("covariance of H"))
         return Trace(
             t=index / self.loop.sample_rate,
             names=self.pipeline.bank.names,
             threshold=threshold,
             ifrf=Response(f, *seen),
-            ifrf_expected=Response(f, healthy[0], healthy[1]),
+            ifrf_expected=expected,
             **columns,
         )
+
+
+def _once(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Return arrays as one, or that which all of them are, with a first axis of length one."""
+    return np.array(values if len({id(value) for value in values}) > 1 else values[:1])
 
 
 def _clock(baseline: Baseline) -> Hashable:
@@ -385,7 +390,7 @@ class _Followed:
         frequencies, origin = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
         E = pipeline.bank.E(frequencies)
         response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
-        view = View(baseline.cov(), origin, response)
+        view = View(baseline.cov(), origin, response, baseline.loop.sample_rate)
         constants = pipeline.constants(baseline.tuning, baseline.watch(pipeline), view)
         healthy = ifrf.response(pipeline.bank, frequencies, origin, baseline.cov())
         return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, origin, healthy)

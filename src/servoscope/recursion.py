@@ -7,23 +7,20 @@ nothing, because everything that is carried from sample to sample stands in that
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
-from collections import namedtuple
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope import drive, estimators
-from servoscope.chain import HEAD, SAMPLE, TILE, Chain, Plan, Sizes
-from servoscope.compiled import filled, inlined, kernel, traced
+from servoscope.chain import HEAD, SAMPLE, WATCHED, Plan, Sizes
 from servoscope.cusum import LAGS, Watch
 from servoscope.linear import Linear
+from servoscope.machine import machine
+from servoscope.memory import Memory
 from servoscope.plants import FloatArray
 from servoscope.straight import coefficients, pattern
 
@@ -32,9 +29,6 @@ BoolArray = npt.NDArray[np.bool_]
 
 LANES = {"float64": 16, "float32": 32}  # assets side by side: state and constants stay in the first-level cache
 WIDTH = {"float64": 8, "float32": 16}  # numbers in a vector
-WATCHED = 8  # CUSUMs are counted in such steps, so that few codes serve many baselines
-STEPS = ("tick", "advance", "used", "learn", "prick", "listen", "alarm", "evaluate", "respond", "tell")
-ALONE = ("begin", "advance", "learn", "follow", "forget")  # where neighbours may do something else
 NOTHING = 1e-12  # of the first coefficient of a filter
 WORTH = 200_000  # samples from which a second core pays
 
@@ -43,12 +37,13 @@ class View(NamedTuple):
     """What complete evaluations take; `response` holds Re and Im of E(f).
 
     `covariance` is that of the baseline (n, n), `origin` (n,) what is said where theta is the baseline's, both in
-    physical units, and `response` has shape (2 F, n).
+    physical units, `response` has shape (2 F, n), and `rate` is that of the samples [Hz].
     """
 
     covariance: FloatArray
     origin: FloatArray
     response: FloatArray
+    rate: float
 
 
 class Constants(NamedTuple):
@@ -142,6 +137,7 @@ class Recursion:
             "cusum": slice(lowest, lowest + self.sizes.watched),
             "extra": slice(lowest + self.sizes.watched, self.size),
         }
+        self._memory = Memory()
         self._own = len({id(c) for c in self.constants}) > 1
         table = np.array([_packed(c, self._plan) for c in (self.constants if self._own else (first,))])
         self._table = table
@@ -186,13 +182,13 @@ class Recursion:
         """Feed a block of samples, shape (assets, N); return the new states and evaluations (assets, K, row)."""
         c = self.constants[0]
         state = np.ascontiguousarray(state)
-        new = np.empty_like(state)
-        out = np.empty((len(state), len(self.rows(state, r.shape[1])), self.sizes.row), dtype=self._type)
+        new = self._memory.empty(state.shape, state.dtype)
+        out = self._memory.empty((len(state), len(self.rows(state, r.shape[1])), self.sizes.row), self._type)
         flags = np.zeros((0, 0), dtype=np.bool_) if restart is None else restart
         signals = state, new, r, u, y, flags, c.every, c.stride
 
         def part(begin: int, end: int) -> None:
-            self._code.block(self._laid, *signals, out, begin, end)
+            self._code.block(self._laid, *signals, out.reshape(len(out), -1), begin, end)
 
         workers = min(_cores(), self._blocks) if r.size >= WORTH else 1
         if workers == 1:
@@ -268,7 +264,7 @@ def _plan(constants: Sequence[Constants]) -> Plan:
             **{"velocity": 11, "bank": entries[0], "steady": len(first.bank.A) * first.bank.B.shape[1]},
             **{"P_d": 0 if first.steady else n * n, "noise": 1 + 2 * lags, "shadow": entries[1], "shadow_steady": nxs},
             **{"apart": n, "white": 1 + 2 * memory, "prior": 0 if start else n * n, "origin": 0 if start else n},
-            **{"basis": 0 if start else n * n, "response": frequencies * 2 * (n + 1)},
+            **{"basis": 0 if start else n * n, "rate": 0 if start else 1, "response": frequencies * 2 * (n + 1)},
         }
     )
     sizes = Sizes(
@@ -302,7 +298,7 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
         return np.pad(x, (0, size - len(x)))
 
     shadow = wide(np.zeros(0), dict(plan.at)["white"] - dict(plan.at)["shadow"] + 1 + 2 * memory)
-    members = np.concatenate([np.zeros((n + LAGS) * watched), np.full(watched, np.inf), np.zeros(watched)])
+    members = np.zeros((n + LAGS + 1, watched))
     if test is not None:
         system = _shadow(c)
         apart = np.linalg.solve(c.basis, test.theta / c.scale) - c.theta
@@ -312,17 +308,13 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
                 *(wide(test.numerator[1 : 1 + memory], memory), wide(test.denominator[1 : 1 + memory], memory)),
             ]
         )
-        heard = len(test.limits)
-        table = np.zeros((n + LAGS + 2, watched))
-        table[n + LAGS] = np.inf
-        table[:, :heard] = np.vstack([test.changes.T, test.limits, 1.0 / test.limits])
-        members = table.ravel()
-    seen: list[FloatArray] = []
+        members[:, : len(test.limits)] = np.vstack([test.changes.T / test.limits, -0.5 * test.limits])
+    seen: list[Any] = []
     if view is not None:
         E = view.response.reshape(-1, 2, n)
         parts = [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E]
         back = np.linalg.inv(c.basis)
-        seen = [(back @ view.covariance @ back.T).ravel(), view.origin, c.basis.ravel(), *parts]
+        seen = [(back @ view.covariance @ back.T).ravel(), view.origin, c.basis.ravel(), [view.rate], *parts]
     counts = [c.every, c.stride]
     gates = [*c.limits, *c.deadzone, c.sign_speed, c.rest_speed, c.still_speed, c.wait, 1.0 / c.wait]
     return np.concatenate(
@@ -330,31 +322,6 @@ def _packed(c: Constants, plan: Plan) -> FloatArray:
             *([float(x) for x in (*counts, *gates, c.memory, 1.0 / c.memory, c.R, test.warm if test else 0)],),
             *(v.A.ravel(), v.B[:, 0], v.C[0], v.D[0], v.steady[:, 0]),
             *(coefficients(plan.bank, c.bank), c.bank.steady.ravel(), np.zeros(0) if c.steady else c.P_d.ravel()),
-            *([c.variance], wide(c.a, lags), wide(c.heads, lags), shadow, *seen, members),
+            *([c.variance], wide(c.a, lags), wide(c.heads, lags), shadow, *seen, members.ravel()),
         ]
     )
-
-
-@functools.cache
-def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
-    """Return the drivers of `servoscope.drive` for a plan, by name; each compiles when it is first called."""
-    estimator, sizes = estimators.load(plan.estimator), plan.sizes
-    steps = Chain(plan, getattr(estimator, "steady", None))
-    to, at = dict(plan.to), dict(plan.at)
-    literals = {x: getattr(sizes, x) for x in ("n", "rows", "row", "floats", "frequencies", "extra", "watched")}
-    literals |= {"columns": sizes.n + 1, "room": sizes.n + 2, "tile": 4 * TILE}
-    literals |= {"lanes": lanes, "width": width, "own": own}
-    names: dict[str, object] = {f"_{name}": number for name, number in literals.items()}
-    names |= {"_to": namedtuple("To", to)(**to), "_at": namedtuple("At", at)(**at), "_update": estimator.update}
-    for step in STEPS:
-        names[f"_{step}"] = traced(getattr(steps, step), width, "" if own else "c")
-    for step in ALONE:
-        names[f"_{step}_one"] = traced(getattr(steps, step))
-    heap = not sizes.steady  # estimators with a P of their own allocate
-    for template in drive.PARTS:
-        names[f"_{template.__name__}"] = inlined(filled(template, names), heap)
-        names["_take"] = names.get("_settled" if sizes.steady else "_refreshed")
-        names["_take_all"] = names.get("_together" if sizes.steady else "_apart")
-        names["_write"] = names.get("_plain" if sizes.start else "_complete")
-    what = repr((plan, lanes, width, own))
-    return SimpleNamespace(**{driver.__name__: kernel(filled(driver, names, what), heap) for driver in drive.DRIVERS})

@@ -11,11 +11,12 @@ Job = Callable[[], object]
 
 @dataclass(frozen=True)
 class Measured:
-    """Times of one job [s]: median, and the quartiles around it."""
+    """Times of one job [s]: median, and the quartiles around it; `processor`, the median of what all cores spent."""
 
     median: float
     low: float
     high: float
+    processor: float
 
 
 @dataclass(frozen=True)
@@ -28,14 +29,17 @@ class Figure:
         What ran.
     ns
         Nanoseconds per sample: median, lower and upper quartile.
+    processor
+        Nanoseconds of processor time per sample, which other work on the machine does not lengthen much; median.
     ratio
-        Of the median to that of the line that it is compared with, and `to`, the name of that line.
+        Of the processor time to that of the line that it is compared with, and `to`, the name of that line.
     error
         Largest relative difference between the results of the two, where they follow the same algorithm.
     """
 
     name: str
     ns: tuple[float, float, float]
+    processor: float
     ratio: float | None = None
     to: str = ""
     error: float | None = None
@@ -45,15 +49,15 @@ def interleaved(jobs: Mapping[str, Job], repeats: int) -> dict[str, Measured]:
     """Run all jobs once uncounted, then in turns; return their times."""
     for job in jobs.values():
         job()
-    times: dict[str, list[float]] = {name: [] for name in jobs}
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
     for _ in range(repeats):
         for name, job in jobs.items():
-            begin = time.perf_counter()
+            begin, spent = time.perf_counter(), time.process_time()
             job()
-            times[name].append(time.perf_counter() - begin)
+            times[name].append((time.perf_counter() - begin, time.process_time() - spent))
     found = {}
     for name, each in times.items():
-        ranked = sorted(each)
-        at = [ranked[round(q * (len(ranked) - 1))] for q in (0.5, 0.25, 0.75)]
-        found[name] = Measured(*at)
+        walls, processor = (sorted(column) for column in zip(*each, strict=True))
+        median, low, high = (walls[round(q * (repeats - 1))] for q in (0.5, 0.25, 0.75))
+        found[name] = Measured(median, low, high, processor[repeats // 2])
     return found

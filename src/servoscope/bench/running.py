@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,10 +22,24 @@ if TYPE_CHECKING:
     from servoscope.loop import Loop
     from servoscope.recording import Recording
 
-FLEET, SECOND = 10_000, 100  # assets, and samples of each
-LOG = 60_000  # samples
-FEW = 2_000  # samples for what is slow
-STEPS = 20_000
+SECOND = 100  # samples of each asset of the fleet
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much is measured: assets of the fleet, samples of the log, samples for what is slow, steps, simulations."""
+
+    fleet: int = 10_000
+    log: int = 60_000
+    few: int = 2_000
+    steps: int = 20_000
+    simulations: int = 1_000
+
+    @classmethod
+    def share(cls, share: float) -> Amount:
+        """Return a part of it all, in (0, 1], in hundreds, so that an evaluation comes with the last sample."""
+        whole = cls()
+        return cls(*(100 * max(1, round(share * getattr(whole, field.name) / 100)) for field in fields(cls)))
 
 
 @dataclass(frozen=True)
@@ -56,7 +70,7 @@ def rig(**monitor: Any) -> Loop:
     return Loop.from_dict(content | {"monitor": content["monitor"] | monitor})
 
 
-def run(repeats: int = 9, tell: Callable[[str], None] = lambda _: None) -> Result:
+def run(repeats: int = 9, tell: Callable[[str], None] = lambda _: None, *, share: float = 1.0) -> Result:
     """Measure everything; about a minute.
 
     Parameters
@@ -65,39 +79,41 @@ def run(repeats: int = 9, tell: Callable[[str], None] = lambda _: None) -> Resul
         Of each measurement, in turns; the medians count.
     tell
         Hears what comes next.
+    share
+        Of the assets, samples and simulations, in (0, 1]: what a quick look leaves out is precision.
     """
     from servoscope.learning import learn
     from servoscope.simulation import reference, simulate
 
     tell("a baseline")
-    loop = rig()
+    loop, amount = rig(), Amount.share(share)
     recording, _ = simulate(loop, reference("profile", 60.0, loop.sample_rate), seed=1)
     baseline = learn(loop, [recording])
     tell("limits of the machine")
     facts = _limits(repeats)
     tell("one log")
-    figures = _log(baseline, recording, repeats)
+    figures = _log(baseline, recording, repeats, amount)
     tell("two stages")
-    figures += _two_stages(recording, repeats)
+    figures += _two_stages(recording, repeats, amount)
     tell("one sample at a time")
-    facts |= _steps(baseline, recording)
+    facts |= _steps(baseline, recording, amount)
     tell("a fleet")
-    more, scaling = _fleet(baseline, recording, repeats)
+    more, scaling = _fleet(baseline, recording, repeats, amount)
     figures += more
     facts |= scaling
     tell("peers")
-    figures += _peers(baseline, recording, max(3, repeats // 3))
+    figures += _peers(baseline, recording, max(3, repeats // 3), amount)
     tell("a thousand simulations")
-    facts |= monte_carlo(baseline, 1000)
+    facts |= monte_carlo(baseline, amount.simulations)
     return Result(tuple(figures), facts)
 
 
 def _figure(name: str, measured: Measured, samples: int, base: tuple[str, Measured, int] | None = None) -> Figure:
-    ns = tuple(1e9 * x / samples for x in (measured.median, measured.low, measured.high))
+    ns = 1e9 * measured.median / samples, 1e9 * measured.low / samples, 1e9 * measured.high / samples
+    processor = 1e9 * measured.processor / samples
     if base is None:
-        return Figure(name, (ns[0], ns[1], ns[2]))
-    ratio = (base[1].median / base[2]) / (measured.median / samples)
-    return Figure(name, (ns[0], ns[1], ns[2]), 1.0 / ratio, base[0])
+        return Figure(name, ns, processor)
+    return Figure(name, ns, processor, processor / (1e9 * base[1].processor / base[2]), base[0])
 
 
 def _limits(repeats: int) -> dict[str, float]:
@@ -105,8 +121,8 @@ def _limits(repeats: int) -> dict[str, float]:
     copy, moved = limits.copying()
     found = interleaved({"fma": burn, "copy": copy}, repeats)
     return {
-        "peak multiply-adds per ns, one core, double": count / found["fma"].median / 1e9,
-        "memory, GB/s read and written, one core": moved / found["copy"].median / 1e9,
+        "peak multiply-adds per ns, one core, double": count / found["fma"].processor / 1e9,
+        "memory, GB/s read and written, one core": moved / found["copy"].processor / 1e9,
     }
 
 
@@ -118,12 +134,12 @@ def _without_test(baseline: Baseline) -> Baseline:
     return baseline.model_copy(update={"members": ()})
 
 
-def _log(baseline: Baseline, recording: Recording, repeats: int) -> list[Figure]:
+def _log(baseline: Baseline, recording: Recording, repeats: int, amount: Amount) -> list[Figure]:
     from servoscope.monitor import Monitor
     from servoscope.recursion import Recursion
 
     monitors = {"whole": Monitor(baseline), "bare": Monitor(_without_test(baseline))}
-    signals, few = _tiled(recording, LOG), _tiled(recording, FEW)
+    signals, few = _tiled(recording, amount.log), _tiled(recording, amount.few)
     pipeline = baseline.pipeline()
     c = pipeline.constants(baseline.tuning)
     jobs: dict[str, Callable[[], object]] = {
@@ -138,32 +154,32 @@ def _log(baseline: Baseline, recording: Recording, repeats: int) -> list[Figure]
     n = len(theta)
     ours = rows[0, -1, 5 : 5 + n], rows[0, -1, 5 + n : 5 + n + n * n].reshape(n, n)
     error = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(ours, (theta, S), strict=True))
-    base = "one log, NumPy, sample by sample", found["numpy"], FEW
-    bare = _figure("one log, without the sequential test", found["bare"], LOG, base)
+    base = "one log, NumPy, sample by sample", found["numpy"], amount.few
+    bare = _figure("one log, without the sequential test", found["bare"], amount.log, base)
     return [
-        _figure(base[0], found["numpy"], FEW),
-        Figure(bare.name, bare.ns, bare.ratio, bare.to, error),
-        _figure("one log, everything", found["whole"], LOG, base),
+        _figure(base[0], found["numpy"], amount.few),
+        replace(bare, error=error),
+        _figure("one log, everything", found["whole"], amount.log, base),
     ]
 
 
-def _two_stages(recording: Recording, repeats: int) -> list[Figure]:
+def _two_stages(recording: Recording, repeats: int, amount: Amount) -> list[Figure]:
     from servoscope.learning import learn
     from servoscope.monitor import Monitor
 
     monitor = Monitor(_without_test(learn(rig(two_stage="adaptive"), [recording])))
-    signals = _tiled(recording, LOG)
+    signals = _tiled(recording, amount.log)
     found = interleaved({"two": lambda: monitor.run(monitor.init(), *signals)}, repeats)
-    return [_figure("one log, two stages, FIR of 40, without the sequential test", found["two"], LOG)]
+    return [_figure("one log, two stages, FIR of 40, without the sequential test", found["two"], amount.log)]
 
 
-def _steps(baseline: Baseline, recording: Recording) -> dict[str, float]:
+def _steps(baseline: Baseline, recording: Recording, amount: Amount) -> dict[str, float]:
     from servoscope.monitor import Monitor
 
     monitor = Monitor(baseline)
     state = monitor.init()
-    samples = list(zip(*(x.tolist() for x in _tiled(recording, STEPS)), strict=True))
-    times = np.empty(STEPS)
+    samples = list(zip(*(x.tolist() for x in _tiled(recording, amount.steps)), strict=True))
+    times = np.empty(amount.steps)
     for k, (r, u, y) in enumerate(samples):
         begin = time.perf_counter_ns()
         monitor.step(state, r, u, y)
@@ -188,19 +204,21 @@ def _on_one_core() -> Iterator[None]:
         recursion._cores = cores
 
 
-def _fleet(baseline: Baseline, recording: Recording, repeats: int) -> tuple[list[Figure], dict[str, float]]:
+def _fleet(
+    baseline: Baseline, recording: Recording, repeats: int, amount: Amount
+) -> tuple[list[Figure], dict[str, float]]:
     from servoscope.monitor import Monitor
 
-    rng, total = np.random.default_rng(0), FLEET * SECOND
-    begin = rng.integers(0, recording.samples - SECOND, FLEET)
+    rng, total = np.random.default_rng(0), amount.fleet * SECOND
+    begin = rng.integers(0, recording.samples - SECOND, amount.fleet)
     at = begin[:, None] + np.arange(SECOND)
     jobs: dict[str, Callable[[], object]] = {}
     for precision, number in (("double", np.float64), ("single", np.float32)):
         signals = [signal[at].astype(number) for signal in (recording.r, recording.u, recording.y)]
         for what, each in (("without the sequential test", _without_test(baseline)), ("everything", baseline)):
-            monitor = Monitor([each] * FLEET, precision=precision)  # type: ignore[arg-type]
+            monitor = Monitor([each] * amount.fleet, precision=precision)  # type: ignore[arg-type]
             state, _ = monitor.run(monitor.init(), *signals)
-            name = f"fleet of {FLEET}, {precision}, {what}"
+            name = f"fleet of {amount.fleet}, {precision}, {what}"
 
             def job(m: Any = monitor, s: Any = state, x: Any = signals) -> None:
                 m.run(s, *x)
@@ -216,14 +234,18 @@ def _fleet(baseline: Baseline, recording: Recording, repeats: int) -> tuple[list
     from servoscope.recursion import _cores
 
     first = next(iter(found))
-    gain = found[f"{first}, one core"].median / found[first].median
-    return figures, {"scaling of a fleet over cores, share of the ideal": gain / _cores(), "cores": float(_cores())}
+    single, whole = found[f"{first}, one core"], found[first]
+    return figures, {
+        "scaling of a fleet over cores, share of the ideal": single.median / whole.median / _cores(),
+        "processor time of a fleet on one core, share of that on all": single.processor / whole.processor,
+        "cores": float(_cores()),
+    }
 
 
-def _peers(baseline: Baseline, recording: Recording, repeats: int) -> list[Figure]:
+def _peers(baseline: Baseline, recording: Recording, repeats: int, amount: Amount) -> list[Figure]:
     pipeline, tuning = baseline.pipeline(), baseline.tuning
     g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
-    eta, phi = g.eta[g.ok][:FEW].copy(), np.ascontiguousarray(g.phi[g.ok][:FEW] / tuning.scale)
+    eta, phi = g.eta[g.ok][: amount.few].copy(), np.ascontiguousarray(g.phi[g.ok][: amount.few] / tuning.scale)
     P_d = tuning.P_d * np.outer(tuning.scale, tuning.scale)
     figures = []
     for what, jobs in (
@@ -232,11 +254,11 @@ def _peers(baseline: Baseline, recording: Recording, repeats: int) -> list[Figur
     ):
         found = interleaved(jobs, repeats)
         results = {name: job() for name, job in jobs.items()}
-        base = f"{what}, servoscope", found["servoscope"], FEW
+        base = f"{what}, servoscope", found["servoscope"], amount.few
         for name, measured in found.items():
-            figure = _figure(f"{what}, {name}", measured, FEW, base)
+            figure = _figure(f"{what}, {name}", measured, amount.few, base)
             error = float(np.abs(results[name] - results["servoscope"]).max() / np.abs(results["servoscope"]).max())
-            figures.append(Figure(figure.name, figure.ns, figure.ratio, figure.to, error))
+            figures.append(replace(figure, error=error))
     return figures
 
 

@@ -226,12 +226,13 @@ def claims(out: Console, found: Sequence[tuple[str, str, str]]) -> None:
 
 def speed(out: Console, found: Result) -> None:
     """Print what was measured of speed: per sample, beside what it is compared with, and single numbers."""
-    table = Table("", "ns per sample", "quartiles", "times", "as long as", "difference", box=None)
+    table = Table("", "ns per sample", "quartiles", "processor time", "times", "as long as", "difference", box=None)
     for figure in found.figures:
         median, low, high = figure.ns
+        times = f"{median:.1f}", f"{low:.1f} to {high:.1f}", f"{figure.processor:.1f}"
         ratio = "" if figure.ratio is None else f"{figure.ratio:.3g}"
         error = "" if figure.error is None else f"{figure.error:.1g}"
-        table.add_row(figure.name, f"{median:.1f}", f"{low:.1f} to {high:.1f}", ratio, figure.to, error)
+        table.add_row(figure.name, *times, ratio, figure.to, error)
     out.print(table)
     out.print()
     for name, number in found.facts.items():

@@ -153,6 +153,9 @@ def reproduce(
 @app.command()
 def bench(
     repeats: Annotated[int, typer.Option(metavar="N", min=1, help="Of each measurement; medians count.")] = 9,
+    share: Annotated[
+        float, typer.Option(metavar="SHARE", min=0.001, max=1.0, help="Of assets, samples, simulations.")
+    ] = 1.0,
     as_json: AsJson = False,
 ) -> None:
     """Measure how fast it is here, beside the machine's own limits and the other libraries that are installed."""
@@ -161,7 +164,7 @@ def bench(
     from servoscope.cli.progress import progress
 
     with progress(9, 1) as steps:
-        found = benchmark.run(repeats, steps.begin)
+        found = benchmark.run(repeats, steps.begin, share=share)
     if as_json:
         print_json(found.to_dict(), lines=False)
     else:
