@@ -120,6 +120,31 @@ def test_every_key_of_the_loop_file_is_documented() -> None:
     assert not missing, f"not in docs/reference/loop-file.md: {', '.join(missing)}"
 
 
+def test_every_key_of_the_service_file_is_documented() -> None:
+    from servoscope.live.config import Config
+
+    elsewhere = ("quality", "alarms", "actions")
+    missing = []
+    for key, field in Config.model_fields.items():
+        models = models_in(field.annotation)
+        text = section("service-file.md", rf"\[{key}[].]" if models else "Top level") or ""
+        inside = [name for model in models for name in model.model_fields] if models else [key]
+        if key not in elsewhere:
+            missing += [f"{key}: {name}" for name in inside if not has_line(text, name)]
+    assert not missing, f"not in docs/reference/service-file.md: {', '.join(missing)}"
+
+
+def test_every_key_of_alarms_data_quality_and_actions_is_documented() -> None:
+    from servoscope import actions, alarms, quality
+
+    text = (REFERENCE.parent / "alarms.md").read_text() + (REFERENCE.parent / "how-to" / "actions.md").read_text()
+    models = [alarms.AlarmDefinition, alarms.FloodSettings, quality.QualitySettings, actions.RetrySettings]
+    models += [actions.WebhookSettings, actions.CommandSettings, actions.ToleranceSettings]
+    keys = {key for model in models for key in model.model_fields}
+    missing = [key for key in sorted(keys) if not re.search(rf"[`\n ]{key}( = [^`\n]*)?[`\n]|`{key}`", text)]
+    assert not missing, f"not in docs/alarms.md or docs/how-to/actions.md: {', '.join(missing)}"
+
+
 @pytest.mark.parametrize("name", servoscope.__all__)
 def test_every_public_name_is_documented(name: str) -> None:
     assert has_line(page("python.md"), name), f"{name} is not in docs/reference/python.md"

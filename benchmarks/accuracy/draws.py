@@ -57,12 +57,15 @@ def clear(kind: str, parameter: str, ratio: float) -> bool:
 
 
 def small(rng: np.random.Generator, kind: str, parameter: str) -> float:
-    """Draw a ratio whose size is log-uniform in radii, up or down."""
-    up = bool(rng.integers(2))
-    most = USED * abs(float(np.log(faults()[parameter].ratio_range[up])))
-    unit = min(radius(kind, parameter, up), most)
-    size = between(rng, RADII[0], min(RADII[1], most / unit)) * unit
-    return float(np.exp(size if up else -size))
+    """Draw a ratio whose size is log-uniform in radii, up or down, under which the loop is stable."""
+    while True:
+        up = bool(rng.integers(2))
+        most = USED * abs(float(np.log(faults()[parameter].ratio_range[up])))
+        unit = min(radius(kind, parameter, up), most)
+        size = between(rng, RADII[0], min(RADII[1], most / unit)) * unit
+        ratio = float(np.exp(size if up else -size))
+        if stable([FaultEvent(parameter, ratio, 0.0)]):
+            return ratio
 
 
 def large(rng: np.random.Generator, *parameters: str) -> dict[str, float]:

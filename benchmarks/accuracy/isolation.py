@@ -14,7 +14,7 @@ from accuracy.rig import FAULT_AT, baseline, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import is_named, is_right, percent, seen, told
 from servoscope.diagnosis import UNKNOWN
-from servoscope.scoring import Reliability, reliability
+from servoscope.scoring import Reliability, reliability, share
 from servoscope.simulation import FaultEvent
 
 RUNS = 20  # per baseline, half of them with small faults
@@ -206,14 +206,21 @@ def figure(results: Mapping[str, Sequence[Numbers]], path: Path) -> None:
         return
     from matplotlib.figure import Figure
 
-    drawn = Figure(figsize=(4.8, 4.8), layout="constrained")
-    axes = drawn.add_subplot(xlim=(0, 1), ylim=(0, 1), xlabel="probability of the first candidate", ylabel="right")
+    labelled: set[str] = set()
+    drawn = Figure(figsize=(6.4, 4.4), layout="constrained")
+    axes = drawn.add_subplot(xlim=(0, 1.1), ylim=(-0.02, 1.06))
+    axes.set(xlabel="probability of the first candidate", ylabel="share that is right, 95 % interval")
     axes.plot([0, 1], [0, 1], color="0.6", linewidth=1.0)
-    for kind, runs in there.items():
-        curve = curve_of(runs, 10)
-        used = curve.count > 0
-        p, n = curve.observed[used], curve.count[used]
-        axes.errorbar(curve.claimed[used], p, np.sqrt(p * (1.0 - p) / n), fmt="o-", label=kind, markersize=4)
-    axes.legend()
+    for i, (kind, runs) in enumerate(there.items()):
+        curve = curve_of(runs, BINS)
+        for claimed, observed, count in zip(curve.claimed, curve.observed, curve.count, strict=True):
+            if not count:
+                continue
+            found, at = share(round(observed * count), int(count)), claimed + 0.008 * (i - 1)
+            axes.plot([at, at], [found.low, found.high], color=f"C{i}", linewidth=1.5)
+            axes.plot(at, found.value, "o", color=f"C{i}", markersize=5, label=kind if kind not in labelled else None)
+            axes.annotate(f"{count:.0f}", (at, found.value), (6, 4 - 10 * i), textcoords="offset points", color=f"C{i}")
+            labelled.add(kind)
+    axes.legend(loc="upper left")
     path.parent.mkdir(parents=True, exist_ok=True)
     drawn.savefig(path, dpi=150)

@@ -44,11 +44,11 @@ def clear(recording: ss.Recording, faults: Sequence[FaultEvent]) -> float:
 
 
 def shares(words: str, found: Sequence[Numbers]) -> list[Row]:
-    """Show what was named, pair by pair."""
+    """Show what was named, pair by pair and in all."""
     runs = seen(found)
     rows = []
-    for pair in combinations(WORDS.values(), 2):
-        own = [run for run in runs if set(run["truth"]) == set(pair)]
+    for pair in (*combinations(WORDS.values(), 2), ()):
+        own = [run for run in runs if set(run["truth"]) == set(pair) or not pair]
         allowed = [run for run in own if run["clear"] >= ALLOWED]
         rest = [run for run in own if run["clear"] < ALLOWED]
         right = [run for run in own if is_right(run)]
@@ -56,7 +56,7 @@ def shares(words: str, found: Sequence[Numbers]) -> list[Row]:
         rows.append(
             (
                 words,
-                " + ".join(pair),
+                " + ".join(pair) or "all",
                 f"{len(own)}",
                 percent(sum(is_named(run) for run in allowed), len(allowed), low=0.95),
                 percent(sum(run["named"] and not is_right(run) for run in rest), len(rest), high=0.05),

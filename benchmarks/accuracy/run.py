@@ -116,7 +116,9 @@ def markdown(table: Table, results: dict[str, Any]) -> str:
     body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     done = [results[each.id]["settings"] for each in there]
     reduced = [one for one in done if one["units"] < one["of"]]
-    words = f" **Reduced: {reduced[0]['units']} of {reduced[0]['of']} units per row.**" if reduced else ""
+    fewest, most = (f(one["units"] / one["of"] for one in reduced or [{"units": 1, "of": 1}]) for f in (min, max))
+    share = f"{100 * fewest:.0f}" if fewest == most else f"{100 * fewest:.0f} to {100 * most:.0f}"
+    words = f" **Reduced: {share} % of the runs, in {len(reduced)} of {len(done)} rows.**" if reduced else ""
     machines = sorted({results[each.id]["machine"] for each in there})
     minutes = sum(results[each.id]["seconds"] * results[each.id]["settings"]["workers"] for each in there) / 60.0
     return f"{body}\n\n{'; '.join(machines)}; {minutes:.2g} core minutes.{words}"

@@ -8,18 +8,28 @@
         BaselineError            a baseline file is unusable, or of another version
         SimulationError          a simulation that was asked for is impossible
         OutputError              a result cannot be written
+        ConfigError              a service file is wrong, or what it names
+        StoreError               a store cannot be used
+          StoreUnavailable       for now: it is full, locked or down; trying again may help
+        AlarmError               what an alarm was told to do has no meaning in its state
+        StateError               a saved state is of another version, or damaged
 
 Every message names the file, the row or the key, says what is wrong with it and what to do.
 """
 
 __all__ = [
+    "AlarmError",
     "BaselineError",
+    "ConfigError",
     "LoopError",
     "NotEnoughError",
     "OutputError",
     "RecordingError",
     "ServoscopeError",
     "SimulationError",
+    "StateError",
+    "StoreError",
+    "StoreUnavailable",
 ]
 
 
@@ -49,3 +59,23 @@ class SimulationError(ServoscopeError):
 
 class OutputError(ServoscopeError):
     """A result cannot be written."""
+
+
+class ConfigError(ServoscopeError):
+    """A service file is wrong, or what it names."""
+
+
+class StoreError(ServoscopeError):
+    """A store cannot be used."""
+
+
+class StoreUnavailable(StoreError):
+    """A store cannot be used for now: it is full, locked or down."""
+
+
+class AlarmError(ServoscopeError):
+    """What an alarm was told to do has no meaning in the state that it is in."""
+
+
+class StateError(ServoscopeError):
+    """A saved state was written by another version, or is damaged."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -83,9 +84,11 @@ def innovations(
     begin, end = min(since, N), min(since + over, N)
     if last == 0:
         begin = N
-    hold(A, b, late, c, K, by, 0, 0, 0, begin, age, u, y, restart, x, following, e, 0)
-    drift(A, b, late, c, K, by, 0, since, over, begin, end, age, u, y, restart, x, following, e, 0)
-    hold(A, b, late, c, K, by, 0, last, max(begin, end), N, age, u, y, restart, x, following, e, 0)
+    for changed in range(2):  # a loop, for each call is compiled into its place
+        if changed:
+            drift(A, b, late, c, K, by, 0, since, over, begin, end, age, u, y, restart, x, following, e, 0)
+        first, stop = (max(begin, end), N) if changed else (0, begin)
+        hold(A, b, late, c, K, by, 0, changed * last, first, stop, age, u, y, restart, x, following, e, 0)
     louder, volume = volumes(S), 0.0 * A[0, 0, 0, 0]
     for k in range(begin, N):
         volume += louder[last if k >= end else (k - since) * last // over, age[k]]
@@ -128,17 +131,17 @@ def volumes(S: Array) -> Array:
     return louder
 
 
-@kernel
-def begin_again(c: Array, y: float, x: Array) -> None:
-    """Put the state x (n,) where y says at once; the first covariance knows that the rest is open."""
-    reach = 0.0 * x[0]
-    for i in range(len(x)):
-        reach += c[i] * c[i]
-    for i in range(len(x)):
-        x[i] = c[i] * y / reach
+@functools.partial(kernel, heap=False)
+def begin_again(c: Array, v: int, p: int, y: float, x: Array) -> None:
+    """Put the state x[v] where y says at once; the first covariance knows that the rest is open."""
+    reach = 0.0 * x[v, 0]
+    for i in range(x.shape[1]):
+        reach += c[v, p, i] * c[v, p, i]
+    for i in range(x.shape[1]):
+        x[v, i] = c[v, p, i] * y / reach
 
 
-@kernel
+@functools.partial(kernel, heap=False)
 def hold(
     A: Array, b: Array, late: Array, c: Array, K: Array, by: Array, v: int, p: int, begin: int, end: int,
     age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
@@ -147,7 +150,7 @@ def hold(
     n = x.shape[1]
     for k in range(begin, end):
         if restart[k]:
-            begin_again(c[v, p], y[k], x[v])
+            begin_again(c, v, p, y[k], x)
         j, before = age[k], u[k] if restart[k] else u[max(k - 1, 0)]
         error = y[k] - 0.0 * x[v, 0]
         for i in range(n):
@@ -162,7 +165,7 @@ def hold(
         e[v, k - first] = error * by[v, p, j]
 
 
-@kernel
+@functools.partial(kernel, heap=False)
 def drift(
     A: Array, b: Array, late: Array, c: Array, K: Array, by: Array, v: int, since: int, over: int, begin: int, end: int,
     age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
@@ -174,7 +177,7 @@ def drift(
         p = int(place)
         q, w = p + 1, place - p
         if restart[k]:
-            begin_again(c[v, p], y[k], x[v])
+            begin_again(c, v, p, y[k], x)
         j, before = age[k], u[k] if restart[k] else u[max(k - 1, 0)]
         error = y[k] - 0.0 * x[v, 0]
         for i in range(n):

@@ -1,0 +1,1 @@
+"""Months in minutes: how the service stands kills, full disks and crashing databases."""

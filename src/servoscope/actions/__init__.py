@@ -1,0 +1,35 @@
+"""What is done about alarms: webhooks, commands and fault-tolerant changes, each at least once by an outbox.
+
+settings = ActionSettings.model_validate(section)
+rows = outgoing(settings, transition, priority, details)    # stored with the transition, in one transaction
+delivery = deliver(row, settings, now)                      # delivery.again takes the row's place; None: it goes
+"""
+
+from servoscope.actions.delivery import deliver, signature
+from servoscope.actions.outbox import Delivery, Outgoing, outgoing, outgoing_flood
+from servoscope.actions.settings import (
+    ActionSettings,
+    CommandSettings,
+    RetrySettings,
+    ToleranceSettings,
+    WebhookSettings,
+)
+from servoscope.actions.tolerance import Change, ToleranceState, begin, respond
+
+__all__ = [
+    "ActionSettings",
+    "Change",
+    "CommandSettings",
+    "Delivery",
+    "Outgoing",
+    "RetrySettings",
+    "ToleranceSettings",
+    "ToleranceState",
+    "WebhookSettings",
+    "begin",
+    "deliver",
+    "outgoing",
+    "outgoing_flood",
+    "respond",
+    "signature",
+]

@@ -1,0 +1,122 @@
+"""From a service file to what runs: assets that go on where they were, sources, store."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from servoscope.baseline import Baseline
+from servoscope.errors import BaselineError, ConfigError
+from servoscope.live.announcing import Announcer
+from servoscope.live.asset import Asset, Following
+from servoscope.live.block import Block, Resume
+from servoscope.live.checkpoint import Counted, unpack
+from servoscope.live.config import Config
+from servoscope.live.replay import Replay
+from servoscope.live.source import Source
+from servoscope.monitor import Monitor
+from servoscope.store import Store
+
+__all__ = ["Assembly", "assemble", "rehearse"]
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """What a service is made of; sources are open, and go on behind what was counted."""
+
+    assets: dict[str, Asset]
+    announcer: Announcer
+    sources: dict[str, Source]
+    store: Store
+
+
+def assemble(config: Config, anew: Collection[str] = ()) -> Assembly:
+    """Open what a service file names.
+
+    Parameters
+    ----------
+    config
+        The service file.
+    anew
+        Assets that begin with a new state, behind the samples that were counted.
+
+    Raises
+    ------
+    ServoscopeError
+        If a baseline, a recording, the store or a saved state cannot be used; nothing is left open.
+    """
+    if strange := set(anew) - set(config.assets):
+        raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(config.assets)}")
+    assets = _assets(config)
+    sources = _sources(config, assets)
+    store = Store.open(config.store.url, config.folder, write=True)
+    try:
+        store.claim([config.name, *assets])
+        rows = store.checkpoints([config.name, *assets])
+        announcer = Announcer(config.name, config.alarms, config.actions)
+        if config.name in rows:
+            announcer.resume(rows[config.name]["state"])
+        for name, asset in assets.items():
+            if name in anew and name in rows:
+                asset.begin(Counted(**rows[name]["status"]["counted"]))
+            elif name in rows:
+                window = [Block.unpack(name, *one) for one in store.recent(name)]
+                asset.resume(unpack(rows[name]["state"], name), window)
+        for name, source in sources.items():
+            own = [each for each, settings in config.assets.items() if settings.source == name]
+            source.open({each: _resumption(assets[each]) for each in own if assets[each].progress is not None})
+    except BaseException:
+        store.close()
+        raise
+    return Assembly(assets, announcer, sources, store)
+
+
+def rehearse(config: Config) -> None:
+    """Read all that a service file names but the store.
+
+    Raises
+    ------
+    ServoscopeError
+        If something cannot be used.
+    """
+    _sources(config, _assets(config))
+
+
+def _resumption(asset: Asset) -> Resume:
+    assert asset.progress is not None, "the caller has looked"
+    return Resume(asset.progress.counted.sequence, asset.progress.counted.began)
+
+
+def _assets(config: Config) -> dict[str, Asset]:
+    how = Following(config.diagnosis, config.quality, config.alarms, config.store.residual_every_s)
+    files: dict[Path, Baseline] = {}
+    shared: dict[tuple[Path, str | None], tuple[Baseline, Monitor]] = {}
+    assets = {}
+    for name, settings in config.assets.items():
+        path, point = config.folder / settings.baseline, settings.point
+        if path not in files:
+            files[path] = Baseline.load(path)
+        if (path, point) not in shared:
+            baseline = files[path] if point is None else files[path].at(point)
+            try:
+                shared[path, point] = baseline, Monitor(baseline)
+            except BaselineError:
+                points = ", ".join(baseline.points)
+                raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
+        assets[name] = Asset(name, *shared[path, point], how)
+    for asset in {id(one.baseline): one for one in assets.values()}.values():
+        asset.warm()
+    return assets
+
+
+def _sources(config: Config, assets: dict[str, Asset]) -> dict[str, Source]:
+    sources: dict[str, Source] = {}
+    for name, settings in config.sources.items():
+        tapes = {
+            each: (tuple(config.folder / file for file in one.files or ()), assets[each].baseline.loop)
+            for each, one in config.assets.items()
+            if one.source == name
+        }
+        sources[name] = Replay(settings, tapes)
+    return sources

@@ -1,0 +1,84 @@
+"""What happened, asked of a store: diagnoses, alarms, audit, residuals, deliveries, over a time, of some assets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import sqlalchemy as sa
+
+from servoscope.store import tables
+from servoscope.store.batch import Row
+from servoscope.store.store import Store
+
+__all__ = ["KINDS", "history", "plain", "spread"]
+
+KINDS: Mapping[str, tuple[sa.Table, str]] = {  # the table, and which of its columns is the time
+    "diagnoses": (tables.diagnoses, "t"),
+    "alarms": (tables.transitions, "t"),
+    "audit": (tables.audit, "at"),
+    "residuals": (tables.residuals, "t"),
+    "deliveries": (tables.outbox, "created"),
+}
+
+
+def history(
+    store: Store,
+    kind: str,
+    *,
+    assets: Sequence[str] = (),
+    span: tuple[float | None, float | None] = (None, None),
+    last: int | None = None,
+) -> list[Row]:
+    """Return rows in the order of time.
+
+    Parameters
+    ----------
+    store
+        Asked.
+    kind
+        One of `KINDS`.
+    assets
+        Of these; empty: of all.
+    span
+        From, and before, a time [UTC s]; None: without bound.
+    last
+        Only that many, the newest.
+    """
+    table, clock = KINDS[kind]
+    query = sa.select(table)
+    if assets and "asset" in table.c:
+        query = query.where(table.c.asset.in_(assets))
+    if span[0] is not None:
+        query = query.where(table.c[clock] >= span[0])
+    if span[1] is not None:
+        query = query.where(table.c[clock] < span[1])
+    ties = [column.desc() for column in table.primary_key]
+    found = store.rows(query.order_by(table.c[clock].desc(), *ties).limit(last))
+    return found[::-1]
+
+
+def plain(row: Row) -> dict[str, Any]:
+    """Return a row with its times as text as well: ``time`` beside ``t``."""
+    clock = next(row[name] for name in ("t", "at", "created") if name in row)
+    return {"time": datetime.fromtimestamp(clock, UTC).isoformat(timespec="milliseconds"), **row}
+
+
+def spread(rows: Sequence[Row]) -> dict[str, list[Any]]:
+    """Return rows as columns for a table: residuals in columns of their own, documents as JSON text."""
+    flat = [_flat(plain(row)) for row in rows]
+    names = dict.fromkeys(name for row in flat for name in row)
+    return {name: [row.get(name) for row in flat] for name in names}
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in row.items():
+        if name == "residual":
+            for f, real, imaginary, healthy in value:
+                found |= {f"gamma_{f:g}Hz_real": real, f"gamma_{f:g}Hz_imag": imaginary, f"healthy_{f:g}Hz": healthy}
+        else:
+            found[name] = json.dumps(value) if isinstance(value, dict | list) else value
+    return found

@@ -1,0 +1,123 @@
+"""The tables of a store, for SQLite and PostgreSQL alike.
+
+All times are UTC seconds: `t` by the clock of the asset's own samples, `at` by that of the machine that wrote the row.
+The rows of one asset are numbered: `number` counts through residuals, diagnoses and transitions, so that a row that is
+lost or written twice would show.
+"""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+
+__all__ = [
+    "TABLES",
+    "audit",
+    "checkpoints",
+    "commands",
+    "diagnoses",
+    "meta",
+    "outbox",
+    "recent",
+    "residuals",
+    "transitions",
+]
+
+TABLES = sa.MetaData()
+
+Identity = sa.BigInteger().with_variant(sa.Integer(), "sqlite")  # the only kind that SQLite counts up by itself
+
+
+def _numbered(name: str, *columns: sa.Column[object]) -> sa.Table:
+    """Return a table of an asset's numbered rows."""
+    return sa.Table(
+        name,
+        TABLES,
+        sa.Column("asset", sa.Text, primary_key=True),
+        sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
+        sa.Column("t", sa.Double, nullable=False),
+        *columns,
+        sa.Index(f"{name}_by_time", "asset", "t"),
+        sqlite_with_rowid=False,
+    )
+
+
+meta = sa.Table(  # schema: version of the tables; commit of NAME: number of that service's last transaction
+    "meta",
+    TABLES,
+    sa.Column("key", sa.Text, primary_key=True),
+    sa.Column("value", sa.BigInteger, nullable=False),
+)
+checkpoints = sa.Table(  # where each asset stands: what `run` resumes from, and what `watch` shows
+    "checkpoints",
+    TABLES,
+    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("sequence", sa.BigInteger, nullable=False),
+    sa.Column("state", sa.LargeBinary, nullable=False),
+    sa.Column("status", sa.JSON, nullable=False),
+    sa.Column("at", sa.Double, nullable=False),
+)
+recent = sa.Table(  # the last minutes of samples, block by block: what a full diagnosis looks at
+    "recent",
+    TABLES,
+    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("sequence", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("samples", sa.LargeBinary, nullable=False),
+)
+residuals = _numbered(
+    "residuals",
+    sa.Column("statistic", sa.Double, nullable=False),  # the largest since the row before, over its limit
+    sa.Column("level", sa.Double, nullable=False),
+    sa.Column("residual", sa.JSON, nullable=False),  # per frequency: [Hz, real, imaginary, healthy |H|]
+)
+diagnoses = _numbered(
+    "diagnoses",
+    sa.Column("grounds", sa.Text, nullable=False),  # examination: at once; full: seconds later, with the refit
+    sa.Column("verdict", sa.Text, nullable=False),
+    sa.Column("summary", sa.Text, nullable=False),
+    sa.Column("onset", sa.Double),
+    sa.Column("document", sa.JSON, nullable=False),
+)
+transitions = _numbered(
+    "transitions",
+    sa.Column("alarm", sa.Text, nullable=False),
+    sa.Column("before", sa.Text, nullable=False),
+    sa.Column("after", sa.Text, nullable=False),
+    sa.Column("cause", sa.Text, nullable=False),
+    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("document", sa.JSON, nullable=False),
+)
+outbox = sa.Table(  # what webhooks and commands are still to be told, and what they were told
+    "outbox",
+    TABLES,
+    sa.Column("key", sa.Text, primary_key=True),
+    sa.Column("sink", sa.Text, nullable=False),
+    sa.Column("event", sa.JSON, nullable=False),
+    sa.Column("created", sa.Double, nullable=False),
+    sa.Column("due", sa.Double),  # when the next try is made; none: there will be no more
+    sa.Column("attempts", sa.Integer, nullable=False),
+    sa.Column("outcome", sa.Text, nullable=False),
+    sa.Index("outbox_by_due", "due"),
+)
+audit = sa.Table(
+    "audit",
+    TABLES,
+    sa.Column("id", Identity, primary_key=True),
+    sa.Column("at", sa.Double, nullable=False),
+    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("asset", sa.Text, nullable=False),  # empty: the service as a whole
+    sa.Column("what", sa.Text, nullable=False),
+    sa.Column("document", sa.JSON, nullable=False),
+    sa.Index("audit_by_time", "at"),
+)
+commands = sa.Table(  # what operators want of alarms; the service carries them out
+    "commands",
+    TABLES,
+    sa.Column("id", Identity, primary_key=True),
+    sa.Column("at", sa.Double, nullable=False),
+    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("asset", sa.Text, nullable=False),
+    sa.Column("alarm", sa.Text, nullable=False),
+    sa.Column("command", sa.Text, nullable=False),
+    sa.Column("document", sa.JSON, nullable=False),
+    sa.Column("outcome", sa.Text),  # none until it was carried out
+)

@@ -1,0 +1,93 @@
+"""Service files with real recordings behind them: a baseline, a healthy minute and one with a leak from 30 s on."""
+
+from __future__ import annotations
+
+import functools
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+from servoscope import writers
+from servoscope.baseline import Baseline
+from servoscope.learning import nominal
+from servoscope.live.config import Config
+from servoscope.loop import Loop
+from servoscope.recording import Recording
+from servoscope.simulation import FaultEvent, reference, simulate
+
+LOOP = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+LEAK = FaultEvent.parse("C_ie=1.2@30")
+
+# What has to be the same whatever has happened to the process: all rows, and all that the next block depends on.
+RESULTS = {
+    "residuals": "SELECT * FROM residuals ORDER BY asset, number",
+    "diagnoses": "SELECT * FROM diagnoses ORDER BY asset, number",
+    "transitions": "SELECT * FROM transitions ORDER BY asset, number",
+    "recent": "SELECT * FROM recent ORDER BY asset, sequence",
+    "states": "SELECT asset, sequence, state, status FROM checkpoints WHERE asset <> 'hall' ORDER BY asset",
+}
+
+
+@functools.cache
+def baseline() -> Baseline:
+    """Return what healthy looks like, from the rig's nominal parameters."""
+    return nominal(Loop.load(LOOP))
+
+
+@functools.cache
+def recorded(seed: int, *faults: FaultEvent, seconds: float = 60.0) -> Recording:
+    """Return a recording of the rig."""
+    loop = Loop.load(LOOP)
+    return simulate(loop, reference("multisine", seconds, loop.sample_rate), faults=faults, seed=seed)[0]
+
+
+def files(folder: Path) -> None:
+    """Put baseline.json, healthy.csv and leaky.csv into a folder."""
+    folder.mkdir(exist_ok=True)
+    baseline().save(folder / "baseline.json")
+    writers.write(folder / "healthy.csv", recorded(1))
+    writers.write(folder / "leaky.csv", recorded(2, LEAK))
+
+
+def hall(folder: Path, name: str, *, speed: float = 0.0, store: str = "", more: str = "") -> Path:
+    """Write a service file for two assets, one of which begins to leak, in a folder that has the `files`."""
+    text = f"""
+        name = "hall"
+        [service]
+        listen = ""
+        commit_every_s = 0.01
+        log = "error"
+        [store]
+        url = "{store or name + ".sqlite"}"
+        residual_every_s = 2.0
+        [diagnosis]
+        window_s = 40.0
+        every_s = 60.0
+        [sources.line]
+        kind = "replay"
+        speed = {speed}
+        block = 0.5
+        start = 2026-01-01T00:00:00Z
+        [assets.press]
+        baseline = "baseline.json"
+        source = "line"
+        files = ["healthy.csv", "leaky.csv", "healthy.csv"]
+        [assets.lift]
+        baseline = "baseline.json"
+        source = "line"
+        files = ["healthy.csv", "healthy.csv", "healthy.csv"]
+        {more}
+    """
+    path = folder / f"{name}.toml"
+    path.write_text("\n".join(line.strip() for line in text.splitlines()), encoding="utf-8")
+    return path
+
+
+def asked(config: Path, query: str) -> list[Any]:
+    """Return what a query finds in the SQLite store of a service file."""
+    found = Config.load(config)
+    connection = sqlite3.connect(found.folder / found.store.url, timeout=10.0)
+    try:
+        return connection.execute(query).fetchall()
+    finally:
+        connection.close()

@@ -1,0 +1,291 @@
+"""What the service is made of: blocks, replay, arrival, checkpoints, verdicts, one asset; each by itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import halls
+from servoscope.alarms import AlarmSettings, Command, Event, State
+from servoscope.errors import AlarmError, ConfigError, RecordingError, StateError
+from servoscope.live import checkpoint
+from servoscope.live.arrival import arrive
+from servoscope.live.asset import Asset, Following
+from servoscope.live.block import Block, Resume
+from servoscope.live.config import Config, DiagnosisSettings
+from servoscope.live.examining import Examined
+from servoscope.live.judging import Judged, judge
+from servoscope.live.replay import Replay, ReplaySettings, Tape
+from servoscope.live.thinning import Thinned, thin
+from servoscope.monitor import Monitor
+from servoscope.quality import QualitySettings
+from servoscope.recording import Recording
+
+BEGAN = 1.7e9
+HOW = Following(
+    DiagnosisSettings(window_s=40.0), QualitySettings(), AlarmSettings.model_validate({}), residual_every_s=1.0
+)
+
+
+def tape(samples: int = 50, *, repeat: bool = False) -> Tape:
+    return Tape((halls.recorded(1), halls.recorded(2, halls.LEAK)), samples, repeat)
+
+
+def asset(how: Following = HOW) -> Asset:
+    return Asset("press", halls.baseline(), Monitor(halls.baseline()), how)
+
+
+def blocks(recording: Recording, samples: int = 50) -> list[Block]:
+    one = Tape((recording,), samples, repeat=False)
+    found = (one.block("press", k, BEGAN) for k in range(math.ceil(recording.samples / samples)))
+    return [block for block in found if block is not None]
+
+
+class TestReplay:
+    def test_every_sample_is_in_one_block(self) -> None:
+        cut = [block for k in range(400) if (block := tape(37).block("press", k, BEGAN)) is not None]
+        whole = np.concatenate([block.signals for block in cut], axis=1)
+        for row, name in zip(whole[1:], "ruy", strict=True):
+            assert (row == np.concatenate([getattr(one, name) for one in tape().recordings])).all()
+        steps = np.diff(whole[0])
+        assert np.flatnonzero(steps > 0.015).tolist() == [5999]  # a gap where the second recording begins
+        assert tape(37).block("press", len(cut), BEGAN) is None
+
+    def test_rounds_repeat_all_but_the_time(self) -> None:
+        first, again = (tape(repeat=True).block("press", k, BEGAN) for k in (7, 240 + 7))
+        assert first is not None and again is not None
+        assert (first.signals[1:] == again.signals[1:]).all()
+        assert np.ptp(again.t - first.t) < 1e-5 and again.t[0] - first.t[0] == pytest.approx(120.02)
+
+    def test_it_goes_on_where_it_was_told_in_the_order_of_time(self, tmp_path: Path) -> None:
+        halls.files(tmp_path)
+        loop = halls.baseline().loop
+        settings = ReplaySettings(kind="replay", speed=0.0, block=1.0)
+        source = Replay(settings, {name: ((tmp_path / "healthy.csv",), loop) for name in ("a", "b")})
+        source.open({"a": Resume(9, BEGAN), "b": Resume(11, BEGAN)})
+        order = [(block.asset, block.sequence) for block in source.poll(5)]
+        assert order == [("a", 10), ("a", 11), ("a", 12), ("b", 12), ("a", 13)]
+        while source.poll(50):
+            pass
+        assert math.isinf(source.waits)
+
+    def test_it_keeps_time(self, tmp_path: Path) -> None:
+        halls.files(tmp_path)
+        settings = ReplaySettings(kind="replay", speed=2.0, block=30.0)
+        source = Replay(settings, {"a": ((tmp_path / "healthy.csv",), halls.baseline().loop)})
+        source.open({})
+        assert source.poll(1) == []
+        assert 14.0 < source.waits < 15.0  # a block of 30 s, twice as fast as it was recorded
+
+
+@pytest.mark.parametrize(
+    ("t", "used", "restart"),
+    [
+        ([1.0, 1.01, 1.02], [1, 1, 1], [0, 0, 0]),
+        ([1.0, 1.01, 1.05], [1, 1, 1], [0, 0, 1]),  # a gap
+        ([1.0, 1.0, 1.01], [1, 0, 1], [0, 0, 0]),  # repeated
+        ([1.0, 0.98, 1.01], [1, 0, 1], [0, 0, 0]),  # late
+        ([1.0, 1.01, 0.5], [1, 1, 1], [0, 0, 1]),  # the clock was set back
+        ([1.0, math.nan, 1.01], [1, 0, 1], [0, 0, 0]),
+        ([0.99, 1.0, 1.01], [0, 1, 1], [0, 0, 0]),  # repeats the block before
+    ],
+)
+def test_what_of_a_block_counts(t: list[float], used: list[int], restart: list[int]) -> None:
+    found = arrive(np.array(t), 0.99, 0.01)
+    assert found.used.tolist() == [bool(x) for x in used]
+    assert found.restart.tolist() == [bool(x) for x in restart]
+    assert found.t == [x for x, yes in zip(t, used, strict=True) if yes][-1]
+
+
+@pytest.fixture(scope="module")
+def packed() -> bytes:
+    """A checkpoint of an asset behind 45 s."""
+    followed = asset()
+    for block in blocks(halls.recorded(1))[:90]:
+        followed.take(block)
+    assert followed.progress is not None
+    return checkpoint.pack(followed.progress)
+
+
+class TestCheckpoint:
+    def test_it_is_turned_back_whole(self, packed: bytes) -> None:
+        assert checkpoint.pack(checkpoint.unpack(packed, "press")) == packed
+
+    @given(where=st.floats(0.0, 1.0, exclude_max=True), bit=st.integers(0, 7))
+    def test_one_bit_is_enough_to_refuse_it(self, packed: bytes, where: float, bit: int) -> None:
+        torn = bytearray(packed)
+        torn[int(where * len(torn))] ^= 1 << bit
+        with pytest.raises(StateError, match=r"press: its saved state is .*run --anew press"):
+            checkpoint.unpack(bytes(torn), "press")
+
+    @given(share=st.floats(0.0, 1.0, exclude_max=True))
+    def test_so_is_a_torn_one(self, packed: bytes, share: float) -> None:
+        with pytest.raises(StateError, match="torn: restore the store from a copy"):
+            checkpoint.unpack(packed[: int(share * len(packed))], "press")
+
+    def test_another_version_is_named(self, packed: bytes) -> None:
+        other = packed[:16] + (checkpoint.VERSION + 1).to_bytes(2, "little") + packed[18:]
+        with pytest.raises(
+            StateError, match=r"is of version 2, this servoscope reads 1: use the version that wrote it"
+        ):
+            checkpoint.unpack(other, "press")
+
+    def test_another_baseline_is_refused(self, packed: bytes) -> None:
+        other = replace(checkpoint.unpack(packed, "press"), baseline="0123")
+        with pytest.raises(StateError, match=r"belongs to another baseline .* run --anew press"):
+            asset().resume(other, [])
+
+
+class TestJudging:
+    settings = DiagnosisSettings(window_s=40.0, every_s=100.0)
+
+    def course(self, exceeded: list[bool], verdict: str = "healthy") -> list[int]:
+        """Return at which seconds there was an examination that says the verdict."""
+        state, looked = Judged(due=1e9, verdict="healthy"), []
+        for t, above in enumerate(exceeded):
+            state, found = judge(state, self.settings, float(t), above, lambda: Examined(verdict, ""))  # type: ignore[arg-type]
+            looked += [t] if found else []
+        return looked
+
+    def test_a_deviation_that_nothing_confirms_is_looked_at_less_and_less(self) -> None:
+        assert self.course([False] * 5 + [True] * 95) == [5, 6, 8, 12, 20, 36, 68]
+
+    def test_one_that_is_confirmed_is_looked_at_once(self) -> None:
+        assert self.course([False] * 5 + [True] * 50, "fault") == [5]
+
+    def test_quiet_assets_are_looked_at_now_and_then(self) -> None:
+        state, found = judge(Judged(due=50.0), self.settings, 51.0, False, lambda: Examined("healthy", "fine"))
+        assert found is not None and (state.verdict, state.since, state.due) == ("healthy", 51.0, 200.0)
+
+    def test_after_a_deviation_the_window_has_to_pass(self) -> None:
+        gone = Examined("undetermined", "gone", recovering=True)
+        state, _ = judge(Judged(due=1e9, verdict="fault"), self.settings, 10.0, False, lambda: gone)
+        assert state.due == 50.0
+
+
+def test_stored_residuals_do_not_depend_on_how_the_blocks_are_cut() -> None:
+    monitor, recording = Monitor(halls.baseline()), halls.recorded(2, halls.LEAK)
+
+    def rows(cuts: list[int]) -> list[dict[str, object]]:
+        state, found, thinned = monitor.init(), [], Thinned()
+        for a, b in pairwise([0, *cuts, 6000]):
+            state, trace = monitor.run(state, recording.r[a:b], recording.u[a:b], recording.y[a:b])
+            thinned, more = thin(thinned, trace, BEGAN + trace.t, 2.5)
+            found += more
+        return found
+
+    whole = rows([])
+    assert len(whole) == 23 and max(row["statistic"] for row in whole) > 5.0  # type: ignore[type-var,operator]
+    assert rows([1, 7, 777, 2000, 2001, 5990]) == whole
+
+
+class TestAsset:
+    def test_a_block_counts_once(self) -> None:
+        one, other, cut = asset(), asset(), blocks(halls.recorded(1))[:20]
+        for block in cut:
+            one.take(block)
+            other.take(block)
+            assert other.take(block).rows == []
+        assert one.progress is not None and other.progress is not None
+        assert other.progress.counted == replace(one.progress.counted, repeated=20)
+        assert (other.progress.monitor == one.progress.monitor).all()
+
+    def test_a_block_that_is_missing_is_told(self) -> None:
+        followed, cut = asset(), blocks(halls.recorded(1))[:20]
+        told = [row for block in (*cut[:8], *cut[11:]) for row in followed.take(block).rows if row.table == "audit"]
+        (lost,) = told
+        assert lost.values["document"] == {"blocks": 3, "after": 7, "before": 11}
+        assert followed.progress is not None and followed.progress.counted.lost == 3
+
+    def test_what_is_no_block_is_refused(self) -> None:
+        followed, block = asset(), blocks(halls.recorded(1))[0]
+        nothing = block.t[:0]
+        for wrong in (
+            replace(block, t=nothing, r=nothing, u=nothing, y=nothing),
+            replace(block, y=block.y[1:]),
+            replace(block, t=np.full(50, math.nan)),
+        ):
+            with pytest.raises(RecordingError, match="press: block 0: t, r, u, y must have one length"):
+                followed.take(wrong)
+        assert followed.progress is None
+
+    def test_a_clock_that_is_set_back_keeps_neither_samples_nor_verdicts_waiting(self) -> None:
+        followed = asset()
+        for k, block in enumerate(blocks(halls.recorded(1, seconds=600.0))):
+            followed.take(replace(block, t=block.t - (3600.0 if k >= 200 else 0.0)))
+        assert followed.progress is not None
+        assert len(followed._window) <= 2 * 40 / 0.5 + 1
+        assert followed.progress.judged.examined is not None
+        assert followed.progress.judged.examined < BEGAN - 3000.0
+
+    def test_what_is_no_number_does_no_harm(self) -> None:
+        followed, cut = asset(), blocks(halls.recorded(1))[:40]
+        for k, block in enumerate(cut):
+            y = np.where(np.arange(50) % 7 == k % 7, [math.inf, math.nan] * 25, block.y)
+            followed.take(replace(block, y=y) if 10 < k < 20 else block)
+        assert followed.progress is not None
+        checkpoint.unpack(checkpoint.pack(followed.progress), "press")
+        assert math.isfinite(followed.progress.shown["statistic"])
+
+    def test_silence_is_an_alarm_and_no_verdict(self) -> None:
+        followed = asset()
+        for block in blocks(halls.recorded(1)):
+            followed.take(block)
+        assert followed.progress is not None
+        assert followed.status(followed.progress)["verdict"] == "healthy"
+        told = [one for quiet in range(1, 40) for one in followed.tick(float(quiet)).transitions]
+        status = followed.status(followed.progress)
+        assert status["verdict"] == "undetermined" and "silent" in status["quality"]
+        assert [one.alarm for one in told if one.after is State.UNACKNOWLEDGED] == ["data_quality"]
+        assert status["ne107"] == "failure"
+
+    def test_a_fault_is_alarmed_and_then_diagnosed_in_full(self) -> None:
+        followed, transitions = asset(), []
+        for block in blocks(halls.recorded(2, halls.LEAK))[:90]:
+            transitions += followed.take(block).transitions
+        (alarm,) = transitions
+        assert alarm.alarm == "fault" and BEGAN + 30.0 < alarm.time < BEGAN + 33.0
+        ((window, seen),) = followed.wanted()
+        assert window.until == alarm.time + 10.0 and seen[-1].t[-1] >= window.until - 0.02
+        assert followed.wanted(ended=True) == [(window, seen)]
+        with pytest.raises(AlarmError, match="reset means nothing there"):
+            followed.obey("fault", Command(Event.RESET, "ann"))
+        (done,) = followed.obey("fault", Command(Event.ACKNOWLEDGE, "ann", "seen")).transitions
+        assert (done.after, done.who, done.cause) == (State.ACKNOWLEDGED, "ann", "seen")
+        with pytest.raises(AlarmError, match=r"press: has no alarm 'falt'"):
+            followed.obey("falt", Command(Event.ACKNOWLEDGE, "ann"))
+
+
+class TestConfig:
+    @pytest.mark.parametrize(
+        ("old", "new", "said"),
+        [
+            ("speed =", "sped =", "[sources] line.sped: unknown key, did you mean 'speed'?"),
+            ("window_s = 40.0", "window_s = 0", "[diagnosis] window_s: 0 must be greater than 0"),
+            ('source = "line"', 'source = "lime"', "there is no source 'lime', only line"),
+            ('kind = "replay"', 'kind = "mqtt"', "[sources] line.kind: 'mqtt' is not one of 'replay'"),
+            ('name = "hall"', 'name = "press"', "'press' is an asset's name too"),
+            ("[store]", "[stor]", "stor: unknown key, did you mean 'store'?"),
+            ("start = 2026-01-01T00:00:00Z", "start = 2026-01-01T00:00:00", "[sources] line.start: "),
+            ('name = "hall"', "name = hall", "not valid TOML"),
+        ],
+    )
+    def test_a_mistake_is_one_line_with_its_key(self, tmp_path: Path, old: str, new: str, said: str) -> None:
+        path = halls.hall(tmp_path, "wrong")
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
+        with pytest.raises(ConfigError) as caught:
+            Config.load(path)
+        assert said in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+    def test_a_missing_file_says_so(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="no such file"):
+            Config.load(tmp_path / "none.toml")

@@ -1,0 +1,256 @@
+"""The store on both databases: batches whole and once, versions, retention, history and its exports."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.compute as pc
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+import sqlalchemy as sa
+from reliability.servers import Postgres, programs
+
+import halls
+from commands import one_line, run
+from servoscope.errors import StoreError, StoreUnavailable
+from servoscope.live.assembling import assemble
+from servoscope.live.config import Config
+from servoscope.live.rows import Row
+from servoscope.live.service import Service
+from servoscope.live.writing import Writer
+from servoscope.store import Batch, Store, schema, tables
+from servoscope.store.history import history
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[Postgres]:
+    found = programs()
+    if found is None:
+        pytest.skip("PostgreSQL is not on this machine: scripts/install-test-servers installs it")
+    server = Postgres.temporary(found)
+    server.start()
+    yield server
+    server.remove()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    if request.param == "sqlite":
+        yield str(tmp_path / "history.sqlite")
+        return
+    server: Postgres = request.getfixturevalue("postgres")
+    yield server.url
+    engine = sa.create_engine(server.url.replace("postgresql", "postgresql+psycopg"))
+    tables.TABLES.drop_all(engine)
+    engine.dispose()
+
+
+@pytest.fixture
+def store(url: str) -> Iterator[Store]:
+    opened = Store.open(url, write=True)
+    yield opened
+    opened.close()
+
+
+def residual(number: int, t: float, asset: str = "press") -> dict[str, Any]:
+    numbers = {"statistic": 0.25, "level": 0.5, "residual": [[1.0, 0.1, -0.2, 2.0], [10.0, None, None, 20.0]]}
+    return {"asset": asset, "number": number, "t": t, **numbers}
+
+
+def batch(*rows: dict[str, Any]) -> Batch:
+    made = Batch()
+    made.rows["residuals"] = list(rows)
+    return made
+
+
+def test_a_batch_is_written_whole_or_not_at_all(store: Store) -> None:
+    store.write(batch(residual(1, 0.0), residual(2, 1.0)), "hall", 1)
+    with pytest.raises(StoreError):
+        store.write(batch(residual(3, 2.0), residual(2, 1.0)), "hall", 2)  # number 2 is there already
+    assert [row["number"] for row in history(store, "residuals")] == [1, 2]
+    assert store.last_commit("hall") == 1 and store.last_commit("another") == 0
+
+
+class Forgetful(Store):
+    """Loses the connection when a commit has been made, before it could say so."""
+
+    cut = 0
+
+    def write(self, batch: Batch, owner: str, commit: int) -> None:
+        super().write(batch, owner, commit)
+        self.cut += 1
+        if self.cut == 1:
+            raise StoreUnavailable("the connection is lost")
+
+
+def test_a_commit_whose_end_was_not_heard_is_not_made_twice(url: str) -> None:
+    store = Forgetful.open(url, write=True)
+    writer = Writer(store, "hall", 10)
+    writer.add("press", [Row("residuals", {k: v for k, v in residual(1, 0.0).items() if k != "asset"})])
+    with pytest.raises(StoreUnavailable):
+        writer.write()
+    assert not writer.empty and writer.unavailable_since is not None
+    while writer.write() is None:
+        time.sleep(0.01)
+    assert writer.empty and writer.unavailable_since is None
+    assert len(history(store, "residuals")) == 1 and store.last_commit("hall") == 1
+    store.close()
+
+
+def test_a_checkpoint_replaces_the_one_before_and_old_samples_go(store: Store) -> None:
+    for sequence in range(3):
+        made = Batch(keep={"press": sequence - 1})
+        made.rows["recent"] = [{"asset": "press", "sequence": sequence, "samples": bytes([sequence])}]
+        row = {"asset": "press", "sequence": sequence, "state": b"x", "status": {"verdict": "healthy"}, "at": 1.0}
+        made.checkpoints["press"] = row
+        store.write(made, "hall", sequence + 1)
+    assert store.statuses()["press"]["sequence"] == 2
+    assert store.recent("press") == [(1, b"\1"), (2, b"\2")]
+
+
+def test_residuals_are_kept_for_as_long_as_said(store: Store) -> None:
+    store.write(batch(*(residual(k, float(k)) for k in range(10))), "hall", 1)
+    store.write(batch(residual(1, 0.0, "lift")), "hall", 2)
+    assert store.forget("residuals", {"press": 7.0}) == 7
+    assert [(row["asset"], row["number"]) for row in history(store, "residuals")] == [
+        ("lift", 1),
+        ("press", 7),
+        ("press", 8),
+        ("press", 9),
+    ]
+
+
+def test_older_tables_are_migrated_and_newer_ones_refused(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = Store.open(url, write=True)
+    first.write(batch(residual(1, 0.0)), "hall", 1)
+    first.close()
+
+    def add_a_note(connection: sa.Connection) -> None:
+        connection.execute(sa.text("ALTER TABLE residuals ADD COLUMN note TEXT DEFAULT 'old'"))
+
+    monkeypatch.setattr(schema, "MIGRATIONS", [add_a_note])
+    with pytest.raises(StoreError, match=r"version 1, servoscope run brings them to 2"):
+        Store.open(url)
+    Store.open(url, write=True).close()
+    again = Store.open(url)
+    assert again.rows(sa.select(sa.column("note")).select_from(tables.residuals)) == [{"note": "old"}]
+    again.close()
+    monkeypatch.setattr(schema, "MIGRATIONS", [])
+    with pytest.raises(StoreError, match=r"of version 2, this servoscope knows up to 1: install a newer one"):
+        Store.open(url)
+
+
+def test_a_migration_that_fails_leaves_all_as_it_was(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    Store.open(url, write=True).close()
+
+    def half(connection: sa.Connection) -> None:
+        connection.execute(sa.text("ALTER TABLE residuals ADD COLUMN note TEXT"))
+        connection.execute(sa.text("ALTER TABLE nowhere ADD COLUMN note TEXT"))
+
+    monkeypatch.setattr(schema, "MIGRATIONS", [half])
+    with pytest.raises(StoreError, match="nowhere"):
+        Store.open(url, write=True)
+    monkeypatch.setattr(schema, "MIGRATIONS", [])
+    store = Store.open(url)
+    with pytest.raises(StoreError, match="note"):
+        store.rows(sa.select(sa.column("note")).select_from(tables.residuals))
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("nowhere/history.sqlite", "no such store, servoscope run makes it"),
+        ("mysql://somewhere/x", "mysql is not supported, give a path for SQLite or postgresql://"),
+        ("postgresql://user:secret@127.0.0.1:1/x", "connection refused"),
+        ("://", "cannot be read as a URL"),
+    ],
+)
+def test_what_cannot_be_opened_is_one_line_without_passwords(url: str, said: str, tmp_path: Path) -> None:
+    line = one_line(run("watch", url, "--once"))
+    assert said.casefold() in line.casefold() and "secret" not in line
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.sqlite").write_bytes(b"not a database, but long enough to be looked at as if it were one" * 20)
+    one_line(run("history", tmp_path / "x.sqlite"), "x.sqlite", "file is not a database")
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A service file whose service has run."""
+    folder = tmp_path_factory.mktemp("history")
+    halls.files(folder)
+    config = halls.hall(folder, "hall")
+    Service(Config.load(config), assemble(Config.load(config))).run()
+    return config
+
+
+class TestCommands:
+    def test_check_reads_all_that_is_named(self, hall: Path) -> None:
+        assert "2 assets, 1 sources; all can be used" in run("run", hall, "--check").out
+        wrong = hall.with_name("wrong.toml")
+        wrong.write_text(hall.read_text().replace("leaky.csv", "weak.csv"))
+        one_line(run("run", wrong, "--check"), "weak.csv")
+        one_line(run("run", hall, "--anew", "nobody"), "--anew nobody", "press, lift")
+
+    def test_watch_shows_assets_as_they_are(self, hall: Path) -> None:
+        shown = run("watch", hall, "--once").out
+        assert "press" in shown and "lift" in shown and "fault" in shown
+        found = {one["asset"]: one["status"] for one in json.loads(run("watch", hall, "--json").out)}
+        assert found["lift"]["verdict"] == "healthy" and found["press"]["alarms"]["fault"]["state"] == "unacknowledged"
+        (only,) = json.loads(run("watch", hall, "--json", "--asset", "lift").out)
+        assert only["asset"] == "lift"
+
+    def test_history_is_asked_by_kind_asset_and_time(self, hall: Path) -> None:
+        rows = [json.loads(line) for line in run("history", hall, "--json").out.splitlines()]
+        assert [row["t"] for row in rows] == sorted(row["t"] for row in rows)
+        alarms = run("history", hall, "--kind", "alarms", "--asset", "press", "--json").out.splitlines()
+        (alarm,) = map(json.loads, alarms)
+        assert alarm["time"].startswith("2026-01-01T00:01:3") and alarm["document"]["priority"] == "high"
+        before = run("history", hall, "--kind", "alarms", "--to", "2026-01-01T00:01", "--json")
+        assert before.out == ""
+        assert "started" in run("history", hall, "--kind", "audit", "--from", "1h").out
+        wrong = run("history", hall, "--from", "yesterday")
+        assert wrong.code == 2 and "2026-01-31T12:00" in " ".join(wrong.err.split())
+
+    def test_history_is_exported(self, hall: Path, tmp_path: Path) -> None:
+        run("history", hall, "--kind", "residuals", "-o", tmp_path / "r.parquet")
+        run("history", hall, "--kind", "residuals", "--asset", "lift", "-o", tmp_path / "r.csv")
+        run("history", hall, "-o", tmp_path / "d.json")
+        table = pq.read_table(tmp_path / "r.parquet")
+        assert {"time", "asset", "statistic", "gamma_1Hz_real", "healthy_20Hz"} <= set(table.column_names)
+        lift = table.filter(pc.equal(table["asset"], "lift"))
+        assert pacsv.read_csv(tmp_path / "r.csv")["statistic"].to_pylist() == lift["statistic"].to_pylist()
+        document = json.loads((tmp_path / "d.json").read_text())
+        assert any(row["grounds"] == "full" and row["document"]["faults"] for row in document)
+
+    def test_alarms_are_answered_through_the_store(self, hall: Path) -> None:
+        assert "press" in run("alarms", "list", hall).out
+        one_line(run("alarms", "ack", hall, "pres", "fault"), "no such asset", "press")
+        # a service that goes on: the same history with more to replay
+        text = hall.read_text().replace("speed = 0.0", "speed = 1.0")
+        hall.write_text(text.replace('kind = "replay"', 'kind = "replay"\nrepeat = true'))
+        service = Service(Config.load(hall), assemble(Config.load(hall)))
+        running = threading.Thread(target=service.run)
+        running.start()
+        try:
+            said = run("alarms", "ack", hall, "press", "fault", "--who", "ann", "--why", "on my way")
+            assert said.out == "press: fault: done\n"
+            one_line(run("alarms", "ack", hall, "press", "fault"), "means nothing there")
+            assert run("alarms", "shelve", hall, "press", "fault", "--for", "8h").code == 0
+            assert json.loads(run("alarms", "list", hall, "--json").out)[0]["state"] == "shelved"
+        finally:
+            service.stop()
+            running.join(30.0)
+        audit = [json.loads(line) for line in run("history", hall, "--kind", "audit", "--json").out.splitlines()]
+        told = [
+            (row["who"], row["what"], row["document"]["outcome"][:8]) for row in audit if "outcome" in row["document"]
+        ]
+        assert told[0] == ("ann", "acknowledge", "done") and told[1][2] == "refused:"
