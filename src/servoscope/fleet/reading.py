@@ -11,7 +11,8 @@ from servoscope.fleet.lake import filesystem
 from servoscope.fleet.rows import Rows, clock_of, names_of, rows_of
 from servoscope.loop import Columns
 from servoscope.readers.columns import find_channel
-from servoscope.readers.tables import Table, open_table
+from servoscope.readers.opening import Opened, open_file
+from servoscope.readers.tables import Table
 
 __all__ = ["blocks"]
 
@@ -58,8 +59,8 @@ class _Part:
         import pyarrow as pa
 
         name = self.file.rpartition("/")[2]
-        if isinstance(self.source, Table):
-            return rows_of(self.source, columns)
+        if isinstance(self.source, Opened):
+            return Rows.joined([rows_of(piece, columns) for piece in self.source.pieces(self.names)])
         try:
             table = self.source.read_row_group(self.group, columns=self.names, use_threads=False)
         except (pa.ArrowException, OSError) as error:
@@ -72,7 +73,8 @@ def _parts(file: str, columns: Columns) -> Iterator[_Part]:
     import pyarrow.parquet as pq
 
     if not file.endswith((".parquet", ".pq")):
-        yield _Part(file, open_table(Path(file)), 0, NOW, [])
+        opened = open_file(Path(file))
+        yield _Part(file, opened, 0, NOW, names_of(columns, opened.columns, file))
         return
     system, path = filesystem(file)
     try:
