@@ -3,7 +3,7 @@
     python tests/carrying.py WARM
 
 runs the service of this file to its end, and reads lines from stdin, each the name of a file: its service is started
-and its process id printed; when it has ended, its exit code.
+and ``runs`` printed with its process id; when it has ended, ``ended`` with its exit code.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ class Carrier:
         assert self._process.stdin is not None
         self._process.stdin.write(f"{config}\n")
         self._process.stdin.flush()
-        return int(self._read())
+        return int(self._read("runs"))
 
     def wait(self) -> int:
         """Wait until it has ended; return its exit code, negative for a signal."""
-        return int(self._read())
+        return int(self._read("ended"))
 
     def kill(self, process: int) -> None:
         """Kill it; nothing in it runs any more."""
         os.kill(process, signal.SIGKILL)
         assert self.wait() in (-signal.SIGKILL, 0)
 
-    def _read(self) -> str:
+    def _read(self, what: str) -> str:
         assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        assert line, "the process that starts the services has died"
-        return line
+        said = self._process.stdout.readline().split()
+        assert said[:1] == [what], f"the process that starts the services says {' '.join(said) or 'nothing'}"
+        return said[1]
 
 
 def carry(warm: Path) -> None:
@@ -75,10 +75,10 @@ def carry(warm: Path) -> None:
         if not child:
             settings = Config.load(line.strip())
             service = Service(settings, assemble(settings))
-            print(os.getpid(), flush=True)
+            print("runs", os.getpid(), flush=True)
             service.run()
             os._exit(0)
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+        print("ended", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ MOST_REFUSED = 0.2  # share of updates that the instrument's guard may skip befo
 FALL_BACK = {"estimator": "akf"}
 LOUDER = 1.5  # growth of the noise's variance from which it is believed
 FORGOTTEN = 1e-9  # share of the past that is left when it counts as forgotten
-MEMORIES = 20.0  # after which it usually is
+MEMORIES = 22.0  # after which it usually is
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope import inverse
 from servoscope.errors import LoopError
@@ -289,8 +290,8 @@ class Pipeline:
         """Turn rows of a recursion, shape (K, row), into estimates in physical units."""
         n, basis = self.bank.n, c.basis
         theta, S, Psi = np.split(rows[:, 5:], [n, n + n * n], axis=1)
-        # basis S basis' and basis Psi/basis, row by row of many evaluations at a time
-        both, from_left = np.kron(basis, basis), np.kron(basis, np.linalg.inv(basis).T)
+        # basis S basis' and basis Psi/basis, each a product with the elements in one row
+        both, back = np.kron(basis, basis), np.kron(basis, np.linalg.inv(basis).T)
         return Estimates(
             index=index,
             updates=rows[:, 0],
@@ -298,10 +299,18 @@ class Pipeline:
             power=rows[:, 2] / c.variance,
             level=rows[:, 3],
             crossed=rows[:, 4],
-            theta=c.origin + theta @ basis.T,
-            S=(S @ both.T).reshape(-1, n, n),
-            Psi=(Psi @ from_left.T).reshape(-1, n, n),
+            theta=c.origin + _transformed(theta, basis),
+            S=_transformed(S, both).reshape(-1, n, n),
+            Psi=_transformed(Psi, back).reshape(-1, n, n),
         )
+
+
+def _transformed(rows: FloatArray, matrix: npt.NDArray[np.floating[Any]]) -> FloatArray:
+    """Return a matrix (p, m) times every row of many, shape (K, p); each is the same bits whatever stands beside it."""
+    columns, found = np.ascontiguousarray(rows.T), np.zeros((len(matrix), len(rows)))
+    for i, j in np.argwhere(matrix):
+        found[i] += matrix[i, j] * columns[j]
+    return np.ascontiguousarray(found.T)
 
 
 class Regressing:

@@ -6,6 +6,7 @@ import math
 import mmap
 import os
 import tempfile
+import weakref
 from collections.abc import Callable, Iterator
 from typing import IO, Any
 
@@ -134,6 +135,7 @@ class Growing:
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(prefix="servoscope-")  # noqa: SIM115 - it outlives this
+                weakref.finalize(self, self._file.close)
             for part in self._parts:
                 part.tofile(self._file)
                 self._dtype = part.dtype

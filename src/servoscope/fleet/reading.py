@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 from servoscope.errors import RecordingError
@@ -11,7 +10,7 @@ from servoscope.fleet.lake import filesystem
 from servoscope.fleet.rows import Rows, clock_of, names_of, rows_of
 from servoscope.loop import Columns
 from servoscope.readers.columns import find_channel
-from servoscope.readers.opening import Opened, open_file
+from servoscope.readers.opening import open_file
 from servoscope.readers.tables import Table
 
 __all__ = ["blocks"]
@@ -59,8 +58,8 @@ class _Part:
         import pyarrow as pa
 
         name = self.file.rpartition("/")[2]
-        if isinstance(self.source, Opened):
-            return Rows.joined([rows_of(piece, columns) for piece in self.source.pieces(self.names)])
+        if isinstance(self.source, Table):
+            return rows_of(self.source, columns)
         try:
             table = self.source.read_row_group(self.group, columns=self.names, use_threads=False)
         except (pa.ArrowException, OSError) as error:
@@ -73,8 +72,9 @@ def _parts(file: str, columns: Columns) -> Iterator[_Part]:
     import pyarrow.parquet as pq
 
     if not file.endswith((".parquet", ".pq")):
-        opened = open_file(Path(file))
-        yield _Part(file, opened, 0, NOW, names_of(columns, opened.columns, file))
+        opened = open_file(file)
+        for i, table in enumerate(opened.pieces(names_of(columns, opened.columns, file))):
+            yield _Part(file, table, i, NOW, [])
         return
     system, path = filesystem(file)
     try:

@@ -6,6 +6,7 @@ import fcntl
 import hashlib
 import os
 import sqlite3
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +31,7 @@ PASSING = {  # what SQLite says when trying again may help
     sqlite3.SQLITE_NOMEM,
     sqlite3.SQLITE_PROTOCOL,
 }
+LINGERS = 2.0  # s: the longest that the lock of a killed process is waited for
 
 
 def url_of(text: str, folder: Path) -> URL:
@@ -152,7 +154,7 @@ class Claim:
         path = Path(f"{self._url.database}.lock")
         try:
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(self._file)
         except BlockingIOError:
             self.drop()
             raise StoreError(
@@ -179,6 +181,18 @@ class Claim:
             self._connection.invalidate()
             self._connection.close()
         self._file = self._connection = None
+
+
+def _lock(file: int) -> None:
+    """Lock a file; what a killed process was about to start holds its lock for a moment longer than itself."""
+    until = time.monotonic() + LINGERS
+    while True:
+        try:
+            return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                raise
+            time.sleep(0.02)
 
 
 def _key(asset: str) -> Any:
