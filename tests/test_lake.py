@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
@@ -113,6 +115,10 @@ def test_a_lake_is_found_by_its_folders_or_in_a_table(lake: Path, tmp_path: Path
     assert found.assets == ("P0", "P1", "P2", "P3") and len(found.items) == 8
     assert found.items[0].key == ("P0", lakes.DAYS[0]) and found.items[0].groups == (("supply", "A"),)
     assert Lake.open(f"file://{lake}").items[0].files[0] == f"file://{found.items[0].files[0]}"
+    values = lakes.table_of(lakes.recorded(0, 0, 1.0), 0).set_column(0, "t", pa.array(np.arange(100) / 100.0))
+    pacsv.write_csv(values, tmp_path / "one.csv")
+    (rows,) = reading.blocks([str(tmp_path / "one.csv")], Columns())
+    assert rows.t_us.tolist() == list(range(0, 1_000_000, 10_000))
     table = tmp_path / "files.csv"
     table.write_text(f"asset,file,site\nP0,{found.items[0].files[0]},north\nP9,gone.csv,\n")
     listed = Lake.open(str(table)).items

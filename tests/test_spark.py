@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import sqlalchemy as sa
 
 import lakes
 from servoscope import fleet
@@ -31,6 +32,8 @@ from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.lake import Lake
 from servoscope.fleet.local import local
 from servoscope.fleet.tasks import Examine
+from servoscope.store import Store
+from servoscope.store.tables import diagnoses
 
 # one session for all of them, so one process of the test runner
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("spark")]
@@ -157,12 +160,12 @@ def the_next_day(folder: Path) -> None:
     put(folder, "next", "P0", pa.table({"t": at, "r": [0.0], "u": [0.0], "y": [0.0]}), 99)
 
 
-def followed(session: Any, plan: Plan, folder: Path, output: Path) -> None:
+def followed(session: Any, plan: Plan, folder: Path, output: Path, store: str | None = None) -> None:
     frame = sinks.files(session, str(folder), lakes.loop().columns)
     stream = streaming.follow(frame, plan.output / "baselines", assets=4, by="supply")
     for left in (2, 1, 0):
         try:
-            return sinks.wait(sinks.start(stream, output, every_s=None))
+            return sinks.wait(sinks.start(stream, output, every_s=None, store=store))
         except ServoscopeError as error:
             # Spark gives a new Python ten seconds to start; on a busy machine that may take another try
             if "failed to connect back" not in str(error) or not left:
@@ -184,8 +187,14 @@ def test_a_stream_finds_what_one_machine_finds_and_writes_the_same_traces(
         for asset in ("P0", "P1", "P3"):
             put(tmp_path / "in", str(day), asset, day_of(Path(plan.lake.where), asset, day), day)
     the_next_day(tmp_path / "in")
-    followed(session, plan, tmp_path / "in", tmp_path / "out")
-    assert items_of(session, tmp_path / "out") == without_files(journal(plan.output), "P0", "P1", "P3")
+    store = str(tmp_path / "history.db")
+    followed(session, plan, tmp_path / "in", tmp_path / "out", store)
+    wanted = without_files(journal(plan.output), "P0", "P1", "P3")
+    assert items_of(session, tmp_path / "out") == wanted
+    stored = {
+        (row["asset"], row["document"]["day"]): row["document"] for row in Store.open(store).rows(sa.select(diagnoses))
+    }
+    assert stored == wanted
     rows = (
         sinks.results(session, tmp_path / "out").where("kind = 'trace' and asset = 'P1'").orderBy("time_us").collect()
     )

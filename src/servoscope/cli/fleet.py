@@ -58,6 +58,9 @@ def fleet(
     checkpoint: Annotated[
         str | None, typer.Option(metavar="URL", help="Stream: else in the folder for results.")
     ] = None,
+    store: Annotated[
+        str | None, typer.Option(metavar="URL", help="Stream: SQLite file or URL that diagnoses go to as well.")
+    ] = None,
     source: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="Stream: options of Spark's source; repeatable.")
     ] = None,
@@ -75,7 +78,7 @@ def fleet(
         lake, output, loop, baselines, baseline_by, healthy_days, groups, (keys[0], keys[1]), columns, window
     )
     if stream:
-        known = _streamed(asked, master, _Stream(assets, every, late, checkpoint, tuple(source or ())))
+        known = _streamed(asked, master, _Stream(assets, every, late, checkpoint, tuple(source or ()), store))
     else:
         known = _examined(asked, engine, jobs, master)
     if as_json:
@@ -95,6 +98,7 @@ class _Stream(NamedTuple):
     late: float
     checkpoint: str | None
     source: tuple[str, ...]
+    store: str | None
 
 
 class _Asked(NamedTuple):
@@ -162,7 +166,7 @@ def _streamed(asked: _Asked, master: str | None, how: _Stream) -> Fleet:
     make = sinks.kafka if asked.lake == KAFKA else sinks.files
     frame = make(found, asked.lake, columns, options)
     followed = follow(frame, path, assets=assets, columns=columns, delay_s=how.late, by=asked.by, window_s=asked.window)
-    query = sinks.start(followed, asked.output, checkpoint=how.checkpoint, every_s=how.every)
+    query = sinks.start(followed, asked.output, checkpoint=how.checkpoint, every_s=how.every, store=how.store)
     with waiting("following the stream"):
         sinks.wait(query)
     groups = groups_of(asked.groups) if asked.groups is not None else {}

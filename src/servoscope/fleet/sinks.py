@@ -7,11 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from servoscope.errors import RecordingError, ServoscopeError
 from servoscope.fleet.common import PRIOR, Prior
 from servoscope.fleet.knowledge import Fleet, known
 from servoscope.fleet.pages import write_knowledge
-from servoscope.fleet.rows import names_of
+from servoscope.fleet.passing import DAY_US
+from servoscope.fleet.rows import MICRO, names_of
 from servoscope.fleet.streaming import SCHEMA
 from servoscope.loop import Columns
 
@@ -19,7 +22,12 @@ if TYPE_CHECKING:
     from pyspark.sql import DataFrame, SparkSession
     from pyspark.sql.streaming import StreamingQuery
 
+    from servoscope.store import Row
+
 __all__ = ["files", "kafka", "report", "results", "start", "wait"]
+
+
+OWNER = "fleet stream"  # in the store: whose transactions these are
 
 
 def files(session: SparkSession, folder: str, columns: Columns, options: Mapping[str, str] | None = None) -> DataFrame:
@@ -65,7 +73,12 @@ def kafka(session: SparkSession, _: str, columns: Columns, options: Mapping[str,
 
 
 def start(
-    followed: DataFrame, output: str | Path, *, checkpoint: str | Path | None = None, every_s: float | None = 60.0
+    followed: DataFrame,
+    output: str | Path,
+    *,
+    checkpoint: str | Path | None = None,
+    every_s: float | None = 60.0,
+    store: str | None = None,
 ) -> StreamingQuery:
     """Start a stream whose results are Parquet, each micro-batch in a folder of its own, `results` / batch=N.
 
@@ -81,16 +94,50 @@ def start(
         Folder or URL for checkpoints; None: beside the results.
     every_s
         Seconds between micro-batches; None: what there is is done, and the stream ends.
+    store
+        A SQLite file or URL of PostgreSQL that diagnoses go to as well, one per asset and day, each micro-batch in one
+        transaction; a batch that is done again is not written again.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be used.
     """
+    if store is not None:
+        from servoscope.store import Batch, Store  # late: it needs an extra of its own
+
+        history = Store.open(store, write=True)
 
     def write(batch: DataFrame, number: int) -> None:
         folder = f"{output}/results/batch={number:09d}"
         batch.write.mode("overwrite").partitionBy("kind").parquet(folder)
+        if store is not None and history.last_commit(OWNER) <= number:
+            items = batch.sparkSession.read.schema(SCHEMA).parquet(folder).where("kind = 'item'").select("result")
+            rows: list[Row] = [_stored(json.loads(row.result)) for row in items.collect()]
+            history.write(Batch(rows={"diagnoses": rows}), OWNER, number + 1)
 
     writer = followed.writeStream.foreachBatch(write).outputMode("append")
     writer = writer.option("checkpointLocation", str(checkpoint or f"{output}/checkpoint"))
     trigger: dict[str, Any] = {"availableNow": True} if every_s is None else {"processingTime": f"{every_s:g} seconds"}
     return writer.trigger(**trigger).start()
+
+
+def _stored(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an item as a row of the store's diagnoses, numbered by its day."""
+    said = entry.get("diagnosis", {})
+    onset = said.get("onset_s")
+    begin = (entry.get("first_us") or 0) / MICRO
+    day = int(np.datetime64(entry["day"], "D").astype(int))
+    return {
+        "asset": entry["asset"],
+        "number": day,
+        "t": (entry.get("last_us") or day * DAY_US) / MICRO,
+        "grounds": "full",
+        "verdict": said.get("verdict", "undetermined"),
+        "summary": said.get("summary") or str(entry["error"]),
+        "onset": begin + onset[1] if onset else None,
+        "document": dict(entry),
+    }
 
 
 def results(session: SparkSession, output: str | Path) -> DataFrame:

@@ -291,11 +291,13 @@ def _chunks(frames: Iterator[Any]) -> Iterator[Any]:
     import pandas as pd
 
     parts: list[Any] = []
+    rows = 0
     for frame in frames:
         parts.append(frame)
-        if sum(map(len, parts)) >= CHUNK:
+        rows += len(frame)
+        if rows >= CHUNK:
             yield pd.concat(parts, ignore_index=True)
-            parts = []
+            parts, rows = [], 0
     if parts:
         yield pd.concat(parts, ignore_index=True)
 
