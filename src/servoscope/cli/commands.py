@@ -193,7 +193,10 @@ def diagnose(
                 for recording in source.read(path):
                     with failures.noted():
                         steps.tell("recursion")
-                        said, course = monitor.examine(healthy, recording, steps.tell)
+                        if traces is None and pages is None:
+                            said, course = monitor.diagnose(healthy, recording, steps.tell), None
+                        else:
+                            said, course = monitor.examine(healthy, recording, steps.tell)
                         faulty |= said.verdict == "fault"
                         with steps.paused():
                             if as_json:
@@ -201,11 +204,11 @@ def diagnose(
                             else:
                                 verdicts.diagnosis(out, said)
                         stem = stem_of(path, recording.name)
-                        if traces is not None:
+                        if traces is not None and course is not None:
                             target = traces.path(stem)
                             writers.write_table(target, course.table())
                             terminal.written(terminal.console(stderr=as_json), target)
-                        if pages is not None:
+                        if pages is not None and course is not None:
                             from servoscope import report as reports
 
                             target = pages.path(stem)
