@@ -1,4 +1,4 @@
-"""How long `servoscope diagnose` takes over a long recording, and how much memory; prints a Markdown table.
+"""How long `servoscope diagnose` takes from a start, and over a long recording; prints Markdown tables.
 
 python benchmarks/from_file.py [--rows 10000000] [--fault] [--json]
 """
@@ -48,6 +48,36 @@ def written(folder: Path, rows: int, fault: bool) -> list[Path]:
     return paths
 
 
+def start(repeats: int = 9) -> Table:
+    """Diagnose a minute, with no code compiled yet and with all of it."""
+    imports = [_run("-c", "import servoscope")[0] for _ in range(repeats)]
+    cells = [("import servoscope", *_spread(imports))]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        baseline, short = str(folder / "b.json"), {fault: str(folder / f"{fault}.parquet") for fault in (False, True)}
+        for fault, path in short.items():
+            _servoscope("simulate", str(RIG), "-o", path, "--seed", "1", *(["--fault", "C_ie=1.2@30"] * fault))
+        _servoscope("learn", str(RIG), short[False], "-o", baseline)
+        for fault, path in short.items():
+            what = "diagnose a minute, a fault" if fault else "diagnose a minute, healthy"
+            cold = []
+            for number in range(3):
+                cache = {"NUMBA_CACHE_DIR": str(folder / f"cache-{fault}-{number}")}
+                cold.append(_servoscope("diagnose", baseline, path, **cache)[0])
+            warm = [_servoscope("diagnose", baseline, path, **cache)[0] for _ in range(repeats)]
+            cells += [(f"{what}, never run before", *_spread(cold)), (what, *_spread(warm))]
+    note = "Whole commands, from the start of Python to its end; the package's byte code is there, as pip leaves it."
+    return Table("Start", f"{note} {_load()}", ("command", "s, median", "s, least to most"), tuple(cells))
+
+
+def _spread(times: list[float]) -> tuple[str, str]:
+    return f"{sorted(times)[len(times) // 2]:.2f}", f"{min(times):.2f} to {max(times):.2f}"
+
+
+def _load() -> str:
+    return f"Load average {os.getloadavg()[0] if hasattr(os, 'getloadavg') else 0.0:.1f}."
+
+
 def from_file(rows: int, fault: bool) -> Table:
     """Diagnose the files, each in a process of its own that has its code compiled already."""
     with tempfile.TemporaryDirectory() as name:
@@ -62,8 +92,7 @@ def from_file(rows: int, fault: bool) -> Table:
         for path in written(folder, rows, fault):
             found = _servoscope("diagnose", baseline, str(path))
             cells.append((f"{path.suffix[1:]}, {rows} rows", *_said(found, rows, path)))
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    note = f"Whole commands, {'a fault in the middle' if fault else 'healthy'}; load average {load:.1f}."
+    note = f"Whole commands, {'a fault in the middle' if fault else 'healthy'}. {_load()}"
     return Table(
         "From file", note, ("file", "MB", "s", "s of processor time", "rows/s of it", "MB of memory"), tuple(cells)
     )
@@ -74,16 +103,21 @@ def _said(found: tuple[float, float, int], rows: int, path: Path) -> tuple[str, 
     return f"{path.stat().st_size / 1e6:.0f}", f"{wall:.1f}", f"{cpu:.1f}", f"{rows / cpu:.3g}", f"{memory / 1e6:.0f}"
 
 
-def _servoscope(*words: str) -> tuple[float, float, int]:
+def _servoscope(*words: str, **environment: str) -> tuple[float, float, int]:
     """Run a command; return its time, processor time [s] and largest resident memory [bytes]."""
-    start = time.perf_counter()
-    child = subprocess.Popen([sys.executable, "-m", "servoscope", *words], stdout=subprocess.DEVNULL)
+    return _run("-m", "servoscope", *words, **environment)
+
+
+def _run(*words: str, **environment: str) -> tuple[float, float, int]:
+    given = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    begin = time.perf_counter()
+    child = subprocess.Popen([sys.executable, *words], stdout=subprocess.DEVNULL, env=given | environment)
     _, status, used = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
-        raise SystemExit(f"servoscope {' '.join(words)}: exit code {child.returncode}")
+        raise SystemExit(f"{' '.join(words)}: exit code {child.returncode}")
     memory = used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    return time.perf_counter() - start, used.ru_utime + used.ru_stime, memory
+    return time.perf_counter() - begin, used.ru_utime + used.ru_stime, memory
 
 
 if __name__ == "__main__":
@@ -91,4 +125,4 @@ if __name__ == "__main__":
     command.add_argument("--rows", type=int, default=10_000_000)
     command.add_argument("--fault", action="store_true", help="with a leak from the middle on")
     given = command.parse_args()
-    show([from_file(given.rows, given.fault)], given.json)
+    show([start(), from_file(given.rows, given.fault)], given.json)

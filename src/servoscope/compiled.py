@@ -20,6 +20,7 @@ from numba.np.arrayobj import make_array, populate_array
 
 from servoscope.arithmetic import Index, Number, Truth
 from servoscope.lanes import Kept, Rows, lanes_of, turned
+from servoscope.parts import Parts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -49,7 +50,7 @@ def kernel(function: F, heap: bool = True) -> F:
     `heap` says whether it, or what it calls, allocates arrays; without, there is no counting of references either.
     """
     function.__qualname__ = f"{function.__qualname__}_{sources()}"
-    compiled = numba.njit(error_model="numpy", nogil=True, _nrt=heap)(function)
+    compiled = numba.njit(error_model="numpy", nogil=True, _nrt=heap, no_cfunc_wrapper=True)(function)
     with contextlib.suppress(RuntimeError):  # Numba found no folder that it can write
         compiled._cache = Cache(function)
     return compiled  # type: ignore[no-any-return]
@@ -65,9 +66,15 @@ class Cache(FunctionCache):  # type: ignore[misc]  # numba has no complete types
             return self._load_overload(sig, target_context)
 
 
+def part(function: F, heap: bool = False, always: bool = False) -> F:
+    """Compile a part of kernels, never called from Python; `always` inlines it, else LLVM decides."""
+    options = {"error_model": "numpy", "_nrt": heap, "forceinline": always, "pipeline_class": Parts}
+    return numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function)  # type: ignore[no-any-return]
+
+
 def inlined(function: F, heap: bool = False) -> F:
-    """Compile a part of other kernels: always inlined, never called from Python."""
-    return numba.njit(error_model="numpy", forceinline=True, _nrt=heap)(function)  # type: ignore[no-any-return]
+    """Compile a part of other kernels that is always inlined."""
+    return part(function, heap, always=True)
 
 
 def filled(template: Callable[..., Any], names: Mapping[str, object], what: str = "") -> Callable[..., Any]:

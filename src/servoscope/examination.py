@@ -6,6 +6,7 @@ computed from the samples that they still remember.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -199,35 +200,20 @@ def _followed(baseline: Baseline, recording: Recording, pipeline: Pipeline, grow
             return tuning.theta
         return np.asarray(walk.advance(_course(recording, rows, 0)) + (tuning.theta - np.array(baseline.model_theta)))
 
-    estimating, whole = Estimating(pipeline, tuning, watch), _Table(recording.samples // pipeline.every)
+    estimating, columns = Estimating(pipeline, tuning, watch), defaultdict[str, spool.Growing](spool.Growing)
     with ThreadPoolExecutor(1) as beside:
         for rows in spool.pieces(0, recording.samples):
             shown = beside.submit(healthy, rows)
             e = estimating.advance(recording.rows(rows))
             expected = np.broadcast_to(shown.result(), e.theta.shape)
             T2 = np.where(e.updates > 0, statistic(e.theta, expected, growth * e.S + C), 0.0)
-            whole.add(**vars(e), expected=expected, statistic=T2)
+            for name, piece in {**vars(e), "expected": expected, "statistic": T2}.items():
+                columns[name].append(piece)
             spool.release(*recording.columns)
-    found = whole.columns
+    found = {name: column.whole() for name, column in columns.items()}
     expected, T2 = found.pop("expected"), found.pop("statistic")
     estimates = Estimates(**found)
     return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
-
-
-class _Table:
-    """Columns of a known length, filled piece by piece."""
-
-    def __init__(self, rows: int) -> None:
-        self.columns: dict[str, npt.NDArray[Any]] = {}
-        self._rows, self._filled = rows, 0
-
-    def add(self, **pieces: npt.NDArray[Any]) -> None:
-        for name, piece in pieces.items():
-            if name not in self.columns:
-                self.columns[name] = spool.empty((self._rows, *piece.shape[1:]), piece.dtype)
-            self.columns[name][self._filled : self._filled + len(piece)] = piece
-        self._filled += len(piece)
-        spool.release(*self.columns.values())
 
 
 def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from servoscope.compiled import kernel
@@ -23,17 +25,16 @@ def filtered(numerator: FloatArray, denominator: FloatArray, x: FloatArray) -> F
     order = max(len(numerator), len(denominator)) - 1
     b, a = (np.pad(np.asarray(c, dtype=np.float64), (0, order + 1 - len(c))) for c in (numerator, denominator))
     out = np.empty_like(columns)
-    _run(b, a, columns, out)
+    _run(b, a, columns, np.zeros((columns.shape[1], order + 1)), out)
     return out.reshape(signals.shape)
 
 
-@kernel
-def _run(b: FloatArray, a: FloatArray, x: FloatArray, out: FloatArray) -> None:
-    order = len(b) - 1
+@functools.partial(kernel, heap=False)
+def _run(b: FloatArray, a: FloatArray, x: FloatArray, z: FloatArray, out: FloatArray) -> None:
+    """Write what leaves the filter; z (m, order + 1) is its state, whose last one stays zero."""
     for m in range(x.shape[1]):
-        z = np.zeros(order + 1)  # the last one stays zero
         for k in range(len(x)):
-            y = b[0] * x[k, m] + z[0]
-            for i in range(order):
-                z[i] = b[i + 1] * x[k, m] + z[i + 1] - a[i + 1] * y
+            y = b[0] * x[k, m] + z[m, 0]
+            for i in range(len(b) - 1):
+                z[m, i] = b[i + 1] * x[k, m] + z[m, i + 1] - a[i + 1] * y
             out[k, m] = y

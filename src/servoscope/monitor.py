@@ -340,7 +340,7 @@ class Monitor:
             "statistic": out[..., 1],
             "level": out[..., 2],
             "crossed": out[..., 3],
-            "ready": out[..., 0] > 0.0,
+            "ready": _begun(out[..., 0]),
         }
         for name, values in self._of_baselines.items():
             columns[name] = np.broadcast_to(values[:, None], (*shape, *values.shape[1:]))
@@ -357,6 +357,13 @@ class Monitor:
             ifrf_expected=expected,
             **columns,
         )
+
+
+def _begun(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Return where there is an estimate; as updates never become fewer, the first column mostly says it."""
+    if updates.size and (updates[:, 0] > 0.0).all():
+        return np.broadcast_to(np.True_, updates.shape)
+    return updates > 0.0
 
 
 def _once(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:

@@ -7,8 +7,11 @@ nothing, because everything that is carried from sample to sample stands in that
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import itertools
 import os
+from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -27,10 +30,11 @@ from servoscope.straight import coefficients, pattern
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-LANES = {"float64": 16, "float32": 32}  # assets side by side: state and constants stay in the first-level cache
+LANES = {"float64": 8, "float32": 16}  # assets side by side: one vector; twice as many leave the first-level cache
 WIDTH = {"float64": 8, "float32": 16}  # numbers in a vector
 NOTHING = 1e-12  # of the first coefficient of a filter
 WORTH = 200_000  # samples from which a second core pays
+PARTS = 12  # that each core takes in turn: one that is held up leaves its share to the others
 
 
 class View(NamedTuple):
@@ -187,16 +191,23 @@ class Recursion:
         flags = np.zeros((0, 0), dtype=np.bool_) if restart is None else restart
         signals = state, new, r, u, y, flags, c.every, c.stride
 
-        def part(begin: int, end: int) -> None:
-            self._code.block(self._laid, *signals, out.reshape(len(out), -1), begin, end)
-
         workers = min(_cores(), self._blocks) if r.size >= WORTH else 1
+        edges = np.linspace(0, self._blocks, PARTS * workers + 1 if workers > 1 else 2).astype(int).tolist()
+        parts = deque(itertools.pairwise(edges))
+
+        def work() -> None:
+            with contextlib.suppress(IndexError):  # there is no part left
+                while True:
+                    self._code.block(self._laid, *signals, out.reshape(len(out), -1), *parts.popleft())
+
         if workers == 1:
-            part(0, self._blocks)
-        else:
-            edges = np.linspace(0, self._blocks, 4 * workers + 1).astype(int).tolist()
-            with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(part, edges[:-1], edges[1:]))
+            work()
+        else:  # this thread works as well: waking another one takes time
+            others = [_pool(workers - 1).submit(work) for _ in range(workers - 1)]
+            work()
+            for other in others:
+                if not other.cancel():
+                    other.result()
         return new, out
 
     @property
@@ -225,6 +236,16 @@ class Recursion:
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@functools.cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    """Return threads that are kept: starting them takes as long as ten thousand samples."""
+    return ThreadPoolExecutor(workers, "servoscope")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # its threads did not come along
 
 
 def structure(c: Constants) -> Hashable:

@@ -96,7 +96,7 @@ def without(column: npt.NDArray[Any], dropped: npt.NDArray[np.intp]) -> npt.NDAr
 
 
 class Growing:
-    """A column that grows piece by piece; a large one lies in a temporary file."""
+    """An array that grows by rows, piece by piece; a large one lies in a temporary file."""
 
     def __init__(self) -> None:
         self._parts: list[npt.NDArray[Any]] = []
@@ -104,20 +104,20 @@ class Growing:
         self._file: IO[bytes] | None = None
 
     def append(self, part: npt.NDArray[Any]) -> None:
-        """Add a piece, shape (N,); all are of one type.
+        """Add a piece, shape (N, ...); all are alike but for N.
 
         Raises
         ------
         OutputError
             If the temporary file cannot be written.
         """
-        self._parts.append(part)
+        self._parts.append(np.ascontiguousarray(part))  # a view of some columns would keep them all
         self._held += part.nbytes
         if self._held >= (LARGE if self._file is None else LARGE // 8):
             self._spill()
 
     def whole(self, dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
-        """Return the column; nothing can be added any more. `dtype` is that of an empty one.
+        """Return the array; nothing can be added any more. `dtype` is that of one without pieces.
 
         Raises
         ------
@@ -126,10 +126,9 @@ class Growing:
         """
         if self._file is None:
             return self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts or [np.empty(0, dtype)])
-        dtype = self._parts[0].dtype if self._parts else self._dtype
         self._spill()
         with self._file as file:
-            return _mapped(file.fileno(), file.tell(), dtype)
+            return _mapped(file.fileno(), file.tell(), self._last.dtype).reshape(-1, *self._last.shape[1:])
 
     def _spill(self) -> None:
         try:
@@ -138,7 +137,7 @@ class Growing:
                 weakref.finalize(self, self._file.close)
             for part in self._parts:
                 part.tofile(self._file)
-                self._dtype = part.dtype
+                self._last = part[:0]
             self._file.flush()
         except OSError as error:
             raise _no_room(error) from None

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import sys
 from typing import Annotated
 
 import typer
 
 from servoscope.cli.shell import Commands
+
+GARBAGE = 200_000  # new objects before cycles are looked for: loading code makes very many, and no garbage
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
@@ -22,6 +26,8 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line of this process."""
+    gc.set_threshold(GARBAGE)  # a quarter of the time to a first result went into looking, here and at the end
+    atexit.register(gc.freeze)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without a sign for squared is no reason to stop

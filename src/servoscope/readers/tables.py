@@ -125,16 +125,15 @@ class Clock:
             If a cell holds text that is neither number nor time.
         """
         import pyarrow as pa
-        import pyarrow.compute as pc
 
         column = table.columns[self.column]
         if not pa.types.is_temporal(column.type):
             return number_column(table, self.column, "time") * UNITS[self._unit]
         missing = np.asarray(column.is_null().to_numpy(zero_copy_only=False), dtype=bool)
         if pa.types.is_date(column.type):
-            column = pc.cast(column, pa.timestamp("ms"))
+            column = column.cast(pa.timestamp("ms"))
         elif pa.types.is_time32(column.type):
-            column = pc.cast(column, pa.time64("ns"))
+            column = column.cast(pa.time64("ns"))
         per_second = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[column.type.unit]
         whole = column.cast(pa.int64()).fill_null(0).to_numpy()
         known = np.flatnonzero(~missing)

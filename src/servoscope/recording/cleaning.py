@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -198,18 +199,24 @@ def _repeats(t: FloatArray, run: IntArray, period: float) -> Index:
 def _spikes(
     r: FloatArray, u: FloatArray, y: FloatArray, run: IntArray, labels: tuple[str, str, str]
 ) -> tuple[Index, list[str]]:
-    in_r = find_spikes(r, run, share=SPIKE_SHARES["r"])
+    with ThreadPoolExecutor(1) as beside:
+        of_y = beside.submit(find_spikes, y, run, share=SPIKE_SHARES["y"])
+        in_r, in_u = _coupled(r, u, run)
+    in_y = of_y.result()
+    spiky = [label for label, found in zip(labels, (in_r, in_u, in_y), strict=True) if found.size]
+    return np.unique(np.concatenate([in_r, in_u, in_y])), spiky
 
+
+def _coupled(r: FloatArray, u: FloatArray, run: IntArray) -> tuple[Index, Index]:
+    """Return the spikes of the reference, and those of the control input that are not its answer to a step."""
+    in_r = find_spikes(r, run, share=SPIKE_SHARES["r"])
     sound, runs = spool.without(r, in_r), spool.without(run, in_r)
 
     def excused(rows: Index) -> BoolArray:
         """Return where a controller kicks u because r steps; spikes of r itself are no steps."""
         return steps_in(sound, runs, rows - np.searchsorted(in_r, rows)) & ~np.isin(rows, in_r)
 
-    in_u = find_spikes(u, run, share=SPIKE_SHARES["u"], excused=excused)
-    in_y = find_spikes(y, run, share=SPIKE_SHARES["y"])
-    spiky = [label for label, found in zip(labels, (in_r, in_u, in_y), strict=True) if found.size]
-    return np.unique(np.concatenate([in_r, in_u, in_y])), spiky
+    return in_r, find_spikes(u, run, share=SPIKE_SHARES["u"], excused=excused)
 
 
 def _gap_notes(t: FloatArray, after: Index, dropped: FloatArray, period: float) -> list[Defect]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import numpy.typing as npt
 
@@ -11,7 +13,7 @@ FloatArray = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
 
-@kernel
+@functools.partial(kernel, heap=False)
 def heights(
     z: FloatArray,
     run: npt.NDArray[np.int32],
@@ -48,17 +50,17 @@ def heights(
     return found
 
 
-@kernel
-def local_steps(z: FloatArray, start: Index, width: Index, neighbours: int, out: FloatArray) -> None:
+@functools.partial(kernel, heap=False)
+def local_steps(z: FloatArray, start: Index, width: Index, around: FloatArray, out: FloatArray) -> None:
     """Write the upper quartile of the steps around places of some width; `out` has their number.
 
-    Mirrored at the ends, a place's own width away, so that one at the end is not compared with itself.
+    Mirrored at the ends, a place's own width away, so that one at the end is not compared with itself; of the
+    steps on either side, as many are taken as `around` has room for.
     """
-    count, size = len(z) - 1, 2 * neighbours
-    around = np.empty(size)
+    count, size = len(z) - 1, len(around)
     for i in range(len(start)):
         for k in range(size):
-            offset = k - neighbours
+            offset = k - size // 2
             at = start[i] + offset if offset < 0 else start[i] + width[i] + offset
             if at < 0:
                 at = width[i] - at

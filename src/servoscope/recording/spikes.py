@@ -150,5 +150,5 @@ def _local_steps(z: FloatArray, start: Index, width: Index) -> FloatArray:
 
     quartile = np.empty(start.size)
     for places in spool.pieces(0, start.size, z, at_once=PLACES):
-        local_steps(z, start[places], width[places], NEIGHBOURS, quartile[places])
+        local_steps(z, start[places], width[places], np.empty(2 * NEIGHBOURS), quartile[places])
     return quartile

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.compiled import kernel
+from servoscope.compiled import kernel, part
 
 Array = npt.NDArray[Any]  # float64, or complex128 for complex-step derivatives
 BoolArray = npt.NDArray[np.bool_]
@@ -107,7 +107,7 @@ def ages(restart: BoolArray, L: int) -> IntArray:
     return age
 
 
-@kernel
+@functools.partial(part, heap=True)
 def inverse(S: Array) -> Array:
     """Return 1/sqrt(S), shape (v, p, L); most of a settled gain's are the same."""
     by: Array = np.empty_like(S)
@@ -118,7 +118,7 @@ def inverse(S: Array) -> Array:
     return by
 
 
-@kernel
+@functools.partial(part, heap=True)
 def volumes(S: Array) -> Array:
     """Return log S of the plants of variant 0 relative to the first one's, shape (p, L)."""
     louder: Array = np.zeros_like(S[0])
@@ -131,7 +131,7 @@ def volumes(S: Array) -> Array:
     return louder
 
 
-@functools.partial(kernel, heap=False)
+@part
 def begin_again(c: Array, v: int, p: int, y: float, x: Array) -> None:
     """Put the state x[v] where y says at once; the first covariance knows that the rest is open."""
     reach = 0.0 * x[v, 0]
@@ -141,7 +141,7 @@ def begin_again(c: Array, v: int, p: int, y: float, x: Array) -> None:
         x[v, i] = c[v, p, i] * y / reach
 
 
-@functools.partial(kernel, heap=False)
+@part
 def hold(
     A: Array, b: Array, late: Array, c: Array, K: Array, by: Array, v: int, p: int, begin: int, end: int,
     age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
@@ -165,7 +165,7 @@ def hold(
         e[v, k - first] = error * by[v, p, j]
 
 
-@functools.partial(kernel, heap=False)
+@part
 def drift(
     A: Array, b: Array, late: Array, c: Array, K: Array, by: Array, v: int, since: int, over: int, begin: int, end: int,
     age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
@@ -266,7 +266,7 @@ def sweep(
     return sums, volume
 
 
-@kernel
+@functools.partial(part, heap=True)
 def add(sums: Array, e: Array, first: int, begin: int, end: int, by: float, Q: Array) -> None:
     """Sum up products of innovations, their derivatives and Q: sums[k - begin + 1] is what they are up to sample k.
 

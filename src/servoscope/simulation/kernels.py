@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.compiled import kernel
+from servoscope.compiled import kernel, part
 from servoscope.plants import FloatArray
 
 IntArray = npt.NDArray[np.int64]
@@ -48,7 +48,7 @@ class Motion(NamedTuple):
     steps: int  # sub-steps per sample
 
 
-@kernel
+@part
 def control(
     settings: Settings, r: float, n_u: float, n_y: float, free: float, share: float, total: float
 ) -> tuple[float, float, float, float]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.compiled import kernel
+from servoscope.compiled import kernel, part
 from servoscope.plants import FloatArray
 from servoscope.simulation.kernels import HEAD, TOTAL, Settings, control
 
@@ -30,7 +30,7 @@ class Physics(NamedTuple):
     substeps: int
 
 
-@kernel
+@part
 def derivative(p: Physics, row: FloatArray, x: FloatArray, drive: float, out: FloatArray) -> None:
     """Write the time derivative of x = [y, y', p_L, spool, spool'] under a held drive to `out`; row as in `run_rig`."""
     speed, pressure = x[1], x[2]
@@ -51,7 +51,7 @@ def derivative(p: Physics, row: FloatArray, x: FloatArray, drive: float, out: Fl
         out[4] = p.valve * (p.valve * (drive - x[3]) - 2.0 * p.damping * x[4])
 
 
-@kernel
+@part
 def advance(p: Physics, row: FloatArray, x: FloatArray, drive: float, duration: float, k: FloatArray) -> None:
     """Move the state x (5,) on under a held drive: Runge and Kutta's fourth order; k (5, 5) is room to work in.
 
