@@ -12,6 +12,8 @@ from servoscope.actions import ActionSettings
 from servoscope.alarms import AlarmSettings
 from servoscope.complaints import describe
 from servoscope.errors import ConfigError
+from servoscope.live.mqtt.outlet import MqttOutletSettings
+from servoscope.live.mqtt.source import MqttSettings
 from servoscope.live.replay import ReplaySettings
 from servoscope.live.settings import NotNegative, Seconds, Settings, Word
 from servoscope.quality import QualitySettings
@@ -20,6 +22,7 @@ __all__ = ["AssetSettings", "Config", "DiagnosisSettings", "ServiceSettings", "S
 
 Name = Annotated[str, Field(strict=True, pattern=r"^[\w][\w.:-]*$", max_length=100)]
 Paths = Annotated[tuple[Word, ...], Field(min_length=1)]
+Source = Annotated[ReplaySettings | MqttSettings, Field(discriminator="kind")]
 
 
 class ServiceSettings(Settings):
@@ -112,8 +115,8 @@ class Config(Settings):
         What the service is called in alarms and messages.
     service, store, diagnosis, quality, alarms, actions
         The sections of these names; each may be left out.
-    sources, assets
-        Tables by name: ``[sources.NAME]``, ``[assets.NAME]``.
+    sources, outlets, assets
+        Tables by name: ``[sources.NAME]``, ``[outlets.NAME]``, ``[assets.NAME]``.
     """
 
     name: Name = "servoscope"
@@ -123,7 +126,8 @@ class Config(Settings):
     quality: QualitySettings = QualitySettings()
     alarms: AlarmSettings = Field(default_factory=lambda: AlarmSettings.model_validate({}))
     actions: ActionSettings = ActionSettings()
-    sources: Annotated[dict[Name, ReplaySettings], Field(min_length=1)]
+    sources: Annotated[dict[Name, Source], Field(min_length=1)]
+    outlets: dict[Name, MqttOutletSettings] = Field(default_factory=dict)
     assets: Annotated[dict[Name, AssetSettings], Field(min_length=1)]
     _folder: Path = PrivateAttr(default=Path())
 
@@ -133,8 +137,11 @@ class Config(Settings):
             if asset.source not in self.sources:
                 known = ", ".join(self.sources)
                 raise ValueError(f"[assets] {name}.source: there is no source {asset.source!r}, only {known}")
-            if asset.files is None:
+            replayed = self.sources[asset.source].kind == "replay"
+            if replayed and asset.files is None:
                 raise ValueError(f"[assets] {name}.files: missing, a replay needs recordings: files = [...]")
+            if asset.files is not None and not replayed:
+                raise ValueError(f"[assets] {name}.files: only a replay has recordings, leave it out")
         if self.name in self.assets:
             raise ValueError(f"name: {self.name!r} is an asset's name too, call the service something else")
         return self
