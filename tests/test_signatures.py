@@ -128,7 +128,7 @@ class TestExpectation:
         plant = expectation.pipeline.loop.plant
         ill = plant.with_ratios({"C_ie": 1.2})
         whole = expectation.path(tuning.theta, plant, ill, 1000)
-        part = expectation.until(1500).path(tuning.theta, plant, ill, 1000)
+        part = expectation.first(15.0).path(tuning.theta, plant, ill, 1000)
         assert np.array_equal(part, whole[:150])
 
 

@@ -25,36 +25,33 @@ def candidates_of(
     recording: Recording,
     expectation: Expectation | None,
     since: int,
-    last: int,
     settled: bool = False,
 ) -> list[Signature]:
     """Return one signature per fault of the loop's plant, and one per fault learned from labelled recordings.
 
     Parameters
     ----------
-    baseline, recording
+    baseline
         What is compared with what.
+    recording
+        What the evaluation that is explained still remembers; it ends there.
     expectation
-        Of the recording; None where the loop cannot be simulated.
+        Of the same; None where the loop cannot be simulated.
     since
-        Sample of the onset.
-    last
-        Sample of the evaluation that is explained.
+        Sample of the onset in it; 0: then or before.
     settled
         Whether the estimate to be explained has taken up all of a change: no recursion, or one that has forgotten.
     """
     needed = not settled and (expectation is None or bool(baseline.learned))
-    taken_up = _learned(baseline, recording, since, last) if needed else np.eye(len(baseline.theta))
-    known = _of_plant(baseline, expectation, since, last, taken_up)
+    taken_up = _learned(baseline, recording, since) if needed else np.eye(len(baseline.theta))
+    known = _of_plant(baseline, expectation, since, taken_up)
     return known + [fault.signature(taken_up) for fault in baseline.learned]
 
 
-def _of_plant(
-    baseline: Baseline, expectation: Expectation | None, since: int, last: int, learned: FloatArray
-) -> list[Signature]:
+def _of_plant(baseline: Baseline, expectation: Expectation | None, since: int, learned: FloatArray) -> list[Signature]:
     faults, plant = baseline.loop.plant.faults, baseline.plant
     if expectation is not None:
-        shift = _simulated(baseline, expectation.until(last + 1), since)
+        shift = _simulated(baseline, expectation, since)
         return [curve(fault, shift(fault), baseline.ratios_std.get(fault.parameter, 0.0)) for fault in faults]
     if plant.has_physics and plant.kind != "polynomial":
         shift = _physical(baseline, learned)
@@ -101,9 +98,8 @@ def _physical(baseline: Baseline, learned: FloatArray) -> Callable[[Fault], Shif
     return of
 
 
-def _learned(baseline: Baseline, recording: Recording, since: int, last: int) -> FloatArray:
-    """Return I - Psi from the onset to the evaluation: the share of a change that theta_hat has taken up by then."""
-    after = recording.part(float(recording.t[since]), float(recording.t[last]) + 0.5 / recording.sample_rate)
-    Psi = baseline.pipeline().estimate(baseline.tuning, after).Psi
+def _learned(baseline: Baseline, recording: Recording, since: int) -> FloatArray:
+    """Return I - Psi from the onset to the end: the share of a change that theta_hat has taken up by then."""
+    Psi = baseline.pipeline().estimate(baseline.tuning, recording.rows(slice(since, None))).Psi
     n = len(baseline.theta)
     return np.eye(n) - Psi[-1] if len(Psi) else np.eye(n)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import inspect
@@ -12,6 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numba
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.caching import FunctionCache
+from numba.core.runtime import rtsys
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
@@ -44,12 +47,20 @@ def kernel(function: F, heap: bool = True) -> F:
     `heap` says whether it, or what it calls, allocates arrays; without, there is no counting of references either.
     """
     function.__qualname__ = f"{function.__qualname__}_{sources()}"
-    options = {"error_model": "numpy", "nogil": True, "_nrt": heap}
-    try:
-        compiled = numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # Numba found no folder that it can write
-        compiled = numba.njit(**options)(function)
+    compiled = numba.njit(error_model="numpy", nogil=True, _nrt=heap)(function)
+    with contextlib.suppress(RuntimeError):  # Numba found no folder that it can write
+        compiled._cache = Cache(function)
     return compiled  # type: ignore[no-any-return]
+
+
+class Cache(FunctionCache):  # type: ignore[misc]  # numba has no complete types
+    """Numba's cache without what only compiling needs: importing that takes a third of a second at every start."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what is cached for a signature, None if nothing is."""
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
 def inlined(function: F, heap: bool = False) -> F:

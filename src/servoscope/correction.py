@@ -8,17 +8,14 @@ the intersample behaviour of y, the noise in phi, the past that is not forgotten
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from servoscope.errors import SimulationError
 from servoscope.inverse import nominal_theta
-from servoscope.noise import Noise
-from servoscope.pipeline import Pipeline, Tuning
 from servoscope.plants import FloatArray, Plant
-from servoscope.recording import Recording
-from servoscope.signatures import Expectation, colour_of
+from servoscope.signatures import Expectation
 
 FREE = 3.0  # standard deviation of the logarithm of a parameter that nothing tells
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
@@ -106,11 +103,3 @@ def _search(misfit: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
 
     found = minimise(misfit, start, diff_step=[STEP], max_nfev=12, x_scale=0.1)
     return np.asarray(found.x if found.cost < HOPELESS else start, dtype=np.float64)
-
-
-def spread_of(pipeline: Pipeline, tuning: Tuning, recording: Recording, noise: Noise, plant: Plant) -> FloatArray:
-    """Return the covariance of theta_hat at every evaluation, shape (K, n, n), with another plant's colour of noise.
-
-    A changed actuator passes the sensor's noise on in another way, and its estimates scatter accordingly.
-    """
-    return pipeline.estimate(replace(tuning, noise=colour_of(pipeline, plant, noise)), recording).S

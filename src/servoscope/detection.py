@@ -15,6 +15,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 SECONDS_PER_YEAR = 365.25 * 86400.0
 POWER = 0.9  # probability with which a promised change is seen
+REACH = 40.0  # memories before an alarm in which its onset is looked for first
+NEGLIGIBLE = 1e-9  # probability that it came earlier
 
 
 def threshold(
@@ -65,6 +67,8 @@ def delayed(exceeded: BoolArray, on: int, off: int) -> BoolArray:
     on, off
         In evaluations (on-delay and off-delay of ISA-18.2).
     """
+    if not exceeded.any():
+        return exceeded
     k = np.arange(len(exceeded))
     calm = np.maximum.accumulate(np.where(exceeded, -1, k))  # last evaluation below the limit
     raised = exceeded & (k - calm > on)
@@ -89,12 +93,27 @@ def whiten(covariance: FloatArray, deviation: FloatArray) -> FloatArray:
     deviation
         Shape (K, n) or (K, n, m).
     """
-    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), np.finfo(float).tiny))
     n = covariance.shape[-1]
-    correlation = covariance / (size[..., :, None] * size[..., None, :]) + 1e-12 * np.eye(n)
-    columns = deviation[..., None] if deviation.ndim == covariance.ndim - 1 else deviation
-    white = np.linalg.solve(np.linalg.cholesky(correlation), columns / size[..., :, None])
-    return np.asarray(white[..., 0] if deviation.ndim == covariance.ndim - 1 else white)
+    # columns of many evaluations at a time: LAPACK takes longer to begin than a matrix of this size takes
+    C = np.ascontiguousarray(np.moveaxis(covariance, 0, -1))
+    columns = np.moveaxis(deviation if deviation.ndim == 3 else deviation[..., None], 0, -1)
+    size = np.sqrt(np.maximum(np.array([C[i, i] for i in range(n)]), np.finfo(float).tiny))
+    L: dict[tuple[int, int], FloatArray] = {}
+    white = np.empty(columns.shape)
+    for i in range(n):
+        for j in range(i + 1):
+            left = C[i, j] / (size[i] * size[j]) + (1e-12 if i == j else 0.0)
+            for k in range(j):
+                left -= L[i, k] * L[j, k]
+            if i == j and not (left > 0.0).all():
+                raise np.linalg.LinAlgError("a covariance is not positive definite")
+            L[i, j] = np.sqrt(left) if i == j else left / L[j, j]
+        rest = columns[i] / size[i]
+        for k in range(i):
+            rest -= L[i, k] * white[k]
+        white[i] = rest / L[i, i]
+    white = np.moveaxis(white, -1, 0)
+    return np.asarray(white[..., 0] if deviation.ndim == 2 else white)
 
 
 def statistic(theta: FloatArray, expected: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -159,22 +178,19 @@ def onset(
     last
         Last sample that `faulty` speaks for.
     """
-    # u itself changes at once, where u_a of stage 1 has to learn the change first
-    single = replace(pipeline, stage_one=None)
-    g = single.regression(recording.r, recording.u, recording.y, recording.restart)
-    used = np.flatnonzero(g.ok[: last + 1])
-    phi = g.phi[used]
-    changed = phi @ (faulty - healthy)
-    noise = tuning.noise.autoregression()  # a short memory: what surrounds each candidate is computed anew
-    costs = _change_costs(g.eta[used] - phi @ healthy, changed, noise.a, _onset_of_filters(pipeline))
-    scale = 2.0 * noise.variance * max(1.0, float(estimates.power[-1]))
-    # a change between two updates shows at the later one
-    at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
-    log_likelihood = -costs[at_update] / scale
-    weight = np.exp(log_likelihood - log_likelihood.max())
-    share = np.cumsum(weight) / weight.sum()
-    likely = int(np.argmax(log_likelihood))
-    low, high = np.searchsorted(share, [0.025, 0.975])
+    reach = round(REACH * pipeline.memory * pipeline.stride)
+    while True:
+        begin = max(until - reach, 0) // pipeline.stride * pipeline.stride
+        near = recording.rows(slice(begin, min(last, until + reach) + 1))
+        likelihood = _likelihood(pipeline, tuning, near, float(estimates.power[-1]), healthy, faulty, until - begin)
+        weight = np.exp(likelihood - likelihood.max())
+        share = np.cumsum(weight) / weight.sum()
+        likely = int(np.argmax(likelihood))
+        if not begin or share[(until - begin) // 2] < NEGLIGIBLE:
+            break
+        reach *= 2  # the change may have come earlier
+    low, high = (begin + int(k) for k in np.searchsorted(share, [0.025, 0.975]))
+    likely += begin
     # what the filters leave of a step is known only about, so neither end is surer than half their settling time
     blur = pipeline.bank.wait / (2.0 * recording.sample_rate)
     t = recording.t
@@ -184,6 +200,30 @@ def onset(
         min(float(t[min(high, until)]) + blur, float(t[until])),
         likely,
     )
+
+
+def _likelihood(
+    pipeline: Pipeline,
+    tuning: Tuning,
+    recording: Recording,
+    power: float,
+    healthy: FloatArray,
+    faulty: FloatArray,
+    until: int,
+) -> FloatArray:
+    """Return the logarithm of the likelihood of a change at each of the samples up to `until`, but for a constant."""
+    # u itself changes at once, where u_a of stage 1 has to learn the change first
+    single = replace(pipeline, stage_one=None)
+    g = single.regression(recording.r, recording.u, recording.y, recording.restart)
+    used = np.flatnonzero(g.ok)
+    phi = g.phi[used]
+    changed = phi @ (faulty - healthy)
+    noise = tuning.noise.autoregression()  # a short memory: what surrounds each candidate is computed anew
+    costs = _change_costs(g.eta[used] - phi @ healthy, changed, noise.a, _onset_of_filters(pipeline))
+    scale = 2.0 * noise.variance * max(1.0, power)
+    # a change between two updates shows at the later one
+    at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
+    return np.asarray(-costs[at_update] / scale)
 
 
 def _onset_of_filters(pipeline: Pipeline) -> FloatArray:

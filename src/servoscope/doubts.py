@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from servoscope import spool
 from servoscope.detection import noncentrality, required_noncentrality
 from servoscope.diagnosis import Warning
 from servoscope.examination import MOST_REFUSED, Examination
 from servoscope.identification import MOST_SATURATED, fault_directions, saturated
 
+AT_ONCE = 4096  # evaluations
 WORTH_TELLING = 0.01  # share of updates without an instrument that is warned about
 NO_PROMISE = 10.0  # relative change; who sees nothing smaller sees nothing
 WEAKER = 3.0  # a recording that sees only changes this much larger than promised is called undetermined
@@ -19,10 +21,11 @@ def seen_by(x: Examination) -> dict[str, tuple[float, float]]:
     promised = {p.parameter: p.change for p in x.baseline.promises if p.change is not None and p.change < NO_PROMISE}
     directions = fault_directions(x.baseline.loop, x.baseline.plant, x.tuning.theta)
     rows = np.array([directions[parameter] for parameter in promised])
-    best = np.zeros(len(rows))
-    if len(rows) and x.ready.any():
-        ok = x.ready
-        best = noncentrality(x.covariance[ok], x.estimates.Psi[ok], rows).max(axis=0)
+    best, e = np.zeros(len(rows)), x.estimates
+    for at in spool.pieces(0, x.evaluations, e.S, e.Psi, at_once=AT_ONCE) if len(rows) else ():
+        ok = e.updates[at] > 0
+        if ok.any():
+            best = np.maximum(best, noncentrality(x.covariance(at)[ok], e.Psi[at][ok], rows).max(axis=0))
     needed = required_noncentrality(x.pipeline.bank.n, x.baseline.limit)
     smallest = (float(np.sqrt(needed / one)) if one > 0.0 else np.inf for one in best)
     return dict(zip(promised, zip(smallest, promised.values(), strict=True), strict=True))

@@ -328,7 +328,10 @@ def regress(
     out: FloatArray,
     ok: Any,
 ) -> None:
-    """Write [eta, phi, z] of every sample of one asset to out (N, rows), and what is said of it to ok (N,)."""
+    """Write [eta, phi, z] of every sample of one asset to out (N, rows), and what is said of it to ok (N,).
+
+    The state is carried on in place.
+    """
     c = laid(constants, 1, 1)
     s = local(constants, _floats, 1)
     h = local(constants, HEAD, 1)
@@ -340,13 +343,19 @@ def regress(
         h[i, 0] = state[i]
     for i in range(_floats):
         s[i, 0] = state[HEAD + i]
+    number = int(h[SAMPLE, 0])
     for k in range(len(r)):
         tile[0, 0], tile[TILE, 0], tile[2 * TILE, 0], tile[3 * TILE, 0] = r[k], u[k], y[k], restart[k]
-        _enter(c, s, h, said, 0, tile, 0, (k + 1) % stride == 0, v, shadow)
+        _enter(c, s, h, said, 0, tile, 0, (number + k + 1) % stride == 0, v, shadow)
         ok[k] = said[0, 0]
         if ok[k] != MISSING:
             for i in range(_rows):
                 out[k, i] = v[i, 0]
+    for i in range(HEAD):
+        state[i] = h[i, 0]
+    state[SAMPLE] = number + len(r)
+    for i in range(_floats):
+        state[HEAD + i] = s[i, 0]
 
 
 PARTS = (enter, settled, refreshed, together, apart, sample, complete, plain)  # each calls only those before it

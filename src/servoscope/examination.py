@@ -1,88 +1,36 @@
-"""One recording against one baseline: what the recursion says, what a healthy loop would have shown, the statistics."""
+"""One recording against one baseline: what the recursion says, what a healthy loop would have shown, the statistics.
+
+A recording of any length is walked through once, piece by piece; what is asked about single evaluations afterwards is
+computed from the samples that they still remember.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope import ifrf
+from servoscope import sequential, spool
 from servoscope.baseline import Baseline
 from servoscope.detection import delayed, statistic
-from servoscope.diagnosis import Trace
 from servoscope.errors import RecordingError
-from servoscope.pipeline import Estimates, Pipeline, Tuning
-from servoscope.plants import FloatArray
+from servoscope.noise import Noise
+from servoscope.pipeline import Estimates, Estimating, Pipeline, Tuning
+from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
-from servoscope.signatures import Expectation, course
+from servoscope.signatures import Course, Expectation, colour_of, course
+from servoscope.simulation import closed_loop_poles
 
 MOST_REFUSED = 0.2  # share of updates that the instrument's guard may skip before the AKF takes over
 FALL_BACK = {"estimator": "akf"}
 LOUDER = 1.5  # growth of the noise's variance from which it is believed
-
-
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """What is compared at every evaluation.
-
-    Parameters
-    ----------
-    theta
-        Estimate without its bias, shape (K, n).
-    covariance
-        Of it, shape (K, n, n).
-    expected, expected_covariance
-        What a healthy loop would show, without its bias too, shapes (K, n) and (n, n).
-    statistic
-        T^2 of the estimate as it is against its expectation as it is, shape (K,).
-    """
-
-    theta: FloatArray
-    covariance: FloatArray
-    expected: FloatArray
-    expected_covariance: FloatArray
-    statistic: FloatArray
-
-
-def trace_of(
-    baseline: Baseline, pipeline: Pipeline, e: Estimates, t: FloatArray, seen: Compared, clock: FloatArray | None = None
-) -> Trace:
-    """Put a trace together: responses from coefficients, alarms from both tests.
-
-    Parameters
-    ----------
-    baseline, pipeline
-        What the recording was compared with, and by which recursion.
-    e
-        Its estimates.
-    t
-        Times of the evaluations [s], shape (K,).
-    seen
-        What was compared.
-    clock
-        Times of all samples [s]; None: uniform from 0.
-    """
-    ready = e.updates > 0
-    respond = pipeline.bank, baseline.loop.monitor.frequencies
-    crossed = np.maximum(e.crossed.astype(np.int64) - 1, 0)
-    at = crossed / baseline.loop.sample_rate if clock is None else clock[crossed]
-    return Trace(
-        t=t,
-        names=pipeline.bank.names,
-        theta=seen.theta,
-        covariance=seen.covariance,
-        expected=seen.expected,
-        statistic=np.where(ready, seen.statistic, 0.0),
-        threshold=baseline.limit,
-        level=e.level,
-        crossed=np.where(e.crossed > 0, at, np.nan),
-        ifrf=ifrf.response(*respond, seen.theta, seen.covariance),
-        ifrf_expected=ifrf.response(
-            *respond, seen.expected, np.broadcast_to(seen.expected_covariance, seen.covariance.shape)
-        ),
-        ready=ready,
-    )
+FORGOTTEN = 1e-9  # share of the past that is left when it counts as forgotten
+MEMORIES = 20.0  # after which it usually is
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +39,10 @@ class Examination:
 
     Parameters
     ----------
-    expectation
-        None where the loop cannot be simulated.
+    noise
+        Of the loop, as loud as in this recording; None where the loop cannot be simulated.
     expected
         theta_hat of a healthy loop, biases included, shape (K, n).
-    covariance
-        Of theta_hat minus that, shape (K, n, n).
     statistic
         T^2, shape (K,).
     refused
@@ -110,9 +56,8 @@ class Examination:
     pipeline: Pipeline
     tuning: Tuning
     estimates: Estimates
-    expectation: Expectation | None
+    noise: Noise | None
     expected: FloatArray
-    covariance: FloatArray
     statistic: FloatArray
     refused: float
     growth: float
@@ -132,54 +77,157 @@ class Examination:
                 f"{recording.name}: sampled at {recording.sample_rate:g} Hz, the baseline's loop at "
                 f"{loop.sample_rate:g} Hz: learn a baseline at this rate"
             )
-        pipeline, tuning = baseline.pipeline(), baseline.tuning
-        own = Expectation(pipeline, tuning, baseline.noise, course(recording)) if baseline.noise else None
-        estimates = pipeline.estimate(tuning, recording, baseline.watch(pipeline, own))
-        refused = _refused(estimates)
+        x = _followed(baseline, recording, baseline.pipeline())
+        refused = _refused(x.estimates)
         if refused > MOST_REFUSED:
             fallen = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
-            pipeline = Pipeline.of(fallen, baseline.stage_one, baseline.still_speed)
-            estimates = pipeline.estimate(tuning, recording, baseline.watch(pipeline, own))
-        expectation, growth = None, 1.0
-        expected = np.broadcast_to(tuning.theta, estimates.theta.shape)
-        if own is not None:
-            growth = _noise_growth(pipeline, estimates)
-            if growth > 1.0:  # the sequential test takes louder noise for steps of a change
-                deafer = pipeline.estimate(tuning, recording, baseline.watch(pipeline, own, growth))
-                estimates = replace(estimates, level=deafer.level, crossed=deafer.crossed)
-            expectation = replace(own, pipeline=pipeline, noise=own.noise.times(np.sqrt(growth)))
-            expected = expectation.healthy(baseline.plant, np.array(baseline.model_theta))
-        covariance = growth * estimates.S + baseline.cov()
-        T2 = np.where(estimates.updates > 0, statistic(estimates.theta, expected, covariance), 0.0)
-        return cls(
-            baseline=baseline,
-            recording=recording,
-            pipeline=pipeline,
-            tuning=tuning,
-            estimates=estimates,
-            expectation=expectation,
-            expected=expected,
-            covariance=covariance,
-            statistic=T2,
-            refused=refused,
-            growth=growth,
-        )
+            x = _followed(baseline, recording, Pipeline.of(fallen, baseline.stage_one, baseline.still_speed))
+        growth = 1.0 if x.noise is None else _noise_growth(x.pipeline, x.estimates)
+        if growth > 1.0:  # it moves what is expected, and the sequential test would take it for steps of a change
+            x = _followed(baseline, recording, x.pipeline, growth)
+        return replace(x, refused=refused)
 
     @property
-    def t(self) -> FloatArray:
-        """Times of the evaluations [s], shape (K,)."""
-        return self.recording.t[self.estimates.index]
+    def evaluations(self) -> int:
+        """Their number K."""
+        return len(self.statistic)
+
+    def t(self, at: Any) -> Any:
+        """Return the times of some evaluations [s]."""
+        return self.recording.t[self.estimates.index[at]]
+
+    def covariance(self, at: Any) -> FloatArray:
+        """Return the covariance of theta_hat minus its expectation at some evaluations, shape (..., n, n)."""
+        return np.asarray(self.growth * self.estimates.S[at] + self.baseline.cov())
 
     @property
     def ready(self) -> npt.NDArray[np.bool_]:
         """Whether the estimator had learned anything by then, shape (K,)."""
         return self.estimates.updates > 0
 
-    @property
+    @cached_property
     def alarm(self) -> npt.NDArray[np.bool_]:
         """Whether there was an alarm: one of the two tests above its limit, after the delays, shape (K,)."""
         exceeded = self.ready & ((self.statistic > self.baseline.limit) | (self.estimates.level >= 1.0))
         return delayed(exceeded, *self.pipeline.delays)
+
+    def recalled(self, at: int) -> int:
+        """Return a sample before which all is forgotten in an evaluation: by the loop, the filters, the estimator.
+
+        Whatever begins there gives the same evaluation as if it had begun with the recording, but for `FORGOTTEN`.
+        """
+        pipeline, tuning = self.pipeline, self.tuning
+        end, turn = (at + 1) * pipeline.every, int(np.lcm(pipeline.every, pipeline.stride))
+        settling = pipeline.bank.wait + (_settling(pipeline, self.baseline.plant) if self.noise is not None else 0)
+        memories = MEMORIES
+        while True:
+            learning = end - round(memories * pipeline.memory * pipeline.stride)
+            first = (learning - settling) // turn * turn
+            if first <= 0:
+                return 0
+            estimating, Psi = Estimating(pipeline, tuning), np.eye(len(tuning.theta))[None]
+            for rows in spool.pieces(learning, end):
+                found = estimating.advance(self.recording.rows(rows)).Psi
+                Psi = found if len(found) else Psi
+            if np.abs(Psi[-1] * tuning.scale[:, None] / tuning.scale).max() <= FORGOTTEN:
+                return first
+            memories *= 2.0
+
+    def expectation(self, first: int, end: int) -> Expectation:
+        """Return what is expected under the reference of samples `first` to `end`, of a loop that can be simulated."""
+        if self.noise is None:
+            raise ValueError("a loop that cannot be simulated expects nothing")
+        return Expectation(self.pipeline, self.tuning, self.noise, course(self.recording.rows(slice(first, end))))
+
+    def path(self, at: slice, plant: Plant, since: int) -> FloatArray:
+        """Return the expected theta_hat at some evaluations, shape (K, n), where the plant turns ill at a sample."""
+        first, start = self.recalled(at.start), np.array(self.baseline.model_theta)
+        walk = self.expectation(first, first + 1).walk(start, self.baseline.plant, plant, max(since - first, 0))
+        return self._gathered(at, first, lambda rows: walk.advance(_course(self.recording, rows, first)))
+
+    def spread(self, at: slice, plant: Plant) -> FloatArray:
+        """Return the covariance of theta_hat at some evaluations, shape (K, n, n), under another plant's noise.
+
+        A changed actuator passes the sensor's noise on in another way, and its estimates scatter accordingly.
+        """
+        coloured = replace(self.tuning, noise=colour_of(self.pipeline, plant, self.expectation(0, 1).noise))
+        estimating = Estimating(self.pipeline, coloured)
+        return self._gathered(at, self.recalled(at.start), lambda rows: estimating.advance(self.recording.rows(rows)).S)
+
+    def _gathered(self, at: slice, first: int, advance: Callable[[slice], FloatArray]) -> FloatArray:
+        """Return what is said at some evaluations, walking from sample `first` on."""
+        every, n = self.pipeline.every, len(self.tuning.theta)
+        found = np.empty((0, n))
+        k = first // every - at.start
+        for rows in spool.pieces(first, at.stop * every):
+            said = advance(rows)
+            if not len(found):
+                found = spool.empty((at.stop - at.start, *said.shape[1:]))
+            found[max(k, 0) : max(k + len(said), 0)] = said[max(-k, 0) :]
+            k += len(said)
+            spool.release(found, *self.recording.columns)
+        return found
+
+
+def _settling(pipeline: Pipeline, plant: Plant) -> int:
+    """Return how many samples a loop takes to forget where it began."""
+    slowest = float(np.abs(closed_loop_poles(pipeline.loop, plant)).max())
+    return int(np.ceil(np.log(FORGOTTEN) / np.log(slowest))) if 0.0 < slowest < 1.0 else 0
+
+
+def _course(recording: Recording, rows: slice, first: int) -> Course:
+    """Return the reference of a piece of a walk that began at sample `first`."""
+    before = rows.start - 1
+    ahead = (float(recording.t[before]), float(recording.r[before])) if rows.start > first else None
+    return course(recording.rows(rows), ahead)
+
+
+def _followed(baseline: Baseline, recording: Recording, pipeline: Pipeline, growth: float = 1.0) -> Examination:
+    """Walk through a recording once: the estimates, and beside them what a healthy loop would show."""
+    tuning, C, noise, walk = baseline.tuning, baseline.cov(), None, None
+    if baseline.noise is None:
+        watch = baseline.watch(pipeline)
+    else:
+        noise = baseline.noise.times(np.sqrt(growth))
+        beginning = recording.rows(slice(0, round(sequential.span(pipeline) * recording.sample_rate)))
+        expectation = Expectation(pipeline, tuning, noise, course(beginning))
+        watch = baseline.watch(pipeline, expectation, growth)
+        walk = expectation.walk(np.array(baseline.model_theta), baseline.plant)
+
+    def healthy(rows: slice) -> FloatArray:
+        if walk is None:
+            return tuning.theta
+        return np.asarray(walk.advance(_course(recording, rows, 0)) + (tuning.theta - np.array(baseline.model_theta)))
+
+    estimating, whole = Estimating(pipeline, tuning, watch), _Table(recording.samples // pipeline.every)
+    with ThreadPoolExecutor(1) as beside:
+        for rows in spool.pieces(0, recording.samples):
+            shown = beside.submit(healthy, rows)
+            e = estimating.advance(recording.rows(rows))
+            expected = np.broadcast_to(shown.result(), e.theta.shape)
+            T2 = np.where(e.updates > 0, statistic(e.theta, expected, growth * e.S + C), 0.0)
+            whole.add(**vars(e), expected=expected, statistic=T2)
+            spool.release(*recording.columns)
+    found = whole.columns
+    expected, T2 = found.pop("expected"), found.pop("statistic")
+    estimates = Estimates(**found)
+    return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
+
+
+class _Table:
+    """Columns of a known length, filled piece by piece."""
+
+    def __init__(self, rows: int) -> None:
+        self.columns: dict[str, npt.NDArray[Any]] = {}
+        self._rows, self._filled = rows, 0
+
+    def add(self, **pieces: npt.NDArray[Any]) -> None:
+        for name, piece in pieces.items():
+            if name not in self.columns:
+                self.columns[name] = spool.empty((self._rows, *piece.shape[1:]), piece.dtype)
+            self.columns[name][self._filled : self._filled + len(piece)] = piece
+        self._filled += len(piece)
+        spool.release(*self.columns.values())
 
 
 def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:

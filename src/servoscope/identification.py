@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoscope import spool
 from servoscope.inverse import nominal_theta
 from servoscope.linear import autocovariances
 from servoscope.loop import Loop
@@ -62,7 +63,11 @@ def saturated(loop: Loop, recording: Recording) -> float:
     if loop.input_limits is None:
         return 0.0
     low, high = loop.input_limits
-    return float(((recording.u <= low) | (recording.u >= high)).mean())
+    count = 0
+    for rows in spool.pieces(0, recording.samples):
+        u = recording.u[rows]
+        count += int(((u <= low) | (u >= high)).sum())
+    return count / recording.samples
 
 
 def simulated(loop: Loop) -> bool:

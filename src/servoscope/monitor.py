@@ -15,6 +15,7 @@ from servoscope.diagnosis import UNKNOWN, Diagnosis, Trace, Warning
 from servoscope.errors import BaselineError, RecordingError
 from servoscope.examination import Examination
 from servoscope.ifrf import Response
+from servoscope.meaning import Meaning, trace
 from servoscope.pipeline import Pipeline
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
@@ -27,7 +28,13 @@ if TYPE_CHECKING:
 DOUBTFUL = 0.05  # probability of an unknown change, from which an operating point does not explain a recording
 
 
-def diagnose(baseline: Baseline, recording: Recording, *, point: str | None = None) -> Diagnosis:
+def diagnose(
+    baseline: Baseline,
+    recording: Recording,
+    progress: Callable[[str], None] = lambda _: None,
+    *,
+    point: str | None = None,
+) -> Diagnosis:
     """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure that is.
 
     Parameters
@@ -36,6 +43,8 @@ def diagnose(baseline: Baseline, recording: Recording, *, point: str | None = No
         What healthy looks like.
     recording
         The recording to judge.
+    progress
+        Told what is being done.
     point
         Operating point that it was taken at. Without it, a recording is healthy if it is so at one point of the
         baseline. A change is explained at the point where the recording stays healthy for longest; among points
@@ -49,7 +58,7 @@ def diagnose(baseline: Baseline, recording: Recording, *, point: str | None = No
     BaselineError
         If the baseline has no such point.
     """
-    return examine(baseline, recording, point=point)[0]
+    return _judged(baseline, recording, progress, point)[0]
 
 
 def examine(
@@ -60,25 +69,34 @@ def examine(
     point: str | None = None,
 ) -> tuple[Diagnosis, Trace]:
     """Return the diagnosis of a recording together with its trace; arguments and errors as for `diagnose`."""
+    said, x, meant = _judged(baseline, recording, progress, point)
+    return said, trace(x, meant)
+
+
+def _judged(
+    baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
+) -> tuple[Diagnosis, Examination, Meaning | None]:
+    """Return the diagnosis, at the operating point that explains the recording, and what its trace is made of."""
     examined = [Examination.of(one, recording) for one in (baseline.each if point is None else (baseline.at(point),))]
     last = max(_healthy_until(x) for x in examined)
     near = last - baseline.loop.monitor.memory if np.isfinite(last) else last
     rivals = sorted((x for x in examined if _healthy_until(x) >= near), key=_excess)
     if np.isinf(last):
-        return judge(rivals[0], progress)
-    judged = sorted((judge(x, progress) for x in rivals), key=lambda found: _size(found[0]))
-    (said, trace), others = judged[0], [other for other, _ in judged[1:] if _explained(other)]
+        said, meant = judge(rivals[0], progress)
+        return said, rivals[0], meant
+    judged = sorted(((*judge(x, progress), x) for x in rivals), key=lambda found: _size(found[0]))
+    (said, meant, x), others = judged[0], [other for other, *_ in judged[1:] if _explained(other)]
     t = recording.t
     doubts = [
         Warning(kind="point", from_s=float(t[0]), to_s=float(t[-1]), count=1, message=f"or else: {other.summary}")
         for other in others
     ]
-    return said.model_copy(update={"warnings": (*said.warnings, *doubts)}), trace
+    return said.model_copy(update={"warnings": (*said.warnings, *doubts)}), x, meant
 
 
 def _healthy_until(x: Examination) -> float:
     alarms = np.flatnonzero(x.alarm)
-    return float(x.t[alarms[0]]) if alarms.size else np.inf
+    return float(x.t(alarms[0])) if alarms.size else np.inf
 
 
 def _excess(x: Examination) -> float:

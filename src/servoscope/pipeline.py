@@ -279,27 +279,18 @@ class Pipeline:
 
     def regression(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
         """Form eta, phi and z of a block, each input of shape (N,); phi and z in physical units."""
-        n = self.bank.n
-        u = self.input(r, self.flow(u, y, restart), restart)
-        out, ok = self._plain.regressors(r, u, y, restart)
-        return Regression(out[:, 0], out[:, 1 : 1 + n].copy(), out[:, -n:].copy(), ok == 1)
+        return Regressing(self).advance(r, u, y, restart)
 
     def estimate(self, tuning: Tuning, recording: Recording, watch: Watch | None = None) -> Estimates:
         """Run the recursion over a recording, from the tuning's theta, with or without the sequential test."""
-        from servoscope.recursion import Recursion
-
-        c = self.constants(tuning, watch)
-        recursion = Recursion([c])
-        state = recursion.start()
-        r, y, restart = recording.r, recording.y, recording.restart
-        u = self.input(r, self.flow(recording.u, y, restart), restart)
-        _, out = recursion.run(state, r[None], u[None], y[None], restart[None])
-        return self.unpack(c, out[0], recursion.rows(state, recording.samples))
+        return Estimating(self, tuning, watch).advance(recording)
 
     def unpack(self, c: Constants, rows: FloatArray, index: IntArray) -> Estimates:
         """Turn rows of a recursion, shape (K, row), into estimates in physical units."""
         n, basis = self.bank.n, c.basis
         theta, S, Psi = np.split(rows[:, 5:], [n, n + n * n], axis=1)
+        # basis S basis' and basis Psi/basis, row by row of many evaluations at a time
+        both, from_left = np.kron(basis, basis), np.kron(basis, np.linalg.inv(basis).T)
         return Estimates(
             index=index,
             updates=rows[:, 0],
@@ -308,6 +299,54 @@ class Pipeline:
             level=rows[:, 3],
             crossed=rows[:, 4],
             theta=c.origin + theta @ basis.T,
-            S=basis @ S.reshape(-1, n, n) @ basis.T,
-            Psi=basis @ Psi.reshape(-1, n, n) @ np.linalg.inv(basis),
+            S=(S @ both.T).reshape(-1, n, n),
+            Psi=(Psi @ from_left.T).reshape(-1, n, n),
         )
+
+
+class Regressing:
+    """Forms eta, phi and z block by block; where a recording is cut changes nothing."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline, self._ahead = pipeline, _Ahead(pipeline)
+        self._state = pipeline._plain.start()[0]
+
+    def advance(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
+        """Return the regression of the next block, each input of shape (N,)."""
+        bank = self._pipeline.bank
+        out, ok = self._pipeline._plain.regressors(self._state, r, self._ahead.input(r, u, y, restart), y, restart)
+        phi = out[:, 1 : 1 + bank.n].copy()
+        return Regression(out[:, 0], phi, out[:, -bank.n :].copy() if bank.has_instrument else phi, ok == 1)
+
+
+class Estimating:
+    """Runs the recursion block by block, from the tuning's theta; where a recording is cut changes nothing."""
+
+    def __init__(self, pipeline: Pipeline, tuning: Tuning, watch: Watch | None = None) -> None:
+        from servoscope.recursion import Recursion
+
+        self._pipeline, self._ahead = pipeline, _Ahead(pipeline)
+        self._constants = pipeline.constants(tuning, watch)
+        self._recursion = Recursion([self._constants])
+        self._state = self._recursion.start()
+
+    def advance(self, block: Recording) -> Estimates:
+        """Return the estimates of the next block; their samples count from the first block on."""
+        r, y, restart = block.r, block.y, block.restart
+        u = self._ahead.input(r, block.u, y, restart)
+        index = self._recursion.rows(self._state, block.samples)
+        self._state, out = self._recursion.run(self._state, r[None], u[None], y[None], restart[None])
+        return self._pipeline.unpack(self._constants, out[0], index)
+
+
+class _Ahead:
+    """What stands before bank and recursion: the valve's law and stage 1, with their states."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._valve, self._stage = pipeline.valve, Stage(pipeline.loop, pipeline.stage_one)
+        self._of_valve, self._of_stage = self._valve.start(), self._stage.start()
+
+    def input(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
+        """Return what takes the place of u in the next block, shape (N,)."""
+        flow = self._valve.run(self._of_valve, u, y, restart)
+        return self._stage.run(self._of_stage, r, flow, restart)

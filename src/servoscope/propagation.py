@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -58,7 +59,7 @@ def remember(s: Any, at: int, phi: Sequence[Any], K: Sequence[Any]) -> None:
             s[at + n * i + j] = fma(-K[i], left, s[at + n * i + j])
 
 
-@kernel
+@functools.partial(kernel, heap=False)
 def mean_path(
     eta: FloatArray,
     phi: FloatArray,
@@ -69,21 +70,20 @@ def mean_path(
     S: FloatArray,
     P_d: FloatArray,
     R: float,
-    start: FloatArray,
+    theta: FloatArray,
+    number: int,
     every: int,
-) -> FloatArray:
-    """Follow the mean of theta_hat at P = P_d for noise-free regressors plus the noise's moments, shape (K, n).
+    room: FloatArray,
+    path: FloatArray,
+) -> None:
+    """Follow the mean of theta_hat at P = P_d for noise-free regressors plus the noise's moments, to path (K, n).
 
     ``theta += (P_d z (eta - phi' theta) + P_d (c - S theta)) / (R + phi' P_d z + tr(P_d S))``; c (p, n) and S
-    (p, n, n) are the noise's E[phi eta] and E[phi phi'] with the plant ``which[k]`` (N,).
+    (p, n, n) are the noise's E[phi eta] and E[phi phi'] with the plant ``which[k]`` (N,). `theta` (n,) is carried on in
+    place, `number` is how many samples were before these, and `room` (2, n) is to work in.
     """
     N, n = phi.shape
-    theta = np.empty(n)
-    for i in range(n):
-        theta[i] = start[i]
-    path = np.empty((N // every, n))
-    gain = np.empty(n)
-    pull = np.empty(n)
+    done = 0
     for k in range(N):
         if ok[k]:
             p = which[k]
@@ -91,19 +91,20 @@ def mean_path(
             denominator = R
             for i in range(n):
                 e -= phi[k, i] * theta[i]
-                gain[i] = 0.0
-                pull[i] = c[p, i]
+                gain = 0.0
+                pull = c[p, i]
                 for j in range(n):
-                    gain[i] += P_d[i, j] * z[k, j]
-                    pull[i] -= S[p, i, j] * theta[j]
+                    gain += P_d[i, j] * z[k, j]
+                    pull -= S[p, i, j] * theta[j]
                     denominator += P_d[i, j] * S[p, j, i]
-                denominator += phi[k, i] * gain[i]
+                denominator += phi[k, i] * gain
+                room[0, i], room[1, i] = gain, pull
             for i in range(n):
-                step = gain[i] * e
+                step = room[0, i] * e
                 for j in range(n):
-                    step += P_d[i, j] * pull[j]
+                    step += P_d[i, j] * room[1, j]
                 theta[i] += step / denominator
-        if (k + 1) % every == 0:
+        if (number + k + 1) % every == 0:
             for i in range(n):
-                path[(k + 1) // every - 1, i] = theta[i]
-    return path
+                path[done, i] = theta[i]
+            done += 1

@@ -21,25 +21,25 @@ LIKELY = 0.05  # probability below which a second fault is not worth its freedom
 
 
 def reasons(
-    x: Examination, trace: Trace, at: int, detected_at: float, candidates: Sequence[Candidate], refit: Refit | None
+    x: Examination, trace: Trace, detected_at: float, candidates: Sequence[Candidate], refit: Refit | None
 ) -> tuple[str, ...]:
     """Return the explanation of an alarm, sentence by sentence.
 
     Parameters
     ----------
-    x, trace
-        The examination, and its estimates without bias.
-    at
-        Evaluation that is explained.
+    x
+        The examination.
+    trace
+        The evaluation that is explained, without bias.
     detected_at, candidates, refit
         Of the diagnosis.
     """
     told = (
         _raised(x, detected_at),
-        _coefficients(x, trace, at),
-        _frequencies(x, trace, at),
+        _coefficients(x, trace),
+        _frequencies(x, trace),
         _left(candidates, refit),
-        _rejected(x, trace, at, candidates),
+        _rejected(x, trace, candidates),
         _second(candidates),
         _mimics(candidates, refit),
     )
@@ -69,21 +69,21 @@ def _joined(told: Sequence[str]) -> str:
     return "; ".join([*told[:1], *(words.replace(DEVIATIONS, "") for words in told[1:])])
 
 
-def _coefficients(x: Examination, trace: Trace, at: int) -> str:
-    std, plant = np.sqrt(np.diag(trace.covariance[at])), x.baseline.plant
+def _coefficients(x: Examination, trace: Trace) -> str:
+    std, plant = np.sqrt(np.diag(trace.covariance[0])), x.baseline.plant
     units = plant.coefficient_units if plant.units[1] else ("",) * len(std)
-    values = zip(trace.names, trace.theta[at], trace.expected[at], std, units, strict=True)
+    values = zip(trace.names, trace.theta[0], trace.expected[0], std, units, strict=True)
     told = _listed([_moved(name, float(v), float(e), float(s), unit) for name, v, e, s, unit in values])
-    return f"By {trace.t[at]:.1f} s {told or 'no coefficient alone has left its healthy range'}."
+    return f"By {trace.t[0]:.1f} s {told or 'no coefficient alone has left its healthy range'}."
 
 
-def _frequencies(x: Examination, trace: Trace, at: int) -> str:
+def _frequencies(x: Examination, trace: Trace) -> str:
     of_y, of_u = x.baseline.plant.units
     unit = f"{of_u}/{of_y}" if of_u else ""
     found = []
     for i, f in enumerate(trace.ifrf.frequencies):
-        now, healthy = trace.ifrf.H[at, i], trace.ifrf_expected.H[at, i]
-        real, imag = np.sqrt(np.diag(trace.ifrf.covariance[at, i])).tolist()
+        now, healthy = trace.ifrf.H[0, i], trace.ifrf_expected.H[0, i]
+        real, imag = np.sqrt(np.diag(trace.ifrf.covariance[0, i])).tolist()
         found.append(_moved(f"real part at {f:g} Hz", float(now.real), float(healthy.real), real, unit))
         found.append(_moved(f"imaginary part at {f:g} Hz", float(now.imag), float(healthy.imag), imag, unit))
     told = _listed(found)
@@ -102,13 +102,13 @@ def _left(candidates: Sequence[Candidate], refit: Refit | None) -> str:
     return f"{over} {best.name} leaves no more unexplained than noise would: {numbers}."
 
 
-def _rejected(x: Examination, trace: Trace, at: int, candidates: Sequence[Candidate]) -> str:
+def _rejected(x: Examination, trace: Trace, candidates: Sequence[Candidate]) -> str:
     singles = [c for c in candidates[1:] if len(c.faults) == 1 and c.probability < REJECTED]
     closest = sorted(singles, key=lambda c: c.misfit or 0.0)[:MOST]
-    return f"Rejected: {_joined([_against(x, trace, at, c) for c in closest])}." if closest else ""
+    return f"Rejected: {_joined([_against(x, trace, c) for c in closest])}." if closest else ""
 
 
-def _against(x: Examination, trace: Trace, at: int, other: Candidate) -> str:
+def _against(x: Examination, trace: Trace, other: Candidate) -> str:
     """Say by how much a candidate fits worse, and where it shows."""
     (fault,) = other.faults
     further = float(np.sqrt(other.misfit or 0.0))
@@ -118,7 +118,7 @@ def _against(x: Examination, trace: Trace, at: int, other: Candidate) -> str:
     words = f"{other.name} ({what}x {fault.ratio:.3g} at best) {fit}"
     theta = _theta_of(x, other)
     if theta is not None:
-        off = (theta - trace.theta[at]) / np.sqrt(np.diag(trace.covariance[at]))
+        off = (theta - trace.theta[0]) / np.sqrt(np.diag(trace.covariance[0]))
         worst = int(np.argmax(np.abs(off)))
         if abs(off[worst]) >= MOVED:
             words += f" with {trace.names[worst]} too {'high' if off[worst] > 0.0 else 'low'}"

@@ -215,14 +215,15 @@ class Recursion:
         return out
 
     def regressors(
-        self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
+        self, state: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
     ) -> tuple[FloatArray, IntArray]:
-        """Return [eta, phi, z] of every sample of the first asset (N, rows), and what it is good for (N,)."""
+        """Return [eta, phi, z] of every sample of the first asset (N, rows), and what it is good for (N,).
+
+        Of the state (size,) the filters are carried on in place.
+        """
         out = np.zeros((len(r), self.sizes.rows))  # a missing sample writes nothing
         ok = np.empty(len(r), dtype=np.int64)
-        machine(self._plan, 1, 1, 1).regress(
-            self._table[0], self.start()[0], r, u, y, restart, self.constants[0].stride, out, ok
-        )
+        machine(self._plan, 1, 1, 1).regress(self._table[0], state, r, u, y, restart, self.constants[0].stride, out, ok)
         return out, ok
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,7 +12,9 @@ from servoscope import digits
 from servoscope.detection import Onset
 from servoscope.diagnosis import UNKNOWN, Candidate, FoundFault, Mimic, Refit, Warning
 from servoscope.examination import Examination
-from servoscope.refinement import Hypothesis, Refined, causes, refine
+
+if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
+    from servoscope.refinement import Hypothesis, Refined
 
 WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
 APART = 3.0  # standard deviations between two sizes that are called different
@@ -21,7 +25,12 @@ def refit(x: Examination, since: Onset, announced: int, last: int, progress: Cal
     exact = x.baseline.exact
     if exact is None or exact.misfit > 1.0:
         return None
-    return refine(x.baseline, x.recording, since.sample, announced, last, progress)
+    from servoscope.refinement import MOST, refine
+
+    begin = max(since.sample - MOST, 0)
+    near = x.recording.rows(slice(begin, since.sample + MOST))
+    found = refine(x.baseline, near, since.sample - begin, announced - begin, last - begin, progress)
+    return replace(found, window=replace(found.window, first=found.window.first + begin))
 
 
 def candidates_of(refined: Refined) -> tuple[Candidate, ...]:
@@ -48,6 +57,8 @@ def onset_of(refined: Refined, x: Examination) -> Onset:
 
 def said(refined: Refined, x: Examination, recursive: tuple[Candidate, ...]) -> Refit:
     """Return what a diagnosis keeps of a refit."""
+    from servoscope.refinement import causes
+
     t, window = x.recording.t, refined.window
     over = refined.since.growth.over
     of_y, of_u = x.baseline.plant.units

@@ -105,9 +105,12 @@ def rated(
 
 
 def _first(expectation: Expectation) -> Expectation:
-    """Return as much of a reference as the design needs."""
-    pipeline = expectation.pipeline
-    return expectation.first(max(LONGEST, 10.0 * FEWEST * pipeline.stride / pipeline.loop.sample_rate))
+    return expectation.first(span(expectation.pipeline))
+
+
+def span(pipeline: Pipeline) -> float:
+    """Return how much of a reference the design needs [s]."""
+    return max(LONGEST, 10.0 * FEWEST * pipeline.stride / pipeline.loop.sample_rate)
 
 
 class _Bench:

@@ -20,12 +20,13 @@ from servoscope.errors import LoopError, SimulationError
 from servoscope.inverse import closed_loop, nominal_theta
 from servoscope.linear import Linear, autocovariances
 from servoscope.noise import Coloured, Noise, coloured
-from servoscope.pipeline import Pipeline, Regression, Tuning
+from servoscope.pipeline import Pipeline, Regressing, Regression, Tuning
 from servoscope.plants import FloatArray, Plant
 from servoscope.recording import Recording
-from servoscope.simulation import response
+from servoscope.simulation.closed_loop import Simulation
 
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
 
 LONGEST_FILL = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
 
@@ -44,14 +45,26 @@ class Course(NamedTuple):
     kept: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
     restart: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
+    def of_kept(self, x: FloatArray) -> FloatArray:
+        """Return the recorded samples of a signal on the gapless clock."""
+        return x if len(self.kept) == len(x) else x[self.kept]
 
-def course(recording: Recording) -> Course:
-    """Put r on a gapless clock; short gaps are bridged by straight lines, for simulation only."""
-    steps = np.round(np.diff(recording.t) * recording.sample_rate).astype(np.int64)
+
+def course(recording: Recording, before: tuple[float, float] | None = None) -> Course:
+    """Put r on a gapless clock; short gaps are bridged by straight lines, for simulation only.
+
+    `before` are t and r of the row before the recording, where that is part of a longer one: its clock goes on there.
+    """
+    t, r = recording.t, recording.r
+    if before is not None:
+        t, r = np.append(before[0], t), np.append(before[1], r)
+    steps = np.round(np.diff(t) * recording.sample_rate).astype(np.int64)
     steps = np.clip(steps, 1, round(LONGEST_FILL * recording.sample_rate))
     kept = np.concatenate([[0], np.cumsum(steps)])
-    r = np.interp(np.arange(kept[-1] + 1), kept, recording.r)
-    return Course(np.asarray(r, dtype=np.float64), kept, recording.restart)
+    if kept[-1] >= len(kept):
+        r = np.interp(np.arange(kept[-1] + 1), kept, r)
+    begin = int(before is not None)
+    return Course(np.ascontiguousarray(r[begin:], dtype=np.float64), kept[begin:] - begin, recording.restart)
 
 
 def noise_system(pipeline: Pipeline, plant: Plant) -> Linear:
@@ -156,45 +169,28 @@ class Expectation:
         SimulationError
             If the loop is unstable with one of the plants.
         """
-        r, kept, restart = self.course
-        plants, onsets = in_turn(plant, ill, since)
-        u, y = response(self.pipeline.loop, r, plants=plants, switch=[int(kept[k]) for k in onsets])
-        return self.pipeline.regression(r[kept], u[kept], y[kept], restart)
+        return Undisturbed(self.pipeline, plant, ill, since).advance(self.course)[0]
 
     def path(self, start: FloatArray, plant: Plant, ill: Plant | None = None, since: int = 0) -> FloatArray:
         """Return the mean of theta_hat at every evaluation, shape (K, n), from `start` (n,) before the first sample.
 
         The other arguments and errors are those of `regression`.
         """
-        from servoscope.propagation import mean_path
+        return self.walk(start, plant, ill, since).advance(self.course)
 
-        g = self.regression(plant, ill, since)
-        plants, onsets = in_turn(plant, ill, since)
-        which = np.searchsorted(np.asarray(onsets), np.arange(len(g.ok)), side="right") - 1
-        moments = [self.moments(each) for each in plants]
-        return mean_path(
-            g.eta,
-            g.phi,
-            g.z,
-            g.ok,
-            which,
-            np.array([m.c for m in moments]),
-            np.array([m.S for m in moments]),
-            self.tuning.P_d,
-            self.tuning.R,
-            np.asarray(start, dtype=np.float64),
-            self.pipeline.every,
-        )
+    def walk(self, start: FloatArray, plant: Plant, ill: Plant | None = None, since: int = 0) -> Walk:
+        """Return what follows the mean of theta_hat piece by piece; the arguments are those of `path`."""
+        return Walk(self, start, plant, ill, since)
 
     def first(self, seconds: float) -> Expectation:
         """Return the expectation for the recording's first seconds only."""
-        return self.until(min(round(seconds * self.pipeline.loop.sample_rate), len(self.course.kept)))
-
-    def until(self, samples: int) -> Expectation:
-        """Return the expectation for the recording's first samples only."""
         r, kept, restart = self.course
-        shorter = Course(r[: int(kept[samples - 1]) + 1], kept[:samples], restart[:samples])
-        return replace(self, course=shorter)
+        samples = min(round(seconds * self.pipeline.loop.sample_rate), len(kept))
+        return self.under(Course(r[: int(kept[samples - 1]) + 1], kept[:samples], restart[:samples]))
+
+    def under(self, course: Course) -> Expectation:
+        """Return the expectation under another reference."""
+        return replace(self, course=course)
 
     def healthy(self, plant: Plant, model_theta: FloatArray) -> FloatArray:
         """Return what a healthy loop would show at every evaluation, shape (K, n).
@@ -223,6 +219,62 @@ class Expectation:
         """
         g = self.regression(plant)
         return (g.eta - g.phi @ theta)[g.ok if ok is None else ok]
+
+
+class Undisturbed:
+    """The regression of a loop without noise whose plant may turn ill, piece by piece; see `Expectation.regression`."""
+
+    def __init__(self, pipeline: Pipeline, plant: Plant, ill: Plant | None = None, since: int = 0) -> None:
+        self.plants, onsets = in_turn(plant, ill, since)
+        self._onsets = np.array(onsets)
+        self._simulation, self._regressing = Simulation(pipeline.loop, self.plants), Regressing(pipeline)
+        self._samples = 0
+
+    def advance(self, course: Course) -> tuple[Regression, IntArray]:
+        """Return the regression of the next piece of a reference, and which plant each sample (N,) had."""
+        r, kept, restart = course
+        since = self._onsets - self._samples  # in samples of this piece
+        inside = (since >= 0) & (since < len(kept))
+        edges = np.where(inside, kept[np.clip(since, 0, len(kept) - 1)], np.where(since < 0, 0, len(r)))
+        u, _, y = self._simulation.advance(_in_turn(edges, len(r)), r)
+        self._samples += len(kept)
+        which = _in_turn(since, len(kept))
+        r, u, y = (course.of_kept(x) for x in (r, u, y))
+        return self._regressing.advance(r, u, y, restart), which
+
+
+def _in_turn(edges: IntArray, samples: int) -> IntArray:
+    """Return which stretch each sample belongs to, shape (N,), of those that begin at the edges, the first before 0."""
+    which = np.zeros(samples, dtype=np.int64)
+    for edge in edges[1:]:
+        which[max(edge, 0) :] += 1
+    return which
+
+
+class Walk:
+    """The mean of theta_hat, piece by piece; see `Expectation.path`."""
+
+    def __init__(
+        self, expectation: Expectation, start: FloatArray, plant: Plant, ill: Plant | None = None, since: int = 0
+    ) -> None:
+        self._pipeline, self._tuning = expectation.pipeline, expectation.tuning
+        self._undisturbed = Undisturbed(self._pipeline, plant, ill, since)
+        moments = [expectation.moments(each) for each in self._undisturbed.plants]
+        self._moments = np.array([m.c for m in moments]), np.array([m.S for m in moments])
+        self._theta, self._samples = np.array(start, dtype=np.float64), 0
+
+    def advance(self, course: Course) -> FloatArray:
+        """Return the mean at the evaluations of the next piece of a reference, shape (K, n)."""
+        from servoscope.propagation import mean_path
+
+        g, which = self._undisturbed.advance(course)
+        tuning, number = self._tuning, self._samples
+        self._samples += len(which)
+        P_d, R, every = tuning.P_d, tuning.R, self._pipeline.every
+        path = np.empty((self._samples // every - number // every, len(P_d)))
+        room = np.empty((2, len(P_d)))
+        mean_path(g.eta, g.phi, g.z, g.ok, which, *self._moments, P_d, R, self._theta, number, every, room, path)
+        return path
 
 
 def in_turn(plant: Plant, ill: Plant | None, since: int) -> tuple[list[Plant], list[int]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,8 +12,10 @@ from servoscope.errors import NotEnoughError, RecordingError
 from servoscope.examination import Examination
 from servoscope.isolation import Signature
 from servoscope.plants import FloatArray
-from servoscope.signatures import course
+from servoscope.signatures import Expectation, course
 from servoscope.tuning import fit
+
+LONGEST = 500_000  # samples of a stretch; more of them say no more
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +41,8 @@ def steady(x: Examination, from_s: float, to_s: float = np.inf) -> Steady:
     except RecordingError as error:
         raise NotEnoughError(f"{name}, from {from_s:.4g} s on: {error}") from None
     expected = np.array(baseline.theta)
-    if x.expectation is not None:  # the bias that this reference has under any plant
-        bias = replace(x.expectation, course=course(rec)).batch(baseline.plant)
+    if x.noise is not None:  # the bias that this reference has under any plant
+        bias = Expectation(x.pipeline, x.tuning, x.noise, course(rec)).batch(baseline.plant)
         expected = expected + bias - np.array(baseline.model_theta)
     return Steady(found.each[0] - expected, found.each_covariance[0])
 
@@ -60,14 +62,18 @@ def isolation_inputs(x: Examination, since: Onset, at: int) -> tuple[list[Signat
         Evaluation that is explained.
     """
     recording, e, last = x.recording, x.estimates, int(x.estimates.index[at])
+    first = x.recalled(at)
     C, settled = x.baseline.cov(), False
     deviation, covariance = e.theta[at] - x.expected[at], e.S[at] * max(1.0, float(e.power[at]))
-    if x.baseline.learned and x.expectation is None:
+    if x.baseline.learned and x.noise is None:
+        begin = max(since.likely_s, float(recording.t[max(last - LONGEST, 0)]))
         try:
-            whole = steady(x, since.likely_s, float(recording.t[last]) + 0.5 / recording.sample_rate)
+            whole = steady(x, begin, float(recording.t[last]) + 0.5 / recording.sample_rate)
         except NotEnoughError:
             pass  # the recursion, which starts from healthy, needs no more than the alarm did
         else:
             deviation, covariance, settled = whole.deviation, whole.covariance, True
-    signatures = candidates_of(x.baseline, recording, x.expectation, since.sample, last, settled)
+    expectation = x.expectation(first, last + 1) if x.noise is not None else None
+    recalled = recording.rows(slice(first, last + 1))
+    signatures = candidates_of(x.baseline, recalled, expectation, max(since.sample - first, 0), settled)
     return signatures, deviation, covariance + C

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from servoscope.correction import explain, spread_of
 from servoscope.detection import Onset, onset
 from servoscope.diagnosis import (
     UNKNOWN,
@@ -22,20 +22,22 @@ from servoscope.diagnosis import (
     Warning,
 )
 from servoscope.doubts import blind_to, doubts, seen_by
-from servoscope.examination import Compared, Examination, trace_of
-from servoscope.inverse import nominal_theta
+from servoscope.examination import Examination
 from servoscope.isolation import isolate
+from servoscope.meaning import Meaning, meaning, trace
 from servoscope.reasons import reasons
-from servoscope.refinement import Refined
 from servoscope.refit import candidates_of, disagreements, onset_of, refit, said
 from servoscope.sentence import summary
 from servoscope.steady import isolation_inputs
 
+if TYPE_CHECKING:
+    from servoscope.refinement import Refined
+
 SURE = 0.95  # probability from which a fault is named
 
 
-def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> tuple[Diagnosis, Trace]:
-    """Return the verdict on an examination and its trace; `progress` is told what is being done."""
+def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> tuple[Diagnosis, Meaning | None]:
+    """Return the verdict on an examination, and what its estimates mean; `progress` is told what is being done."""
     recording = x.recording
     warnings = [Warning.of(defect) for defect in recording.defects] + doubts(x)
     alarm = alarm_of(x, progress)
@@ -44,7 +46,8 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
     faults: tuple[FoundFault, ...] = ()
     since: Onset | None = None
     told: Refit | None = None
-    at, detected_at = len(x.t) - 1, None
+    last = x.evaluations - 1
+    at, detected_at = last, None
     if alarm is not None:
         at, since = alarm.at, alarm.since
         detected_at = float(recording.t[alarm.announced])
@@ -63,8 +66,9 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         span = float(recording.t[0]), float(recording.t[-1])
         warnings += [Warning(kind="power", from_s=span[0], to_s=span[1], count=1, message=text) for text in blind]
     verdict: Verdict = "fault" if alarm else "undetermined" if blind else "healthy"
-    compared = unbiased(x, candidates, since, at)
-    trace = trace_of(x.baseline, x.pipeline, x.estimates, x.t, compared, recording.t)
+    meant = meaning(x, candidates, since, at)
+    end = trace(x, meant, slice(max(last, 0), last + 1))
+    explained = end if at == last else trace(x, meant, slice(at, at + 1))
     found = Diagnosis(
         recording=recording.name,
         samples=recording.samples,
@@ -76,14 +80,14 @@ def judge(x: Examination, progress: Callable[[str], None] = lambda _: None) -> t
         probability=candidates[0].probability if candidates else None,
         faults=faults,
         candidates=candidates,
-        explanation=reasons(x, trace, at, detected_at, candidates, told) if detected_at is not None else (),
+        explanation=reasons(x, explained, detected_at, candidates, told) if detected_at is not None else (),
         refit=told,
-        parameters=_parameters(trace),
-        ifrf=_ifrf(trace),
+        parameters=_parameters(end),
+        ifrf=_ifrf(end),
         warnings=tuple(sorted(warnings, key=lambda warning: warning.from_s)),
         point=x.baseline.point or None,
     )
-    return found, trace
+    return found, meant
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ def alarm_of(x: Examination, progress: Callable[[str], None] = lambda _: None) -
     first = int(alarms[0])
     announced = _announced(x, first)
     # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
-    at = len(x.t) - 1 if x.alarm[-1] else first + int(np.argmax(x.statistic[first:]))
+    at = x.evaluations - 1 if x.alarm[-1] else first + int(np.argmax(x.statistic[first:]))
     progress("onset")
     return Alarm(announced, at, _onset(x, announced, at))
 
@@ -141,36 +145,6 @@ def _since(x: Examination, found: Onset | None, told: Refit | None) -> str:
         return "since the start of the recording or before"
     drifting = told is not None and told.over_s > 0.0 and told.misfit <= told.limit
     return f"since {found.likely_s:.1f} s{f', growing over {told.over_s:.3g} s' if told and drifting else ''}"
-
-
-def unbiased(x: Examination, candidates: tuple[Candidate, ...], since: Onset | None, at: int) -> Compared:
-    """Take the biases out of estimates and expectation, as far as the loop can be simulated.
-
-    After a change the past that theta_hat has not forgotten yet counts as a bias too. The covariance becomes that of
-    the estimate alone: the noise in the coefficients under the actuator that was found, and what is left of the start.
-    """
-    e, C = x.estimates, x.baseline.cov()
-    if x.expectation is None or not len(x.t) or not x.ready[at] or x.baseline.loop.monitor.structure != "svf":
-        return Compared(e.theta, x.covariance, x.expected, C, x.statistic)
-    plant, start = x.baseline.plant, np.array(x.baseline.model_theta)
-    healthy = nominal_theta(x.pipeline.loop, plant)
-    # the healthy path: what was expected, without what the model leaves unexplained
-    bias = shift = x.expected - (x.tuning.theta - start) - healthy
-    S, gain = x.growth * e.S, np.eye(x.pipeline.bank.n)
-    if since is not None:
-        likely = next((c for c in candidates if c.name != UNKNOWN), None)
-        guess = {fault.parameter: fault.ratio for fault in likely.faults} if likely else {}
-        until = x.expectation.until(int(e.index[at]) + 1)
-        found = explain(until, plant, start, e.theta[at], S[at] + C, since.sample, guess)
-        gain, ill = found.gain, found.plant
-        late = e.index >= since.sample
-        true = np.where(late[:, None], nominal_theta(x.pipeline.loop, ill), healthy)
-        bias = x.expectation.path(start, plant, ill, since.sample) - true
-        if x.baseline.loudest is not None:
-            spread = spread_of(x.pipeline, x.tuning, x.recording, x.expectation.noise, ill)
-            S = np.where(late[:, None, None], spread, S)
-    covariance = gain @ (S + e.Psi @ C @ np.swapaxes(e.Psi, -1, -2)) @ gain.T
-    return Compared(e.theta - bias, covariance, x.expected - shift, C, x.statistic)
 
 
 def _parameters(trace: Trace) -> dict[str, Parameter]:

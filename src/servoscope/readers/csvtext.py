@@ -1,56 +1,37 @@
-"""Reads delimited text: finds delimiter, decimal sign, header and comments, then lets Arrow do the work."""
+"""Reads delimited text: finds delimiter, decimal sign, header and comments, then lets Arrow read piece by piece."""
 
 from __future__ import annotations
 
-import io
 import re
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from servoscope.errors import RecordingError
+from servoscope.readers.tables import NULLS, Table
 
-__all__ = ["NULLS", "CsvColumns", "read_csv"]
+__all__ = ["Layout", "layout_of", "read_csv"]
 
-NULLS = (
-    "",
-    "NaN",
-    "nan",
-    "NAN",
-    "-nan",
-    "-NaN",
-    "NA",
-    "N/A",
-    "#N/A",
-    "#NA",
-    "null",
-    "NULL",
-    "None",
-    "-",
-    "?",
-    "1.#QNAN",
-)
 COMMENTS = ("#", "%", "//")
 SNIFFED = 20  # lines
+PIECE = 1 << 23  # bytes that are read at a time
 MOST_BROKEN = 0.01  # share of rows that may not fit the columns
 
 
-class CsvColumns(NamedTuple):
-    """Columns by name, number of the first row in the file, and the rows that did not fit (see `Table`)."""
+@dataclass(frozen=True)
+class Layout:
+    """How a text file is laid out: delimiter, decimal sign, names of the columns, lines before the rows, encoding."""
 
-    columns: dict[str, Any]
-    first_row: int
-    broken: list[tuple[int, int, str]]
-
-
-class _Layout(NamedTuple):
     delimiter: str
     decimal: str
-    names: list[str]
+    names: tuple[str, ...]
     skipped: int
+    encoding: str = "utf-8-sig"
 
 
-def read_csv(path: Path, head: bytes) -> CsvColumns:
-    """Read a text file with columns.
+def layout_of(path: Path, head: bytes) -> Layout:
+    """Find out how a text file is laid out.
 
     Parameters
     ----------
@@ -64,58 +45,117 @@ def read_csv(path: Path, head: bytes) -> CsvColumns:
     RecordingError
         If it is not a table.
     """
-    import pyarrow as pa
-    import pyarrow.csv as pc
-
-    encoding, source = _encoding(head), None
+    encoding = _encoding(head)
     lines = head.decode(encoding, errors="replace").splitlines()
     if len(head) == 65536:
         lines = lines[:-1] or lines
-    layout = _layout(lines, path)
-    if encoding in ("utf-16", "latin-1") or layout.delimiter == " ":
-        text = path.read_bytes().decode(encoding)
-        if layout.delimiter == " ":
-            # Arrow knows no runs of blanks as one delimiter.
-            text = "\n".join(re.sub(r"[ \t]+", " ", line.strip()) for line in text.splitlines())
-        source = text.encode()
-    broken: list[tuple[int, int, str]] = []
+    return replace(_layout(lines, path), encoding=encoding)
+
+
+def read_csv(path: Path, layout: Layout, wanted: Sequence[str], texts: Collection[str] = ()) -> Iterator[Table]:
+    """Yield the rows of a text file with columns, piece by piece.
+
+    Parameters
+    ----------
+    path, layout
+        The file.
+    wanted
+        Names of the columns that are read.
+    texts
+        Names of those that are text even where they look like numbers.
+
+    Raises
+    ------
+    RecordingError
+        If it is not a table.
+    """
+    rows = broken = 0
+    odd: tuple[int, int] | None = None
+    for text, before, last in _pieces(path, layout):
+        skipped = 0 if before else layout.skipped
+        if before and not text.strip():
+            continue
+        columns, torn = _parsed(path, layout, wanted, texts, text, skipped)
+        told = [(number - skipped - 1 - index, before + number, line) for index, (number, _, line) in enumerate(torn)]
+        table = Table(path.name, columns, before + skipped + 1, tuple(told))
+        rows, broken = rows + table.rows, broken + len(torn)
+        odd = odd or next(((before + number, actual) for number, actual, _ in torn), None)
+        if last and odd is not None and broken > max(1, MOST_BROKEN * rows):
+            raise RecordingError(
+                f"{path}: {broken} rows do not fit, first row {odd[0]} with {odd[1]} columns instead of"
+                f" {len(layout.names)}: is it one table with one delimiter?"
+            )
+        yield table
+
+
+def _pieces(path: Path, layout: Layout) -> Iterator[tuple[bytes, int, bool]]:
+    """Yield whole lines, how many lines were before them, and whether they are the last ones."""
+    before, held = 0, b""
+    plain = layout.encoding == "utf-8-sig" and layout.delimiter != " "
+    for text in _plain(path) if plain else _recoded(path, layout):
+        if held:
+            yield held, before, False
+            before += held.count(b"\n") or held.count(b"\r")
+        held = text
+    yield held, before, True
+
+
+def _plain(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while text := file.read(PIECE):
+            yield text if text.endswith(b"\n") else text + file.readline()
+
+
+def _recoded(path: Path, layout: Layout) -> Iterator[bytes]:
+    """Yield lines as UTF-8 with single blanks: Arrow knows no runs of them as one delimiter."""
+    with path.open(encoding=layout.encoding) as file:
+        while lines := file.readlines(PIECE):
+            if layout.delimiter == " ":
+                lines = [re.sub(r"[ \t]+", " ", line.strip()) + "\n" for line in lines]
+            yield "".join(lines).encode()
+
+
+def _parsed(
+    path: Path, layout: Layout, wanted: Sequence[str], texts: Collection[str], text: bytes, skipped: int
+) -> tuple[dict[str, Any], list[tuple[int, int, str]]]:
+    """Return columns, and the rows that do not fit: number of the line in the text, columns that it has, its text."""
+    import pyarrow as pa
+    import pyarrow.csv as pc
+
+    torn: list[tuple[int, int, str]] = []
     comments = 0
 
     def invalid(row: Any) -> str:
-        nonlocal broken, comments
+        nonlocal comments
         if row.text.lstrip().startswith(COMMENTS):
             comments += 1
         else:
-            broken.append((row.number, row.actual_columns, row.text))
+            torn.append((row.number, row.actual_columns, row.text))
         return "skip"
 
     def parse(threads: bool) -> Any:
         return pc.read_csv(
-            io.BytesIO(source) if source is not None else path,
-            read_options=pc.ReadOptions(column_names=layout.names, skip_rows=layout.skipped, use_threads=threads),
+            pa.BufferReader(text),
+            read_options=pc.ReadOptions(column_names=layout.names, skip_rows=skipped, use_threads=threads),
             parse_options=pc.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=invalid),
             convert_options=pc.ConvertOptions(
-                null_values=list(NULLS), strings_can_be_null=True, decimal_point=layout.decimal
+                null_values=list(NULLS),
+                strings_can_be_null=True,
+                decimal_point=layout.decimal,
+                include_columns=list(wanted),
+                column_types=dict.fromkeys(texts, pa.string()),
             ),
         )
 
     try:
         table = parse(True)
-        if broken or comments:
+        if torn or comments:
             # row numbers, which messages name, exist without threads only
-            broken, comments = [], 0
+            torn.clear()
             table = parse(False)
     except pa.ArrowInvalid as error:
         raise RecordingError(f"{path}: cannot be read as CSV ({' '.join(str(error).split())[:100]})") from None
-    if len(broken) > max(1, MOST_BROKEN * table.num_rows):
-        number, actual, _ = broken[0]
-        raise RecordingError(
-            f"{path}: {len(broken)} rows do not fit, first row {number} with {actual} columns instead of"
-            f" {len(layout.names)}: is it one table with one delimiter?"
-        )
-    first = layout.skipped + 1
-    told = [(number - first - index, number, text) for index, (number, _, text) in enumerate(broken)]
-    return CsvColumns({name: table.column(name) for name in layout.names}, first, told)
+    return {name: table.column(name) for name in wanted}, torn
 
 
 def _encoding(head: bytes) -> str:
@@ -128,7 +168,7 @@ def _encoding(head: bytes) -> str:
     return "utf-8-sig"
 
 
-def _layout(lines: list[str], path: Path) -> _Layout:
+def _layout(lines: list[str], path: Path) -> Layout:
     skipped = 0
     while skipped < len(lines) and (not lines[skipped].strip() or lines[skipped].lstrip().startswith(COMMENTS)):
         skipped += 1
@@ -140,12 +180,12 @@ def _layout(lines: list[str], path: Path) -> _Layout:
     decimal = "," if delimiter != "," and any(re.search(r"\d,\d|(?<!\d),\d", line) for line in body) else "."
     cells = _cells(sample[0], delimiter)
     if all(_is_number(cell, decimal) for cell in cells):
-        return _Layout(delimiter, decimal, [f"c{index}" for index in range(len(cells))], skipped)
+        return Layout(delimiter, decimal, tuple(f"c{index}" for index in range(len(cells))), skipped)
     names = [cell or f"c{index}" for index, cell in enumerate(cells)]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise RecordingError(f"{path}: two columns are called {twice!r}, rename one of them")
-    return _Layout(delimiter, decimal, names, skipped + 1)
+    return Layout(delimiter, decimal, tuple(names), skipped + 1)
 
 
 def _delimiter(sample: list[str]) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from servoscope import spool
 from servoscope.errors import RecordingError
 from servoscope.recording.defects import Defect, spans
 
@@ -28,21 +30,34 @@ RATE_NOTE = 0.001
 
 
 class Axis(NamedTuple):
-    """A rising time axis: rows of the log in its order (M,), their t [s] (M,), run (M,), sample rate [Hz]."""
+    """A rising time axis: t [s] (M,), run (M,), sample rate [Hz], and what was done to the rows of the log for it.
 
-    rows: Index
+    `dropped` are the rows without a usable stamp; `sorted_rows` the stretches of what is left that were sorted, each as
+    its first row and the order of its rows.
+    """
+
     t: FloatArray
     run: IntArray
     sample_rate: float
     notes: list[Defect]
+    dropped: Index
+    sorted_rows: list[tuple[int, Index]]
+
+    def arranged(self, column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return a column of the log, shape (N,), in the order of this axis, shape (M,)."""
+        return _sorted(spool.without(column, self.dropped), self.sorted_rows)
 
 
 def gaps(t: FloatArray, run: IntArray, period: float) -> Index:
     """Return the indices of the rows after which more than 1.5 samples are missing within a run."""
-    return np.flatnonzero((np.diff(t) > (GAP + 1e-6) * period) & (np.diff(run) == 0))
+
+    def test(rows: slice) -> npt.NDArray[np.bool_]:
+        return np.asarray((_steps(t, rows) > (GAP + 1e-6) * period) & (run[rows] == run[_before(rows)]))
+
+    return spool.where(test, t, run, first=1) - 1
 
 
-def arrange(t: FloatArray, marks: npt.NDArray[np.generic], sample_rate: float | None, name: str) -> Axis:
+def arrange(t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: float | None, name: str) -> Axis:
     """Sort the rows within their runs and lay the runs end to end where their times overlap.
 
     Parameters
@@ -50,7 +65,7 @@ def arrange(t: FloatArray, marks: npt.NDArray[np.generic], sample_rate: float | 
     t
         Time stamps [s] as logged, shape (N,).
     marks
-        Values, shape (N,), whose change starts a new run.
+        Values, shape (N,), whose change starts a new run; None: there is one.
     sample_rate
         Expected [Hz]; None: as measured.
     name
@@ -62,94 +77,180 @@ def arrange(t: FloatArray, marks: npt.NDArray[np.generic], sample_rate: float | 
         If the time axis runs backwards or in disorder, is too coarse or irregular, or the rate is not the
         expected one.
     """
-    rows = np.flatnonzero(np.isfinite(t))
-    if rows.size < 2:
+    lost = spool.where(lambda rows: ~np.isfinite(t[rows]), t)
+    if t.size - lost.size < 2:
         raise RecordingError(f"{name}: the time column holds no numbers, choose another")
-    lost = t.size - rows.size
-    change = np.concatenate([[0], np.cumsum(marks[1:] != marks[:-1])])
-    period = _check_direction(t[rows], change[rows], name)
-    rows, wild = _without_wild(t, rows, change, period)
-    run = _split(t[rows], change[rows], period)
-    order = np.lexsort((t[rows], run))
-    moved = order != np.arange(order.size)
-    rows, run = rows[order], run[order]
-    rate, jitter = _measure(t[rows], run, sample_rate, name)
+    begins = np.empty(0, dtype=np.intp)
+    if marks is not None:
+        begins = spool.where(lambda rows: np.asarray(marks[rows] != marks[_before(rows)]), marks, first=1)
+    t = spool.without(t, lost)
+    begins = _moved_up(begins, lost, t.size)
+    period, backwards = _check_direction(t, begins, name)
+    wild = _wild(t, begins, backwards, period)
+    if wild.size:
+        t = spool.without(t, wild)
+        begins = _moved_up(begins, wild, t.size)
+        backwards = _backwards(t)
+    begins = _split(t, begins, backwards, period)
+    t, order = _in_order(t, begins, np.setdiff1d(backwards, begins))
+    rate, jitter = _measure(t, begins, sample_rate, name)
     used = sample_rate if sample_rate is not None else rate
-    laid = _lay_out(t[rows], run, 1.0 / used)
+    laid = _lay_out(t, begins, 1.0 / used)
 
-    notes = [_order_note(laid[start:stop]) for start, stop in spans(moved)]
-    start, end = float(laid[0]), float(laid[-1])
-    if lost:
-        notes.append(Defect("nan", start, end, lost, f"{lost} rows without a time stamp dropped"))
-    if wild:
-        notes.append(Defect("clock", start, end, wild, f"{wild} rows with an absurd time stamp dropped"))
+    moved = [_order_note(laid[first + a : first + b]) for first, rows in order for a, b in _displaced(rows)]
+    notes, start, end = moved, float(laid[0]), float(laid[-1])
+    if lost.size:
+        notes.append(Defect("nan", start, end, lost.size, f"{lost.size} rows without a time stamp dropped"))
+    if wild.size:
+        notes.append(Defect("clock", start, end, wild.size, f"{wild.size} rows with an absurd time stamp dropped"))
     if jitter:
         words = f"time stamps jitter: {jitter} steps off by more than {JITTER:.0%} of a sample, taken as uniform"
         notes.append(Defect("jitter", start, end, jitter, words))
     if abs(rate / used - 1.0) > RATE_NOTE:
         words = f"time stamps say {rate:.6g} Hz, the loop says {used:.6g} Hz: the loop's is used"
-        notes.append(Defect("clock", start, end, rows.size, words))
-    return Axis(rows, laid, run, used, notes)
+        notes.append(Defect("clock", start, end, t.size, words))
+    dropped = np.union1d(lost, wild + np.searchsorted(lost - np.arange(lost.size), wild, side="right"))
+    return Axis(laid, _numbered(t.size, begins), used, notes, dropped, order)
 
 
-def _check_direction(t: FloatArray, change: Index, name: str) -> float:
-    """Return a first guess of the sample time [s]."""
-    steps = np.diff(t)[np.diff(change) == 0]
-    steps = steps if steps.size else np.diff(t)
-    backwards = int((steps < 0.0).sum())
-    if backwards > 0.9 * steps.size:
+def _before(rows: slice) -> slice:
+    return slice(rows.start - 1, rows.stop - 1)
+
+
+def _steps(t: FloatArray, rows: slice) -> FloatArray:
+    """Return the steps to some rows from those before them; the first row of all is none of them."""
+    return np.asarray(t[rows] - t[_before(rows)])
+
+
+def _within(t: FloatArray, begins: Index, rows: slice) -> FloatArray:
+    """Return the steps to some rows within runs, which start at `begins`."""
+    rows = slice(max(rows.start, 1), rows.stop)
+    first, last = np.searchsorted(begins, [rows.start, rows.stop])
+    return np.asarray(np.delete(_steps(t, rows), begins[first:last] - rows.start))
+
+
+def _moved_up(begins: Index, dropped: Index, left: int) -> Index:
+    """Return where runs begin, but for the first, when rows have been dropped and so many are left."""
+    if not dropped.size:
+        return begins
+    begins = np.unique(begins - np.searchsorted(dropped, begins))
+    return np.asarray(begins[(begins > 0) & (begins < left)])
+
+
+def _backwards(t: FloatArray) -> Index:
+    """Return the rows whose stamp is earlier than the one before."""
+    return spool.where(lambda rows: _steps(t, rows) < 0.0, t, first=1)
+
+
+def _check_direction(t: FloatArray, begins: Index, name: str) -> tuple[float, Index]:
+    """Return a first guess of the sample time [s], and the rows at which time goes backwards."""
+    begins = begins if begins.size < t.size - 1 else begins[:0]
+    back = _backwards(t)
+    backwards = np.setdiff1d(back, begins).size
+    count, repeated = t.size - 1 - begins.size, 0
+    for rows in spool.pieces(0, t.size, t):
+        repeated += int((_within(t, begins, rows) == 0.0).sum())
+    if backwards > 0.9 * count:
         raise RecordingError(f"{name}: time runs backwards throughout, sort the rows or choose another time column")
-    if backwards > DISORDER * steps.size:
+    if backwards > DISORDER * count:
         raise RecordingError(
-            f"{name}: {backwards} of {steps.size} time steps go backwards, choose another time column or sort the rows"
+            f"{name}: {backwards} of {count} time steps go backwards, choose another time column or sort the rows"
         )
-    repeated = int((steps == 0.0).sum())
-    if repeated > COARSE * steps.size:
+    if repeated > COARSE * count:
         raise RecordingError(
-            f"{name}: {repeated} of {steps.size + 1} time stamps repeat the one before:"
+            f"{name}: {repeated} of {count + 1} time stamps repeat the one before:"
             " the clock is too coarse, log finer time stamps or leave the time column out"
         )
-    return float(np.median(steps[steps > 0.0]))
+    steps = _some_steps(t, begins)
+    return float(np.median(steps[steps > 0.0])), back
 
 
-def _without_wild(t: FloatArray, rows: Index, change: Index, period: float) -> tuple[Index, int]:
-    """Drop single stamps far ahead of both neighbours; sorted in, they would stretch the time axis."""
-    stamps, runs = t[rows], change[rows]
-    between = stamps[2:] - stamps[:-2]
-    close = (between > 0.0) & (between < LATE * period) & (runs[2:] == runs[:-2])
-    wild = close & (stamps[1:-1] - stamps[2:] > LATE * period)
-    keep = np.ones(rows.size, dtype=bool)
-    keep[1:-1] = ~wild
-    return rows[keep], int(wild.sum())
+def _some_steps(t: FloatArray, begins: Index) -> FloatArray:
+    some = np.concatenate([_within(t, begins, rows) for rows in spool.some(t.size)])
+    spool.release(t)
+    return some
 
 
-def _split(t: FloatArray, change: Index, period: float) -> IntArray:
-    """Return the number of each row's run; a change of the marks and a time that falls back start one."""
-    starts = np.concatenate([[True], np.diff(change) != 0])
-    begin, high = 0, t[0]
-    for back in np.flatnonzero((np.diff(t) < 0.0) | starts[1:]) + 1:
-        if starts[back]:
-            begin, high = int(back), t[back]
+def _wild(t: FloatArray, begins: Index, backwards: Index, period: float) -> Index:
+    """Return single stamps far ahead of both neighbours; sorted in, they would stretch the time axis."""
+    after = backwards[backwards >= 2]
+    between = t[after] - t[after - 2]
+    one_run = np.searchsorted(begins, after, side="right") == np.searchsorted(begins, after - 2, side="right")
+    close = (between > 0.0) & (between < LATE * period) & one_run
+    return np.asarray(after[close & (t[after - 1] - t[after] > LATE * period)] - 1)
+
+
+def _split(t: FloatArray, begins: Index, backwards: Index, period: float) -> Index:
+    """Return where runs begin, but for the first: where the marks say so, and where time falls back."""
+    marked = set(begins.tolist())
+    starts, looked, high = [], 0, float(t[0])
+    for back in np.union1d(begins, backwards).tolist():
+        if back in marked:
+            starts.append(back)
+            looked, high = back, float(t[back])
             continue
-        high = max(high, float(t[begin:back].max()))
+        high, looked = max(high, float(t[looked:back].max())), back
         returns = (t[back : back + LATE + 1] > high).any()
         if high - t[back] > LATE * period and not returns:
-            starts[back] = True
-            begin, high = int(back), t[back]
-    return np.asarray(np.cumsum(starts) - 1, dtype=np.int32)
+            starts.append(back)
+            high = float(t[back])
+    return np.array(starts, dtype=np.intp)
 
 
-def _measure(t: FloatArray, run: IntArray, expected: float | None, name: str) -> tuple[float, int]:
+def _in_order(t: FloatArray, begins: Index, backwards: Index) -> tuple[FloatArray, list[tuple[int, Index]]]:
+    """Sort the rows within their runs; return the stretches concerned, each as its first row and the order of its rows.
+
+    Up to a row at which time goes backwards all is sorted: only rows later than it, and those that are late, move.
+    """
+    found: list[tuple[int, Index]] = []
+    logged, done = t, 0
+    t = spool.copied(t) if backwards.size else t
+    for back in backwards.tolist():
+        if back < done:
+            continue
+        run = int(np.searchsorted(begins, back, side="right"))
+        begin = int(begins[run - 1]) if run else 0
+        stop = int(begins[run]) if run < begins.size else t.size
+        done, high, low = back, float(t[back - 1]), float(t[back])
+        while done < stop and t[done] < high:
+            low, done = min(low, float(t[done])), done + 1
+        first = begin + int(np.searchsorted(t[begin:back], low, side="right"))
+        while found and first <= found[-1][0] + found[-1][1].size:  # one stretch with what was sorted before
+            first = min(first, found.pop()[0])
+        order = np.argsort(logged[first:done], kind="stable")
+        t[first:done] = logged[first:done][order]
+        found.append((first, order))
+    return t, found
+
+
+def _displaced(order: Index) -> list[tuple[int, int]]:
+    return spans(order != np.arange(order.size))
+
+
+def _sorted(column: npt.NDArray[Any], order: list[tuple[int, Index]]) -> npt.NDArray[Any]:
+    if not order:
+        return column
+    column = spool.copied(column)
+    for first, rows in order:
+        column[first : first + rows.size] = column[first : first + rows.size][rows]
+    return column
+
+
+def _measure(t: FloatArray, begins: Index, expected: float | None, name: str) -> tuple[float, int]:
     """Return the measured rate [Hz] and the number of jittery steps."""
-    steps = np.diff(t)[np.diff(run) == 0]
-    steps = steps[steps > 0.0]
-    if steps.size == 0:
+    some = _some_steps(t, begins)
+    some = some[some > 0.0]
+    if some.size == 0:
         raise RecordingError(f"{name}: time does not advance, choose another time column")
-    typical = float(np.median(steps))
-    typical = float(np.median(steps[steps > SAME * typical]))
-    near = steps[(steps > 0.5 * typical) & (steps < GAP * typical)]
+    typical = float(np.median(some))
+    typical = float(np.median(some[some > SAME * typical]))
+    total, count = 0.0, 0
+    for rows in spool.pieces(0, t.size, t):
+        steps = _within(t, begins, rows)
+        near = steps[(steps > 0.5 * typical) & (steps < GAP * typical)]
+        total, count = total + float(near.sum()), count + near.size
     # The mean is right also where stamps are rounded, for example 3, 3, 4 ms at 300 Hz; the median is not.
-    rate = float(f"{1.0 / near.mean():.9g}")  # stamps are no better than that, and 25 Hz should read 25
+    rate = float(f"{count / total:.9g}")  # stamps are no better than that, and 25 Hz should read 25
     if expected is not None and abs(rate / expected - 1.0) > RATE_TOLERANCE:
         factor = next(
             (unit for unit, f in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if abs(rate * f / expected - 1) < 0.02),
@@ -160,25 +261,37 @@ def _measure(t: FloatArray, run: IntArray, expected: float | None, name: str) ->
         )
         raise RecordingError(f"{name}: sampled at {rate:.6g} Hz, the loop says {expected:.6g} Hz: {hint}")
     period = 1.0 / (expected if expected is not None else rate)
-    steps = steps[steps > SAME * period]
-    far = int(((steps > GAP * period * (1 + 1e-6)) | (steps < 0.5 * period)).sum())
-    if far > IRREGULAR * steps.size:
+    advancing = far = jitter = 0
+    for rows in spool.pieces(0, t.size, t):
+        steps = _within(t, begins, rows) / period
+        steps = steps[steps > SAME]
+        advancing += steps.size
+        far += int(((steps > GAP * (1 + 1e-6)) | (steps < 0.5)).sum())
+        jitter += int(((np.abs(steps - 1.0) > JITTER + 1e-6) & (steps <= GAP)).sum())
+    if far > IRREGULAR * advancing:
         raise RecordingError(
-            f"{name}: {far} of {steps.size} time steps are far from one sample of {period:g} s:"
+            f"{name}: {far} of {advancing} time steps are far from one sample of {period:g} s:"
             " log at a fixed rate, nothing is interpolated here"
         )
-    jitter = (np.abs(steps / period - 1.0) > JITTER + 1e-6) & (steps <= GAP * period)
-    return rate, int(jitter.sum())
+    return rate, jitter
 
 
-def _lay_out(t: FloatArray, run: IntArray, period: float) -> FloatArray:
-    laid = t.copy()
-    begins = np.flatnonzero(np.diff(run, prepend=run[:1] - 1))
-    stops = [*begins[1:], t.size]
-    for begin, stop in zip(begins[1:], stops[1:], strict=True):
+def _lay_out(t: FloatArray, begins: Index, period: float) -> FloatArray:
+    """Move runs that begin before the one before them has ended to its end."""
+    laid = t
+    for begin, stop in pairwise([*begins.tolist(), t.size]):
         if laid[begin] < laid[begin - 1] + 0.5 * period:
+            laid = spool.copied(t) if laid is t else laid
             laid[begin:stop] += laid[begin - 1] + period - t[begin]
     return laid
+
+
+def _numbered(size: int, begins: Index) -> IntArray:
+    """Return the number of each row's run, shape (N,)."""
+    run = spool.empty((size,), np.int32)
+    for rows in spool.pieces(0, size, run):
+        run[rows] = np.searchsorted(begins, np.arange(rows.start, rows.stop), side="right") if begins.size else 0
+    return run
 
 
 def _order_note(t: FloatArray) -> Defect:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Defect", "listed", "shortened", "spans"]
+__all__ = ["Defect", "listed", "shortened", "spans", "together"]
 
 MOST_LISTED = 100  # events of one kind that are told one by one
 
@@ -41,16 +41,22 @@ def spans(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
-def listed(kind: str, mask: npt.NDArray[np.bool_], t: npt.NDArray[np.float64], words: str) -> list[Defect]:
-    """Return one defect per stretch of the mask, shape (N,), at the times t [s], shape (N,).
+def together(rows: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
+    """Return rows, in order, cut into stretches that follow each other."""
+    return np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if rows.size else []
+
+
+def listed(kind: str, rows: npt.NDArray[np.intp], t: npt.NDArray[np.float64], words: str) -> list[Defect]:
+    """Return one defect per stretch of rows, which are in order, at the times t [s], shape (N,).
 
     ``{s}`` in the words becomes an s where a stretch has several rows.
     """
     notes = []
-    for start, stop in spans(mask):
-        when = f"at {t[start]:g} s" if stop - start == 1 else f"from {t[start]:g} to {t[stop - 1]:g} s"
-        message = f"{words.replace('{s}', 's' * (stop - start > 1))} ({when})"
-        notes.append(Defect(kind, float(t[start]), float(t[stop - 1]), stop - start, message))
+    for stretch in together(rows):
+        start, end, count = float(t[stretch[0]]), float(t[stretch[-1]]), stretch.size
+        when = f"at {start:g} s" if count == 1 else f"from {start:g} to {end:g} s"
+        message = f"{words.replace('{s}', 's' * (count > 1))} ({when})"
+        notes.append(Defect(kind, start, end, count, message))
     return shortened(notes)
 
 

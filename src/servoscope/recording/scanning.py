@@ -15,6 +15,7 @@ Index = npt.NDArray[np.intp]
 def heights(
     z: FloatArray,
     run: npt.NDArray[np.int32],
+    at: Index,
     width: int,
     smallest: float,
     at_edge: float,
@@ -23,12 +24,13 @@ def heights(
 ) -> int:
     """Write where `width` samples of one run stand above or below both neighbours, and how far; return how many do.
 
-    They must do so by more than `smallest`; at the edge of a run, where there is one neighbour, by more than `at_edge`.
+    They are looked for at some places. They must do so by more than `smallest`; at the edge of a run, where there is
+    one neighbour, by more than `at_edge`.
     """
     found = 0
-    for i in range(len(z) - width + 1):
+    for i in at:
         last = i + width - 1
-        if run[i] != run[last]:
+        if last >= len(z) or run[i] != run[last]:
             continue
         low, high = z[i], z[i]
         for k in range(i + 1, last + 1):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -82,9 +83,11 @@ def innovations(
     begin, end = min(since, N), min(since + over, N)
     if last == 0:
         begin = N
-    hold(A, b, late, c, K, S, 0, 0, 0, begin, age, u, y, restart, x, following, e, 0)
-    drift(A, b, late, c, K, S, 0, since, over, begin, end, age, u, y, restart, x, following, e, 0)
-    hold(A, b, late, c, K, S, 0, last, max(begin, end), N, age, u, y, restart, x, following, e, 0)
+    for changed in range(2):  # a loop, for each call is compiled into its place
+        if changed:
+            drift(A, b, late, c, K, S, 0, since, over, begin, end, age, u, y, restart, x, following, e, 0)
+        first, stop = (max(begin, end), N) if changed else (0, begin)
+        hold(A, b, late, c, K, S, 0, changed * last, first, stop, age, u, y, restart, x, following, e, 0)
     volume = 0.0 * A[0, 0, 0, 0]
     for k in range(begin, N):
         p = last if k >= end else (k - since) * last // over
@@ -104,7 +107,7 @@ def ages(restart: BoolArray, L: int) -> IntArray:
     return age
 
 
-@kernel
+@functools.partial(kernel, heap=False)
 def hold(
     A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, p: int, begin: int, end: int,
     age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,
@@ -132,7 +135,7 @@ def hold(
         e[v, k - first] = error / np.sqrt(S[v, p, j])
 
 
-@kernel
+@functools.partial(kernel, heap=False)
 def drift(
     A: Array, b: Array, late: Array, c: Array, K: Array, S: Array, v: int, since: int, over: int, begin: int, end: int,
     age: IntArray, u: Array, y: Array, restart: BoolArray, x: Array, following: Array, e: Array, first: int,

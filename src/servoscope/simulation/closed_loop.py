@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -101,7 +101,7 @@ def simulate(
     n_u, n_y = noises(r.size, noise_u_std, noise_y_std, seed)
     events = resolve(loop.plant, faults)
     plan = schedule(loop.plant, events, r.size, loop.sample_rate)
-    u, acting, y = _run(loop, plan.plants, words(plan), plan.which, r, n_u, n_y)
+    u, acting, y = Simulation(loop, plan.plants, words(plan)).advance(plan.which, r, n_u, n_y)
     recording = recorded(loop, r, u, y + n_y)
     ratios = {name: values[plan.which] for name, values in plan.ratios.items()}
     theta = np.array([plant.theta() for plant in plan.plants])[plan.which]
@@ -137,8 +137,7 @@ def response(
     if edges.shape != (len(plants),) or edges.size == 0 or edges[0] != 0 or np.any(np.diff(edges) <= 0):
         raise SimulationError("switch needs one sample per plant, increasing, the first of them 0")
     which = np.searchsorted(edges, np.arange(r.size), side="right") - 1
-    numbered = [f"plant {i + 1} of {len(plants)}" for i in range(len(plants))]
-    u, _, y = _run(loop, plants, numbered, which, r, np.zeros(r.size), np.zeros(r.size))
+    u, _, y = Simulation(loop, plants).advance(which, r)
     return u, y
 
 
@@ -178,33 +177,64 @@ def recorded(loop: Loop, r: FloatArray, u: FloatArray, y: FloatArray) -> Recordi
     )
 
 
-def _run(
-    loop: Loop,
-    plants: Sequence[Plant],
-    called: Sequence[str],
-    which: npt.NDArray[np.int64],
-    r: FloatArray,
-    n_u: FloatArray,
-    n_y: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return u as logged, what acts on the plant, and y without noise; `called` says which plant is unstable."""
-    settings = settings_of(loop)
-    from servoscope.simulation import axis, kernels
+class Simulation:
+    """A loop from rest at zero, simulated piece by piece: its state is carried on, and where it is cut changes nothing.
 
-    discrete = [discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants]
-    for each, what in zip(discrete, called, strict=True):
-        check_stable(loop, each, what)
-    if not loop.plant.linear:
-        from servoscope.simulation.rig import run_nonlinear
+    Parameters
+    ----------
+    loop
+        Loop with a controller.
+    plants
+        Plants that it may have.
+    called
+        What errors call them.
 
-        u, limited, acting, y = run_nonlinear(loop, plants, which, settings, r, n_u, n_y)
-    elif loop.plant.extras:
-        motion = axis.motion(plants, loop)
-        u, limited, acting, y = kernels.run_axis(motion, which, settings, r, n_u, n_y)
-    else:
-        A, b_next, b_now, b_late, c = (np.stack([each[i] for each in discrete]) for i in range(5))
-        u, limited, acting, y = kernels.run_linear(A, b_next, b_now, b_late, c, which, settings, r, n_u, n_y)
-    return (limited if loop.input_logged == "after_limiter" else u), acting, y
+    Raises
+    ------
+    SimulationError
+        If the loop has no controller or is unstable with one of the plants.
+    """
+
+    def __init__(self, loop: Loop, plants: Sequence[Plant], called: Sequence[str] | None = None) -> None:
+        settings = settings_of(loop)
+        from servoscope.simulation import axis, kernels
+
+        called = called or [f"plant {i + 1} of {len(plants)}" for i in range(len(plants))]
+        discrete = [discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants]
+        for each, what in zip(discrete, called, strict=True):
+            check_stable(loop, each, what)
+        self._unlimited = loop.input_logged != "after_limiter"
+        self._run: Callable[..., object]
+        if not loop.plant.linear:
+            from servoscope.simulation.rig import nonlinear
+
+            self._run, states = nonlinear(loop, plants, settings), 5
+        elif loop.plant.extras:
+            motion, states = axis.motion(plants, loop), 2
+            self._run = lambda which, *signals: kernels.run_axis(motion, which, settings, *signals)
+        else:
+            A, b_next, b_now, b_late, c = (np.stack([each[i] for each in discrete]) for i in range(5))
+            states, room = c.shape[1], np.zeros(c.shape[1])
+            self._run = lambda which, *signals: kernels.run_linear(
+                A, b_next, b_now, b_late, c, room, which, settings, *signals
+            )
+        self._state, self._acted = np.zeros(kernels.HEAD + states), np.zeros(settings.m + 2)
+
+    def advance(
+        self, which: npt.NDArray[np.int64], r: FloatArray, n_u: FloatArray | None = None, n_y: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return u as logged, what acts on the plant, and y without noise, each (N,).
+
+        `which` (N,) numbers the plant from each sample to the next; without noises there are none.
+        """
+        nothing = np.zeros(r.size)
+        noises = [nothing if noise is None else noise for noise in (n_u, n_y)]
+        u, limited, y = np.empty((3, r.size))
+        acting = np.concatenate([self._acted, nothing])
+        self._run(which, r, *noises, self._state, u, limited, acting, y)
+        past = self._acted.size
+        self._acted = acting[r.size :]
+        return (u if self._unlimited else limited), acting[past:], y
 
 
 def settings_of(loop: Loop) -> Settings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -171,6 +171,7 @@ def simulate_rig(
     SimulationError
         If the plant is no EHA, u is not held, or as for `simulate`; stability is judged without friction, at p_L = 0.
     """
+    from servoscope.simulation.kernels import HEAD
     from servoscope.simulation.rig_kernels import run_rig
 
     rig = Rig() if rig is None else rig
@@ -195,25 +196,22 @@ def simulate_rig(
     settings = settings._replace(low=max(settings.low, -limit), high=min(settings.high, limit))
     supply, leakage, friction, beta = parameters.values()
     rows = np.column_stack([_flow_gain(plant, supply), 1.0 / supply, leakage, friction, 2.0 * beta / plant.V_o])
-    u, limited, acting, y, measured, p_L, spool = run_rig(_physics(plant, rig, loop, rows), settings, rows, r, n_u, n_y)
+    physics, past = _physics(plant, rig, loop, rows), settings.m + 2
+    u, limited, y = np.empty((3, r.size))
+    acting = np.zeros(past + r.size)
+    state = np.zeros(HEAD + 5)
+    measured, p_L, spool = run_rig(physics, settings, rows, r, n_u, n_y, state, u, limited, acting, y)
+    acting = acting[past:]
     recording = recorded(loop, r, limited if loop.input_logged == "after_limiter" else u, measured)
     ratios = {name: values[plan.which] for name, values in plan.ratios.items()}
     theta = np.array([each.theta() for each in plan.plants])[plan.which]
     return recording, RigTruth(t, y, acting, ratios, theta, events, plant, p_L, spool, temperature, parameters)
 
 
-def run_nonlinear(
-    loop: Loop,
-    plants: Sequence[Plant],
-    which: npt.NDArray[np.int64],
-    settings: Settings,
-    r: FloatArray,
-    n_u: FloatArray,
-    n_y: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Run the closed loop of actuators with the valve law and the Coulomb friction of their loop file.
+def nonlinear(loop: Loop, plants: Sequence[Plant], settings: Settings) -> Callable[..., object]:
+    """Return what runs the closed loop of actuators with the valve law and the Coulomb friction of their loop file.
 
-    Arguments and results are those of `servoscope.simulation.kernels.run_linear`, with plants in place of matrices.
+    It takes which, r, n_u, n_y, the state, and what `servoscope.simulation.kernels.run_linear` writes.
 
     Raises
     ------
@@ -224,11 +222,12 @@ def run_nonlinear(
 
     _check_hold(loop)
     actuators = [plant for plant in plants if isinstance(plant, EHA)]
-    rows = np.array([[_flow_gain(p, p.p_s), 1.0 / p.p_s, p.C_ie, p.b_p, 1.0 / p.capacity] for p in actuators])[which]
+    rows = np.array([[_flow_gain(p, p.p_s), 1.0 / p.p_s, p.C_ie, p.b_p, 1.0 / p.capacity] for p in actuators])
     first = actuators[0]
     root = first.valve_law == "square-root"
     rig = replace(Rig.ideal(), load_pressure_flow=root, coulomb=first.coulomb, static=first.coulomb)
-    return run_rig(_physics(first, rig, loop, rows), settings, rows, r, n_u, n_y)[:4]
+    physics = _physics(first, rig, loop, rows)
+    return lambda which, *signals: run_rig(physics, settings, rows[which], *signals)
 
 
 def _check_hold(loop: Loop) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from servoscope.compiled import kernel
 from servoscope.plants import FloatArray
-from servoscope.simulation.kernels import Settings, control
+from servoscope.simulation.kernels import HEAD, TOTAL, Settings, control
 
 
 class Physics(NamedTuple):
@@ -82,31 +82,31 @@ def advance(p: Physics, row: FloatArray, x: FloatArray, drive: float, duration: 
 
 @kernel
 def run_rig(
-    p: Physics, settings: Settings, rows: FloatArray, r: FloatArray, n_u: FloatArray, n_y: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Run the closed loop of the rig from rest at zero.
+    p: Physics, settings: Settings, rows: FloatArray, r: FloatArray, n_u: FloatArray, n_y: FloatArray, s: FloatArray,
+    u: FloatArray, limited: FloatArray, acting: FloatArray, y: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Run the closed loop of the rig, and carry s (HEAD + 5,) on: see `servoscope.simulation.kernels`.
 
     ``rows`` (N, 5) holds flow gain, 1/p_s, leakage, viscous friction and 1/capacity from each sample to the next; r,
-    n_u, n_y have shape (N,). Returns u, u after the limits, what acts on the valve before the delay, y, y as measured,
-    load pressure and spool, each (N,).
+    n_u, n_y have shape (N,). Writes u, u after the limits, what acts on the valve before the delay (m + 2 + N,), and y;
+    returns y as measured, load pressure and spool, each (N,).
     """
     N, m = r.size, settings.m
-    u, limited, acting, y = np.empty(N), np.empty(N), np.empty(N), np.empty(N)
     measured, pressure, spool = np.empty(N), np.empty(N), np.empty(N)
-    x, room = np.zeros(5), np.empty((5, 5))
-    total = 0.0
+    x, room, past = s[HEAD : HEAD + 5], np.empty((5, 5)), m + 2
+    total = s[TOTAL]
     for k in range(N):
         y[k], pressure[k], spool[k] = x[0], x[2], x[3]
         measured[k] = y[k] + n_y[k]
         if p.resolution > 0.0:
             measured[k] = p.resolution * np.rint(measured[k] / p.resolution)
         error = measured[k] - y[k]
-        u[k], limited[k], acting[k], total = control(settings, r[k], n_u[k], error, y[k], 0.0, total)
-        now = acting[k - m] if k - m >= 0 else 0.0
-        late = acting[k - 1 - m] if k - 1 - m >= 0 else 0.0
+        u[k], limited[k], acting[past + k], total = control(settings, r[k], n_u[k], error, y[k], 0.0, total)
+        now, late = acting[past + k - m], acting[past + k - 1 - m]
         if settings.rest > 0.0:
             advance(p, rows[k], x, late, settings.rest * p.T, room)
         advance(p, rows[k], x, now, (1.0 - settings.rest) * p.T, room)
         if p.valve == 0.0:
             x[3], x[4] = now, 0.0
-    return u, limited, acting, y, measured, pressure, spool
+    s[TOTAL] = total
+    return measured, pressure, spool
