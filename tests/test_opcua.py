@@ -69,6 +69,7 @@ def test_a_constant_signal_goes_on_while_the_server_lives_and_a_gap_is_a_gap() -
     assert np.allclose(first.t, BEGAN + 1.0 + 0.1 * np.arange(10)) and (first.values == [[1.0], [2.0]]).all()
     aligner.add(1, BEGAN + 1.5, 9.0)
     assert not aligner.take(BEGAN + 1.9).t.size and aligner.late == 1
+    aligner.add(1, BEGAN + 1.95, 7.0)  # heard last, and part of no sample yet: nobody knows how long it held
     aligner.cut(BEGAN + 5.0)
     aligner.add(0, BEGAN + 4.0, 3.0)
     aligner.add(1, BEGAN + 4.2, 4.0)  # before the subscription: they tell what holds

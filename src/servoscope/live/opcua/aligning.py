@@ -66,7 +66,10 @@ class Aligner:
         Unless all changes of the time between are known, what was held before is worth nothing any more.
         """
         self._cut, self._begin = True, begin
-        self._known &= complete
+        if not complete:
+            self._known[:] = False
+            self._pending.clear()
+            self._newest = -math.inf
 
     def add(self, signal: int, t: float, value: float) -> None:
         """Take a value; NaN where its status says that it is bad."""
