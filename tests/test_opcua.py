@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import math
-import select
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -20,6 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reliability.servers import Cable
 
 from brokers import BEGAN, until
 from opcua_plant import NODES
@@ -124,11 +123,9 @@ class Plant:
     """The server of `opcua_plant`, behind a cable that can be pulled."""
 
     def __init__(self, mode: str) -> None:
-        self._behind, self.port, self.began, self._mode = free_port(), free_port(), time.time() - 60.0, mode
-        self.pulled = threading.Event()
-        self._over = threading.Event()
-        self._listener = socket.create_server(("127.0.0.1", self.port))
-        threading.Thread(target=self._accept, daemon=True).start()
+        self._behind, self.began, self._mode = free_port(), time.time() - 60.0, mode
+        self._cable = Cable(self._behind)
+        self.port, self.pulled = self._cable.port, self._cable.pulled
         self.start()
 
     def start(self) -> None:
@@ -143,34 +140,8 @@ class Plant:
         self._process.wait()
 
     def close(self) -> None:
-        self._over.set()
         self.kill()
-        self._listener.close()
-
-    def _accept(self) -> None:
-        while not self._over.is_set():
-            try:
-                one, _ = self._listener.accept()
-                other = socket.create_connection(("127.0.0.1", self._behind))
-            except OSError:
-                continue
-            threading.Thread(target=self._join, args=(one, other), daemon=True).start()
-
-    def _join(self, one: socket.socket, other: socket.socket) -> None:
-        """Carry bytes both ways; while the cable is pulled nothing moves, and nobody is told."""
-        with one, other:
-            while not self._over.is_set():
-                if self.pulled.is_set():
-                    time.sleep(0.05)
-                    continue
-                for ready in select.select([one, other], [], [], 0.05)[0]:
-                    try:
-                        data = ready.recv(65536)
-                        (other if ready is one else one).sendall(data)
-                    except OSError:
-                        return
-                    if not data:
-                        return
+        self._cable.close()
 
 
 @pytest.fixture
