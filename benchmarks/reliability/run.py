@@ -44,11 +44,13 @@ COMPARED = 10  # assets that are run once more without disturbance
 CALM = 0.25  # share of the run at the end that is left in peace
 EVERY_S = 25.0  # mean time between disturbances
 FULL_DAY = 24.0 * 200
-DISK_MB = 512
+DISK_MB = 256
+BUSY = 1.0  # load from which times mean little
 
 
 def trial(name: str, fleet_of: tuple[int, float, float], every_s: float, seed: int = 1) -> dict[str, Any]:
     """Run one trial, of so many assets, hours and times the true speed; return what was measured, ready for JSON."""
+    load = round(os.getloadavg()[0], 1)
     with workplace() as (folder, disk):
         fleet = Fleet(folder, *fleet_of)
         fleet.make()
@@ -59,7 +61,13 @@ def trial(name: str, fleet_of: tuple[int, float, float], every_s: float, seed: i
             measured = Trial(config, port, disturbances, every_s, CALM, blocks, seed).run()
             compared = fleet.names[:: max(1, fleet.assets // COMPARED)]
             found = check(fleet, config, compared)
-    return {"name": name, "machine": machine(), "settings": settings_of(fleet, seed), **told(measured), **asdict(found)}
+    return {
+        "name": name,
+        "machine": machine(),
+        "settings": {**settings_of(fleet, seed), "load": load},
+        **told(measured),
+        **asdict(found),
+    }
 
 
 def settings_of(fleet: Fleet, seed: int) -> dict[str, Any]:
@@ -178,6 +186,10 @@ def markdown(found: list[dict[str, Any]]) -> str:
     reduced = [one for one in found if one["settings"]["hours"] * one["settings"]["assets"] < FULL_DAY]
     words = " **Reduced: not the whole day of 200 assets yet.**" if reduced else ""
     machines = "; ".join(sorted({one["machine"] for one in found}))
+    loads = ", ".join(f"{one['settings']['load']:g}" for one in found)
+    words += f" Load of the machine by other work, before each: {loads}."
+    if any(one["settings"]["load"] > BUSY for one in found):
+        words += " **So recovery and latency say more of that work than of the service.**"
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + f"\n\n{machines}.{words}"
 
 

@@ -22,7 +22,9 @@ import numpy as np
 
 BUCKET = re.compile(r'servoscope_latency_seconds_bucket\{le="([^"]+)"\} (\S+)')
 COUNTED = re.compile(r"servoscope_blocks_total\{[^}]*\} (\S+)")
+UP = re.compile(r"servoscope_store_up (\S+)")
 LONGEST_RECOVERY_S = 120.0
+LONGEST_NOTICE_S = 60.0
 CALM_S = 5.0  # after a disturbance is over
 
 
@@ -37,7 +39,7 @@ class Disturbance:
     begin, end
         What to do.
     lasts_s
-        How long it lasts.
+        How long it lasts, from when the service noticed it.
     kills
         Whether the process is gone by it and has to be started again.
     """
@@ -97,6 +99,7 @@ class Trial:
         self._blocks, self._calm = blocks, (1.0 - calm_share) * blocks
         self._log = config.with_suffix(".log").open("ab")
         self._seen: dict[float, float] = {}
+        self._up = True
         self.measured = Measured()
 
     def run(self) -> Measured:
@@ -147,9 +150,13 @@ class Trial:
         if what.kills:
             self._process.send_signal(signal.SIGKILL)
             self._process.wait()
-        over = time.monotonic() + what.lasts_s
-        while time.monotonic() < over:
+        noticed = time.monotonic() + LONGEST_NOTICE_S
+        while not what.kills and self._up and time.monotonic() < noticed:
             time.sleep(0.1)
+            self._look(calm=False)
+        if not what.kills and self._up:
+            raise RuntimeError(f"{what.name}: not noticed within {LONGEST_NOTICE_S:g} s")
+        time.sleep(what.lasts_s)
         self._look(calm=False)
         before = sum(self._seen.values())
         what.end()
@@ -174,6 +181,7 @@ class Trial:
             return 0.0
         self.measured.memory.append((time.monotonic() - self._started, int(pages) * resource.getpagesize() / 2**20))
         ends = {float(end): float(count) for end, count in BUCKET.findall(text)}
+        self._up = UP.findall(text) == ["1.0"]
         within = dict(zip(ends, np.diff([0.0, *ends.values()]).tolist(), strict=True))
         to = self.measured.latencies if calm else self.measured.disturbed
         for end, count in within.items():
