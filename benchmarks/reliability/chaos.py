@@ -18,7 +18,6 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Callable
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from tables import machine  # noqa: E402
 
 from reliability.checks import NUMBERED, numbers_of, opened  # noqa: E402
-from reliability.fleet import BLOCK_S, LOOP, SPEED, Fleet  # noqa: E402
+from reliability.fleet import BLOCK_S, LOOP, Fleet  # noqa: E402
 from reliability.run import PAGE, RESULTS, free_port  # noqa: E402
 from reliability.servers import Cable, Mosquitto, mosquitto  # noqa: E402
 from reliability.trial import COUNTED  # noqa: E402
@@ -51,14 +50,14 @@ PULLED_S = 3.0
 class Plain:
     """A sender that keeps nothing: what its broker forgets is gone."""
 
-    def __init__(self, fleet: Fleet, port: int, speed: float) -> None:
+    def __init__(self, fleet: Fleet, port: int) -> None:
         loop = Loop.load(LOOP)
         recording = read(fleet.folder / "healthy-0.csv", loop)
         self._tape = Tape((recording,), round(BLOCK_S * loop.sample_rate), True)
         self._client = reach(BrokerSettings(host="127.0.0.1", port=port), Path(), "plain")
         self._client.connect_async("127.0.0.1", port, keepalive=5)
         self._client.loop_start()
-        self._over, self._every = threading.Event(), BLOCK_S / speed
+        self._over, self._every = threading.Event(), BLOCK_S / fleet.speed
         self.sent = 0
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -86,26 +85,23 @@ class Chaos:
     ----------
     fleet
         What is published.
-    speed
-        How many times as fast as it was measured.
     every_s
         Mean time between two disturbances.
     seed
         Of the chance.
     """
 
-    def __init__(self, fleet: Fleet, speed: float, every_s: float, seed: int = 1) -> None:
+    def __init__(self, fleet: Fleet, every_s: float, seed: int = 1) -> None:
         program = mosquitto()
         assert program is not None, "mosquitto is missing: scripts/install-test-servers installs it"
         self._fleet, self._every, self._chance = fleet, every_s, random.Random(seed)
         self._broker = Mosquitto(fleet.folder, program)
         self._cables = {"publisher": Cable(self._broker.port), "service": Cable(self._broker.port)}
         self._port, self._log = free_port(), (fleet.folder / "chaos.log").open("ab")
-        self.config, self._publish = self._files(speed)
-        self._speed = speed
+        self.config, self._publish = self._files()
         self.happened: dict[str, list[float]] = {}
 
-    def _files(self, speed: float) -> tuple[Path, Path]:
+    def _files(self) -> tuple[Path, Path]:
         names = [*self._fleet.names, "plain"]
         service = [
             f'name = "fleet"\n[service]\nlisten = "127.0.0.1:{self._port}"\nlog = "warning"',
@@ -114,7 +110,8 @@ class Chaos:
             *(f'[assets.{name}]\nbaseline = "baseline.json"\nsource = "line"' for name in names),
         ]
         publish = [
-            f"ahead = {AHEAD}\nagain_s = 2.0\n[replay]\nspeed = {speed}\nblock = {BLOCK_S}\nstart = {START}",
+            f"ahead = {AHEAD}\nagain_s = 2.0\n[replay]\nspeed = {self._fleet.speed}",
+            f"block = {BLOCK_S}\nstart = {START}",
             f'[broker]\nhost = "127.0.0.1"\nport = {self._cables["publisher"].port}',
             *(
                 f'[assets.{name}]\nloop = "{LOOP}"\nfiles = {json.dumps(self._fleet.files(name))}'
@@ -130,8 +127,8 @@ class Chaos:
         """Run until all that was published is safe; return how many blocks the plain sender has sent."""
         self._broker.start()
         service, publisher = self._start("run", self.config), self._start("publish", self._publish)
-        self._until_more(0.0)  # the service has subscribed by then
-        plain = Plain(self._fleet, self._cables["publisher"].port, self._speed)
+        self._until_more(0.0, publisher)  # the service has subscribed by then
+        plain = Plain(self._fleet, self._cables["publisher"].port)
         due = time.monotonic() + self._wait()
         while publisher.poll() is None:
             time.sleep(0.2)
@@ -157,7 +154,7 @@ class Chaos:
                 else:
                     publisher = self._start("publish", self._publish)
             ended = time.monotonic()
-            self._until_more(before, lambda: publisher.poll() is not None)
+            self._until_more(before, publisher)
             self.happened.setdefault(what, []).append(round(time.monotonic() - ended, 2))
             due = time.monotonic() + self._wait()
         assert publisher.returncode == 0, f"the publisher has ended with {publisher.returncode}, see {self._log.name}"
@@ -186,9 +183,9 @@ class Chaos:
         except (OSError, HTTPException):
             return 0.0
 
-    def _until_more(self, before: float, over: Callable[[], bool] = lambda: False) -> None:
+    def _until_more(self, before: float, publisher: subprocess.Popen[bytes]) -> None:
         deadline = time.monotonic() + LONGEST_S
-        while self._counted() <= before and not over():
+        while self._counted() <= before and publisher.poll() is None:
             assert time.monotonic() < deadline, f"nothing is stored any more, see {self._log.name}"
             time.sleep(0.05)
 
@@ -196,9 +193,9 @@ class Chaos:
 def trial(hours: float, assets: int, speed: float, every_s: float, seed: int = 1) -> dict[str, Any]:
     """Run one trial and return what was found, ready for JSON."""
     with tempfile.TemporaryDirectory(prefix="servoscope-chaos-") as folder:
-        fleet = Fleet(Path(folder), assets, hours)
+        fleet = Fleet(Path(folder), assets, hours, speed)
         fleet.make()
-        chaos = Chaos(fleet, speed, every_s, seed)
+        chaos = Chaos(fleet, every_s, seed)
         begun = time.monotonic()
         sent = chaos.run()
         found = looked_at(fleet, chaos.config, sent)
@@ -244,15 +241,19 @@ def markdown(one: dict[str, Any]) -> str:
     """Return the table."""
     settings, plain = one["settings"], one["plain"]
     size = f"{settings['hours']:g} h, {settings['assets']} assets, {settings['speed']:g} times true speed"
+    happened = [
+        (f"{what}: times, longest recovery", f"{len(x)}, {max(x):.1f} s") for what, x in one["happened"].items()
+    ]
+    wrong, named = f"{one['lost']}, {one['doubled']}, {one['other']}", f"{plain['stored']}, {plain['named as lost']}"
     rows = [
         ("simulated", f"{size}, in {one['seconds']:.0f} s"),
-        *((f"{what}: times, longest recovery", f"{len(x)}, {max(x):.1f} s") for what, x in one["happened"].items()),
-        ("blocks published and kept; lost, doubled, other samples", f"{one['blocks']}; {one['lost']}, {one['doubled']}, {one['other']}"),
+        *happened,
+        ("blocks published and kept; lost, doubled, other samples", f"{one['blocks']}; {wrong}"),
         ("assets whose rows are not numbered through", f"{one['misnumbered']}"),
         ("sent once more and left out", f"{one['left out as repeated']}"),
-        ("by a sender that keeps nothing: sent; stored, named as lost", f"{plain['sent']}; {plain['stored']}, {plain['named as lost']}"),
-        ("not named; sent after the last one that was stored", f"{plain['unnamed']}; {plain['behind the last one stored']}"),
-    ]  # fmt: skip
+        ("by a sender that keeps nothing: sent; stored, named as lost", f"{plain['sent']}; {named}"),
+        ("not named; sent after the last one stored", f"{plain['unnamed']}; {plain['behind the last one stored']}"),
+    ]
     words = "" if settings["hours"] * settings["assets"] >= 1000.0 else " **Reduced: not ten hours of 100 assets yet.**"
     lines = ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
     return "\n".join(lines) + f"\n\n{one['machine']}.{words}"
@@ -271,7 +272,7 @@ def main() -> None:
     command = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     command.add_argument("--hours", type=float, default=10.0, help="simulated hours")
     command.add_argument("--assets", type=int, default=100, help="assets")
-    command.add_argument("--speed", type=float, default=SPEED, help="times true speed")
+    command.add_argument("--speed", type=float, default=60.0, help="times true speed")
     command.add_argument("--every", type=float, default=20.0, help="mean time between disturbances, in s")
     command.add_argument("--render", action="store_true", help="write the table into docs/reliability.md, and no more")
     given = command.parse_args()
