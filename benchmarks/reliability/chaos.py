@@ -34,6 +34,7 @@ from reliability.run import PAGE, RESULTS, free_port  # noqa: E402
 from reliability.servers import Cable, Mosquitto, mosquitto  # noqa: E402
 from reliability.trial import COUNTED  # noqa: E402
 from servoscope.broker import BrokerSettings, reach  # noqa: E402
+from servoscope.live.checkpoint import unpack  # noqa: E402
 from servoscope.live.mqtt import payload, topics  # noqa: E402
 from servoscope.live.replay import Tape  # noqa: E402
 from servoscope.loop import Loop  # noqa: E402
@@ -207,7 +208,8 @@ def trial(hours: float, assets: int, speed: float, every_s: float, seed: int = 1
 def looked_at(fleet: Fleet, config: Path, sent: int) -> dict[str, Any]:
     """Hold the store against what was sent."""
     store = opened(config)
-    status = {name: row["status"]["counted"] for name, row in store.statuses([*fleet.names, "plain"]).items()}
+    rows = store.checkpoints([*fleet.names, "plain"])
+    status = {name: row["status"]["counted"] for name, row in rows.items()}
     lost = doubled = other = misnumbered = repeated = blocks = 0
     for name, (expected, _, digest) in fleet.expected().items():
         counted = status[name]
@@ -216,8 +218,9 @@ def looked_at(fleet: Fleet, config: Path, sent: int) -> dict[str, Any]:
         doubled += max(0, counted["blocks"] - expected)
         other += counted["digest"] != digest
         repeated += counted["repeated"]
-        numbers = sorted(row["number"] for table in NUMBERED for row in store.rows(numbers_of(table, name)))
-        misnumbered += numbers != list(range(1, counted["rows"] + 1))
+        numbers = [row["number"] for table in NUMBERED for row in store.rows(numbers_of(table, name))]
+        numbers += [window.number for window in unpack(rows[name]["state"], name).windows]  # still to be diagnosed
+        misnumbered += sorted(numbers) != list(range(1, counted["rows"] + 1))
     plain = status["plain"]
     store.close()
     return {
