@@ -199,7 +199,7 @@ def test_through_the_whole_service_and_back(tmp_path: Path, broker: Mosquitto, s
     subscribed.write_text(
         common.format(name="subscribed") + f'[sources.line]\nkind = "mqtt"\n{address}\n'
         f'[outlets.plant]\nkind = "mqtt"\n{address}\n'
-        f'[actions.mqtt.scada]\ntopic = "plant/alarms"\n[actions.mqtt.scada.broker]\n{address}\n'
+        f'[actions.mqtt.scada]\nalarms = ["fault"]\ntopic = "plant/alarms"\n[actions.mqtt.scada.broker]\n{address}\n'
     )
     service = Running(Service(Config.load(subscribed), assemble(Config.load(subscribed))))
     Running(publisher(tmp_path, broker.port)).end()

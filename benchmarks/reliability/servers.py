@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import pwd
+import select
 import shutil
 import signal
 import socket
 import subprocess
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -142,3 +144,54 @@ class Mosquitto:
         """Stop it, or kill it."""
         self._process.send_signal(how)
         self._process.wait(30)
+
+
+class Cable:
+    """A connection to a server on this machine that can be pulled: nothing moves then, and nobody is told.
+
+    Parameters
+    ----------
+    to
+        Port of the server.
+    """
+
+    def __init__(self, to: int) -> None:
+        self._to = to
+        self.pulled = threading.Event()
+        self._over = threading.Event()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._listener.getsockname()[1])
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def close(self) -> None:
+        """Take it away."""
+        self._over.set()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        while not self._over.is_set():
+            try:
+                one, _ = self._listener.accept()
+            except OSError:
+                return
+            try:
+                other = socket.create_connection(("127.0.0.1", self._to))
+            except OSError:
+                one.close()
+                continue
+            threading.Thread(target=self._join, args=(one, other), daemon=True).start()
+
+    def _join(self, one: socket.socket, other: socket.socket) -> None:
+        with one, other:
+            while not self._over.is_set():
+                if self.pulled.is_set():
+                    time.sleep(0.05)
+                    continue
+                for ready in select.select([one, other], [], [], 0.05)[0]:
+                    try:
+                        data = ready.recv(65536)
+                        (other if ready is one else one).sendall(data)
+                    except OSError:
+                        return
+                    if not data:
+                        return

@@ -13,8 +13,11 @@ from servoscope.live.asset import Asset, Following
 from servoscope.live.block import Block, Resume
 from servoscope.live.checkpoint import Counted, unpack
 from servoscope.live.config import Config
-from servoscope.live.mqtt.outlet import MqttOutlet
+from servoscope.live.mqtt.outlet import MqttOutlet, MqttOutletSettings
 from servoscope.live.mqtt.source import MqttSettings, MqttSource
+from servoscope.live.opcua.outlet import OpcuaOutlet
+from servoscope.live.opcua.settings import OpcuaSettings
+from servoscope.live.opcua.source import OpcuaSource
 from servoscope.live.outlet import Outlet
 from servoscope.live.replay import Replay
 from servoscope.live.source import Source
@@ -93,7 +96,7 @@ def rehearse(config: Config) -> None:
 def _resumption(asset: Asset) -> Resume:
     assert asset.progress is not None, "the caller has looked"
     counted = asset.progress.counted
-    return Resume(counted.sequence, counted.began, counted.stream)
+    return Resume(counted.sequence, counted.began, counted.stream, counted.t)
 
 
 def _assets(config: Config) -> dict[str, Asset]:
@@ -125,6 +128,14 @@ def _sources(config: Config, assets: dict[str, Asset]) -> dict[str, Source]:
         if isinstance(settings, MqttSettings):
             sources[name] = MqttSource(settings, frozenset(own), config.folder, f"{config.name}.{name}")
             continue
+        if isinstance(settings, OpcuaSettings):
+            nodes = {
+                each: (one.nodes, assets[each].baseline.loop.sample_rate)
+                for each, one in own.items()
+                if one.nodes is not None
+            }
+            sources[name] = OpcuaSource(settings, nodes, config.folder)
+            continue
         tapes = {
             each: (tuple(config.folder / file for file in one.files or ()), assets[each].baseline.loop)
             for each, one in own.items()
@@ -135,5 +146,8 @@ def _sources(config: Config, assets: dict[str, Asset]) -> dict[str, Source]:
 
 def _outlets(config: Config) -> dict[str, Outlet]:
     return {
-        name: MqttOutlet(settings, config.folder, f"{config.name}.{name}") for name, settings in config.outlets.items()
+        name: MqttOutlet(settings, config.folder, f"{config.name}.{name}")
+        if isinstance(settings, MqttOutletSettings)
+        else OpcuaOutlet(settings, config.folder)
+        for name, settings in config.outlets.items()
     }

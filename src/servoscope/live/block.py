@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,11 +16,15 @@ __all__ = ["Block", "Resume"]
 
 
 class Resume(NamedTuple):
-    """Where an asset goes on: last sequence that was counted, begin of its first block [UTC s], name of its stream."""
+    """Where an asset goes on: last sequence that was counted, when its first block began, its stream, its last sample.
+
+    Times are [UTC s].
+    """
 
     sequence: int
     began: float
     stream: int = 0
+    t: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
