@@ -262,7 +262,10 @@ def test_waits_double_up_to_a_bound_differ_by_event_and_end() -> None:
         ({"command": {"t": {"argv": ["say", "{aset}"]}}}, "'{aset}' is no placeholder, choose from"),
         ({"command": {"t": {"argv": ["{asset}"]}}}, "the program must be named"),
         ({"command": {"t": {"argv": "say it"}}}, "'say it' is not a list"),
-        ({"command": {"t": {"argv": ["x"]}}, "webhook": {"t": {"url": "http://x"}}}, "'t' names a webhook and a com"),
+        (
+            {"command": {"t": {"argv": ["x"]}}, "webhook": {"t": {"url": "http://x"}}},
+            "'t' names two of webhook, command and mqtt",
+        ),
     ],
 )
 def test_wrong_settings_are_told_in_one_line(section: dict[str, Any], complaint: str) -> None:
