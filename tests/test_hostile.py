@@ -1,9 +1,13 @@
-"""An asset fed with what decoders let through, as hostile as it can be: no exception, and it finds back."""
+"""Readers and decoders fed with broken input; an asset fed with what they let through: it finds back."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hostile.feeding import fed, markdown
+from hostile.targets import targets
 
 import halls
 from servoscope.alarms import AlarmSettings
@@ -69,3 +73,12 @@ def test_it_goes_on(case: str, following: tuple[Monitor, Following]) -> None:
     normal(BEGAN + 1.0, 60)
     assert asset.progress is not None
     assert asset.progress.counted.blocks == 101 and asset.progress.judged.verdict != "fault"
+
+
+@pytest.mark.filterwarnings("ignore")  # of libraries, about broken files
+def test_what_is_broken_is_read_or_refused_and_nothing_else(tmp_path: Path) -> None:
+    """The benchmark itself, short; its target list is that of all readers and decoders."""
+    found = [fed(target, 66, seed=7) for target in targets(tmp_path)]
+    assert {one["name"]: one["cases"] for one in found if one["other"] or one["badly told"]} == {}
+    assert all(one["refused"] for one in found) and len(found) == 16
+    assert "| CSV file | 66 |" in markdown({"targets": found, "machine": ""})

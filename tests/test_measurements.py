@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,21 +26,22 @@ SIGNALS = {name: np.random.default_rng(k).normal(size=N) for k, name in enumerat
 COLUMNS = Columns(time="time", reference="SetPoint", input="0.5 * ValveCurrent", output="Pos")
 
 
-def write_mdf(path: Path) -> None:
+def write_mdf(path: Path, times: int = 1) -> None:
     from asammdf import MDF, Signal
 
+    t = np.arange(N * times) / RATE
     with MDF(version="4.10") as file:
-        file.append([Signal(x, T, name=name) for name, x in SIGNALS.items()])
+        file.append([Signal(np.tile(x, times), t, name=name) for name, x in SIGNALS.items()])
         file.append([Signal(np.arange(9.0), np.arange(9.0), name="Temperature")])
         file.save(path, overwrite=True)
 
 
-def write_tdms(path: Path) -> None:
+def write_tdms(path: Path, times: int = 1) -> None:
     from nptdms import ChannelObject, TdmsWriter
 
     clock = {"wf_increment": 1.0 / RATE, "wf_start_offset": 0.0}
     with TdmsWriter(path) as file:
-        for rows in (slice(0, 3000), slice(3000, N)):
+        for rows in times * (slice(0, 3000), slice(3000, N)):
             file.write_segment([ChannelObject("rig", name, x[rows], clock) for name, x in SIGNALS.items()])
         file.write_segment([ChannelObject("slow", "Temperature", np.arange(9.0), {"wf_increment": 1.0})])
 
@@ -65,6 +67,29 @@ def test_a_recording_is_read_piece_by_piece(
         assert np.array_equal(getattr(found, letter), factor * SIGNALS[name])
     with pytest.raises(RecordingError, match="'Temperature' was not sampled together with"):
         readers.read(path, columns=COLUMNS.model_copy(update={"output": "Temperature"}))
+
+
+@KINDS
+def test_memory_does_not_grow_with_the_file(
+    tmp_path: Path, suffix: str, write: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"log{suffix}"
+    write(path, 200)  # a million rows, 24 MB and more
+    monkeypatch.setattr(measurements, "ROWS", 10_000)
+    opened = readers.opening.open_file(path)
+    tracemalloc.start()
+    rows = sum(table.rows for table in opened.pieces([*SIGNALS, "time"]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert rows == 200 * N and peak < 10e6
+
+
+def test_a_file_that_was_never_finished_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "log.mf4"
+    write_mdf(path)
+    path.write_bytes(b"UnFinMF " + path.read_bytes()[8:])
+    with pytest.raises(RecordingError, match="MDF file that its recorder never finished: finalize it"):
+        readers.read(path, columns=COLUMNS)
 
 
 @KINDS

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,8 @@ def mdf(path: Path) -> Opened:
     except ModuleNotFoundError:
         raise RecordingError(f"{path}: MDF files need asammdf, pip install 'servoscope[mdf]'") from None
 
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # an error tells of broken files
+
     def look(file: Any) -> list[_Raster]:
         found = []
         for g, group in enumerate(file.groups):
@@ -53,15 +56,30 @@ def mdf(path: Path) -> Opened:
         signals = file.select(places, record_offset=first, record_count=rows, copy_master=False)
         return {name: signal.samples for name, signal in zip(names, signals, strict=True)}
 
-    return _opened(path, "MDF", lambda: MDF(path), look, read)
+    @contextmanager
+    def entered() -> Iterator[Any]:
+        # given a path, the library takes all of the file for memory, and reads whole channels for each piece
+        with path.open("rb") as raw:
+            try:
+                file = MDF(raw)
+            except Exception as error:
+                _let_go(error)
+                raise
+            with closing(file):
+                yield file
+
+    return _opened(path, "MDF", entered, look, read)
 
 
 def tdms(path: Path) -> Opened:
     """Look at a TDMS file."""
     try:
         from nptdms import TdmsFile
+        from nptdms.log import log_manager
     except ModuleNotFoundError:
         raise RecordingError(f"{path}: TDMS files need npTDMS, pip install 'servoscope[tdms]'") from None
+
+    log_manager.set_level(logging.CRITICAL)  # broken files are told by an error, not byte by byte on the terminal
 
     def look(file: Any) -> list[_Raster]:
         channels = [channel for group in file.groups() for channel in group.channels()]
@@ -87,18 +105,29 @@ def tdms(path: Path) -> Opened:
                 found[name] = other + one * np.arange(first, first + rows)
         return found
 
-    return _opened(path, "TDMS", lambda: TdmsFile.open(path), look, read)
+    return _opened(path, "TDMS", lambda: closing(TdmsFile.open(path)), look, read)
+
+
+def _let_go(error: Exception) -> None:
+    """Mark what asammdf has half made as closed; else it complains on the terminal when it is collected."""
+    trace = error.__traceback__
+    while trace is not None:
+        made: Any = trace.tb_frame.f_locals.get("self")
+        if hasattr(made, "_closed"):
+            made._closed = True
+        trace = trace.tb_next
 
 
 def _opened(
-    path: Path, kind: str, enter: Callable[[], Any], look: Callable[[Any], list[_Raster]], read: _Read
+    path: Path,
+    kind: str,
+    entered: Callable[[], AbstractContextManager[Any]],
+    look: Callable[[Any], list[_Raster]],
+    read: _Read,
 ) -> Opened:
     def damaged(error: Exception) -> RecordingError:
         said = " ".join(str(error).split())[:80] or type(error).__name__
         return RecordingError(f"{path}: is a damaged {kind} file ({said}), export it again")
-
-    def entered() -> AbstractContextManager[Any]:
-        return closing(enter())
 
     def pieces(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
         import pyarrow as pa

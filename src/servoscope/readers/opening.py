@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.errors import RecordingError
-from servoscope.readers import csvtext, measurements
+from servoscope.readers import csvtext, mat5, measurements
 from servoscope.readers.opened import Opened
 from servoscope.readers.tables import Table
 
@@ -44,6 +44,7 @@ MAGIC = {
     b"\xd0\xcf\x11\xe0": "Excel workbook",
     b"\x1f\x8b": "gzip archive",
     b"MDF ": "MDF",
+    b"UnFinMF ": "MDF file that its recorder never finished",
     b"TDSm": "TDMS",
 }
 
@@ -100,6 +101,7 @@ def _check_kind(path: Path, head: bytes) -> str:
         "MAT": "rename it to .mat",
         "MDF": "rename it to .mf4",
         "TDMS": "rename it to .tdms",
+        "MDF file that its recorder never finished": "finalize it with the recorder's own tool",
     }.get(found or "", f"export it as {wanted}")
     raise RecordingError(f"{path}: is not {wanted} but a {found or 'text file'}: {advice}")
 
@@ -158,6 +160,7 @@ def _load_mat(path: Path) -> Mapping[str, Any]:
     import scipy.io
 
     if not h5py.is_hdf5(path):
+        mat5.check(path)
         loaded: dict[str, Any] = scipy.io.loadmat(path, squeeze_me=False)
         return {name: value for name, value in loaded.items() if not name.startswith("__")}
 
