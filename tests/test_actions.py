@@ -151,7 +151,7 @@ def test_what_fails_otherwise_is_said_and_put_off_too(tmp_path: Path) -> None:
                 assert not result.delivered
         assert len(receiver.requests) == 1  # no redirect is followed, nothing goes out unsigned
     result = deliver(row_for(webhook(nobody)), ActionSettings(), NOW)
-    assert "no webhook or command is called 'desk' any more" in result.detail
+    assert "no webhook, command or mqtt is called 'desk' any more" in result.detail
 
 
 def test_a_receiver_that_does_not_answer_in_time_is_tried_again() -> None:
@@ -262,7 +262,10 @@ def test_waits_double_up_to_a_bound_differ_by_event_and_end() -> None:
         ({"command": {"t": {"argv": ["say", "{aset}"]}}}, "'{aset}' is no placeholder, choose from"),
         ({"command": {"t": {"argv": ["{asset}"]}}}, "the program must be named"),
         ({"command": {"t": {"argv": "say it"}}}, "'say it' is not a list"),
-        ({"command": {"t": {"argv": ["x"]}}, "webhook": {"t": {"url": "http://x"}}}, "'t' names a webhook and a com"),
+        (
+            {"command": {"t": {"argv": ["x"]}}, "webhook": {"t": {"url": "http://x"}}},
+            "'t' names two of webhook, command and mqtt",
+        ),
     ],
 )
 def test_wrong_settings_are_told_in_one_line(section: dict[str, Any], complaint: str) -> None:
@@ -346,7 +349,7 @@ def test_an_executed_change_goes_through_a_sink_once_with_a_key(tmp_path: Path) 
         ({"nominal": 30.0}, "nominal: 30 must lie between min and max"),
         ({"exponent": None, "value": 30.0}, "value: 30 must lie between min and max"),
         ({"mode": "execute"}, "sink: missing"),
-        ({"mode": "execute", "sink": "plc"}, "no webhook or command is called 'plc'"),
+        ({"mode": "execute", "sink": "plc"}, "no webhook, command or mqtt is called 'plc'"),
     ],
 )
 def test_a_change_without_limits_or_sink_is_refused(wrong: dict[str, Any], complaint: str) -> None:

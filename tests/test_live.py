@@ -201,7 +201,7 @@ class TestAsset:
         followed, cut = asset(), blocks(halls.recorded(1))[:20]
         told = [row for block in (*cut[:8], *cut[11:]) for row in followed.take(block).rows if row.table == "audit"]
         (lost,) = told
-        assert lost.values["document"] == {"blocks": 3, "after": 7, "before": 11}
+        assert lost.values["document"] == {"blocks": 3, "after": [0, 7], "before": [0, 11]}
         assert followed.progress is not None and followed.progress.counted.lost == 3
 
     def test_what_is_no_block_is_refused(self) -> None:
@@ -270,7 +270,9 @@ class TestConfig:
             ("speed =", "sped =", "[sources] line.sped: unknown key, did you mean 'speed'?"),
             ("window_s = 40.0", "window_s = 0", "[diagnosis] window_s: 0 must be greater than 0"),
             ('source = "line"', 'source = "lime"', "there is no source 'lime', only line"),
-            ('kind = "replay"', 'kind = "mqtt"', "[sources] line.kind: 'mqtt' is not one of 'replay'"),
+            ('kind = "replay"', 'kind = "mqt"', "[sources] line.kind: 'mqt' is not one of 'replay', 'mqtt', 'opcua'"),
+            ('kind = "replay"', "", "[sources] line.kind: missing, add it"),
+            ('kind = "replay"', 'kind = "mqtt"', "[sources] line.speed: unknown key, choose from host, port"),
             ('name = "hall"', 'name = "press"', "'press' is an asset's name too"),
             ("[store]", "[stor]", "stor: unknown key, did you mean 'store'?"),
             ("start = 2026-01-01T00:00:00Z", "start = 2026-01-01T00:00:00", "[sources] line.start: "),

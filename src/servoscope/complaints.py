@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import types
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -51,15 +52,18 @@ def describe(error: ValidationError, model: type[BaseModel], section: str = "") 
     found = error.errors(include_url=False)
     # A misspelt key is reported twice, as unknown and as missing: the first says more.
     first = min(found, key=lambda detail: detail["type"] != "extra_forbidden")
-    path = ([section] if section else []) + [str(part) for part in first["loc"] if not isinstance(part, int)]
-    entry = next((int(part) + 1 for part in first["loc"] if isinstance(part, int)), None)
+    place, owner = _walk(model, first["loc"])
+    path = ([section] if section else []) + [str(part) for part in place if not isinstance(part, int)]
+    entry = next((int(part) + 1 for part in place if isinstance(part, int)), None)
+    if first["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        path.append(first["ctx"]["discriminator"].strip("'"))
     if not path or (path == [section] and first["type"] == "value_error"):
         return _one_line(f"[{section}] {_text(first)}" if section else _text(first))
     if entry is not None and first["type"] not in ("missing", "too_long", "too_short"):
         path[-1] += f", entry {entry}"
     key = path[0] if len(path) == 1 and not section else f"[{path[0]}] {'.'.join(path[1:])}".rstrip()
     if first["type"] == "extra_forbidden":
-        return _one_line(f"{key}: {_unknown(path, model, section)}")
+        return _one_line(f"{key}: {_unknown(path, model, owner, section)}")
     if first["type"] == "missing" and entry is not None:
         return _one_line(f"{key}: has too few entries")
     if len(path) == 1 and not section and isinstance(first["input"], Mapping) and first["type"] == "missing":
@@ -68,11 +72,39 @@ def describe(error: ValidationError, model: type[BaseModel], section: str = "") 
     return _one_line(f"{key}: {_text(first)}")
 
 
-def _unknown(path: list[str], model: type[BaseModel], section: str) -> str:
-    parents = path[1:-1] if section else path[:-1]
-    owner: type[BaseModel] = model
-    for name in parents:
-        owner = _submodel(owner, name) or owner
+def _walk(model: type[BaseModel], loc: tuple[int | str, ...]) -> tuple[list[int | str], type[BaseModel]]:
+    """Return a place without the tags that pydantic puts where one of several models is chosen, and the last model."""
+    place, owner = list[int | str](), model
+    at: Any = model
+    for part in loc:
+        while get_origin(at) is Annotated:
+            at = get_args(at)[0]
+        choices = [one for one in get_args(at) if _is_model(one)] if get_origin(at) in (Union, types.UnionType) else []
+        chosen = next((one for one in choices if part in _tags(one)), None)
+        if chosen is not None:
+            owner = at = chosen
+            continue
+        place.append(part)
+        if len(choices) == 1:
+            at = choices[0]
+        if _is_model(at):
+            owner = at
+            at = at.model_fields[part].annotation if part in at.model_fields else Any
+        elif get_args(at):
+            at = [one for one in get_args(at) if one is not ...][-1]  # the values of a table, the entries of a list
+    return place, owner
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _tags(model: type[BaseModel]) -> set[Any]:
+    kinds = (field.annotation for field in model.model_fields.values())
+    return {tag for kind in kinds if get_origin(kind) is Literal for tag in get_args(kind)}
+
+
+def _unknown(path: list[str], model: type[BaseModel], owner: type[BaseModel], section: str) -> str:
     guess = nearest(path[-1], owner.model_fields)
     if guess:
         return f"unknown key, did you mean {guess[0]!r}?"
@@ -96,7 +128,7 @@ def _submodel(model: type[BaseModel], name: str) -> type[BaseModel] | None:
 
 def _text(detail: ErrorDetails) -> str:
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
-    if kind == "missing":
+    if kind in ("missing", "union_tag_not_found"):
         return "missing, add it"
     if kind == "value_error":
         return str(context.get("error", detail["msg"]))
@@ -104,6 +136,8 @@ def _text(detail: ErrorDetails) -> str:
         return f"{_shown(value)} {TYPES[kind]}"
     if kind == "literal_error":
         return f"{_shown(value)} is not one of {context['expected']}"
+    if kind == "union_tag_invalid":
+        return f"{context['tag']!r} is not one of {context['expected_tags']}"
     if kind in ("too_long", "too_short"):
         bound = context.get("max_length", context.get("min_length"))
         relation = "at most" if kind == "too_long" else "at least"

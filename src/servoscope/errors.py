@@ -9,6 +9,8 @@
         SimulationError          a simulation that was asked for is impossible
         OutputError              a result cannot be written
         ConfigError              a service file is wrong, or what it names
+        MessageError             a message from outside holds no block that can be used
+        SourceError              what samples come from, or go to, cannot be used
         StoreError               a store cannot be used
           StoreUnavailable       for now: it is full, locked or down; trying again may help
         AlarmError               what an alarm was told to do has no meaning in its state
@@ -22,11 +24,13 @@ __all__ = [
     "BaselineError",
     "ConfigError",
     "LoopError",
+    "MessageError",
     "NotEnoughError",
     "OutputError",
     "RecordingError",
     "ServoscopeError",
     "SimulationError",
+    "SourceError",
     "StateError",
     "StoreError",
     "StoreUnavailable",
@@ -63,6 +67,18 @@ class OutputError(ServoscopeError):
 
 class ConfigError(ServoscopeError):
     """A service file is wrong, or what it names."""
+
+
+class MessageError(ServoscopeError):
+    """A message from outside holds no block that can be used; `kind` names the case, for counts."""
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+class SourceError(ServoscopeError):
+    """What samples come from, or go to, cannot be used."""
 
 
 class StoreError(ServoscopeError):

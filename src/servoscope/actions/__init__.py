@@ -10,6 +10,7 @@ from servoscope.actions.outbox import Delivery, Outgoing, outgoing, outgoing_flo
 from servoscope.actions.settings import (
     ActionSettings,
     CommandSettings,
+    MessageSettings,
     RetrySettings,
     ToleranceSettings,
     WebhookSettings,
@@ -21,6 +22,7 @@ __all__ = [
     "Change",
     "CommandSettings",
     "Delivery",
+    "MessageSettings",
     "Outgoing",
     "RetrySettings",
     "ToleranceSettings",

@@ -1,4 +1,4 @@
-"""One try to deliver one row of the outbox: a signed POST, or a program run without a shell."""
+"""One try to deliver one row of the outbox: a signed POST, a program run without a shell, a message to a broker."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import tempfile
 from pathlib import Path
 
 from servoscope.actions.outbox import Delivery, Outgoing, put_off
-from servoscope.actions.settings import PLACEHOLDERS, ActionSettings, CommandSettings, WebhookSettings
+from servoscope.actions.settings import PLACEHOLDERS, ActionSettings, CommandSettings, MessageSettings, WebhookSettings
+from servoscope.broker import reach
+from servoscope.errors import ConfigError
 
 __all__ = ["deliver", "signature"]
 
@@ -43,8 +45,8 @@ def deliver(row: Outgoing, settings: ActionSettings, now: float) -> Delivery:
     wait = 0.0
     try:
         if sink is None:
-            raise _Failed(f"no webhook or command is called {row.sink!r} any more")
-        detail = _post(row, sink, now) if isinstance(sink, WebhookSettings) else _run(row, sink)
+            raise _Failed(f"no webhook, command or mqtt is called {row.sink!r} any more")
+        detail = _sent(row, sink, now)
         return Delivery(row.key, row.sink, now, row.attempts + 1, True, detail)
     except _Failed as failure:
         detail, wait = str(failure), failure.wait
@@ -55,6 +57,35 @@ def deliver(row: Outgoing, settings: ActionSettings, now: float) -> Delivery:
 def signature(secret: bytes, timestamp: str, body: bytes) -> str:
     """Return what stands in the header ``X-Servoscope-Signature``: HMAC-SHA256 (RFC 2104) of "timestamp.body"."""
     return "sha256=" + hmac.new(secret, timestamp.encode() + b"." + body, hashlib.sha256).hexdigest()
+
+
+def _sent(row: Outgoing, sink: WebhookSettings | CommandSettings | MessageSettings, now: float) -> str:
+    if isinstance(sink, WebhookSettings):
+        return _post(row, sink, now)
+    return _publish(row, sink) if isinstance(sink, MessageSettings) else _run(row, sink)
+
+
+def _publish(row: Outgoing, sink: MessageSettings) -> str:
+    host, port = sink.broker.address
+    try:
+        client = reach(sink.broker, Path(), "")
+    except ConfigError as error:
+        raise _Failed(str(error)) from None
+    client.connect_timeout = sink.timeout_s
+    try:
+        client.connect(host, port)
+        client.loop_start()
+        told = client.publish(sink.topic, json.dumps(row.event, allow_nan=False), qos=1)
+        told.wait_for_publish(sink.timeout_s)
+        done = told.is_published()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _Failed(f"{host}:{port}: {error or type(error).__name__}") from None
+    finally:
+        client.disconnect()
+        client.loop_stop()
+    if not done:
+        raise _Failed(f"{host}:{port}: not taken within {sink.timeout_s:g} s")
+    return "taken by the broker"
 
 
 def _post(row: Outgoing, sink: WebhookSettings, now: float) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from servoscope.actions.settings import ActionSettings, CommandSettings, RetrySettings, WebhookSettings
+from servoscope.actions.settings import ActionSettings, CommandSettings, MessageSettings, RetrySettings, WebhookSettings
 from servoscope.alarms import Notice, Priority, Transition
 
 __all__ = ["Delivery", "Outgoing", "outgoing", "outgoing_flood"]
@@ -15,7 +15,7 @@ __all__ = ["Delivery", "Outgoing", "outgoing", "outgoing_flood"]
 
 @dataclass(frozen=True)
 class Outgoing:
-    """One event for one webhook or command, until it is delivered.
+    """One event for one webhook, command or broker, until it is delivered.
 
     It is written in the same transaction as the transition that it tells of, and taken out, or put off, after a
     delivery: so it is delivered at least once, and again after a crash in between. Receivers know a second time by
@@ -163,7 +163,9 @@ def put_off(retry: RetrySettings, row: Outgoing, now: float, at_least: float = 0
     return None if due - row.created > retry.give_up_s else replace(row, due=due, attempts=attempts)
 
 
-def _concerns(sink: WebhookSettings | CommandSettings, transition: Transition, priority: Priority) -> bool:
+def _concerns(
+    sink: WebhookSettings | CommandSettings | MessageSettings, transition: Transition, priority: Priority
+) -> bool:
     wanted: tuple[tuple[tuple[str, ...] | None, str], ...] = (
         (sink.alarms, transition.alarm),
         (sink.assets, transition.asset),

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from typing import Annotated, Literal, Self
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from servoscope.alarms import Event, Priority, State
+from servoscope.broker import BrokerSettings
 
-__all__ = ["PLACEHOLDERS", "ActionSettings", "CommandSettings", "RetrySettings", "ToleranceSettings", "WebhookSettings"]
+__all__ = [
+    "PLACEHOLDERS",
+    "ActionSettings",
+    "CommandSettings",
+    "MessageSettings",
+    "RetrySettings",
+    "ToleranceSettings",
+    "WebhookSettings",
+]
 
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
@@ -129,6 +139,21 @@ class CommandSettings(_Sink):
         return value
 
 
+class MessageSettings(_Sink):
+    """The event as JSON, published to an MQTT broker with QoS 1.
+
+    Parameters
+    ----------
+    broker
+        Which one.
+    topic
+        Where to.
+    """
+
+    broker: BrokerSettings
+    topic: Annotated[str, Field(strict=True, pattern=r"^[^#+\x00]+$", max_length=1000)]
+
+
 class ToleranceSettings(_Settings):
     """A change of a set-point or a gain that lets the loop live with a fault; off unless told otherwise.
 
@@ -198,26 +223,27 @@ class ActionSettings(_Settings):
     ----------
     retry
         The table `[actions.retry]`.
-    webhook, command, tolerance
+    webhook, command, mqtt, tolerance
         Tables by name: `[actions.webhook.NAME]` and so on. No name may be used twice.
     """
 
     retry: RetrySettings = RetrySettings()
     webhook: dict[Name, WebhookSettings] = Field(default_factory=dict)
     command: dict[Name, CommandSettings] = Field(default_factory=dict)
+    mqtt: dict[Name, MessageSettings] = Field(default_factory=dict)
     tolerance: dict[Name, ToleranceSettings] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _names(self) -> Self:
-        twice = set(self.webhook) & set(self.command)
+        twice = [name for name, count in Counter([*self.webhook, *self.command, *self.mqtt]).items() if count > 1]
         if twice:
-            raise ValueError(f"{min(twice)!r} names a webhook and a command, rename one")
+            raise ValueError(f"{min(twice)!r} names two of webhook, command and mqtt, rename one")
         for name, one in self.tolerance.items():
             if one.sink is not None and one.sink not in self.sinks:
-                raise ValueError(f"tolerance.{name}: sink: no webhook or command is called {one.sink!r}")
+                raise ValueError(f"tolerance.{name}: sink: no webhook, command or mqtt is called {one.sink!r}")
         return self
 
     @property
-    def sinks(self) -> dict[str, WebhookSettings | CommandSettings]:
-        """Webhooks and commands, by name."""
-        return {**self.webhook, **self.command}
+    def sinks(self) -> dict[str, WebhookSettings | CommandSettings | MessageSettings]:
+        """Webhooks, commands and messages, by name."""
+        return {**self.webhook, **self.command, **self.mqtt}

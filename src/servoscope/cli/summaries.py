@@ -38,7 +38,9 @@ def simulated(recording: Recording, truth: Truth, columns: Columns) -> dict[str,
 
 
 def channels(name: str, found: Sequence[ChannelInfo]) -> dict[str, object]:
-    """Return the columns of a file."""
+    """Return the columns of a file, and which of them might be t, r, u and y."""
+    from servoscope.readers.proposing import propose
+
     told = [
         {
             "name": c.name,
@@ -47,7 +49,7 @@ def channels(name: str, found: Sequence[ChannelInfo]) -> dict[str, object]:
         }
         for c in found
     ]
-    return {"recording": name, "channels": told}
+    return {"recording": name, "channels": told, "proposed": propose([c.name for c in found])}
 
 
 def baseline(b: Baseline) -> dict[str, object]:

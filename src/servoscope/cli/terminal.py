@@ -143,11 +143,16 @@ def _baseline(out: Console, b: Baseline) -> None:
 
 
 def channels(out: Console, name: str, found: Sequence[ChannelInfo]) -> None:
-    """Print the columns of a file."""
+    """Print the columns of a file, and which of them might be t, r, u and y."""
+    from servoscope.readers.proposing import propose
+
     out.print(Text.assemble((name, "bold"), f": {len(found)} columns"))
     rows = [(c.name, c.dtype, f"{c.min:.6g}", f"{c.max:.6g}") for c in found]
     shown = [[cell if cell != "nan" else "-" for cell in row] for row in rows]
     table(out, ("column", "type", "smallest", "largest"), shown, words=2)
+    if proposed := propose([c.name for c in found]):
+        mapping = ", ".join(f"{letter}={column}" for letter, column in proposed.items())
+        notes(out, [f"by their names, perhaps: --columns {mapping!r}"])
 
 
 def _sources(b: Baseline) -> str:

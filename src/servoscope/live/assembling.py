@@ -13,6 +13,12 @@ from servoscope.live.asset import Asset, Following
 from servoscope.live.block import Block, Resume
 from servoscope.live.checkpoint import Counted, unpack
 from servoscope.live.config import Config
+from servoscope.live.mqtt.outlet import MqttOutlet, MqttOutletSettings
+from servoscope.live.mqtt.source import MqttSettings, MqttSource
+from servoscope.live.opcua.outlet import OpcuaOutlet
+from servoscope.live.opcua.settings import OpcuaSettings
+from servoscope.live.opcua.source import OpcuaSource
+from servoscope.live.outlet import Outlet
 from servoscope.live.replay import Replay
 from servoscope.live.source import Source
 from servoscope.monitor import Monitor
@@ -28,6 +34,7 @@ class Assembly:
     assets: dict[str, Asset]
     announcer: Announcer
     sources: dict[str, Source]
+    outlets: dict[str, Outlet]
     store: Store
 
 
@@ -49,7 +56,7 @@ def assemble(config: Config, anew: Collection[str] = ()) -> Assembly:
     if strange := set(anew) - set(config.assets):
         raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(config.assets)}")
     assets = _assets(config)
-    sources = _sources(config, assets)
+    sources, outlets = _sources(config, assets), _outlets(config)
     store = Store.open(config.store.url, config.folder, write=True)
     try:
         store.claim([config.name, *assets])
@@ -66,10 +73,12 @@ def assemble(config: Config, anew: Collection[str] = ()) -> Assembly:
         for name, source in sources.items():
             own = [each for each, settings in config.assets.items() if settings.source == name]
             source.open({each: _resumption(assets[each]) for each in own if assets[each].progress is not None})
+        for outlet in outlets.values():
+            outlet.open({name: row["status"] for name, row in rows.items()})
     except BaseException:
         store.close()
         raise
-    return Assembly(assets, announcer, sources, store)
+    return Assembly(assets, announcer, sources, outlets, store)
 
 
 def rehearse(config: Config) -> None:
@@ -81,11 +90,13 @@ def rehearse(config: Config) -> None:
         If something cannot be used.
     """
     _sources(config, _assets(config))
+    _outlets(config)
 
 
 def _resumption(asset: Asset) -> Resume:
     assert asset.progress is not None, "the caller has looked"
-    return Resume(asset.progress.counted.sequence, asset.progress.counted.began)
+    counted = asset.progress.counted
+    return Resume(counted.sequence, counted.began, counted.stream, counted.t)
 
 
 def _assets(config: Config) -> dict[str, Asset]:
@@ -113,10 +124,30 @@ def _assets(config: Config) -> dict[str, Asset]:
 def _sources(config: Config, assets: dict[str, Asset]) -> dict[str, Source]:
     sources: dict[str, Source] = {}
     for name, settings in config.sources.items():
+        own = {each: one for each, one in config.assets.items() if one.source == name}
+        if isinstance(settings, MqttSettings):
+            sources[name] = MqttSource(settings, frozenset(own), config.folder, f"{config.name}.{name}")
+            continue
+        if isinstance(settings, OpcuaSettings):
+            nodes = {
+                each: (one.nodes, assets[each].baseline.loop.sample_rate)
+                for each, one in own.items()
+                if one.nodes is not None
+            }
+            sources[name] = OpcuaSource(settings, nodes, config.folder)
+            continue
         tapes = {
             each: (tuple(config.folder / file for file in one.files or ()), assets[each].baseline.loop)
-            for each, one in config.assets.items()
-            if one.source == name
+            for each, one in own.items()
         }
         sources[name] = Replay(settings, tapes)
     return sources
+
+
+def _outlets(config: Config) -> dict[str, Outlet]:
+    return {
+        name: MqttOutlet(settings, config.folder, f"{config.name}.{name}")
+        if isinstance(settings, MqttOutletSettings)
+        else OpcuaOutlet(settings, config.folder)
+        for name, settings in config.outlets.items()
+    }

@@ -19,6 +19,7 @@ from servoscope.live.checkpoint import Counted, Progress
 from servoscope.live.config import DiagnosisSettings
 from servoscope.live.examining import Examined, Told, examine
 from servoscope.live.judging import Judged, Window, judge, phase_of
+from servoscope.live.numbering import Place, place
 from servoscope.live.rows import Outcome, Row, transition_row
 from servoscope.live.showing import status_of
 from servoscope.live.thinning import gamma, thin
@@ -104,8 +105,8 @@ class Asset:
 
     @property
     def keep(self) -> int:
-        """The first sequence of the window: samples before it are no longer needed."""
-        return self._window[0].sequence if self._window else self._now.counted.sequence + 1
+        """The first number of the window: samples before it are no longer needed."""
+        return self._window[0].sequence if self._window else self._now.counted.blocks
 
     def take(self, block: Block) -> Outcome:
         """Process a block; one that was counted before leads to nothing.
@@ -116,19 +117,22 @@ class Asset:
             If it is no block: empty, without time, or of signals of different lengths.
         """
         began = block.begins()
+        found = place(self.progress.counted if self.progress is not None else None, block)
         if self.progress is None:
-            self.begin(Counted(began, began))
-        before, self._out = self._now, Outcome([], [])
-        if block.sequence <= before.counted.sequence:
-            self.progress = replace(before, counted=replace(before.counted, repeated=before.counted.repeated + 1))
+            self.begin(Counted(began, began, stream=block.stream))
+        counted, self._out = self._now.counted, Outcome([], [])
+        if found is None:
+            self.progress = replace(self._now, counted=replace(counted, repeated=counted.repeated + 1))
             return self._out
-        self._window.append(block)
-        self._out.rows.append(Row("recent", {"sequence": block.sequence, "samples": block.pack()}))
-        lost = block.sequence - before.counted.sequence - 1
-        if lost:
-            words = {"blocks": lost, "after": before.counted.sequence, "before": block.sequence}
-            self._out.rows.append(Row("audit", {"who": "servoscope", "what": "blocks lost", "document": words}))
-        self._follow(block, lost)
+        # kept under a number of our own, for the sender's may begin anew
+        self._window.append(replace(block, sequence=counted.blocks))
+        self._out.rows.append(Row("recent", {"sequence": counted.blocks, "samples": block.pack()}))
+        if found.lost or found.anew:
+            what = "blocks lost" if found.lost else "stream began anew"
+            words = {"after": [counted.stream, counted.sequence], "before": [block.stream, block.sequence]}
+            document = {"blocks": found.lost, **words}
+            self._out.rows.append(Row("audit", {"who": "servoscope", "what": what, "document": document}))
+        self._follow(block, found)
         self._judge()
         self._raise_alarms()
         self._forget()
@@ -177,7 +181,11 @@ class Asset:
         progress = self._now
         if window not in progress.windows:
             return Outcome([], [])
-        self.progress = replace(progress, windows=tuple(one for one in progress.windows if one != window))
+        judged = progress.judged
+        if said.verdict == judged.verdict == "fault":
+            judged = replace(judged, faults=said.document.get("faults", []))
+        left = tuple(one for one in progress.windows if one != window)
+        self.progress = replace(progress, judged=judged, windows=left)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **said._asdict()}
         self._forget()
         return Outcome([Row("diagnoses", values)], [])
@@ -197,12 +205,12 @@ class Asset:
     def _add(self, table: str, **values: Any) -> None:
         self._out.rows.append(Row(table, {"number": self._number(), **values}))
 
-    def _follow(self, block: Block, lost: int) -> None:
+    def _follow(self, block: Block, found: Place) -> None:
         """Let monitor and data quality see the samples."""
         progress = self._now
         arrival = arrive(block.t, np.nan if progress.last is None else progress.last, 1.0 / self._rate)
         restart = arrival.restart[arrival.used]
-        restart[:1] |= lost > 0
+        restart[:1] |= found.lost > 0 or found.anew
         signals = np.stack([block.r, block.u, block.y])[:, arrival.used]
         r, u, y = np.where(np.isfinite(signals), signals, np.nan)
         monitor, trace = self._monitor.run(progress.monitor, r, u, y, restart)
@@ -234,9 +242,10 @@ class Asset:
                 counted,
                 t=arrival.t if np.isfinite(arrival.t) else counted.t,
                 sequence=block.sequence,
+                stream=block.stream,
                 blocks=counted.blocks + 1,
                 samples=counted.samples + block.t.size,
-                lost=counted.lost + lost,
+                lost=counted.lost + found.lost,
                 digest=block.digest(counted.digest),
             ),
         )

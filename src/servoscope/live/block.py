@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,10 +16,15 @@ __all__ = ["Block", "Resume"]
 
 
 class Resume(NamedTuple):
-    """Where an asset's stream goes on: the last sequence that was counted, and when its first block began [UTC s]."""
+    """Where an asset goes on: last sequence that was counted, when its first block began, its stream, its last sample.
+
+    Times are [UTC s].
+    """
 
     sequence: int
     began: float
+    stream: int = 0
+    t: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +44,10 @@ class Block:
         Reference, control input, measured output, shape (N,); NaN where a value is missing.
     due
         When its last sample had been taken, by the clock of `time.monotonic` [s]: latency counts from there.
+    stream
+        Name of the asset's stream, greater for a later one; 0: it has none, and there is only one.
+    kept
+        Whether its sender keeps it until it is known to be safe, and sends it again as long.
     """
 
     asset: str
@@ -47,6 +57,8 @@ class Block:
     u: FloatArray
     y: FloatArray
     due: float = 0.0
+    stream: int = 0
+    kept: bool = False
 
     def begins(self) -> float:
         """Return the time of its first sample that has one.

@@ -33,7 +33,7 @@ class Counted:
     ----------
     began, t
         Time of the first and of the last sample [UTC s].
-    sequence
+    stream, sequence
         Of the last block.
     blocks, samples
         How many.
@@ -54,6 +54,7 @@ class Counted:
     repeated: int = 0
     digest: int = 0
     rows: int = 0
+    stream: int = 0
 
 
 @dataclass(frozen=True, eq=False)

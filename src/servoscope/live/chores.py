@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from servoscope.alarms import Command, Event
 from servoscope.errors import AlarmError, StoreUnavailable
 from servoscope.live.logs import log
+from servoscope.live.refusals import Refusals
 from servoscope.live.rows import Row
 from servoscope.store import Row as Stored
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["Chores"]
 
 RETENTION_EVERY_S = 3600.0
+REFUSALS_EVERY_S = 60.0  # that a flood of bad messages is written down
 DAY_S = 86400.0
 
 
@@ -33,11 +35,14 @@ class Chores:
         self._of = service
         self._obeyed: set[int] = set()  # commands whose outcome is on its way to the store
         self._next_retention = 0.0
+        self._refused = Refusals()
+        self._next_refusals = 0.0
 
     def do(self) -> None:
         """Do what is due."""
         self._watch_itself()
         self._take_deliveries()
+        self._take_refusals()
         try:
             if self._of.writer.unavailable_since is None:
                 self._obey()
@@ -61,6 +66,21 @@ class Chores:
             due = None if one.again is None else one.again.due
             row = {"attempts": one.attempt, "due": due, "outcome": one.detail}
             self._of.writer.batch.deliveries[one.key] = row
+
+    def _take_refusals(self) -> None:
+        """Note what came from outside and could not be used: at once, then once a minute."""
+        for name, source in self._of.sources.items():
+            for one in source.refused():
+                self._of.metrics.refused(name, one)
+                self._refused.add(one.asset or name, one.kind, one.why, one.number)
+        now = time.monotonic()
+        if now < self._next_refusals:
+            return
+        for one in self._refused.taken():
+            self._next_refusals = now + REFUSALS_EVERY_S
+            log("warning", "refused", of=one.asset, kind=one.kind, count=one.number, why=one.why)
+            words = {"kind": one.kind, "count": one.number, "why": one.why}
+            self._of.writer.add(one.asset, [Row("audit", {"who": "servoscope", "what": "refused", "document": words})])
 
     def _obey(self) -> None:
         """Carry out what operators have asked for."""

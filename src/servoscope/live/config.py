@@ -12,6 +12,10 @@ from servoscope.actions import ActionSettings
 from servoscope.alarms import AlarmSettings
 from servoscope.complaints import describe
 from servoscope.errors import ConfigError
+from servoscope.live.mqtt.outlet import MqttOutletSettings
+from servoscope.live.mqtt.source import MqttSettings
+from servoscope.live.opcua.outlet import OpcuaOutletSettings
+from servoscope.live.opcua.settings import Nodes, OpcuaSettings
 from servoscope.live.replay import ReplaySettings
 from servoscope.live.settings import NotNegative, Seconds, Settings, Word
 from servoscope.quality import QualitySettings
@@ -20,6 +24,8 @@ __all__ = ["AssetSettings", "Config", "DiagnosisSettings", "ServiceSettings", "S
 
 Name = Annotated[str, Field(strict=True, pattern=r"^[\w][\w.:-]*$", max_length=100)]
 Paths = Annotated[tuple[Word, ...], Field(min_length=1)]
+Outlet = Annotated[MqttOutletSettings | OpcuaOutletSettings, Field(discriminator="kind")]
+Source = Annotated[ReplaySettings | MqttSettings | OpcuaSettings, Field(discriminator="kind")]
 
 
 class ServiceSettings(Settings):
@@ -95,12 +101,15 @@ class AssetSettings(Settings):
         Name of the source that its samples come from.
     files
         What a source of kind ``replay`` replays for it, one recording after the other.
+    nodes
+        Where a source of kind ``opcua`` finds it.
     """
 
     baseline: Word
     point: Word | None = None
     source: Word
     files: Paths | None = None
+    nodes: Nodes | None = None
 
 
 class Config(Settings):
@@ -112,8 +121,8 @@ class Config(Settings):
         What the service is called in alarms and messages.
     service, store, diagnosis, quality, alarms, actions
         The sections of these names; each may be left out.
-    sources, assets
-        Tables by name: ``[sources.NAME]``, ``[assets.NAME]``.
+    sources, outlets, assets
+        Tables by name: ``[sources.NAME]``, ``[outlets.NAME]``, ``[assets.NAME]``.
     """
 
     name: Name = "servoscope"
@@ -123,7 +132,8 @@ class Config(Settings):
     quality: QualitySettings = QualitySettings()
     alarms: AlarmSettings = Field(default_factory=lambda: AlarmSettings.model_validate({}))
     actions: ActionSettings = ActionSettings()
-    sources: Annotated[dict[Name, ReplaySettings], Field(min_length=1)]
+    sources: Annotated[dict[Name, Source], Field(min_length=1)]
+    outlets: dict[Name, Outlet] = Field(default_factory=dict)
     assets: Annotated[dict[Name, AssetSettings], Field(min_length=1)]
     _folder: Path = PrivateAttr(default=Path())
 
@@ -133,8 +143,15 @@ class Config(Settings):
             if asset.source not in self.sources:
                 known = ", ".join(self.sources)
                 raise ValueError(f"[assets] {name}.source: there is no source {asset.source!r}, only {known}")
-            if asset.files is None:
-                raise ValueError(f"[assets] {name}.files: missing, a replay needs recordings: files = [...]")
+            kind = self.sources[asset.source].kind
+            for key, given, of, words in (
+                ("files", asset.files, "replay", "recordings: files = [...]"),
+                ("nodes", asset.nodes, "opcua", "nodes: nodes = { r = ..., u = ..., y = ... }"),
+            ):
+                if given is None and kind == of:
+                    raise ValueError(f"[assets] {name}.{key}: missing, a source of kind {of} needs {words}")
+                if given is not None and kind != of:
+                    raise ValueError(f"[assets] {name}.{key}: leave it out, its source is of kind {kind}")
         if self.name in self.assets:
             raise ValueError(f"name: {self.name!r} is an asset's name too, call the service something else")
         return self

@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from servoscope.live.config import DiagnosisSettings
 from servoscope.live.examining import Examined
@@ -45,6 +46,8 @@ class Judged:
         When the next one is [UTC s].
     doubts, retry
         How often the recursion disagreed in vain, and when it is heard again [UTC s].
+    faults
+        What the last full diagnosis says of the fault that is there: name, parameter, ratio, interval.
     """
 
     due: float
@@ -55,6 +58,7 @@ class Judged:
     examined: float | None = None
     doubts: int = 0
     retry: float = 0.0
+    faults: list[dict[str, Any]] = field(default_factory=list)
 
 
 def phase_of(asset: str) -> float:
@@ -120,6 +124,7 @@ def judge(
             since=since,
             onset=found.onset,
             examined=t,
+            faults=state.faults if found.verdict == "fault" else [],
         ),
         found,
     )

@@ -12,6 +12,7 @@ from servoscope.errors import ConfigError
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
+    from servoscope.live.refusals import Refusal
     from servoscope.live.service import Service
 
 __all__ = ["Metrics"]
@@ -54,6 +55,10 @@ class Metrics:
         self._commits = Histogram(
             "servoscope_commit_seconds", "Duration of a commit", buckets=SECONDS, registry=registry
         )
+        labels = ["source", "asset", "kind"]
+        self._refused = Counter(
+            "servoscope_refused", "Messages that could not be used", labelnames=labels, registry=registry
+        )
         registry.register(self)  # whatever has a method collect
 
     def committed(self, latencies: Sequence[float], seconds: float) -> None:
@@ -61,6 +66,10 @@ class Metrics:
         self._commits.observe(seconds)
         for latency in latencies:
             self._latency.observe(latency)
+
+    def refused(self, source: str, one: Refusal) -> None:
+        """Take note of messages that could not be used."""
+        self._refused.labels(source, one.asset, one.kind).inc(one.number)
 
     def text(self) -> bytes:
         """Return all of them as Prometheus reads them."""
@@ -95,7 +104,10 @@ class Metrics:
         )
         for labels, count in alarms.items():
             standing.add_metric(list(labels), count)
-        yield from (last, verdict, standing, *self._own(GaugeMetricFamily))
+        up = GaugeMetricFamily("servoscope_source_up", "Whether a source is connected", labels=["source"])
+        for name, source in self._service.sources.items():
+            up.add_metric([name], float(source.up))
+        yield from (last, verdict, standing, up, *self._own(GaugeMetricFamily))
 
     def _own(self, family: type) -> Iterable[Metric]:
         service = self._service

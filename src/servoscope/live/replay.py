@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import AwareDatetime
 
 from servoscope.live.block import Block, Resume
+from servoscope.live.refusals import Refusal
 from servoscope.live.settings import NotNegative, Seconds, Settings
 from servoscope.loop import Loop
 from servoscope.readers import read
@@ -39,7 +40,7 @@ class ReplaySettings(Settings):
         Time of the first sample; None: when the service first ran.
     """
 
-    kind: Literal["replay"]
+    kind: Literal["replay"] = "replay"
     speed: NotNegative = 1.0
     block: Seconds = 1.0
     repeat: bool = False
@@ -130,6 +131,8 @@ class Replay:
         self._next: list[tuple[float, int, _Reel, Block]] = []
         self._pace = (0.0, 0.0)
 
+    up = True
+
     @property
     def pace(self) -> float:
         """How many times as fast as it was recorded."""
@@ -164,8 +167,12 @@ class Replay:
             self._advance(order, reel)
         return found
 
-    def acknowledge(self, asset: str, sequence: int) -> None:
+    def acknowledge(self, asset: str, blocks: int) -> None:
         """Do nothing: a file is still there after a restart."""
+
+    def refused(self) -> list[Refusal]:
+        """Return nothing: files are checked when they are read."""
+        return []
 
     @property
     def waits(self) -> float:

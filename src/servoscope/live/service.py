@@ -42,7 +42,8 @@ class Service:
     """
 
     def __init__(self, config: Config, assembly: Assembly) -> None:
-        self.config, self._sources, self.store = config, assembly.sources, assembly.store
+        self.config, self.sources, self.store = config, assembly.sources, assembly.store
+        self._outlets = assembly.outlets
         self.assets, self.announcer = assembly.assets, assembly.announcer
         self.writer = Writer(self.store, config.name, config.service.buffer)
         self.metrics = Metrics(self)
@@ -89,8 +90,10 @@ class Service:
         finally:
             self.courier.stop()
             self._looker.close()
-            for source in self._sources.values():
+            for source in self.sources.values():
                 source.close()
+            for outlet in self._outlets.values():
+                outlet.close()
             self.store.close()
         log("info", "stopped", service=self.config.name)
 
@@ -102,7 +105,7 @@ class Service:
         now = self.beat
         if self.writer.room:
             self._listened += min(now - before, 2.0 * LONGEST_PAUSE_S)
-        for source in self._sources.values():
+        for source in self.sources.values():
             for block in source.poll(min(AT_ONCE, self.writer.room)):
                 self._take(block)
         self._look(ended=self._exhausted)
@@ -160,7 +163,7 @@ class Service:
         """Let time pass for assets that nothing is heard of, as fast as their samples' clock runs."""
         for name, asset in self.assets.items():
             silence = self._listened - self._heard.setdefault(name, self._listened)
-            pace = self._sources[self.config.assets[name].source].pace
+            pace = self.sources[self.config.assets[name].source].pace
             if silence >= CHORES_EVERY_S and not self._exhausted:
                 self.tell(asset, outcome := asset.tick(silence * pace))
                 if outcome.rows:
@@ -184,17 +187,19 @@ class Service:
             seconds = round(time.time() - before, 3)
             log("info", "store available again", seconds=seconds, waiting=self.writer.waiting)
             self._audit("store was unavailable", {"from": before, "seconds": seconds})
+        for outlet in self._outlets.values():
+            outlet.tell({name: row["status"] for name, row in done.batch.checkpoints.items()})
         self.courier.expect()
         now = time.monotonic()
-        for name, sequence in done.sequences.items():
-            self._sources[self.config.assets[name].source].acknowledge(name, sequence)
+        for name, blocks in done.taken.items():
+            self.sources[self.config.assets[name].source].acknowledge(name, blocks)
         self.metrics.committed([now - due for due in done.due], now - begun)
         latest = max((now - due for due in done.due), default=0.0)
         log("debug", "commit", blocks=len(done.due), seconds=round(now - begun, 4), latest=round(latest, 4))
 
     @property
     def _exhausted(self) -> bool:
-        return all(math.isinf(source.waits) for source in self._sources.values())
+        return all(math.isinf(source.waits) for source in self.sources.values())
 
     def _ended(self) -> bool:
         """Whether there is nothing left to do, and never will be."""
@@ -202,7 +207,7 @@ class Service:
 
     def _pause(self) -> float:
         """Return how long to sleep before the next turn [s]."""
-        due = min(source.waits for source in self._sources.values()) if self.writer.room else math.inf
+        due = min(source.waits for source in self.sources.values()) if self.writer.room else math.inf
         return min(due, LONGEST_PAUSE_S, max(0.0, self._next_commit - time.monotonic()))
 
     def _finish(self) -> None:

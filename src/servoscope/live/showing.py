@@ -31,6 +31,7 @@ def status_of(progress: Progress, definitions: Mapping[str, AlarmDefinition]) ->
         "summary": judged.summary,
         "since": judged.since,
         "onset": judged.onset,
+        "faults": judged.faults,
         "examined": judged.examined,
         "ne107": ne107.ne107,
         "reasons": list(ne107.reasons),

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from servoscope.live.block import Block, Resume
+from servoscope.live.refusals import Refusal
 
 __all__ = ["Source"]
 
@@ -27,8 +28,15 @@ class Source(Protocol):
     def poll(self, most: int) -> list[Block]:
         """Return up to `most` blocks that are due and were not returned before, in the order of time; at once."""
 
-    def acknowledge(self, asset: str, sequence: int) -> None:
-        """Take note that an asset's blocks up to this sequence are safe and need not be offered again."""
+    def acknowledge(self, asset: str, blocks: int) -> None:
+        """Take note that so many more of an asset's blocks are safe, in the order in which they were polled."""
+
+    def refused(self) -> list[Refusal]:
+        """Return what came and could not be used, since the last call."""
+
+    @property
+    def up(self) -> bool:
+        """Whether it is connected to where its blocks come from."""
 
     @property
     def waits(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,14 +27,14 @@ class Commit:
     ----------
     batch
         What is written.
-    sequences
-        Newest sequence per asset.
+    taken
+        How many blocks of each asset.
     due
         When each of its blocks had been complete, by the monotonic clock [s].
     """
 
     batch: Batch = field(default_factory=Batch)
-    sequences: dict[str, int] = field(default_factory=dict)
+    taken: Counter[str] = field(default_factory=Counter)
     due: list[float] = field(default_factory=list)
 
 
@@ -97,9 +98,12 @@ class Writer:
 
     def stands(self, asset: Asset, due: float | None = None) -> None:
         """Take note of where an asset stands, after a block that had been complete at `due`, if there was one."""
-        progress, keep = asset.progress, asset.keep
-        if progress is None:
+        if due is not None:
+            self._gathered.taken[asset.name] += 1
+            self._gathered.due.append(due)
+        if asset.progress is None:
             return
+        progress, keep = asset.progress, asset.keep
         status = asset.status
 
         def checkpoint() -> tuple[dict[str, Any], int]:
@@ -107,9 +111,6 @@ class Writer:
             return {**row, "state": pack(progress), "status": status(progress), "at": time.time()}, keep
 
         self._stand[progress.asset] = checkpoint  # made when it is written: of many blocks, only the last one counts
-        if due is not None:
-            self._gathered.sequences[progress.asset] = progress.counted.sequence
-            self._gathered.due.append(due)
 
     def remember(self, row: dict[str, Any]) -> None:
         """Take a checkpoint that is no asset's."""

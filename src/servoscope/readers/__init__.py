@@ -1,4 +1,4 @@
-"""Files to recordings: CSV, Parquet, MAT; which columns are r, u, y and t."""
+"""Files to recordings: CSV, Parquet, MAT, MDF, TDMS; which columns are r, u, y and t."""
 
 from servoscope.readers.reading import SUFFIXES, ChannelInfo, channels, read, read_parts
 

@@ -103,12 +103,21 @@ def _pieces(path: Path, layout: Layout) -> Iterator[tuple[bytes, int, bool]]:
 def _plain(path: Path) -> Iterator[bytes]:
     with path.open("rb") as file:
         while text := file.read(PIECE):
-            yield text if text.endswith(b"\n") else text + file.readline()
+            yield _utf8(text if text.endswith(b"\n") else text + file.readline())
+
+
+def _utf8(text: bytes) -> bytes:
+    """Return text with a replacement for what is none: Arrow cannot tell of rows that it cannot decode."""
+    try:
+        text.decode("utf-8")
+    except UnicodeDecodeError:
+        return text.decode("utf-8", errors="replace").encode()
+    return text
 
 
 def _recoded(path: Path, layout: Layout) -> Iterator[bytes]:
     """Yield lines as UTF-8 with single blanks: Arrow knows no runs of them as one delimiter."""
-    with path.open(encoding=layout.encoding) as file:
+    with path.open(encoding=layout.encoding, errors="replace") as file:
         while lines := file.readlines(PIECE):
             if layout.delimiter == " ":
                 lines = [re.sub(r"[ \t]+", " ", line.strip()) + "\n" for line in lines]

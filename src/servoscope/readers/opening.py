@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.errors import RecordingError
-from servoscope.readers import csvtext
+from servoscope.readers import csvtext, mat5, measurements
+from servoscope.readers.opened import Opened
 from servoscope.readers.tables import Table
 
 __all__ = ["SUFFIXES", "Opened", "open_file"]
@@ -27,6 +27,9 @@ SUFFIXES = {
     ".parquet": "Parquet",
     ".pq": "Parquet",
     ".mat": "MAT",
+    ".mf4": "MDF",
+    ".mdf": "MDF",
+    ".tdms": "TDMS",
 }
 MAGIC = {
     b"PAR1": "Parquet",
@@ -41,52 +44,9 @@ MAGIC = {
     b"\xd0\xcf\x11\xe0": "Excel workbook",
     b"\x1f\x8b": "gzip archive",
     b"MDF ": "MDF",
+    b"UnFinMF ": "MDF file that its recorder never finished",
     b"TDSm": "TDMS",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Opened:
-    """A file whose columns are known and whose rows are not read yet.
-
-    Parameters
-    ----------
-    path
-        The file.
-    columns
-        Names of its columns.
-    read
-        Takes names of columns, and names of those among them that are text even where they look like numbers; returns
-        the rows piece by piece.
-    others
-        Variables that exist but are not channels: name -> why not.
-    """
-
-    path: Path
-    columns: tuple[str, ...]
-    read: Callable[[Sequence[str], Collection[str]], Iterator[Table]]
-    others: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """What errors call the file."""
-        return self.path.name
-
-    def pieces(self, wanted: Collection[str], texts: Collection[str] = ()) -> Iterator[Table]:
-        """Yield the rows piece by piece, of the columns that are wanted; `texts` among them are text in any case.
-
-        Raises
-        ------
-        RecordingError
-            If the file is damaged or has no rows.
-        """
-        rows = 0
-        for table in self.read([name for name in self.columns if name in wanted], texts):
-            rows += table.rows
-            if table.rows:
-                yield table
-        if not rows:
-            raise RecordingError(f"{self.path}: holds no rows")
 
 
 def open_file(path: str | Path) -> Opened:
@@ -114,6 +74,8 @@ def open_file(path: str | Path) -> Opened:
         return _parquet(path)
     if kind == "MAT":
         return _mat(path)
+    if kind in ("MDF", "TDMS"):
+        return measurements.mdf(path) if kind == "MDF" else measurements.tdms(path)
     layout = csvtext.layout_of(path, head)
     return Opened(path, tuple(layout.names), lambda *wanted: csvtext.read_csv(path, layout, *wanted))
 
@@ -134,7 +96,13 @@ def _check_kind(path: Path, head: bytes) -> str:
     is_mat = wanted == "MAT" and found in ("MAT", "HDF5")
     if is_mat or found == wanted or (wanted == "CSV" and found is None):
         return wanted
-    advice = {"Parquet": "rename it to .parquet", "MAT": "rename it to .mat"}.get(found or "", f"export it as {wanted}")
+    advice = {
+        "Parquet": "rename it to .parquet",
+        "MAT": "rename it to .mat",
+        "MDF": "rename it to .mf4",
+        "TDMS": "rename it to .tdms",
+        "MDF file that its recorder never finished": "finalize it with the recorder's own tool",
+    }.get(found or "", f"export it as {wanted}")
     raise RecordingError(f"{path}: is not {wanted} but a {found or 'text file'}: {advice}")
 
 
@@ -192,6 +160,7 @@ def _load_mat(path: Path) -> Mapping[str, Any]:
     import scipy.io
 
     if not h5py.is_hdf5(path):
+        mat5.check(path)
         loaded: dict[str, Any] = scipy.io.loadmat(path, squeeze_me=False)
         return {name: value for name, value in loaded.items() if not name.startswith("__")}
 

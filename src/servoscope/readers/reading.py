@@ -49,7 +49,7 @@ def channels(path: str | Path) -> list[ChannelInfo]:
     opened = open_file(path)
     ranges: dict[str, list[tuple[float, float]]] = {name: [] for name in opened.columns}
     kinds: dict[str, list[str]] = {name: [] for name in opened.columns}
-    for table in opened.pieces(opened.columns):
+    for table in (each for names in opened.together or [opened.columns] for each in opened.pieces(names)):
         for name, column in table.columns.items():
             kinds[name].append(str(column.type))
             try:
@@ -81,7 +81,7 @@ def read(
     Parameters
     ----------
     path
-        CSV (any delimiter, decimal comma with ``;``), Parquet, or MAT (v5 and v7.3).
+        CSV (any delimiter, decimal comma with ``;``), Parquet, MAT (v5 and v7.3), MDF (3 and 4), or TDMS.
     loop
         The loop it was taken from: columns, sample rate, input limits. None: columns t, r, u, y and the
         rate as measured.

@@ -25,6 +25,7 @@ DISORDER = 0.25  # share of steps that may go backwards
 COARSE = 0.3  # share of stamps that may be repeated
 IRREGULAR = 0.2  # share of steps that may be far from one sample
 JITTER = 0.1  # samples
+FARTHEST = 1e100  # s: beyond, steps cannot be counted any more
 RATE_TOLERANCE = 0.01
 RATE_NOTE = 0.001
 
@@ -77,7 +78,7 @@ def arrange(t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: float | 
         If the time axis runs backwards or in disorder, is too coarse or irregular, or the rate is not the
         expected one.
     """
-    lost = spool.where(lambda rows: ~np.isfinite(t[rows]), t)
+    lost = spool.where(lambda rows: ~(np.abs(t[rows]) < FARTHEST), t)
     if t.size - lost.size < 2:
         raise RecordingError(f"{name}: the time column holds no numbers, choose another")
     begins = np.empty(0, dtype=np.intp)

@@ -1,0 +1,83 @@
+"""Feeding, counting, and the table of what came of it."""
+
+from __future__ import annotations
+
+import random
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from hostile.damage import damaged
+from hostile.targets import Target, targets
+from servoscope.errors import MessageError, ServoscopeError
+
+__all__ = ["fed", "feed_all", "markdown"]
+
+SHOWN = 3  # of what must not happen, on stderr
+
+
+def fed(target: Target, inputs: int, seed: int = 1) -> dict[str, Any]:
+    """Feed one target; return how often what happened."""
+    chance = random.Random(f"{seed} {target.name}")
+    came: Counter[str] = Counter()
+    cases: Counter[str] = Counter()
+    slowest, shown = 0.0, 0
+    for good in target.good:
+        target.feed(good, chance)  # as it is, it is read
+    for number in range(inputs):
+        data = damaged(chance.choice(target.good), chance, number) if target.good else b""
+        begun = time.process_time()
+        try:
+            target.feed(data, chance)
+            came["read"] += 1
+        except ServoscopeError as error:
+            text = str(error)
+            came["refused" if text and "\n" not in text else "badly told"] += 1
+            cases[error.kind if isinstance(error, MessageError) else type(error).__name__] += 1
+        except Exception as error:
+            came["other"] += 1
+            cases[f"!{type(error).__name__}"] += 1
+            shown += 1
+            if shown <= SHOWN:
+                print(f"{target.name}, input {number}:", file=sys.stderr)
+                traceback.print_exc()
+        slowest = max(slowest, time.process_time() - begun)
+    return {
+        "name": target.name, "inputs": inputs, **{key: came[key] for key in ("read", "refused", "badly told", "other")},
+        "cases": dict(cases.most_common()), "slowest_s": round(slowest, 2),
+    }  # fmt: skip
+
+
+def feed_all(inputs: int, only: str = "") -> list[dict[str, Any]]:
+    """Feed all of them, or those whose names contain a word."""
+    warnings.simplefilter("ignore")  # libraries warn of what they meet in broken files
+    with tempfile.TemporaryDirectory(prefix="servoscope-hostile-") as folder:
+        return [fed(target, inputs) for target in targets(Path(folder)) if only in target.name]
+
+
+def markdown(found: dict[str, Any]) -> str:
+    """Return the table."""
+    lines = [("reader or decoder", "inputs", "read", "refused", "any other exception", "slowest"), ("---",) * 6]
+    lines += [
+        (
+            one["name"],
+            f"{one['inputs']}",
+            f"{one['read']}",
+            f"{one['refused']}",
+            f"{one['other'] + one['badly told']}",
+            f"{one['slowest_s']:.2f} s",
+        )
+        for one in found["targets"]
+    ]
+    refused = Counter[str]()
+    for one in found["targets"]:
+        if one["name"].startswith(("MQTT", "OPC UA", "blocks")):
+            refused.update(one["cases"])
+    cases = ", ".join(f"{kind} {count}" for kind, count in sorted(refused.items(), key=lambda x: -x[1]))
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"{table}\n\nRefused messages, values and blocks by case: {cases}. {found['machine']}."

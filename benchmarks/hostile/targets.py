@@ -1,0 +1,287 @@
+"""What is fed: every reader and decoder of servoscope, with something whole to begin from."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from hostile.damage import refitted
+from servoscope import readers, writers
+from servoscope.alarms import AlarmSettings
+from servoscope.baseline import Baseline
+from servoscope.errors import MessageError
+from servoscope.learning import nominal
+from servoscope.live.asset import Asset, Following
+from servoscope.live.block import Block
+from servoscope.live.checkpoint import pack, unpack
+from servoscope.live.config import Config, DiagnosisSettings
+from servoscope.live.mqtt import payload, topics
+from servoscope.live.mqtt.publishing import PublishSettings
+from servoscope.live.opcua.following import block_of, single
+from servoscope.loop import Columns, Loop
+from servoscope.monitor import Monitor
+from servoscope.quality import QualitySettings
+from servoscope.recording import Recording
+from servoscope.simulation import reference, simulate
+
+__all__ = ["Target", "targets"]
+
+LOOP = Path(__file__).parents[2] / "src/servoscope/examples/reference-rig.toml"
+BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
+ROWS = 400
+SERVICE = """
+name = "hall"
+[sources.line]
+kind = "mqtt"
+host = "127.0.0.1"
+port = 1883
+in_flight = 100
+[assets.press]
+baseline = "press.json"
+source = "line"
+[quality]
+silent_s = 5.0
+"""
+PUBLISH = """
+ahead = 10
+[broker]
+host = "127.0.0.1"
+[replay]
+speed = 2.0
+start = 2026-01-01T00:00:00Z
+[assets.press]
+loop = "loop.toml"
+files = ["press.csv"]
+"""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that reads what others have written.
+
+    Parameters
+    ----------
+    name
+        What the table calls it.
+    good
+        What it reads without complaint; empty: `feed` makes its own.
+    feed
+        Takes bytes, and the chance for what is made of them; returns in one word what came of it.
+    """
+
+    name: str
+    good: Sequence[bytes]
+    feed: Callable[[bytes, random.Random], str]
+
+
+def targets(folder: Path) -> list[Target]:
+    """Return all of them; files are written to a folder."""
+    loop = Loop.load(LOOP)
+    recording = simulate(loop, reference("multisine", ROWS / loop.sample_rate, loop.sample_rate), seed=1)[0]
+    return [*_files(folder, recording), *_settings(folder, loop), *_messages(recording), *_values(), _asset(loop)]
+
+
+def _files(folder: Path, recording: Recording) -> list[Target]:
+    columns = {name: np.asarray(getattr(recording, name)) for name in "truy"}
+    made = {"CSV": "csv", "Parquet": "parquet", "MAT 5": "mat", "MAT 7.3": "mat", "MDF": "mf4", "TDMS": "tdms"}
+    writing: dict[str, Callable[[Path], object]] = {
+        "MAT 5": lambda path: _mat(path, columns),
+        "MAT 7.3": lambda path: _hdf5(path, columns),
+        "MDF": lambda path: _mdf(path, columns),
+        "TDMS": lambda path: _tdms(path, columns),
+    }
+    found = []
+    for kind, suffix in made.items():
+        path = folder / f"{kind.replace(' ', '-')}.{suffix}"
+        writing.get(kind, lambda path: writers.write_table(path, columns))(path)
+
+        def feed(data: bytes, _: random.Random, path: Path = path) -> str:
+            path.write_bytes(data)
+            readers.channels(path)
+            readers.read(path, columns=Columns(time="time") if path.suffix == ".mf4" else None)
+            return "read"
+
+        good = [path.read_bytes()]
+        if kind == "CSV":
+            text = good[0].decode()
+            good += [
+                text.replace(",", ";").replace(".", ",").encode(),
+                text.replace(",", " ").encode(),
+                text.encode("utf-16"),
+            ]
+        found.append(Target(f"{kind} file", good, feed))
+    return found
+
+
+def _mat(path: Path, columns: dict[str, Any]) -> None:
+    import scipy.io
+
+    scipy.io.savemat(path, columns)
+
+
+def _hdf5(path: Path, columns: dict[str, Any]) -> None:
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, x in columns.items():
+            file[name] = x[None, :]
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(128))
+
+
+def _mdf(path: Path, columns: dict[str, Any]) -> None:
+    from asammdf import MDF, Signal
+
+    with MDF(version="4.10") as file:
+        file.append([Signal(columns[name], columns["t"], name=name) for name in "ruy"])
+        file.save(path, overwrite=True)
+
+
+def _tdms(path: Path, columns: dict[str, Any]) -> None:
+    from nptdms import ChannelObject, TdmsWriter
+
+    with TdmsWriter(path) as file:
+        for rows in (slice(0, ROWS // 2), slice(ROWS // 2, ROWS)):
+            file.write_segment([ChannelObject("rig", name, columns[name][rows]) for name in "truy"])
+
+
+def _settings(folder: Path, loop: Loop) -> list[Target]:
+    nominal(loop).save(folder / "good.json")
+    files: tuple[tuple[str, bytes, str, Callable[[Path], object]], ...] = (
+        ("loop file", LOOP.read_bytes(), "loop.toml", Loop.load),
+        ("service file", SERVICE.encode(), "service.toml", Config.load),
+        ("file for publish", PUBLISH.encode(), "publish.toml", PublishSettings.load),
+        ("baseline", (folder / "good.json").read_bytes(), "baseline.json", Baseline.load),
+    )
+    found = []
+    for name, good, file, load in files:
+
+        def feed(
+            data: bytes, _: random.Random, path: Path = folder / file, load: Callable[[Path], object] = load
+        ) -> str:
+            path.write_bytes(data)
+            load(path)
+            return "read"
+
+        found.append(Target(name, [good], feed))
+    return found
+
+
+def _messages(recording: Recording) -> list[Target]:
+    rows = slice(0, 50)
+    t = BEGAN + np.asarray(recording.t[rows])
+    blocks = [
+        Block("press", 7, t, recording.r[rows], recording.u[rows], recording.y[rows], stream=5),
+        Block("press", 8, np.sort(t + 1e-4 * np.sin(t)), recording.r[rows], recording.u[rows], recording.y[rows]),
+    ]
+
+    def binary(data: bytes, chance: random.Random) -> str:
+        payload.decode("press", refitted(data, chance))
+        return "read"
+
+    def text(data: bytes, _: random.Random) -> str:
+        payload.decode("press", data)
+        return "read"
+
+    def ack(data: bytes, _: random.Random) -> str:
+        topics.ack_of(data)
+        return "read"
+
+    return [
+        Target("MQTT block, binary", [payload.encode(block, 3) for block in blocks], binary),
+        Target("MQTT block, JSON", [payload.to_json(block, 3) for block in blocks], text),
+        Target("MQTT acknowledgement", [topics.to_ack(5, 7)], ack),
+    ]
+
+
+CELLS: tuple[Any, ...] = (
+    0.0, -1.0, 1e308, 5e-324, float("nan"), float("inf"), 10**400, -(10**30), 2**63, True, None, "1", b"\xff", [],
+    [1.0], BEGAN, 253402300800.0, datetime(2026, 1, 1, tzinfo=UTC),
+)  # fmt: skip
+STAMPS = (None, datetime(1601, 1, 1), datetime(2026, 1, 1), datetime(9999, 12, 31), datetime(2026, 1, 1, tzinfo=UTC))
+
+
+def _values() -> list[Target]:
+    """OPC UA values as the client hands them on: decoded, but of any type and any content."""
+
+    def told(value: object, chance: random.Random) -> Any:
+        bad = chance.random() < 0.1
+        status = SimpleNamespace(is_bad=lambda: bad, name="Bad", value=0)
+        return SimpleNamespace(
+            Value=SimpleNamespace(Value=value) if chance.random() < 0.95 else None,
+            SourceTimestamp=chance.choice(STAMPS),
+            ServerTimestamp=chance.choice(STAMPS),
+            StatusCode=status if chance.random() < 0.9 else None,
+        )
+
+    def scalar(_: bytes, chance: random.Random) -> str:
+        single(told(chance.choice(CELLS), chance))
+        return "read"
+
+    def array(_: bytes, chance: random.Random) -> str:
+        n = chance.choice((1, 2, 50))
+        cells: list[Any] = [float(chance.randrange(100)), *(BEGAN + 0.01 * k for k in range(n)), *[0.5] * (3 * n)]
+        for _ in range(chance.choice((0, 1, 1, 3))):
+            cells[chance.randrange(len(cells))] = chance.choice(CELLS)
+        cells = cells[: chance.choice((len(cells), len(cells), chance.randrange(len(cells))))]
+        block_of("press", told(cells if chance.random() < 0.95 else chance.choice(CELLS), chance))
+        return "read"
+
+    return [Target("OPC UA value", [], scalar), Target("OPC UA array", [], array)]
+
+
+def _asset(loop: Loop) -> Target:
+    """Return an asset, fed with blocks that decoders let through; it must be able to store what it knows after each."""
+    baseline = nominal(loop)
+    how = Following(
+        DiagnosisSettings(window_s=10.0, every_s=60.0), QualitySettings(), AlarmSettings.model_validate({}), 2.0
+    )
+    asset = Asset("press", baseline, Monitor(baseline), how)
+    sound = simulate(loop, reference("multisine", 60.0, loop.sample_rate), seed=2)[0]
+    n, state = 50, {"number": 0, "t": BEGAN}
+
+    def feed(_: bytes, chance: random.Random) -> str:
+        k = int(state["number"]) % (sound.samples // n)
+        t = state["t"] + 0.01 * np.arange(n)
+        signals = np.stack([x[n * k : n * (k + 1)] for x in (sound.r, sound.u, sound.y)])
+        number, what = int(state["number"]), chance.choice(BLOCKS)
+        if what in ("late", "repeated"):
+            back = chance.choice((1, 2, 50))
+            number, t = max(0, number - back), t - (0.01 * n * back if what == "repeated" else 0.0)
+        elif what == "lost":
+            number += chance.choice((1, 5, 10**6, 2**62))
+        elif what == "clock":
+            t = np.clip(t + chance.choice((-1e9, -3600.0, -1.0, 1.0, 3600.0, 1e9, 2e11)), 0.0, payload.LATEST - 1.0)
+        elif what == "order":
+            t = np.array(chance.sample(t.tolist(), n))
+        elif what == "moment":
+            t = np.full(n, t[0])
+        elif what != "sound":
+            signals[:, chance.randrange(n) :] = chance.choice(NUMBERS)
+        block = Block("press", min(number, payload.LARGEST), t, *signals)
+        before = None if asset.progress is None else asset.progress.counted
+        asset.take(block)
+        assert asset.progress is not None
+        unpack(pack(asset.progress), "press")
+        after = asset.progress.counted
+        if before is not None and after.blocks == before.blocks:
+            if after.repeated != before.repeated + 1:
+                raise AssertionError("a block was left out, and not counted as repeated")
+            raise MessageError("repeated", "it was counted before, or its place has passed")
+        state["number"], state["t"] = number + 1 if number < 2**61 else 0, float(t.max()) + 0.01
+        if state["t"] > BEGAN + 1e9:
+            state["t"] = BEGAN
+        return what
+
+    return Target("blocks of an asset", [], feed)
+
+
+BLOCKS = ("sound", "sound", "late", "repeated", "lost", "clock", "order", "moment", "numbers")
+NUMBERS = (float("nan"), float("inf"), 1e300, -1.7e308, 5e-324, 0.0)

@@ -1,0 +1,1 @@
+"""Samples from an OPC UA server, and verdicts offered as one."""

@@ -1,0 +1,140 @@
+"""Measurement files, MDF and TDMS: the same recording as from a table, piece by piece; broken ones are refused."""
+
+from __future__ import annotations
+
+import gc
+import json
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from commands import run
+from servoscope import readers
+from servoscope.errors import RecordingError
+from servoscope.loop import Columns
+from servoscope.readers import measurements
+from servoscope.readers.proposing import propose
+
+N, RATE = 5000, 100.0
+T = np.arange(N) / RATE
+SIGNALS = {name: np.random.default_rng(k).normal(size=N) for k, name in enumerate(("SetPoint", "ValveCurrent", "Pos"))}
+COLUMNS = Columns(time="time", reference="SetPoint", input="0.5 * ValveCurrent", output="Pos")
+
+
+def write_mdf(path: Path, times: int = 1) -> None:
+    from asammdf import MDF, Signal
+
+    t = np.arange(N * times) / RATE
+    with MDF(version="4.10") as file:
+        file.append([Signal(np.tile(x, times), t, name=name) for name, x in SIGNALS.items()])
+        file.append([Signal(np.arange(9.0), np.arange(9.0), name="Temperature")])
+        file.save(path, overwrite=True)
+
+
+def write_tdms(path: Path, times: int = 1) -> None:
+    from nptdms import ChannelObject, TdmsWriter
+
+    clock = {"wf_increment": 1.0 / RATE, "wf_start_offset": 0.0}
+    with TdmsWriter(path) as file:
+        for rows in times * (slice(0, 3000), slice(3000, N)):
+            file.write_segment([ChannelObject("rig", name, x[rows], clock) for name, x in SIGNALS.items()])
+        file.write_segment([ChannelObject("slow", "Temperature", np.arange(9.0), {"wf_increment": 1.0})])
+
+
+# asammdf and npTDMS warn about NumPy and pandas, and leave files open, and objects half made, after an error
+pytestmark = [
+    pytest.mark.filterwarnings(f"ignore::{name}")
+    for name in ("DeprecationWarning", "FutureWarning", "ResourceWarning", "pytest.PytestUnraisableExceptionWarning")
+]
+KINDS = pytest.mark.parametrize(("suffix", "write"), [(".mf4", write_mdf), (".tdms", write_tdms)])
+
+
+@KINDS
+def test_a_recording_is_read_piece_by_piece(
+    tmp_path: Path, suffix: str, write: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"log{suffix}"
+    write(path)
+    monkeypatch.setattr(measurements, "ROWS", 700)
+    found = readers.read(path, columns=COLUMNS)
+    assert found.sample_rate == pytest.approx(RATE) and np.allclose(found.t, T, atol=1e-9)
+    for letter, name, factor in (("r", "SetPoint", 1.0), ("u", "ValveCurrent", 0.5), ("y", "Pos", 1.0)):
+        assert np.array_equal(getattr(found, letter), factor * SIGNALS[name])
+    with pytest.raises(RecordingError, match="'Temperature' was not sampled together with"):
+        readers.read(path, columns=COLUMNS.model_copy(update={"output": "Temperature"}))
+
+
+@KINDS
+def test_memory_does_not_grow_with_the_file(
+    tmp_path: Path, suffix: str, write: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"log{suffix}"
+    write(path, 200)  # a million rows, 24 MB and more
+    monkeypatch.setattr(measurements, "ROWS", 10_000)
+    opened = readers.opening.open_file(path)
+    tracemalloc.start()
+    rows = sum(table.rows for table in opened.pieces([*SIGNALS, "time"]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert rows == 200 * N and peak < 10e6
+
+
+def test_a_file_that_was_never_finished_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "log.mf4"
+    write_mdf(path)
+    path.write_bytes(b"UnFinMF " + path.read_bytes()[8:])
+    with pytest.raises(RecordingError, match="MDF file that its recorder never finished: finalize it"):
+        readers.read(path, columns=COLUMNS)
+
+
+@KINDS
+def test_inspect_lists_channels_and_proposes(tmp_path: Path, suffix: str, write: Callable[[Path], None]) -> None:
+    path = tmp_path / f"log{suffix}"
+    write(path)
+    told = json.loads(run("inspect", path, "--json").out)
+    assert {one["name"] for one in told["channels"]} == {"time", "SetPoint", "ValveCurrent", "Pos", "Temperature"}
+    (one,) = [one for one in told["channels"] if one["name"] == "Temperature"]
+    assert (one["min"], one["max"]) == (0.0, 8.0)
+    assert told["proposed"] == {"t": "time", "r": "SetPoint", "u": "ValveCurrent", "y": "Pos"}
+
+
+@pytest.mark.parametrize(
+    ("names", "proposed"),
+    [
+        (["t", "r", "u", "y"], {"t": "t", "r": "r", "u": "u", "y": "y"}),
+        (["Zeit", "Soll", "Stell", "Ist"], {"t": "Zeit", "r": "Soll", "u": "Stell", "y": "Ist"}),
+        (["a", "pos_ref", "motor torque", "pos"], {"r": "pos_ref", "u": "motor torque", "y": "pos"}),
+        (["a", "b"], {}),
+    ],
+)  # fmt: skip
+def test_names_speak_for_themselves_or_not(names: list[str], proposed: dict[str, str]) -> None:
+    assert propose(names) == proposed
+
+
+@KINDS
+def test_broken_files_are_refused(tmp_path: Path, suffix: str, write: Callable[[Path], None]) -> None:
+    """Whatever is cut off or overwritten: a recording, or the project's own error in one line."""
+    good = tmp_path / f"good{suffix}"
+    write(good)
+    whole = good.read_bytes()
+    path = tmp_path / f"bad{suffix}"
+
+    @given(st.integers(0, len(whole)), st.lists(st.tuples(st.integers(0, 4000), st.integers(0, 255)), max_size=6))
+    @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+    def broken(cut: int, changes: list[tuple[int, int]]) -> None:
+        data = bytearray(whole[:cut] if not changes else whole)
+        for at, byte in changes:
+            data[at] = byte
+        path.write_bytes(data)
+        try:
+            readers.read(path, columns=COLUMNS)
+        except RecordingError as error:
+            assert "\n" not in str(error)
+
+    broken()
+    gc.collect()
