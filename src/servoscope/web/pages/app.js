@@ -1,0 +1,102 @@
+// Around every page: navigation, theme, person, the state of the live link; then the page itself.
+import * as api from "./api.js";
+import { complaint, h, mark, tell } from "./dom.js";
+
+const PAGES = {
+  fleet: () => import("./fleet.js"),
+  asset: () => import("./asset.js"),
+  alarms: () => import("./alarms.js"),
+  diagnose: () => import("./diagnose.js"),
+  diagnosis: () => import("./diagnosis.js"),
+  learn: () => import("./learn.js"),
+  design: () => import("./design.js"),
+  login: () => import("./login.js"),
+};
+const NAVIGATION = [
+  ["/", "Fleet", ["fleet", "asset"]],
+  ["/alarms", "Alarms", ["alarms"]],
+  ["/diagnose", "Diagnose", ["diagnose", "diagnosis"]],
+  ["/learn", "Learn", ["learn"]],
+  ["/design", "Design", ["design"]],
+];
+const name = document.querySelector("script[data-page]").dataset.page;
+const left = new AbortController();
+const theme = h("button", { type: "button", class: "quiet theme", onclick: change });
+const person = h("span", { class: "person" });
+const link = h("span", { class: "link", role: "status" });
+
+function dark() {
+  const chosen = document.documentElement.dataset.theme;
+  return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+}
+
+function named() {
+  tell(theme, dark() ? "Light" : "Dark");
+  mark(theme, "aria-label", `Switch to ${dark() ? "light" : "dark"} colours`);
+}
+
+function change() {
+  const chosen = dark() ? "light" : "dark";
+  document.documentElement.dataset.theme = chosen;
+  try {
+    localStorage.setItem("theme", chosen);
+  } catch {
+    // it holds until the page is left
+  }
+  named();
+  dispatchEvent(new Event("themechange"));
+}
+
+function surround() {
+  named();
+  const pages = NAVIGATION.map(([address, words, of]) => h("a", { href: address, "aria-current": of.includes(name) && "page" }, words));
+  document
+    .querySelector("header.top")
+    .append(
+      h("a", { class: "brand", href: "/" }, h("img", { src: "/icon.svg", alt: "", width: "22", height: "22" }), "servoscope"),
+      h("nav", { "aria-label": "Pages" }, pages),
+      link,
+      person,
+      theme,
+    );
+}
+
+function introduce(session) {
+  if (!session.login_required) {
+    person.replaceChildren(h("span", { title: "Only this machine reaches the pages, and it may do everything" }, "no login: this machine only"));
+  } else if (session.user) {
+    const out = h("button", { type: "button", class: "quiet", onclick: async () => (await api.logout(), log_in()) }, "Log out");
+    person.replaceChildren(h("span", {}, `${session.user}, ${session.role}`), out);
+  }
+}
+
+function log_in() {
+  location.assign(`/login?next=${encodeURIComponent(location.pathname + location.search)}`);
+}
+
+// Whether what is on the page is still being told: words, beside the navigation.
+function linked(state) {
+  mark(link, "data-state", state);
+  tell(link, state === "live" ? "Live" : "Connection lost, trying again");
+}
+
+async function start() {
+  surround();
+  const main = document.getElementById("main");
+  addEventListener("pagehide", (event) => event.persisted || left.abort());
+  addEventListener("pageshow", (event) => event.persisted && location.reload());
+  try {
+    const session = await api.session();
+    introduce(session);
+    if (session.login_required && !session.user && name !== "login") return log_in();
+    addEventListener("streamclosed", async () => (await api.session()).user ?? log_in());
+    const page = await PAGES[name]();
+    await page.show(main, { session, signal: left.signal, linked, values: new URLSearchParams(location.search) });
+  } catch (error) {
+    if (error.status === 401) return log_in();
+    if (!(error instanceof api.Problem)) console.error(error);
+    main.append(complaint(error));
+  }
+}
+
+start();
