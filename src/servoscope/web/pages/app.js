@@ -3,23 +3,23 @@ import * as api from "./api.js";
 import { complaint, h, mark, tell } from "./dom.js";
 
 const PAGES = {
-  fleet: () => import("./fleet.js"),
-  asset: () => import("./asset.js"),
-  alarms: () => import("./alarms.js"),
-  diagnose: () => import("./diagnose.js"),
-  diagnosis: () => import("./diagnosis.js"),
-  learn: () => import("./learn.js"),
-  design: () => import("./design.js"),
-  login: () => import("./login.js"),
+  "": ["Fleet", () => import("./fleet.js")],
+  assets: ["Asset", () => import("./asset.js")],
+  alarms: ["Alarms", () => import("./alarms.js")],
+  diagnose: ["Diagnose a recording", () => import("./diagnose.js")],
+  diagnoses: ["Diagnosis", () => import("./diagnosis.js")],
+  learn: ["Learn a baseline", () => import("./learn.js")],
+  design: ["Before deployment", () => import("./design.js")],
+  login: ["Log in", () => import("./login.js")],
 };
 const NAVIGATION = [
-  ["/", "Fleet", ["fleet", "asset"]],
+  ["/", "Fleet", ["", "assets"]],
   ["/alarms", "Alarms", ["alarms"]],
-  ["/diagnose", "Diagnose", ["diagnose", "diagnosis"]],
+  ["/diagnose", "Diagnose", ["diagnose", "diagnoses"]],
   ["/learn", "Learn", ["learn"]],
   ["/design", "Design", ["design"]],
 ];
-const name = document.querySelector("script[data-page]").dataset.page;
+const [name, ...rest] = location.pathname.slice(1).split("/").map(decodeURIComponent);
 const left = new AbortController();
 const theme = h("button", { type: "button", class: "quiet theme", onclick: change });
 const person = h("span", { class: "person" });
@@ -53,7 +53,7 @@ function surround() {
   document
     .querySelector("header.top")
     .append(
-      h("a", { class: "brand", href: "/" }, h("img", { src: "/icon.svg", alt: "", width: "22", height: "22" }), "servoscope"),
+      h("a", { class: "brand", href: "/" }, h("img", { src: "/static/icon.svg", alt: "", width: "22", height: "22" }), "servoscope"),
       h("nav", { "aria-label": "Pages" }, pages),
       link,
       person,
@@ -80,6 +80,10 @@ function linked(state) {
   tell(link, state === "live" ? "Live" : "Connection lost, trying again");
 }
 
+function entitle(title) {
+  document.title = `${title} · servoscope`;
+}
+
 async function start() {
   surround();
   const main = document.getElementById("main");
@@ -90,8 +94,10 @@ async function start() {
     introduce(session);
     if (session.login_required && !session.user && name !== "login") return log_in();
     addEventListener("streamclosed", async () => (await api.session()).user ?? log_in());
-    const page = await PAGES[name]();
-    await page.show(main, { session, signal: left.signal, linked, values: new URLSearchParams(location.search) });
+    const [title, load] = PAGES[name] ?? ["No such page", () => import("./missing.js")];
+    entitle(title);
+    const page = await load();
+    await page.show(main, { session, entitle, linked, signal: left.signal, part: rest.join("/"), values: new URLSearchParams(location.search) });
   } catch (error) {
     if (error.status === 401) return log_in();
     if (!(error instanceof api.Problem)) console.error(error);

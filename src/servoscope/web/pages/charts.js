@@ -101,13 +101,8 @@ export function line(name, data, colour, rest = {}) {
   return { type: "line", name, data, color: colour, showSymbol: false, lineStyle: { width: 1.4, color: colour, ...rest.stroke }, ...rest };
 }
 
-// The outline of the 95 % ellipse of a covariance [[xx, xy], [xy, yy]] around a point.
-export function ellipse(x, y, xx, xy, yy, steps = 64) {
-  const middle = (xx + yy) / 2;
-  const half = Math.hypot((xx - yy) / 2, xy);
-  const angle = 0.5 * Math.atan2(2 * xy, xx - yy);
-  const a = Math.sqrt(5.991 * Math.max(middle + half, 0));
-  const b = Math.sqrt(5.991 * Math.max(middle - half, 0));
+// The outline of an ellipse around a point: half axes, and the angle of the first of them.
+export function outline(x, y, a, b, angle, steps = 64) {
   return Array.from({ length: steps + 1 }, (_, i) => {
     const phi = (2 * Math.PI * i) / steps;
     const p = a * Math.cos(phi);

@@ -122,7 +122,7 @@ export async function show(main, { signal, linked, values }) {
     for (const row of rows) {
       const known = assets.get(row.asset);
       if (!known) {
-        const one = { row, tile: h("a", { class: "tile", href: `/asset?name=${encodeURIComponent(row.asset)}` }), line: lineOf(row) };
+        const one = { row, tile: h("a", { class: "tile", href: `/assets/${encodeURIComponent(row.asset)}` }), line: lineOf(row) };
         assets.set(row.asset, one);
         dress(one);
         fresh = true;
@@ -189,7 +189,7 @@ function gauge() {
 // One asset's row; only what has changed is touched.
 function lineOf(first) {
   const cell = (kind = "") => h("span", { role: "cell", class: kind });
-  const name = h("a", { href: `/asset?name=${encodeURIComponent(first.asset)}` }, first.asset);
+  const name = h("a", { href: `/assets/${encodeURIComponent(first.asset)}` }, first.asset);
   const state = cell("state");
   const [group, what, since, deviation, data, alarms, last] = [cell(), cell("what"), cell(), cell("n"), cell(), cell(), cell("n")];
   const statistic = gauge();
