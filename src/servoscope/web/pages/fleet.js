@@ -8,6 +8,8 @@ import { DASH, duration, moment, multiple, plain, sentence } from "./words.js";
 const STALE_S = 10; // without a sample for so long, the age is told
 const ORDER_MS = 5000; // between two changes of the order: rows must not run away from whoever reads them
 const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² / limit", "Sequential / limit", "Deviation", "Data", "Alarms", "Last sample"];
+// Steps of urgency: what the statistics do below their limits moves no row.
+const rank = (row) => 2 * Math.floor(row.severity / 4) + (row.severity % 4 >= 1 ? 1 : 0);
 const OPEN = ["unacknowledged", "returned_unacknowledged", "latched_unacknowledged"];
 
 export async function show(main, { signal, linked, values }) {
@@ -85,7 +87,7 @@ export async function show(main, { signal, linked, values }) {
   // Rows are put where they belong, but not under somebody's hands.
   function order(forced = false) {
     if (!forced && (body.matches(":hover") || body.contains(document.activeElement))) return;
-    const worst = [...assets.values()].sort((a, b) => b.row.severity - a.row.severity || (a.row.asset < b.row.asset ? -1 : 1));
+    const worst = [...assets.values()].sort((a, b) => rank(b.row) - rank(a.row) || (a.row.asset < b.row.asset ? -1 : 1));
     worst.forEach(({ line }, i) => body.children[i] !== line.element && body.insertBefore(line.element, body.children[i] ?? null));
   }
 

@@ -14,7 +14,8 @@ export function planes(responses, unit, signal) {
   const element = h("div", { class: "planes" }, panels.map((one) => h("div", {}, one.title, one.element)));
   let faulty = false;
 
-  const start = () => {
+  const start = (fault = false) => {
+    faulty = fault;
     for (const one of panels) {
       const label = `Inverse response at ${number(one.now.frequency_hz, 3)} Hz in the complex plane`;
       one.plot = plot(one.element, label, (c) => described(one, c, unit, faulty), signal);
@@ -25,6 +26,12 @@ export function planes(responses, unit, signal) {
       const of = history.residuals[one.i];
       if (!of) continue;
       one.trail = of.real.map((real, k) => (real === null ? null : [one.now.nominal_real + real, one.now.nominal_imag + of.imag[k]])).filter(Boolean);
+    }
+  };
+  const trails = (paths) => {
+    for (const one of panels) {
+      const of = paths[one.i];
+      if (of) one.trail = of.real.map((real, k) => (real === null ? null : [real, of.imag[k]])).filter(Boolean);
     }
   };
   const take = (responses, fault) => {
@@ -40,7 +47,7 @@ export function planes(responses, unit, signal) {
       one.plot?.draw();
     }
   };
-  return { element, start, past, take };
+  return { element, start, past, trails, take };
 }
 
 // Limits that hold what must be seen, and move only when it leaves them or fills too little of them.
