@@ -95,12 +95,15 @@ class AssetSettings(Settings):
         Name of the source that its samples come from.
     files
         What a source of kind ``replay`` replays for it, one recording after the other.
+    group
+        What people know it to belong to: a line, a hall.
     """
 
     baseline: Word
     point: Word | None = None
     source: Word
     files: Paths | None = None
+    group: Annotated[str, Field(strict=True, max_length=100)] = ""
 
 
 class Config(Settings):
