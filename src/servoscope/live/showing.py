@@ -30,6 +30,7 @@ def about(baseline: Baseline, group: str, window_s: float) -> dict[str, Any]:
         "sample_rate_hz": loop.sample_rate,
         "units": list(loop.plant.units),  # of y and u
         "coefficient_units": list(loop.plant.coefficient_units),
+        "faults": {fault.name: fault.words for fault in loop.plant.faults},
         "window_s": window_s,
     }
 
