@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
+from servoscope.access import WebSettings
 from servoscope.actions import ActionSettings
 from servoscope.alarms import AlarmSettings
 from servoscope.complaints import describe
@@ -95,12 +96,15 @@ class AssetSettings(Settings):
         Name of the source that its samples come from.
     files
         What a source of kind ``replay`` replays for it, one recording after the other.
+    group
+        What people know it to belong to: a line, a hall.
     """
 
     baseline: Word
     point: Word | None = None
     source: Word
     files: Paths | None = None
+    group: Annotated[str, Field(strict=True, max_length=100)] = ""
 
 
 class Config(Settings):
@@ -110,8 +114,8 @@ class Config(Settings):
     ----------
     name
         What the service is called in alarms and messages.
-    service, store, diagnosis, quality, alarms, actions
-        The sections of these names; each may be left out.
+    service, store, diagnosis, quality, alarms, actions, web
+        The sections of these names; each may be left out. Without ``[web]`` there are no pages.
     sources, assets
         Tables by name: ``[sources.NAME]``, ``[assets.NAME]``.
     """
@@ -123,6 +127,7 @@ class Config(Settings):
     quality: QualitySettings = QualitySettings()
     alarms: AlarmSettings = Field(default_factory=lambda: AlarmSettings.model_validate({}))
     actions: ActionSettings = ActionSettings()
+    web: WebSettings | None = None
     sources: Annotated[dict[Name, ReplaySettings], Field(min_length=1)]
     assets: Annotated[dict[Name, AssetSettings], Field(min_length=1)]
     _folder: Path = PrivateAttr(default=Path())

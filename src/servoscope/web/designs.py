@@ -1,0 +1,5 @@
+"""designs."""
+
+from fastapi import APIRouter
+
+router = APIRouter(tags=["designs"])

@@ -1,0 +1,5 @@
+"""diagnoses."""
+
+from fastapi import APIRouter
+
+router = APIRouter(tags=["diagnoses"])
