@@ -4,12 +4,12 @@ import { history as steps } from "./alarms.js";
 import { plot } from "./charts.js";
 import { commands, STATES } from "./commands.js";
 import { signals as drawn, tests } from "./curves.js";
-import { h, section, table, tell } from "./dom.js";
+import { h, section, table, tell, titled } from "./dom.js";
 import { follow } from "./live.js";
-import { badge, mark, priority, STATUS, VERDICTS } from "./marks.js";
+import { badge, mark, priority, prose, say, STATUS, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
 import { planes } from "./planes.js";
-import { capital, count, DASH, duration, moment, multiple, plain, sentence, size, symbol } from "./words.js";
+import { capital, count, DASH, duration, moment, multiple, plain, size } from "./words.js";
 
 const SPANS = { "1 h": 3600, "24 h": 86400, "7 d": 604800, "30 d": 2592000, "1 y": 31536000 };
 const SIGNALS_S = 30;
@@ -27,7 +27,7 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   const sizes = parameters(asset.parameters);
   const said = h("p", { class: "working", role: "status" });
   const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
-  const statistic = h("div", { class: "plot" });
+  const statistic = h("div", { class: "plot tall" });
   const samples = h("div", { class: "plot tall" });
   const spans = Object.entries(SPANS).map(([words, seconds]) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(seconds) }, words));
   const baseline = asset.baseline && h("a", { href: `/design?baseline=${part(asset.baseline)}` }, "What this baseline can tell apart");
@@ -39,17 +39,17 @@ export async function show(main, { session, signal, linked, part: name, entitle 
       "div",
       { class: "columns" },
       section("Inverse frequency response", "Input per unit of output, as a complex number: the diamond is healthy, the dot is now, its ellipse holds 95 %. Each panel has its own scales.", plane.element),
-      half(section("Distance from healthy", null, h("div", { class: "actions" }, spans), statistic)),
-      half(section("Signals", null, samples)),
+      half(titled("Distance from healthy", spans, statistic)),
+      half(titled("Signals", h("small", {}, `the last ${SIGNALS_S} s`), samples)),
       half(section("Coefficients", "Against what a healthy loop would show under the same reference.", sizes.element)),
-      half(section("Alarms", null, said, standing, past)),
+      half(section("Alarms", null, standing, said, past)),
       half(section("Diagnoses", null, diagnoses)),
       half(section("Stream", null, counted)),
     ),
   );
 
   // Live parts first: they need nothing but what is there already.
-  plane.start();
+  plane.start(began(asset));
   let past24 = null;
   let span = SPANS["1 h"];
   const live = { t: [], statistic: [], level: [] };
@@ -61,7 +61,7 @@ export async function show(main, { session, signal, linked, part: name, entitle 
     const cut = past24?.t.length ? past24.t.at(-1) : -Infinity;
     const from = live.t.findIndex((t) => t > cut);
     const rest = (values) => (from < 0 ? [] : values.slice(from));
-    const marks = asset.verdict === "fault" && asset.onset ? [[asset.onset, "onset"]] : [];
+    const marks = began(asset) === null ? [] : [[began(asset), "onset"]];
     const joined = (key) => [...(past24?.[key] ?? []), ...rest(live[key])];
     return { t: joined("t"), statistic: joined("statistic"), level: joined("level"), marks, range: [asset.t - span, asset.t] };
   }
@@ -92,7 +92,7 @@ export async function show(main, { session, signal, linked, part: name, entitle 
     asset = next;
     verdict.update(asset);
     sizes.update(asset.parameters);
-    plane.take(asset.responses, asset.verdict === "fault");
+    plane.take(asset.responses, asset.t, began(asset));
     if (moved && asset.statistic !== null) {
       for (const key of ["t", "statistic", "level"]) {
         live[key].push(asset[key]);
@@ -122,9 +122,10 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   );
   const timer = setInterval(() => sample().catch(() => {}), SIGNALS_EVERY_MS);
   signal.addEventListener("abort", () => clearInterval(timer));
-  await Promise.all([chosen(span).then(() => (plane.past(past24), plane.take(asset.responses, asset.verdict === "fault"))), look(), sample()]);
+  await Promise.all([chosen(span).then(() => (plane.past(past24), plane.take(asset.responses, asset.t, began(asset)))), look(), sample()]);
 }
 
+const began = (asset) => (asset.verdict === "fault" ? (asset.onset ?? asset.since) : null);
 const half = (element) => (element.classList.add("half"), element);
 
 function relative({ t, r, u, y }) {
@@ -140,24 +141,25 @@ function verdictOf(name) {
   const facts = Object.fromEntries(["since", "size", "statistic", "level", "data", "last"].map((key) => [key, { value: h("b", {}), more: h("small", {}) }]));
   const names = { since: "Since", size: "How large", statistic: "Statistic T², × limit", level: "Sequential test, × limit", data: "Data", last: "Last sample" };
   const element = h("div", { class: "verdict", "aria-label": `Verdict on ${name}`, role: "region" }, kind, headline, summary, h("dl", { class: "facts" }, Object.entries(facts).map(([key, one]) => h("div", {}, h("dt", {}, names[key]), h("dd", {}, one.value, one.more)))));
-  const put = (key, value, more = "") => (tell(facts[key].value, value), tell(facts[key].more, more));
+  const put = (key, value, more = "") => (say(facts[key].value, value), tell(facts[key].more, more));
   let look = "";
   const update = (asset) => {
-    if (look !== asset.verdict + asset.ne107) {
-      look = asset.verdict + asset.ne107;
+    const now = [asset.verdict, asset.ne107, ...asset.reasons].join();
+    if (look !== now) {
+      look = now;
       element.className = `verdict ${asset.verdict}`;
-      kind.replaceChildren(mark(asset.verdict), VERDICTS[asset.verdict], badge(asset.ne107, `NE 107: ${STATUS[asset.ne107]}`));
+      kind.replaceChildren(mark(asset.verdict), VERDICTS[asset.verdict], badge(asset.ne107, `NE 107: ${STATUS[asset.ne107]}${asset.reasons.length ? `, for ${asset.reasons.map(plain).join(", ")}` : ""}`));
     }
     tell(headline, headlineOf(asset));
-    tell(summary, sentence(asset.summary));
-    const since = asset.verdict === "fault" && asset.onset ? asset.onset : asset.since;
+    say(summary, asset.summary);
+    const since = began(asset) ?? asset.since;
     put("since", moment(since), `for ${duration(asset.t - since)}${asset.verdict === "fault" ? ", onset as estimated" : ""}`);
     const [first] = asset.sizes;
     const told = first && size({ ...first, interval: [first.low, first.high] });
-    put("size", told ? `${symbol(first.parameter)} ${told[0]}` : DASH, told ? `95 %: ${told[1]} to ${told[2]}` : asset.verdict === "fault" && asset.awaited.length ? "the full diagnosis is under way" : "no fault that is named");
+    put("size", told ? `${first.parameter} ${told[0]}` : DASH, told ? `95 %: ${told[1]} to ${told[2]}` : asset.verdict === "fault" && asset.awaited.length ? "the full diagnosis is under way" : "no fault that is named");
     put("statistic", multiple(asset.statistic), asset.statistic >= 1 ? "above its limit" : "alarm at 1");
     put("level", multiple(asset.level), asset.level >= 1 ? "above its limit" : "alarm at 1");
-    put("data", capital(asset.quality.map(plain).join(", ") || "sound"), asset.reasons.map(plain).join(", "));
+    put("data", capital(asset.quality.map(plain).join(", ") || "sound"), `${count(asset.counted.lost)} blocks lost`);
     put("last", moment(asset.t).slice(11), moment(asset.t).slice(0, 10));
   };
   return { element, update };
@@ -189,6 +191,6 @@ export function list(diagnoses) {
   return table(
     "Diagnoses, the newest first",
     ["When", "Verdict", "Grounds", "In words"],
-    [...diagnoses].reverse().map((one) => [h("a", { class: "t", href: `/diagnoses/${part(one.id)}` }, moment(one.t)), badge(one.verdict, VERDICTS[one.verdict]), one.recording ?? one.grounds, sentence(one.summary)]),
+    [...diagnoses].reverse().map((one) => [h("a", { class: "t", href: `/diagnoses/${part(one.id)}` }, moment(one.t)), badge(one.verdict, VERDICTS[one.verdict]), one.recording ?? one.grounds, prose(one.summary)]),
   );
 }

@@ -17,10 +17,6 @@ export function colours() {
   return found;
 }
 
-export function faded(colour, alpha) {
-  return colour.replace(/^rgba?\(([^)]*?)(?:,[^,)]*)?\)$/, (_, rgb) => `rgba(${rgb.split(",").slice(0, 3).join(",")}, ${alpha})`);
-}
-
 // A plot in an element of fixed height. `describe(colours)` returns an option; call `draw` when its data have changed.
 export function plot(element, label, describe, signal) {
   const chart = globalThis.echarts.init(element, null, { renderer: "canvas" });
@@ -91,7 +87,7 @@ export function axis(c, name, rest = {}) {
     nameTextStyle: { color: c.ink, fontSize: 12 },
     axisLine: { show: true, onZero: false, lineStyle: { color: c.muted } },
     axisTick: { lineStyle: { color: c.muted } },
-    axisLabel: { color: c.ink, fontSize: 11, hideOverlap: true, showMinLabel: true, ...rest.label },
+    axisLabel: { color: c.ink, fontSize: 11, hideOverlap: true, ...rest.label },
     splitLine: { show: true, lineStyle: { color: c.rule, width: 0.6 } },
     ...rest,
   };

@@ -1,5 +1,5 @@
 // Curves over time: both tests against their limit, and signals; live or of a recording, they look the same.
-import { axis, faded, legend, line, tooltip } from "./charts.js";
+import { axis, legend, line, tooltip } from "./charts.js";
 import { moment, multiple, number, unit } from "./words.js";
 
 // Both tests as multiples of their limits, on a logarithmic axis; marks are [time, words] of what happened.
@@ -20,7 +20,7 @@ export function tests(c, { t, statistic, level, marks = [], clock = true, range 
     tooltip: tooltip(c, {
       formatter: (points) => [clock ? moment(points[0].value[0] / 1000) : `${number(points[0].value[0], 5)} s`, ...points.map((one) => `${one.seriesName} ${multiple(one.value[1])} × limit`)].join("\n"),
     }),
-    xAxis: axis(c, clock ? "" : "time [s]", { type: clock ? "time" : "value", min: at(range[0], clock), max: at(range[1], clock), splitNumber: 8 }),
+    xAxis: axis(c, clock ? "" : "time [s]", { type: clock ? "time" : "value", min: at(range[0], clock), max: at(range[1], clock), splitNumber: 8, label: { showMinLabel: false, ...(clock ? {} : { formatter: short }) } }),
     yAxis: axis(c, "multiple of the limit", { type: "log", min: 10 ** Math.floor(Math.log10(lowest)), max: 10 ** Math.ceil(Math.log10(1.2 * highest)), gap: 44, label: { formatter: String } }),
     series: [
       line("sequential test", pairs(level), c.healthy, { stroke: { width: 1.1 } }),
@@ -42,10 +42,10 @@ export function signals(c, { t, r, u, y, units, name = "time [s]", marks = [] })
       { left: 70, right: 14, top: 30, height: "36%" },
       { left: 70, right: 14, bottom: 40, height: "32%" },
     ],
-    legend: legend(c, ["output y", "reference r", "input u"]),
+    legend: legend(c, ["output y", "reference r"]),
     tooltip: tooltip(c, { formatter: (points) => [`${number(points[0].value[0], 5)} s`, ...points.map((one) => `${one.seriesName} ${number(one.value[1], 4)} ${one.seriesName === "input u" ? (units?.u ?? "") : (units?.y ?? "")}`)].join("\n") }),
     axisPointer: { link: [{ xAxisIndex: "all" }] },
-    xAxis: [upper, axis(c, name, { ...time, gridIndex: 1 })],
+    xAxis: [upper, axis(c, name, { ...time, gridIndex: 1, label: { formatter: short, showMinLabel: false } })],
     yAxis: [axis(c, `r, y${unit(units?.y)}`, { type: "value", scale: true, gridIndex: 0, gap: 52, splitNumber: 3, label: { formatter: short } }), axis(c, `u${unit(units?.u)}`, { type: "value", scale: true, gridIndex: 1, gap: 52, splitNumber: 3, label: { formatter: short } })],
     series: [
       line("output y", pairs(y), c.measured, { xAxisIndex: 0, yAxisIndex: 0, stroke: { width: 2.2 }, markLine: lines }),
@@ -72,7 +72,7 @@ export function coefficient(c, { t, one }) {
     yAxis: axis(c, `deviation${unit(relative ? "%" : one.unit)}`, { type: "value", scale: true, gap: 44, splitNumber: 3, label: { formatter: short } }),
     series: [
       { ...band, name: "low", data: t.map((at, i) => [at, middle[i] === null ? null : middle[i] - half[i]]) },
-      { ...band, name: "width", data: t.map((at, i) => [at, middle[i] === null ? null : 2 * half[i]]), areaStyle: { color: faded(c.measured, 0.2) } },
+      { ...band, name: "width", data: t.map((at, i) => [at, middle[i] === null ? null : 2 * half[i]]), areaStyle: { color: c.measured, opacity: 0.2 } },
       line("estimate", t.map((at, i) => [at, middle[i]]), c.measured, { markLine: { silent: true, symbol: "none", label: { show: false }, lineStyle: { color: c.healthy, type: [5, 3] }, data: [{ yAxis: 0 }] } }),
     ],
   };

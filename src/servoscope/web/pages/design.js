@@ -4,7 +4,8 @@ import { axis, legend, plot, tooltip } from "./charts.js";
 import { short } from "./curves.js";
 import { complaint, field, h, section, table, tell } from "./dom.js";
 import { loopChoice } from "./loops.js";
-import { capital, change, DASH, moment, number, plain, symbol } from "./words.js";
+import { prose } from "./marks.js";
+import { capital, change, DASH, moment, number, general, plain } from "./words.js";
 
 const REFERENCES = ["profile", "multisine", "trapezoid", "steps", "chirp"];
 
@@ -19,7 +20,7 @@ export async function show(main, { session, signal, values, entitle }) {
     const drawn = [];
     const report = h("a", { class: "button", href: `/api/v1/designs/${part(id)}/report`, target: "_blank", rel: "noopener" }, "Report as one file");
     main.replaceChildren(
-      h("div", { class: "head" }, h("h1", {}, `Before deployment: ${found.loop}`), h("span", { class: "note" }, `${moment(found.at)}, reference ${found.reference}, ${number(found.study.after_s, 3)} s after the onset`), h("span", { class: "gap" }), h("div", { class: "actions" }, h("a", { class: "button", href: "/design" }, "Another study"), h("button", { type: "button", onclick: () => print() }, "Print"), report)),
+      h("div", { class: "head" }, h("h1", {}, `Before deployment: ${found.loop}`), h("span", { class: "note" }, `${moment(found.at)}, reference ${found.reference}, ${general(found.study.after_s)} s after the onset`), h("span", { class: "gap" }), h("div", { class: "actions" }, h("a", { class: "button", href: "/design" }, "Another study"), h("button", { type: "button", onclick: () => print() }, "Print"), report)),
       ...studied(found.study, drawn, signal),
     );
     drawn.forEach((draw) => draw());
@@ -83,7 +84,7 @@ function studied(study, drawn, signal) {
       table(
         "Radii of faults",
         ["Change", "*Detected from", "*Named from", "*Linear bound", "Else taken for", "*Half announced within"],
-        sides.map(([fault, way, side]) => [h("span", {}, `${capital(plain(fault.name))} ${way} `, h("small", {}, symbol(fault.parameter))), change(side.detectable), change(named(side)), change(side.bound), side.nearest || DASH, side.delays.length && side.delays[0].half_s !== null ? `${number(side.delays[0].half_s, 3)} s` : DASH]),
+        sides.map(([fault, way, side]) => [h("span", {}, `${capital(plain(fault.name))} ${way} `, h("small", {}, prose(fault.parameter))), change(side.detectable), change(named(side)), change(side.bound), side.nearest || DASH, side.delays.length && side.delays[0].half_s !== null ? `${number(side.delays[0].half_s, 3)} s` : DASH]),
       ),
     ),
     h(
@@ -93,9 +94,9 @@ function studied(study, drawn, signal) {
       h("div", { class: "half" }, section("How sure a size becomes", "Cramér-Rao bound, with the healthy parameters as well known as they are.", picture("Standard deviation of the size over time", (c) => sizes(c, faults)))),
     ),
     names.length > 1 && section("How alike they look", "Cosine between what small changes do: 1 or −1 cannot be told apart, 0 is as different as can be.", table("Cosines between faults", ["Change", ...names.map((name) => `*${plain(name)}`)], names.map((one) => [plain(one), ...names.map((other) => heat(study.cosines[one][other]))]))),
-    study.mimics?.length > 0 && section("What else it could be", "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart.", table("Mimics", ["Change", "Is most like", "*Cosine", "*So much", "*Looks like", "*Told apart from"], study.mimics.map((one) => [h("span", {}, `${one.words} `, h("small", {}, plain(one.name))), one.imitates, number(one.cosines[one.imitates], 3), amount(one.amount, one.unit), change(one.looks_like), amount(one.told_apart, one.unit)]))),
-    section("Frequencies to monitor", `Standard deviation of each size as one frequency shows it. The best set the faults ${number(study.frequencies.gain, 3)} times as far apart, on average.`, table("Frequencies", ["Frequency", "", ...names.map((name) => `*${plain(name)}`)], [["monitored", study.frequencies.own], ["best", study.frequencies.best]].flatMap(([what, several]) => several.map((one) => [`${number(one.frequency_hz, 3)} Hz`, what, ...names.map((name) => percent(one.apart[name]))])))),
-    study.dither?.length > 0 && section("What a dither would buy", "Sizes from which on each fault is named, of linear sensitivities; amplitude as a share of the reference's rms.", table("Dither", ["Sine on the reference", "*Adds to u (rms)", ...names.map((name) => `*${plain(name)} from`)], study.dither.map((one) => [one.share ? `${number(100 * one.share, 3)} % at ${number(one.frequency_hz, 3)} Hz` : "none", number(one.extra_u_rms, 3), ...names.map((name) => change(one.radius[name]))]))),
+    study.mimics?.length > 0 && section("What else it could be", "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart.", table("Mimics", ["Change", "Is most like", "*Cosine", "*So much", "*Looks like", "*Told apart from"], study.mimics.map((one) => [h("span", {}, `${one.words} `, h("small", {}, prose(one.name))), one.imitates, number(one.cosines[one.imitates], 3), amount(one.amount, one.unit), change(one.looks_like), amount(one.told_apart, one.unit)]))),
+    section("Frequencies to monitor", `Standard deviation of each size as one frequency shows it. The best set the faults ${number(study.frequencies.gain, 3)} times as far apart, on average.`, table("Frequencies", ["Frequency", "", ...names.map((name) => `*${plain(name)}`)], [["monitored", study.frequencies.own], ["best", study.frequencies.best]].flatMap(([what, several]) => several.map((one) => [`${general(one.frequency_hz)} Hz`, what, ...names.map((name) => percent(one.apart[name]))])))),
+    study.dither?.length > 0 && section("What a dither would buy", "Sizes from which on each fault is named, of linear sensitivities; amplitude as a share of the reference's rms.", table("Dither", ["Sine on the reference", "*Adds to u (rms)", ...names.map((name) => `*${plain(name)} from`)], study.dither.map((one) => [one.share ? `${general(100 * one.share)} % at ${general(one.frequency_hz)} Hz` : "none", number(one.extra_u_rms, 3), ...names.map((name) => change(one.radius[name]))]))),
   ].filter(Boolean);
 }
 

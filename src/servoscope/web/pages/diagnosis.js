@@ -3,10 +3,10 @@ import { get, part } from "./api.js";
 import { plot } from "./charts.js";
 import { coefficient, signals, tests } from "./curves.js";
 import { h, section, table } from "./dom.js";
-import { mark, VERDICTS } from "./marks.js";
+import { mark, prose, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
 import { planes } from "./planes.js";
-import { capital, DASH, moment, number, plain, probability, sentence, size, symbol } from "./words.js";
+import { capital, DASH, moment, number, plain, probability, size } from "./words.js";
 
 export async function show(main, { signal, part: id, entitle }) {
   const found = await get(`/diagnoses/${part(id)}`, signal);
@@ -44,7 +44,7 @@ function verdict(found, said) {
   else if (found.onset) facts.push(["Since about", moment(found.onset), "as the tests tell it"]);
   for (const fault of said.faults ?? []) {
     const [value, low, high] = size(fault);
-    facts.push(["How large", `${symbol(fault.parameter)} ${value}`, `95 %: ${low} to ${high}`]);
+    facts.push(["How large", prose(`${fault.parameter} ${value}`), `95 %: ${low} to ${high}`]);
   }
   if (said.probability) facts.push(["How sure", probability(said.probability), said.faults.length ? "among the faults that this plant knows" : `for ${said.candidates[0]?.name ?? "it"}`]);
   if (said.detected_at_s !== null && said.detected_at_s !== undefined) facts.push(["Detected at", at(said.detected_at_s), "first evaluation above a limit"]);
@@ -66,10 +66,10 @@ function sections(found, said, picture, drawn, signal) {
   const units = found.units ?? {};
   const marks = said.onset_s ? [[said.onset_s[1], "onset"]] : [];
   const made = [];
-  if (said.explanation?.length) made.push(section("Why", null, h("ul", { class: "why" }, said.explanation.map((words) => h("li", {}, sentence(words))))));
+  if (said.explanation?.length) made.push(section("Why", null, h("ul", { class: "why" }, said.explanation.map((words) => h("li", {}, prose(words))))));
   if (said.candidates?.length) made.push(section("Candidates", "What could explain the change, how large each explanation would have to be, how probable it is.", candidates(found, said)));
   if (said.refit?.mimics?.length) {
-    const rows = said.refit.mimics.map((one) => [plain(one.name), one.words, one.unit === "ratio" ? `× ${number(one.value, 4)}` : `${number(one.value, 3)} ${one.unit}`]);
+    const rows = said.refit.mimics.map((one) => [h("span", {}, prose(one.name)), one.words, one.unit === "ratio" ? `× ${number(one.value, 4)}` : `${number(one.value, 3)} ${one.unit}`]);
     made.push(section("What else it could be", null, table("Causes outside the list of faults", ["Cause", "In words", "*Size"], rows)));
   }
   if (trace) {
@@ -78,12 +78,12 @@ function sections(found, said, picture, drawn, signal) {
   if (found.signals) made.push(section("Signals", null, picture("Reference, output and input", (c) => signals(c, { ...found.signals, units, marks }), "plot tall")));
   if (said.ifrf?.length) {
     const plane = planes(said.ifrf.map(response), units.response ?? "", signal);
-    if (trace) plane.trails(trace.responses);
-    drawn.push(() => plane.start(found.verdict === "fault"));
+    if (trace) plane.trails(trace.responses, trace.t);
+    drawn.push(() => plane.start(said.onset_s ? said.onset_s[1] : null));
     made.push(section("Inverse frequency response", "Input per unit of output, as a complex number: the diamond is healthy, the dot is the estimate, its ellipse two standard deviations each way.", plane.element));
   }
   if (trace?.parameters?.length) {
-    const panels = trace.parameters.map((one) => h("div", {}, h("h3", {}, symbol(one.name)), picture(`Deviation of ${one.name} over time`, (c) => coefficient(c, { t: trace.t, one }))));
+    const panels = trace.parameters.map((one) => h("div", {}, h("h3", {}, prose(one.name)), picture(`Deviation of ${one.name} over time`, (c) => coefficient(c, { t: trace.t, one }))));
     made.push(section("Coefficients over time", "Deviation from what a healthy loop would show under the same reference, with two standard deviations.", h("div", { class: "planes" }, panels)));
   }
   const names = Object.entries(said.parameters ?? {});
@@ -108,7 +108,7 @@ function candidates(found, said) {
     bar.style.width = `${(100 * one.probability).toFixed(1)}%`;
     return [
       h("span", {}, plain(one.name)),
-      sizes.length ? h("span", {}, sizes.map(([fault, [value]], i) => [i > 0 && h("br"), `${symbol(fault.parameter)} ${value}`])) : DASH,
+      sizes.length ? h("span", {}, sizes.map(([fault, [value]], i) => [i > 0 && h("br"), ...prose(`${fault.parameter} ${value}`)])) : DASH,
       sizes.length ? h("span", {}, sizes.map(([, [, low, high]], i) => [i > 0 && h("br"), `${low} to ${high}`])) : DASH,
       one.misfit === null || one.misfit === undefined ? DASH : `${number(Math.sqrt(Math.max(one.misfit, 0)), 3)} σ`,
       h("span", {}, h("span", { class: "share", "aria-hidden": "true" }, bar), probability(one.probability)),

@@ -62,6 +62,11 @@ export function section(title, note, ...children) {
   return h("section", {}, h("h2", {}, title), note && h("p", { class: "note" }, note), ...children);
 }
 
+// The same with controls beside the title.
+export function titled(title, controls, ...children) {
+  return h("section", {}, h("div", { class: "titled" }, h("h2", {}, title), controls), ...children);
+}
+
 // What went wrong, said where it matters; screen readers hear it at once.
 export function complaint(error) {
   return h("p", { class: "complaint", role: "alert" }, error.message ?? String(error));

@@ -7,7 +7,7 @@ import { DASH, duration, moment, multiple, plain, sentence } from "./words.js";
 
 const STALE_S = 10; // without a sample for so long, the age is told
 const ORDER_MS = 5000; // between two changes of the order: rows must not run away from whoever reads them
-const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² / limit", "Sequential / limit", "Deviation", "Data", "Alarms", "Last sample"];
+const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² × limit", "Sequential ×", "Deviation", "Data", "Alarms", "Sample"];
 // Steps of urgency: what the statistics do below their limits moves no row.
 const rank = (row) => 2 * Math.floor(row.severity / 4) + (row.severity % 4 >= 1 ? 1 : 0);
 const OPEN = ["unacknowledged", "returned_unacknowledged", "latched_unacknowledged"];

@@ -2,8 +2,8 @@
 import { plot, axis, legend, line, tooltip } from "./charts.js";
 import { short, signals } from "./curves.js";
 import { h, table } from "./dom.js";
-import { mark } from "./marks.js";
-import { capital, DASH, number, sentence } from "./words.js";
+import { mark, prose } from "./marks.js";
+import { capital, DASH, general, number } from "./words.js";
 
 const VERDICTS = { usable: "healthy", "usable with care": "care", "not usable": "stop" };
 
@@ -16,16 +16,16 @@ export function inspected(found, units, signal) {
     "div",
     {},
     h("p", { class: `badge ${VERDICTS[said.verdict]}` }, mark(VERDICTS[said.verdict]), h("b", {}, capital(said.verdict))),
-    h("p", {}, sentence(said.summary)),
+    h("p", {}, prose(said.summary)),
     findings(said),
-    said.recommendations.length > 0 && [h("h3", {}, "What to do"), h("ul", { class: "why" }, said.recommendations.map((words) => h("li", {}, sentence(words))))],
+    said.recommendations.length > 0 && [h("h3", {}, "What to do"), h("ul", { class: "why" }, said.recommendations.map((words) => h("li", {}, prose(words))))],
     found.signals && curves,
     said.frequencies.length > 0 && [
       h("h3", {}, "Excitation"),
       table(
         "How well each monitored frequency is excited",
         ["Frequency", "*Coherence r → u", "*Coherence r → y", "*Signal to noise", "*Spread of the response, whole recording", "*within the memory"],
-        said.frequencies.map((one) => [`${number(one.frequency_hz, 3)} Hz`, number(one.coherence_u, 3), number(one.coherence_y, 3), number(one.snr, 3), percent(one.relative_std), percent(one.relative_std_memory)]),
+        said.frequencies.map((one) => [`${general(one.frequency_hz)} Hz`, number(one.coherence_u, 3), number(one.coherence_y, 3), number(one.snr, 3), percent(one.relative_std), percent(one.relative_std_memory)]),
       ),
     ],
     found.spectra && spectrum,
@@ -39,7 +39,7 @@ export function inspected(found, units, signal) {
 
 export function findings(said) {
   const words = { stop: "stops: ", care: "care: ", note: "" };
-  return h("ul", { class: "findings" }, said.findings.map((one) => h("li", { class: one.severity === "note" ? "note" : one.severity }, mark(one.severity), h("span", {}, h("span", { class: "hidden" }, words[one.severity]), sentence(one.message)))));
+  return h("ul", { class: "findings" }, said.findings.map((one) => h("li", { class: one.severity === "note" ? "note" : one.severity }, mark(one.severity), h("span", {}, h("span", { class: "hidden" }, words[one.severity]), prose(one.message)))));
 }
 
 function coherence(c, { frequency_hz: f, coherence_u: u, coherence_y: y }) {

@@ -3,9 +3,9 @@ import { get, job, mayChange, part, post } from "./api.js";
 import { complaint, field, h, section, table, tell } from "./dom.js";
 import { findings, inspected } from "./inspection.js";
 import { loopChoice } from "./loops.js";
-import { mark } from "./marks.js";
+import { mark, prose } from "./marks.js";
 import { dropzone, earlier, mapping, preview } from "./uploads.js";
-import { change, count, DASH, duration, moment, number, plain, sentence, symbol, withStd } from "./words.js";
+import { change, count, DASH, duration, general, moment, number, plain, withStd } from "./words.js";
 
 const KINDS = { usable: "healthy", "usable with care": "care", "not usable": "stop" };
 
@@ -117,15 +117,15 @@ function learned(found, refresh) {
 }
 
 function told(summary) {
-  const promises = (summary.promises ?? []).map((one) => [plain(one.name), symbol(one.parameter), one.change === null ? "never" : change(1 + one.change)]);
-  const values = Object.entries(summary.parameters ?? {}).map(([name, one]) => [symbol(name), ...withStd(one.value, one.std)]);
+  const promises = (summary.promises ?? []).map((one) => [plain(one.name), h("span", {}, prose(one.parameter)), one.change === null ? "never" : change(1 + one.change)]);
+  const values = Object.entries(summary.parameters ?? {}).map(([name, one]) => [h("span", {}, prose(name)), ...withStd(one.value, one.std)]);
   return h(
     "div",
     {},
-    h("p", {}, `Explains ${number(100 * summary.explained, 4)} % of the input; threshold of T² ${number(summary.threshold, 4)}, for ${number(summary.false_alarms_per_year, 3)} false alarms a year.`),
+    h("p", {}, `Explains ${number(100 * summary.explained, 4)} % of the input; threshold of T² ${number(summary.threshold, 4)}, for ${general(summary.false_alarms_per_year)} false alarms a year.`),
     promises.length > 0 && table("The smallest change that this baseline promises to see", ["Fault", "Parameter", "*Seen from"], promises),
     values.length > 0 && table("Learned coefficients", ["Name", "*Value", "*Standard deviation"], values),
-    (summary.notes ?? []).length > 0 && h("ul", { class: "why" }, summary.notes.map((words) => h("li", {}, sentence(typeof words === "string" ? words : (words.message ?? ""))))),
+    (summary.notes ?? []).length > 0 && h("ul", { class: "why" }, summary.notes.map((words) => h("li", {}, prose(typeof words === "string" ? words : (words.message ?? ""))))),
   );
 }
 

@@ -1,5 +1,6 @@
 // States as shapes: colour is never the only thing that tells them apart.
 import { h, s } from "./dom.js";
+import { sentence } from "./words.js";
 
 const SHAPES = {
   fault: ["M12 2 23 21.5H1Z", "M12 9v6M12 17.4v1.6"],
@@ -39,4 +40,22 @@ export function badge(kind, words) {
 export function priority(name) {
   const bars = PRIORITIES.length - Math.max(PRIORITIES.indexOf(name), 0);
   return h("span", { class: `priority ${name}` }, h("span", { class: "bars", "aria-hidden": "true" }, "▮".repeat(bars) + "▯".repeat(4 - bars)), ` ${name}`);
+}
+
+// A sentence, or a name, with its parameters as symbols: C_ie with a subscript.
+export function prose(text) {
+  return sentence(text)
+    .split(/\b([A-Za-z]{1,2}_[A-Za-z]\w{0,2})\b/)
+    .map((part, i) => {
+      if (i % 2 === 0) return part;
+      const [letter, index] = part.split("_");
+      return h("span", {}, h("i", {}, letter), h("sub", {}, index));
+    });
+}
+
+// The same in place, where it changes.
+export function say(element, text) {
+  if (element.dataset.text === text) return;
+  element.dataset.text = text;
+  element.replaceChildren(...prose(text));
 }

@@ -1,6 +1,7 @@
 // Estimated coefficients with their intervals, as a table whose numbers move without the page moving.
 import { h, tell } from "./dom.js";
-import { DASH, number, symbol, withStd } from "./words.js";
+import { prose } from "./marks.js";
+import { DASH, signed, withStd } from "./words.js";
 
 const WIDTH = 160; // px of the picture of an interval
 
@@ -10,10 +11,10 @@ export function parameters(first) {
     const band = h("i");
     const dot = h("b");
     const picture = h("td", {}, h("span", { class: "interval", "aria-hidden": "true" }, band, dot));
-    const unit = h("td", {}, one.unit || DASH);
-    return { name: one.name, cells, band, dot, element: h("tr", {}, h("th", { scope: "row" }, symbol(one.name)), cells.value, unit, cells.nominal, cells.change, cells.sigma, picture) };
+    const unit = h("td", { class: "unit" }, one.unit || DASH);
+    return { name: one.name, cells, band, dot, element: h("tr", {}, h("th", { scope: "row" }, prose(one.name)), cells.value, unit, cells.nominal, cells.change, cells.sigma, picture) };
   });
-  const heads = ["Name", "Estimate ± 2σ", "Unit", "Healthy", "Change", "In σ", "95 % interval around healthy"];
+  const heads = ["Name", "Estimate ± 2σ", "Unit", "Healthy", "Change", "In σ", "95 % interval"];
   const element = h(
     "div",
     { class: "scroll", tabindex: "0", role: "region", "aria-label": "Coefficients" },
@@ -31,8 +32,8 @@ export function parameters(first) {
       const sigma = one.std > 0 ? (one.value - one.nominal) / one.std : null;
       tell(row.cells.value, `${value} ± ${spread}`);
       tell(row.cells.nominal, nominal);
-      tell(row.cells.change, share === null ? DASH : `${share > 0 ? "+" : ""}${share.toFixed(Math.abs(share) < 10 ? 2 : 1)} %`.replace("-", "−"));
-      tell(row.cells.sigma, sigma === null ? DASH : number(sigma, Math.abs(sigma) < 10 ? 2 : 3));
+      tell(row.cells.change, share === null ? DASH : `${signed(share, Math.abs(share) < 10 ? 2 : 1)} %`);
+      tell(row.cells.sigma, sigma === null ? DASH : signed(sigma, Math.abs(sigma) < 100 ? 1 : 0));
       row.element.classList.toggle("first", Math.abs(sigma) > 5);
       const place = (x) => WIDTH * Math.min(Math.max(0.5 + (x - one.nominal) / one.std / scale / 2, 0), 1);
       row.band.style.left = `${place(one.low).toFixed(1)}px`;

@@ -5,7 +5,7 @@ const GREEK = { theta: "θ", beta: "β", rho: "ρ" };
 const SUBSCRIPT = "₀₁₂₃₄₅₆₇₈₉";
 const SUPERSCRIPT = "⁰¹²³⁴⁵⁶⁷⁸⁹";
 
-const signed = (text) => text.replaceAll("-", "−");
+const minus = (text) => text.replaceAll("-", "−");
 const power = (exponent) => ` × 10${exponent < 0 ? "⁻" : ""}${[...String(Math.abs(exponent))].map((c) => SUPERSCRIPT[c]).join("")}`;
 
 // So many significant digits; very small and large ones as powers of ten.
@@ -13,9 +13,12 @@ export function number(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return DASH;
   if (value === 0) return "0";
   const exponent = Math.floor(Math.log10(Math.abs(value)));
-  if (exponent >= -4 && exponent < 6) return signed(value.toFixed(Math.max(digits - 1 - exponent, 0)));
-  return signed((value / 10 ** exponent).toFixed(digits - 1)) + power(exponent);
+  if (exponent >= -4 && exponent < 6) return minus(value.toFixed(Math.max(digits - 1 - exponent, 0)));
+  return minus((value / 10 ** exponent).toFixed(digits - 1)) + power(exponent);
 }
+
+// How many decimals show the first digit of an uncertainty, or two where they are below 35.
+const decimals = (uncertainty) => (uncertainty > 0 ? Math.min(Math.max(-Math.floor(Math.log10(uncertainty / 3.5)), 0), 7) : 3);
 
 // A value and its standard deviation, both to the digits that the deviation supports.
 export function withStd(value, std, ...others) {
@@ -24,10 +27,23 @@ export function withStd(value, std, ...others) {
   const top = Math.max(...values.filter(Number.isFinite).map(Math.abs));
   let exponent = top > 0 ? Math.floor(Math.log10(top)) : 0;
   if (exponent >= -3 && exponent < 6) exponent = 0;
-  const decimals = Math.min(Math.max(1 - Math.floor(Math.log10(std / 10 ** exponent)), 0), 7);
+  const places = decimals(std / 10 ** exponent);
   return values.map((each) =>
-    Number.isFinite(each) ? signed((each / 10 ** exponent).toFixed(decimals)) + (exponent ? power(exponent) : "") : DASH,
+    Number.isFinite(each) ? minus((each / 10 ** exponent).toFixed(places)) + (exponent ? power(exponent) : "") : DASH,
   );
+}
+
+// With its sign, and so many decimals.
+export function signed(value, decimals) {
+  const text = value.toFixed(decimals);
+  return (Number(text) > 0 ? "+" : "") + (Number(text) === 0 ? text.replace("-", "") : minus(text));
+}
+
+// Marks of an axis: as many decimals as its range asks for.
+export function ticks(low, high) {
+  const places = Math.max(0, 1 - Math.floor(Math.log10(high - low || 1)));
+  const far = Math.max(Math.abs(low), Math.abs(high));
+  return places > 6 || far >= 1e6 ? (value) => number(value, 3) : (value) => minus(value.toFixed(places));
 }
 
 export function count(value) {
@@ -45,12 +61,11 @@ export function size(fault) {
   const values = [fault.ratio, ...fault.interval];
   const percent = fault.parameter !== "severity" && values.every((each) => each >= 0.2 && each < 3);
   const scale = percent ? 100 : 1;
-  const width = (scale * (values[2] - values[1])) / 2;
-  const decimals = width > 0 && Number.isFinite(width) ? Math.min(Math.max(1 - Math.floor(Math.log10(width)), 0), 6) : 3;
+  const places = decimals((scale * (values[2] - values[1])) / 2);
   return values.map((each) => {
-    if (!percent) return signed(`× ${each.toFixed(decimals)}`);
-    const change = (100 * (each - 1)).toFixed(decimals);
-    return signed(`${change.startsWith("-") ? "" : "+"}${change} %`);
+    if (!percent) return minus(`× ${each.toFixed(places)}`);
+    const change = (100 * (each - 1)).toFixed(places);
+    return minus(`${change.startsWith("-") ? "" : "+"}${change} %`);
   });
 }
 
@@ -59,7 +74,7 @@ export function change(ratio) {
   if (ratio === null || ratio === undefined) return "never";
   if (ratio <= 0.5 || ratio >= 2) return `× ${number(ratio, 3)}`;
   const percent = Number((100 * (ratio - 1)).toPrecision(3));
-  return signed(`${percent > 0 ? "+" : ""}${percent} %`);
+  return minus(`${percent > 0 ? "+" : ""}${percent} %`);
 }
 
 // A multiple of a limit, at a width that does not jump.
@@ -69,11 +84,9 @@ export function multiple(value) {
   return value >= 100 ? value.toFixed(0) : value >= 10 ? value.toFixed(1) : value.toFixed(2);
 }
 
-// theta_0 as θ₀, viscous_friction as words.
-export function symbol(name) {
-  const found = /^(theta|beta|rho)(?:_(\d+))?$/.exec(name);
-  if (found) return GREEK[found[1]] + [...(found[2] ?? "")].map((c) => SUBSCRIPT[c]).join("");
-  return /^[A-Za-z]{1,2}_\w{1,3}$/.test(name) ? name : plain(name);
+// A number as it was set: no more digits than it has.
+export function general(value) {
+  return value === null || value === undefined ? DASH : minus(String(Number(value.toPrecision(6))));
 }
 
 export function plain(name) {
@@ -86,7 +99,7 @@ export function capital(text) {
 
 // A sentence of the service, with symbols and a true sign of multiplication.
 export function sentence(text) {
-  return (text ?? "").replace(/\b(theta_\d+|beta|rho)\b/g, symbol).replace(/\bx (?=\d)/g, "× ").replaceAll("T^2", "T²");
+  return (text ?? "").replace(/\b(theta|beta|rho)(?:_(\d+))?\b/g, (_, name, index) => GREEK[name] + [...(index ?? "")].map((c) => SUBSCRIPT[c]).join("")).replace(/\bx (?=\d)/g, "× ").replaceAll("T^2", "T²").replace(/\b[a-z]{3,}(?:_[a-z]+)+\b/g, plain);
 }
 
 const pad = (value) => String(value).padStart(2, "0");
