@@ -18,8 +18,8 @@ from servoscope.web.hub import of_services
 from servoscope.web.models import (
     Alarms,
     Audit,
-    CommandName,
     Commanded,
+    CommandName,
     OfAlarmRows,
     OfAlarms,
     OfAudit,

@@ -1,4 +1,4 @@
-"""What the server keeps beside the store: uploads, baselines, diagnoses of uploads, designs; each in a folder of its own.
+"""What the server keeps beside the store: uploads, baselines, diagnoses, designs; each in a folder of its own.
 
 What is still being made has no `about.json` yet, and is not there for anybody else.
 """

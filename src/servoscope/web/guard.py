@@ -1,4 +1,4 @@
-"""What every request passes before anything else looks at it: host, origin, login, token, size; and what answers carry."""
+"""What every request passes first: host, origin, login, token, size; and what answers carry."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from servoscope.access import Hosts, Sessions, Users, WebSettings
@@ -35,12 +36,8 @@ HEADERS = {
 }
 
 
-class Refused(Exception):
+class Refused(HTTPException):
     """A request that goes no further."""
-
-    def __init__(self, status: int, detail: str) -> None:
-        super().__init__(detail)
-        self.status, self.detail = status, detail
 
 
 def cookie_name(secure: bool) -> str:
@@ -89,7 +86,7 @@ class Guard:
             most = self._check(scope)
             await self._app(scope, _bounded(receive, most), answer)
         except Refused as refused:
-            await problem(refused.status, refused.detail, scope["path"])(scope, receive, answer)
+            await problem(refused.status_code, refused.detail, scope["path"])(scope, receive, answer)
         finally:
             self._metrics.answered(scope, seen["status"], time.perf_counter() - begun)
 

@@ -58,6 +58,8 @@ class Job:
         Where it runs: the folder of what it reads, so that messages name files and not the server's folders.
     finish
         Turns its answer into the job's result, in a thread.
+    abandon
+        Takes away what it has begun, where it fails.
     """
 
     kind: str
@@ -66,6 +68,7 @@ class Job:
     arguments: Plain
     cwd: Path
     finish: Callable[[Plain], Plain]
+    abandon: Callable[[], None] = lambda: None
     id: str = field(default_factory=lambda: secrets.token_hex(8))
     state: str = "queued"
     step: str | None = None
@@ -97,8 +100,8 @@ class Jobs:
         self._turn = asyncio.Semaphore(AT_ONCE)
         self._glance = asyncio.Semaphore(AT_ONCE)
 
-    def submit(self, job: Job) -> Job:
-        """Put a job into the queue.
+    def submitted(self, job: Job) -> Job:
+        """Put a job into the queue and return it.
 
         Raises
         ------
@@ -106,6 +109,7 @@ class Jobs:
             429: if too many wait.
         """
         if sum(one.finished is None for one in self._jobs.values()) >= WAITING:
+            job.abandon()
             raise HTTPException(429, "too many jobs wait, try again later", headers={"Retry-After": "10"})
         for old in [one for one in self._jobs.values() if one.finished is not None][: -KEPT or None]:
             del self._jobs[old.id]
@@ -169,6 +173,8 @@ class Jobs:
             job.state, job.problem = "failed", problems.describe(500, "it failed; the server's log has more")
             raise
         finally:
+            if job.state == "failed":
+                job.abandon()
             job.finished, job.step = time.time(), None
             job.ended.set()
 

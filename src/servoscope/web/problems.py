@@ -9,6 +9,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse, Response
 
 from servoscope.errors import AlarmError, ServoscopeError, StoreError
@@ -71,6 +72,10 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(ServoscopeError)
     async def _own(request: Request, error: ServoscopeError) -> Response:
         return answer(error, request.url.path)
+
+    @app.exception_handler(ClientDisconnect)
+    async def _gone(request: Request, _: ClientDisconnect) -> Response:
+        return problem(400, "the request was not sent to its end", request.url.path)
 
     @app.exception_handler(Exception)
     async def _unexpected(request: Request, error: Exception) -> Response:

@@ -96,7 +96,7 @@ def detail_of(name: str, at: float, said: Mapping[str, Any]) -> Plain:
         "exceeded": said.get("exceeded"),
         "responses": [_response(*row) for row in said.get("responses", ())],
         "parameters": [
-            _parameter(*row, units[i] if i < len(units) else "") for i, row in enumerate(said.get("parameters", ()))
+            _parameter(units[i] if i < len(units) else "", *row) for i, row in enumerate(said.get("parameters", ()))
         ],
         "counted": {key: value for key, value in said["counted"].items() if key not in ("digest", "rows")},
         "about": {
@@ -129,7 +129,7 @@ def _response(f: float, real: float, imag: float, real0: float, imag0: float, rr
     }
 
 
-def _parameter(name: str, value: float, std: float, nominal: float, unit: str) -> Plain:
+def _parameter(unit: str, name: str, value: float, std: float, nominal: float) -> Plain:
     low, high = value - TWO_SIDED * std, value + TWO_SIDED * std
     return {"name": name, "value": value, "std": std, "low": low, "high": high, "nominal": nominal, "unit": unit}
 

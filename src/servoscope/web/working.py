@@ -28,9 +28,9 @@ def work() -> None:
         said.flush()
 
     try:
-        from servoscope.web import tasks
+        from servoscope.web.tasks import TASKS
 
-        answer = tasks.TASKS[asked["task"]](lambda step: tell(step=step), **asked["arguments"])
+        answer = TASKS[asked["task"]](lambda step: tell(step=step), **asked["arguments"])
         tell(answer=answer)
     except ServoscopeError as error:
         tell(problem=str(error))
