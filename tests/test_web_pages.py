@@ -248,7 +248,7 @@ def test_what_cannot_be_read_is_said(open_page: Open, tmp_path: Path) -> None:
 def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: Path, project: Path) -> None:
     log = shared_data / "real" / "emps" / "DATA_EMPS.mat"
     page = open_page("/learn")
-    page.get_by_label("Loop", exact=True).select_option("a loop file of your own")
+    page.get_by_role("combobox", name="Loop", exact=True).select_option("a loop file of your own")
     page.get_by_label("Loop file (TOML)").last.fill((project / "examples" / "emps.toml").read_text())
     page.get_by_label("Drop healthy recordings here").set_input_files(log)
     expect(page.get_by_role("region", name="Recordings to learn from")).to_contain_text("DATA_EMPS.mat")
@@ -271,7 +271,7 @@ def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: P
 
 def test_a_study_says_what_can_be_told_apart(open_page: Open) -> None:
     page = open_page("/design")
-    page.get_by_label("Loop", exact=True).select_option(index=0)
+    page.get_by_role("combobox", name="Loop", exact=True).select_option(index=0)
     page.get_by_role("button", name="Study").click()
     expect(page.get_by_role("heading", name="How alike they look")).to_be_visible(timeout=LONG_MS)
     expect(page.get_by_role("region", name="Radii of faults")).to_contain_text("Leakage up")
@@ -324,7 +324,7 @@ def test_login_is_refused_and_granted_by_role(open_page: Open, config: Path) -> 
         environment = os.environ | {"PYTHONPATH": screens.SOURCES}
         subprocess.run([*command, "--password-stdin"], input=b"correct horse battery\n", check=True, env=environment)
     with screens.serving(config, "--users", "users.json") as address:
-        page = open_page("/alarms", address=address, quiet=("401",))
+        page = open_page("/alarms", address=address, quiet=("401", "ERR_"))
         expect(page.get_by_role("heading", name="Log in")).to_be_visible()
         accessible(page)
         shot(page, "login")

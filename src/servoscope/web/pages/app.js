@@ -99,6 +99,7 @@ async function start() {
     const page = await load();
     await page.show(main, { session, entitle, linked, signal: left.signal, part: rest.join("/"), values: new URLSearchParams(location.search) });
   } catch (error) {
+    if (left.signal.aborted) return;
     if (error.status === 401) return log_in();
     if (!(error instanceof api.Problem)) console.error(error);
     main.append(complaint(error));

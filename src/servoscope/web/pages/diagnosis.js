@@ -56,7 +56,7 @@ function verdict(found, said) {
     { class: `verdict ${found.verdict}`, role: "region", "aria-label": "Verdict" },
     h("p", { class: "kind" }, mark(found.verdict), VERDICTS[found.verdict]),
     h("h2", {}, headline ?? (names.length ? capital(names.join(" and ")) : "The actuator has changed")),
-    h("p", { class: "summary" }, sentence(found.summary)),
+    h("p", { class: "summary" }, prose(found.summary)),
     facts.length > 0 && h("dl", { class: "facts" }, facts.map(([key, value, more]) => h("div", {}, h("dt", {}, key), h("dd", {}, h("b", {}, value), h("small", {}, more))))),
   );
 }
@@ -93,7 +93,7 @@ function sections(found, said, picture, drawn, signal) {
     made.push(section("Coefficients at the end", null, parameters(rows).element));
   }
   if (said.warnings?.length) {
-    const rows = said.warnings.map((one) => [plain(one.kind), `${number(one.from_s, 4)} to ${number(one.to_s, 4)}`, String(one.count), sentence(one.message)]);
+    const rows = said.warnings.map((one) => [plain(one.kind), `${number(one.from_s, 4)} to ${number(one.to_s, 4)}`, String(one.count), h("span", {}, prose(one.message))]);
     made.push(section("Warnings", null, table("Defects and doubts", ["Kind", "*When [s]", "*Count", "In words"], rows)));
   }
   return made;

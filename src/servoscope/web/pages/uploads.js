@@ -1,5 +1,5 @@
 // Recordings on their way in: dropped or chosen files, what is in them, which column is what.
-import { get, part, query, upload } from "./api.js";
+import { get, part, upload } from "./api.js";
 import { complaint, field, h, table } from "./dom.js";
 import { count, moment, number } from "./words.js";
 
