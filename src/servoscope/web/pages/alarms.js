@@ -3,8 +3,8 @@ import { get, part, query } from "./api.js";
 import { commands, STATES } from "./commands.js";
 import { h, section, table, tell } from "./dom.js";
 import { follow } from "./live.js";
-import { priority } from "./marks.js";
-import { DASH, duration, moment, plain, sentence } from "./words.js";
+import { priority, prose } from "./marks.js";
+import { DASH, duration, moment, plain } from "./words.js";
 
 const OFTEN_MS = 1000; // between two looks at all alarms while they change
 
@@ -23,8 +23,8 @@ export async function show(main, { session, signal, linked, values }) {
   main.replaceChildren(
     h("div", { class: "head" }, h("h1", {}, "Alarms"), h("span", { class: "gap" }), state, search),
     flood,
-    said,
     standing,
+    said,
     section("What has happened", "Every step of every alarm, with its cause and who wanted it.", past),
   );
   state.addEventListener("change", draw);
@@ -61,11 +61,11 @@ export async function show(main, { session, signal, linked, values }) {
     const todo = [one.operator_action, one.consequence && `else: ${one.consequence}`].filter(Boolean).join("; ");
     const until = one.state === "shelved" && one.until ? ` until ${moment(one.until, { seconds: false })}` : "";
     return [
-      h("span", {}, h("a", { href: `/assets/${part(one.asset)}` }, one.asset), ` ${plain(one.alarm)}`),
+      h("span", { class: "t" }, h("a", { href: `/assets/${part(one.asset)}` }, one.asset), ` ${plain(one.alarm)}`),
       one.priority ? priority(one.priority) : DASH,
       `${STATES[one.state]}${until}`,
       h("span", { class: "t", title: `${duration(now - one.since)} ago` }, moment(one.since)),
-      sentence(one.cause) || DASH,
+      one.cause ? h("span", {}, prose(one.cause)) : DASH,
       h("span", {}, todo || DASH, answer && h("small", {}, ` ${answer}`)),
       commands(one, session, heard),
     ];
@@ -102,10 +102,10 @@ export function history(transitions, named) {
       .reverse()
       .map((one) => [
         h("span", { class: "t" }, moment(one.t)),
-        ...(named ? [h("a", { href: `/assets/${part(one.asset)}` }, one.asset)] : []),
+        ...(named ? [h("a", { class: "t", href: `/assets/${part(one.asset)}` }, one.asset)] : []),
         h("span", {}, plain(one.alarm), one.priority && h("small", {}, ` ${one.priority}`)),
         `${STATES[one.before]} → ${STATES[one.after]}`,
-        sentence(one.cause) || DASH,
+        one.cause ? h("span", {}, prose(one.cause)) : DASH,
         one.who || DASH,
       ]),
   );

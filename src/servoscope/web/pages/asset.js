@@ -9,7 +9,7 @@ import { follow } from "./live.js";
 import { badge, mark, priority, prose, say, STATUS, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
 import { planes } from "./planes.js";
-import { capital, count, DASH, duration, moment, multiple, plain, size } from "./words.js";
+import { capital, count, DASH, duration, moment, multiple, number, plain, size } from "./words.js";
 
 const SPANS = { "1 h": 3600, "24 h": 86400, "7 d": 604800, "30 d": 2592000, "1 y": 31536000 };
 const SIGNALS_S = 30;
@@ -22,7 +22,7 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   let asset = await get(path, signal);
   const units = asset.about.units ?? {};
   const verdict = verdictOf(name);
-  const about = [asset.about.loop, asset.about.plant, asset.about.point, asset.about.sample_rate_hz && `${asset.about.sample_rate_hz} Hz`].filter(Boolean).join(", ");
+  const about = [asset.about.loop, asset.about.plant && `plant ${asset.about.plant}`, asset.about.point, asset.about.sample_rate_hz && `${asset.about.sample_rate_hz} Hz`].filter(Boolean).join(", ");
   const plane = planes(asset.responses, units.response ?? "", signal);
   const sizes = parameters(asset.parameters);
   const said = h("p", { class: "working", role: "status" });
@@ -63,7 +63,7 @@ export async function show(main, { session, signal, linked, part: name, entitle 
     const rest = (values) => (from < 0 ? [] : values.slice(from));
     const marks = began(asset) === null ? [] : [[began(asset), "onset"]];
     const joined = (key) => [...(past24?.[key] ?? []), ...rest(live[key])];
-    return { t: joined("t"), statistic: joined("statistic"), level: joined("level"), marks, range: [asset.t - span, asset.t] };
+    return { t: joined("t"), statistic: joined("statistic"), level: joined("level"), marks, range: [Math.max(asset.t - span, asset.counted.began), asset.t] };
   }
 
   async function chosen(seconds) {
@@ -125,7 +125,20 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   await Promise.all([chosen(span).then(() => (plane.past(past24), plane.take(asset.responses, asset.t, began(asset)))), look(), sample()]);
 }
 
-const began = (asset) => (asset.verdict === "fault" ? (asset.onset ?? asset.since) : null);
+// Since when there is a fault: as the full diagnosis has it; a window that it fills knows no better than its beginning.
+function began({ verdict, onset, since, diagnosis }) {
+  if (verdict !== "fault") return null;
+  if (diagnosis?.grounds === "full" && diagnosis.onset) return diagnosis.onset;
+  return Math.min(onset ?? since, since);
+}
+
+// What is known of a fault once it has a name; before that, what the service says.
+function told(asset) {
+  if (asset.verdict !== "fault" || !asset.sizes.length) return asset.summary;
+  const each = asset.sizes.map((one) => `${one.parameter} is ${number(one.ratio, 4)} times its healthy value (95 %: ${number(one.low, 4)} to ${number(one.high, 4)})`);
+  return `${capital(each.join(", "))}, as the full diagnosis of the moments around its onset says.`;
+}
+
 const half = (element) => (element.classList.add("half"), element);
 
 function relative({ t, r, u, y }) {
@@ -151,12 +164,12 @@ function verdictOf(name) {
       kind.replaceChildren(mark(asset.verdict), VERDICTS[asset.verdict], badge(asset.ne107, `NE 107: ${STATUS[asset.ne107]}${asset.reasons.length ? `, for ${asset.reasons.map(plain).join(", ")}` : ""}`));
     }
     tell(headline, headlineOf(asset));
-    say(summary, asset.summary);
+    say(summary, told(asset));
     const since = began(asset) ?? asset.since;
     put("since", moment(since), `for ${duration(asset.t - since)}${asset.verdict === "fault" ? ", onset as estimated" : ""}`);
     const [first] = asset.sizes;
-    const told = first && size({ ...first, interval: [first.low, first.high] });
-    put("size", told ? `${first.parameter} ${told[0]}` : DASH, told ? `95 %: ${told[1]} to ${told[2]}` : asset.verdict === "fault" && asset.awaited.length ? "the full diagnosis is under way" : "no fault that is named");
+    const found = first && size({ ...first, interval: [first.low, first.high] });
+    put("size", found ? `${first.parameter} ${found[0]}` : DASH, found ? `95 %: ${found[1]} to ${found[2]}` : asset.verdict === "fault" && asset.awaited.length ? "the full diagnosis is under way" : "no fault that is named");
     put("statistic", multiple(asset.statistic), asset.statistic >= 1 ? "above its limit" : "alarm at 1");
     put("level", multiple(asset.level), asset.level >= 1 ? "above its limit" : "alarm at 1");
     put("data", capital(asset.quality.map(plain).join(", ") || "sound"), `${count(asset.counted.lost)} blocks lost`);

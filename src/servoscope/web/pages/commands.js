@@ -7,8 +7,8 @@ const WORDS = {
   reset: "Reset",
   shelve: "Shelve",
   unshelve: "Unshelve",
-  remove_from_service: "Take out of service",
-  return_to_service: "Return to service",
+  remove_from_service: "Out of service",
+  return_to_service: "Back in service",
 };
 const NEEDS = { shelve: "How long, and why?", remove_from_service: "Why is it taken out of service?" };
 const HOURS = { "15 min": 900, "1 h": 3600, "8 h": 28800, "24 h": 86400, "7 d": 604800 };

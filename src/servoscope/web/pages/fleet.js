@@ -3,11 +3,11 @@ import { get } from "./api.js";
 import { h, mark as set, tell } from "./dom.js";
 import { follow } from "./live.js";
 import { mark, VERDICTS } from "./marks.js";
-import { DASH, duration, moment, multiple, plain, sentence } from "./words.js";
+import { DASH, duration, moment, multiple, plain, recent, sentence } from "./words.js";
 
 const STALE_S = 10; // without a sample for so long, the age is told
 const ORDER_MS = 5000; // between two changes of the order: rows must not run away from whoever reads them
-const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² × limit", "Sequential ×", "Deviation", "Data", "Alarms", "Sample"];
+const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² / limit", "CUSUM / limit", "Deviation", "Data", "Alarms", "Sample"];
 // Steps of urgency: what the statistics do below their limits moves no row.
 const rank = (row) => 2 * Math.floor(row.severity / 4) + (row.severity % 4 >= 1 ? 1 : 0);
 const OPEN = ["unacknowledged", "returned_unacknowledged", "latched_unacknowledged"];
@@ -217,7 +217,9 @@ function lineOf(first) {
     tell(group, row.group || DASH);
     tell(what, told);
     set(what, "title", told);
-    tell(since, moment(row.verdict === "fault" ? (row.onset ?? row.since) : row.since, { seconds: false }).slice(2));
+    const from = row.verdict === "fault" ? Math.min(row.onset ?? row.since, row.since) : row.since;
+    tell(since, recent(from, now));
+    set(since, "title", moment(from));
     drawn(statistic, row.statistic);
     drawn(level, row.level);
     tell(deviation, row.deviation === null ? DASH : `${(100 * row.deviation).toFixed(1)} %`);

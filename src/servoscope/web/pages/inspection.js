@@ -48,7 +48,7 @@ function coherence(c, { frequency_hz: f, coherence_u: u, coherence_y: y }) {
     grid: { left: 62, right: 14, top: 30, bottom: 40 },
     legend: legend(c, ["r → u", "r → y"]),
     tooltip: tooltip(c, { formatter: (points) => [`${number(points[0].value[0], 3)} Hz`, ...points.map((one) => `${one.seriesName} ${number(one.value[1], 3)}`)].join("\n") }),
-    xAxis: axis(c, "frequency [Hz]", { type: "log", label: { formatter: short } }),
+    xAxis: axis(c, "frequency [Hz]", { type: "log", max: f.at(-1), label: { formatter: short, showMaxLabel: false } }),
     yAxis: axis(c, "coherence", { type: "value", min: 0, max: 1, gap: 40 }),
     series: [line("r → u", pairs(u), c.healthy), line("r → y", pairs(y), c.measured)],
   };
