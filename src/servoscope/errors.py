@@ -15,11 +15,13 @@
           StoreUnavailable       for now: it is full, locked or down; trying again may help
         AlarmError               what an alarm was told to do has no meaning in its state
         StateError               a saved state is of another version, or damaged
+        AccessError              a file of users cannot be used, or a user is none
 
 Every message names the file, the row or the key, says what is wrong with it and what to do.
 """
 
 __all__ = [
+    "AccessError",
     "AlarmError",
     "BaselineError",
     "ConfigError",
@@ -95,3 +97,7 @@ class AlarmError(ServoscopeError):
 
 class StateError(ServoscopeError):
     """A saved state was written by another version, or is damaged."""
+
+
+class AccessError(ServoscopeError):
+    """A file of users cannot be used, or what was asked of it makes no sense."""

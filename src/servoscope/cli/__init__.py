@@ -12,7 +12,8 @@ from servoscope.cli import (  # they add themselves to the application
     publishing,
     service,
     unrecorded,
+    web,
 )
 from servoscope.cli.app import app, main
 
-__all__ = ["alarming", "app", "commands", "fleet", "main", "publishing", "service", "unrecorded"]
+__all__ = ["alarming", "app", "commands", "fleet", "main", "publishing", "service", "unrecorded", "web"]

@@ -15,7 +15,6 @@ import typer
 from servoscope.errors import RecordingError, ServoscopeError
 
 if TYPE_CHECKING:
-    from servoscope.baseline import Baseline
     from servoscope.loop import Columns, Loop
     from servoscope.readers import ChannelInfo
     from servoscope.recording import Recording
@@ -33,7 +32,6 @@ __all__ = [
     "healthy",
     "labelled",
     "no_mapping",
-    "provenance",
 ]
 
 MOST_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
@@ -249,22 +247,3 @@ def no_mapping(path: Path) -> RecordingError:
     """Return the error that asks for a mapping."""
     example = "--columns 't=..., r=..., u=..., y=...'"
     return RecordingError(f"{path.name}: lacks a column t, r, u or y: say which they are, {example}, or give --loop")
-
-
-def provenance(baseline: Baseline, file: Path, recording: Path) -> dict[str, str]:
-    """Return where a diagnosis comes from, line by line, for its report."""
-    from datetime import UTC, datetime
-
-    from servoscope import __version__
-
-    sources = [source.name for source in baseline.sources]
-    more = f" and {len(sources) - 5} more" if len(sources) > 6 else ""
-    return {
-        "recording": str(recording),
-        "baseline": f"{file} ({baseline.hash})",
-        **({"operating point": baseline.point} if baseline.point else {}),
-        "learned from": ", ".join(sources if not more else sources[:5]) + more,
-        "threshold": f"{baseline.limit:.4g}",
-        "made with": f"servoscope {__version__}",
-        "made at": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-    }

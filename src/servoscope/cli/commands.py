@@ -33,8 +33,8 @@ def inspect(
     """Say whether a log is usable, and if not, why; without a mapping, say which columns it has."""
     check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
 
-    from servoscope import inspection
-    from servoscope.cli import summaries, terminal
+    from servoscope import inspection, summaries
+    from servoscope.cli import terminal
     from servoscope.cli.progress import progress
     from servoscope.inspection import pages as inspection_figures
     from servoscope.loop import Loop
@@ -110,9 +110,9 @@ def learn(
     files = [path for _, path in named] + [path for *_, path in faults]
     check_output(output, "-o", (), [loop, *files, *filter(None, [compare])])
 
-    from servoscope import learning, points
+    from servoscope import learning, points, summaries
     from servoscope.baseline import Baseline
-    from servoscope.cli import summaries, terminal
+    from servoscope.cli import terminal
     from servoscope.cli.progress import progress
     from servoscope.loop import Loop
 
@@ -174,9 +174,9 @@ def diagnose(
     check_output(report, "--report", REPORTS, inputs, folder=True)
     check_output(trace, "--trace", TRACES, inputs, folder=True)
 
-    from servoscope import monitor, writers
+    from servoscope import monitor, summaries, writers
     from servoscope.baseline import Baseline
-    from servoscope.cli import summaries, terminal, verdicts
+    from servoscope.cli import terminal, verdicts
     from servoscope.cli.progress import progress
 
     healthy = Baseline.load(baseline)
@@ -213,7 +213,7 @@ def diagnose(
 
                             target = pages.path(stem)
                             judged = healthy.at(said.point) if said.point else healthy
-                            origin = arguments.provenance(judged, baseline, path)
+                            origin = summaries.provenance(judged, baseline, path)
                             reports.write(target, said, course, recording, judged.loop, origin)
                             terminal.written(terminal.console(stderr=as_json), target)
     if fail_on_fault and faulty:

@@ -70,14 +70,20 @@ def run(
     logs.set_up(settings.service.log)
     from servoscope.live.service import Service
     from servoscope.live.serving import serve
+    from servoscope.web.beside import Beside
 
     service = Service(settings, assemble(settings, anew or ()))
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
     server = serve(service, settings.service.listen) if settings.service.listen else None
+    pages = Beside(config) if settings.web is not None else None
     try:
+        if pages is not None:
+            pages.start()
         service.run()
     finally:
+        if pages is not None:
+            pages.stop()
         if server is not None:
             server.shutdown()
 

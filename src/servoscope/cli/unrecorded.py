@@ -42,8 +42,8 @@ def simulate(
     arguments.check_reference(reference)
     events = arguments.fault_events(fault or [])
 
-    from servoscope import simulation, writers
-    from servoscope.cli import summaries, terminal
+    from servoscope import simulation, summaries, writers
+    from servoscope.cli import terminal
     from servoscope.cli.progress import progress
     from servoscope.loop import Loop
 
@@ -92,7 +92,8 @@ def design(
     check_output(report, "--report", REPORTS, [loop, *(healthy or [])])
     arguments.check_reference(reference)
 
-    from servoscope.cli import studies, summaries, terminal
+    from servoscope import summaries
+    from servoscope.cli import studies, terminal
     from servoscope.cli.progress import progress
     from servoscope.design import design_study
     from servoscope.loop import Loop

@@ -115,7 +115,7 @@ def _assets(config: Config) -> dict[str, Asset]:
             except BaselineError:
                 points = ", ".join(baseline.points)
                 raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
-        assets[name] = Asset(name, *shared[path, point], how)
+        assets[name] = Asset(name, *shared[path, point], how, settings.group)
     for asset in {id(one.baseline): one for one in assets.values()}.values():
         asset.warm()
     return assets

@@ -21,8 +21,8 @@ from servoscope.live.examining import Examined, Told, examine
 from servoscope.live.judging import Judged, Window, judge, phase_of
 from servoscope.live.numbering import Place, place
 from servoscope.live.rows import Outcome, Row, transition_row
-from servoscope.live.showing import status_of
-from servoscope.live.thinning import gamma, thin
+from servoscope.live.showing import about, shown, status_of
+from servoscope.live.thinning import thin
 from servoscope.monitor import Monitor
 
 __all__ = ["Asset", "Following"]
@@ -51,10 +51,13 @@ class Asset:
         Of this baseline; assets that have it in common share it.
     how
         Settings.
+    group
+        What it belongs to, for people.
     """
 
-    def __init__(self, name: str, baseline: Baseline, monitor: Monitor, how: Following) -> None:
+    def __init__(self, name: str, baseline: Baseline, monitor: Monitor, how: Following, group: str = "") -> None:
         self.name, self.baseline, self.how = name, baseline, how
+        self._about = about(baseline, group, how.diagnosis.window_s)
         self._monitor, self._rate = monitor, baseline.loop.sample_rate
         self._limits = how.quality.limits(self._rate)
         self._definitions = how.alarms.of_asset
@@ -101,7 +104,7 @@ class Asset:
 
     def status(self, progress: Progress) -> dict[str, Any]:
         """Return what people are shown of a progress, as plain values."""
-        return status_of(progress, self._definitions)
+        return {**status_of(progress, self._definitions), "about": self._about}
 
     @property
     def keep(self) -> int:
@@ -218,24 +221,13 @@ class Asset:
         watched, _ = quality.tick(self._limits, watched, arrival.t if np.isfinite(arrival.t) else progress.counted.t)
         at = np.rint(trace.t * self._rate).astype(np.int64) - progress.fed
         thinned, rows = thin(progress.thinned, trace, block.t[arrival.used][at], self.how.residual_every_s)
-        shown = progress.shown
-        if at.size:
-            excess = np.nan_to_num(trace.statistic / trace.threshold)
-            shown = {
-                "t": float(block.t[arrival.used][at[-1]]),
-                "statistic": float(excess[-1]),
-                "level": float(trace.level[-1]),
-                "peaks": [float(excess.max()), float(trace.level.max())],  # of the block: what alarms go by
-                "residual": gamma(trace, -1),
-                "exceeded": bool(trace.exceeded[-1]),
-            }
         counted = progress.counted
         self.progress = replace(
             progress,
             monitor=monitor,
             quality=watched,
             thinned=thinned,
-            shown=shown,
+            shown=shown(trace, float(block.t[arrival.used][at[-1]])) if at.size else progress.shown,
             last=arrival.t if np.isfinite(arrival.t) else None,
             fed=progress.fed + r.size,
             counted=replace(

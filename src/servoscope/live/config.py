@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
+from servoscope.access import WebSettings
 from servoscope.actions import ActionSettings
 from servoscope.alarms import AlarmSettings
 from servoscope.complaints import describe
@@ -103,6 +104,8 @@ class AssetSettings(Settings):
         What a source of kind ``replay`` replays for it, one recording after the other.
     nodes
         Where a source of kind ``opcua`` finds it.
+    group
+        What people know it to belong to: a line, a hall.
     """
 
     baseline: Word
@@ -110,6 +113,7 @@ class AssetSettings(Settings):
     source: Word
     files: Paths | None = None
     nodes: Nodes | None = None
+    group: Annotated[str, Field(strict=True, max_length=100)] = ""
 
 
 class Config(Settings):
@@ -119,8 +123,8 @@ class Config(Settings):
     ----------
     name
         What the service is called in alarms and messages.
-    service, store, diagnosis, quality, alarms, actions
-        The sections of these names; each may be left out.
+    service, store, diagnosis, quality, alarms, actions, web
+        The sections of these names; each may be left out. Without ``[web]`` there are no pages.
     sources, outlets, assets
         Tables by name: ``[sources.NAME]``, ``[outlets.NAME]``, ``[assets.NAME]``.
     """
@@ -132,6 +136,7 @@ class Config(Settings):
     quality: QualitySettings = QualitySettings()
     alarms: AlarmSettings = Field(default_factory=lambda: AlarmSettings.model_validate({}))
     actions: ActionSettings = ActionSettings()
+    web: WebSettings | None = None
     sources: Annotated[dict[Name, Source], Field(min_length=1)]
     outlets: dict[Name, Outlet] = Field(default_factory=dict)
     assets: Annotated[dict[Name, AssetSettings], Field(min_length=1)]

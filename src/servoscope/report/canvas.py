@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +23,12 @@ __all__ = ["COLOURS", "STYLE", "BoolArray", "envelope", "robust_range", "save", 
 
 BoolArray = npt.NDArray[np.bool_]
 
-# Blue is measured, grey is expected, orange is alarm: told apart by every common kind of colour vision.
-COLOURS = {
-    "paper": "#ffffff",
-    "ink": "#1c2530",
-    "muted": "#687482",
-    "rule": "#d9dfe5",
-    "measured": "#1f5fa8",
-    "healthy": "#7d8894",
-    "alarm": "#c6501c",
-    "reference": "#a9b5c0",
-}
+# The light side of palette.css, which reports and pages share.
+COLOURS: dict[str, str] = dict(
+    re.findall(
+        r"--(\w+): light-dark\((#\w+)", files("servoscope.report").joinpath("palette.css").read_text(encoding="utf-8")
+    )
+)
 STYLE: dict[str, Any] = {
     "axes.edgecolor": COLOURS["muted"],
     "axes.facecolor": "none",

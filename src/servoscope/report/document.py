@@ -103,7 +103,8 @@ def framed(title: str, kind: str, sections: Iterable[str]) -> str:
     sections
         HTML.
     """
-    style = files("servoscope.report").joinpath("report.css").read_text(encoding="utf-8")
+    folder = files("servoscope.report")
+    style = "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in ("palette.css", "report.css"))
     lines = (
         "<!DOCTYPE html>",
         '<html lang="en">',

@@ -13,7 +13,7 @@ from servoscope.store import tables
 from servoscope.store.batch import Row
 from servoscope.store.store import Store
 
-__all__ = ["KINDS", "history", "plain", "spread"]
+__all__ = ["KINDS", "coarse", "history", "plain", "spread"]
 
 KINDS: Mapping[str, tuple[sa.Table, str]] = {  # the table, and which of its columns is the time
     "diagnoses": (tables.diagnoses, "t"),
@@ -58,6 +58,34 @@ def history(
     ties = [column.desc() for column in table.primary_key]
     found = store.rows(query.order_by(table.c[clock].desc(), *ties).limit(last))
     return found[::-1]
+
+
+def coarse(store: Store, asset: str, span: tuple[float, float], points: int) -> tuple[list[Row], int]:
+    """Return an asset's residuals over a time at a resolution that can be drawn, and how many rows they stand for.
+
+    The time from and before `span` [UTC s] is cut into `points` equal parts. Of each that has rows the one with the
+    largest statistic is returned, with the largest level of the part: what was above a limit stays so.
+    """
+    table, (since, until) = tables.residuals, span
+    width = (until - since) / points
+    part = sa.cast(sa.func.floor((table.c.t - since) / width), sa.BigInteger).label("part")
+    inside = (table.c.asset == asset) & (table.c.t >= since) & (table.c.t < until)
+    ranked = sa.select(
+        part,
+        table.c.number,
+        sa.func.max(table.c.level).over(partition_by=part).label("level"),
+        sa.func.count().over(partition_by=part).label("rows"),
+        sa.func.row_number().over(partition_by=part, order_by=(table.c.statistic.desc(), table.c.number)).label("rank"),
+    ).where(inside)
+    top = ranked.subquery()
+    query = (
+        sa.select(table.c.t, table.c.statistic, top.c.level, table.c.residual, top.c.rows)
+        .join(top, (table.c.asset == asset) & (table.c.number == top.c.number))
+        .where(top.c.rank == 1)
+        .order_by(top.c.part)
+    )
+    rows = store.rows(query)
+    return rows, sum(row["rows"] for row in rows)
 
 
 def plain(row: Row) -> dict[str, Any]:

@@ -138,6 +138,17 @@ class Store:
             query = query.where(table.c.asset.in_(assets))
         return {row["asset"]: row for row in self.rows(query)}
 
+    def clocks(self) -> dict[str, float]:
+        """Return when each asset's newest checkpoint was written [UTC s]: it changes with every one."""
+        table = tables.checkpoints
+        return {row["asset"]: row["at"] for row in self.rows(sa.select(table.c.asset, table.c.at))}
+
+    def note(self, who: str, asset: str, what: str, document: Row) -> None:
+        """Write a line of the audit, from any process; an empty asset: of all of them, or of none."""
+        row = {"at": time.time(), "who": who, "asset": asset, "what": what, "document": dict(document)}
+        with self._transaction() as connection:
+            connection.execute(tables.audit.insert(), row)
+
     def recent(self, asset: str) -> list[tuple[int, bytes]]:
         """Return an asset's recent samples: sequence and packed block, in order."""
         table = tables.recent

@@ -6,7 +6,8 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from servoscope.recording import Recording
     from servoscope.simulation import Truth
 
-__all__ = ["baseline", "channels", "plain", "simulated"]
+__all__ = ["baseline", "channels", "finite", "plain", "provenance", "simulated"]
 
 
 def simulated(recording: Recording, truth: Truth, columns: Columns) -> dict[str, object]:
@@ -85,3 +86,31 @@ def _one(b: Baseline) -> dict[str, object]:
 def plain(said: BaseModel) -> object:
     """Return a result as plain values; what is no number becomes None."""
     return json.loads(said.model_dump_json())
+
+
+def finite(value: Any) -> Any:
+    """Return plain values in which what is no number is None."""
+    if isinstance(value, dict):
+        return {key: finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def provenance(baseline: Baseline, file: Path, recording: Path) -> dict[str, str]:
+    """Return where a diagnosis comes from, line by line, for its report."""
+    from datetime import UTC, datetime
+
+    from servoscope import __version__
+
+    sources = [source.name for source in baseline.sources]
+    more = f" and {len(sources) - 5} more" if len(sources) > 6 else ""
+    return {
+        "recording": str(recording),
+        "baseline": f"{file} ({baseline.hash})",
+        **({"operating point": baseline.point} if baseline.point else {}),
+        "learned from": ", ".join(sources if not more else sources[:5]) + more,
+        "threshold": f"{baseline.limit:.4g}",
+        "made with": f"servoscope {__version__}",
+        "made at": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    }

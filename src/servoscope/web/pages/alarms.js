@@ -1,0 +1,112 @@
+// Alarms that are not normal, the most urgent first, with what to do about them; and what has happened to alarms.
+import { get, part, query } from "./api.js";
+import { commands, STATES } from "./commands.js";
+import { h, section, table, tell } from "./dom.js";
+import { follow } from "./live.js";
+import { priority, prose } from "./marks.js";
+import { DASH, duration, moment, plain } from "./words.js";
+
+const OFTEN_MS = 1000; // between two looks at all alarms while they change
+
+export async function show(main, { session, signal, linked, values }) {
+  const asset = values.get("asset") ?? "";
+  const standing = h("div", {});
+  const past = h("div", {});
+  const said = h("p", { class: "working", role: "status" });
+  const flood = h("p", { class: "complaint", hidden: true, role: "status" });
+  const state = h("select", {}, h("option", { value: "" }, "All"), h("option", { value: "open" }, "To acknowledge"), h("option", { value: "aside" }, "Shelved, suppressed, out of service"));
+  const search = h("input", { type: "search", value: asset, placeholder: "Search", "aria-label": "Search alarms" });
+  state.setAttribute("aria-label", "Show");
+  let alarms = [];
+  let now = 0;
+
+  main.replaceChildren(
+    h("div", { class: "head" }, h("h1", {}, "Alarms"), h("span", { class: "gap" }), state, search),
+    flood,
+    standing,
+    said,
+    section("What has happened", "Every step of every alarm, with its cause and who wanted it.", past),
+  );
+  state.addEventListener("change", draw);
+  search.addEventListener("input", draw);
+
+  const heard = (words) => {
+    tell(said, words ?? "Done.");
+    look();
+  };
+
+  function draw() {
+    const wanted = search.value.trim().toLowerCase();
+    const shown = alarms.filter((one) => {
+      const aside = ["shelved", "suppressed_by_design", "out_of_service"].includes(one.state);
+      const open = one.commands.includes("acknowledge");
+      const text = `${one.asset} ${one.alarm} ${one.cause} ${one.priority}`.toLowerCase();
+      return (!state.value || (state.value === "open" ? open : aside)) && text.includes(wanted);
+    });
+    const focused = document.activeElement?.getAttribute?.("aria-label");
+    standing.replaceChildren(
+      shown.length
+        ? table(
+            "Alarms, the most urgent first",
+            ["Alarm", "Priority", "State", "Since", "Cause", "What to do", "Answer"],
+            shown.map((one) => row(one)),
+          )
+        : h("p", { class: "empty" }, alarms.length ? "No alarm is like this." : "Nothing asks for an answer."),
+    );
+    if (focused) standing.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus(); // it was redrawn under the user's hands
+  }
+
+  function row(one) {
+    const answer = one.response_time_s ? `within ${duration(one.response_time_s)}` : "";
+    const todo = [one.operator_action, one.consequence && `else: ${one.consequence}`].filter(Boolean).join("; ");
+    const until = one.state === "shelved" && one.until ? ` until ${moment(one.until, { seconds: false })}` : "";
+    return [
+      h("span", { class: "t" }, h("a", { href: `/assets/${part(one.asset)}` }, one.asset), ` ${plain(one.alarm)}`),
+      one.priority ? priority(one.priority) : DASH,
+      `${STATES[one.state]}${until}`,
+      h("span", { class: "t", title: `${duration(now - one.since)} ago` }, moment(one.since)),
+      one.cause ? h("span", {}, prose(one.cause)) : DASH,
+      h("span", {}, todo || DASH, answer && h("small", {}, ` ${answer}`)),
+      commands(one, session, heard),
+    ];
+  }
+
+  async function look() {
+    const [found, steps] = await Promise.all([get("/alarms", signal), get(query("/alarms/history", { asset, last: 100 }), signal)]);
+    ({ alarms, now } = found);
+    flood.hidden = !found.flood;
+    if (found.flood) tell(flood, `Alarm flood since ${moment(found.flood.since)}: ${found.flood.counted} new alarms, ${found.flood.held} held back.`);
+    draw();
+    past.replaceChildren(history(steps.transitions, true));
+  }
+
+  await look();
+  let waiting = 0;
+  const soon = () => {
+    waiting ||= setTimeout(() => {
+      waiting = 0;
+      look().catch(() => {}); // the stream says that the service is gone
+    }, OFTEN_MS);
+  };
+  follow("", ["alarm", "services"], soon, linked, signal);
+  signal.addEventListener("abort", () => clearTimeout(waiting));
+}
+
+// Steps of alarms, the newest first.
+export function history(transitions, named) {
+  if (!transitions.length) return h("p", { class: "empty" }, "No alarm has ever occurred.");
+  return table(
+    "Steps of alarms, the newest first",
+    ["When", ...(named ? ["Asset"] : []), "Alarm", "Step", "Cause", "Who"],
+    [...transitions]
+      .reverse()
+      .map((one) => [
+        h("span", { class: "t" }, moment(one.t)),
+        ...(named ? [h("a", { class: "t", href: `/assets/${part(one.asset)}` }, one.asset)] : []),
+        h("span", {}, plain(one.alarm), one.priority && h("small", {}, ` ${one.priority}`)),
+        `${STATES[one.before]} → ${STATES[one.after]}`,
+        one.cause ? h("span", {}, prose(one.cause)) : DASH,
+        one.who || DASH,
+      ]),
+  );
+}

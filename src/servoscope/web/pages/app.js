@@ -1,0 +1,109 @@
+// Around every page: navigation, theme, person, the state of the live link; then the page itself.
+import * as api from "./api.js";
+import { complaint, h, mark, tell } from "./dom.js";
+
+const PAGES = {
+  "": ["Fleet", () => import("./fleet.js")],
+  assets: ["Asset", () => import("./asset.js")],
+  alarms: ["Alarms", () => import("./alarms.js")],
+  diagnose: ["Diagnose a recording", () => import("./diagnose.js")],
+  diagnoses: ["Diagnosis", () => import("./diagnosis.js")],
+  learn: ["Learn a baseline", () => import("./learn.js")],
+  design: ["Before deployment", () => import("./design.js")],
+  login: ["Log in", () => import("./login.js")],
+};
+const NAVIGATION = [
+  ["/", "Fleet", ["", "assets"]],
+  ["/alarms", "Alarms", ["alarms"]],
+  ["/diagnose", "Diagnose", ["diagnose", "diagnoses"]],
+  ["/learn", "Learn", ["learn"]],
+  ["/design", "Design", ["design"]],
+];
+const [name, ...rest] = location.pathname.slice(1).split("/").map(decodeURIComponent);
+const left = new AbortController();
+const theme = h("button", { type: "button", class: "quiet theme", onclick: change });
+const person = h("span", { class: "person" });
+const link = h("span", { class: "link", role: "status" });
+
+function dark() {
+  const chosen = document.documentElement.dataset.theme;
+  return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+}
+
+function named() {
+  tell(theme, dark() ? "Light" : "Dark");
+  mark(theme, "aria-label", `Switch to ${dark() ? "light" : "dark"} colours`);
+}
+
+function change() {
+  const chosen = dark() ? "light" : "dark";
+  document.documentElement.dataset.theme = chosen;
+  try {
+    localStorage.setItem("theme", chosen);
+  } catch {
+    // it holds until the page is left
+  }
+  named();
+  dispatchEvent(new Event("themechange"));
+}
+
+function surround() {
+  named();
+  const pages = NAVIGATION.map(([address, words, of]) => h("a", { href: address, "aria-current": of.includes(name) && "page" }, words));
+  document
+    .querySelector("header.top")
+    .append(
+      h("a", { class: "brand", href: "/" }, h("img", { src: "/static/icon.svg", alt: "", width: "22", height: "22" }), "servoscope"),
+      h("nav", { "aria-label": "Pages" }, pages),
+      link,
+      person,
+      theme,
+    );
+}
+
+function introduce(session) {
+  if (!session.login_required) {
+    person.replaceChildren(h("span", { title: "Only this machine reaches the pages, and it may do everything" }, "no login: this machine only"));
+  } else if (session.user) {
+    const out = h("button", { type: "button", class: "quiet", onclick: async () => (await api.logout(), log_in()) }, "Log out");
+    person.replaceChildren(h("span", {}, `${session.user}, ${session.role}`), out);
+  }
+}
+
+function log_in() {
+  location.assign(`/login?next=${encodeURIComponent(location.pathname + location.search)}`);
+}
+
+// Whether what is on the page is still being told: words, beside the navigation.
+function linked(state) {
+  mark(link, "data-state", state);
+  tell(link, state === "live" ? "Live" : "Connection lost, trying again");
+}
+
+function entitle(title) {
+  document.title = `${title} · servoscope`;
+}
+
+async function start() {
+  surround();
+  const main = document.getElementById("main");
+  addEventListener("pagehide", (event) => event.persisted || left.abort());
+  addEventListener("pageshow", (event) => event.persisted && location.reload());
+  try {
+    const session = await api.session();
+    introduce(session);
+    if (session.login_required && !session.user && name !== "login") return log_in();
+    addEventListener("streamclosed", async () => (await api.session()).user ?? log_in());
+    const [title, load] = PAGES[name] ?? ["No such page", () => import("./missing.js")];
+    entitle(title);
+    const page = await load();
+    await page.show(main, { session, entitle, linked, signal: left.signal, part: rest.join("/"), values: new URLSearchParams(location.search) });
+  } catch (error) {
+    if (left.signal.aborted) return;
+    if (error.status === 401) return log_in();
+    if (!(error instanceof api.Problem)) console.error(error);
+    main.append(complaint(error));
+  }
+}
+
+start();

@@ -1,0 +1,108 @@
+// ECharts in the look of the report: its colours, its axes, no animation; drawn anew when the theme changes.
+import "./vendor/echarts.common.min.js";
+
+const NAMES = ["paper", "panel", "ink", "muted", "rule", "measured", "healthy", "alarm", "reference", "care", "check"];
+const LETTERS = getComputedStyle(document.documentElement).getPropertyValue("--letters");
+const plots = new Set();
+
+// The colours that hold now: custom properties with light-dark() are only resolved where they are used.
+export function colours() {
+  const probe = document.body.appendChild(document.createElement("i"));
+  const found = {};
+  for (const name of NAMES) {
+    probe.style.color = `var(--${name})`;
+    found[name] = getComputedStyle(probe).color;
+  }
+  probe.remove();
+  return found;
+}
+
+// A plot in an element of fixed height. `describe(colours)` returns an option; call `draw` when its data have changed.
+export function plot(element, label, describe, signal) {
+  const chart = globalThis.echarts.init(element, null, { renderer: "canvas" });
+  let wanted = 0;
+  const now = () => {
+    wanted = 0;
+    const c = colours();
+    chart.setOption({ ...base(c), ...describe(c) }, { replaceMerge: ["series"] });
+  };
+  const draw = () => {
+    wanted ||= requestAnimationFrame(now);
+  };
+  const watcher = new ResizeObserver(() => chart.resize());
+  watcher.observe(element);
+  element.setAttribute("role", "img");
+  element.setAttribute("aria-label", label);
+  const one = { draw, chart };
+  plots.add(one);
+  signal.addEventListener("abort", () => {
+    cancelAnimationFrame(wanted);
+    watcher.disconnect();
+    plots.delete(one);
+    chart.dispose();
+  });
+  now();
+  return one;
+}
+
+export function redraw() {
+  for (const one of plots) one.draw();
+}
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+addEventListener("themechange", redraw);
+addEventListener("beforeprint", redraw);
+
+function base(c) {
+  return {
+    animation: false,
+    textStyle: { fontFamily: LETTERS, fontSize: 12, color: c.ink },
+    grid: { left: 62, right: 14, top: 30, bottom: 40 },
+    tooltip: tooltip(c),
+  };
+}
+
+// Drawn in the canvas: HTML would need inline styles, which the policy forbids.
+export function tooltip(c, rest = {}) {
+  return {
+    trigger: "axis",
+    renderMode: "richText",
+    backgroundColor: c.panel,
+    borderColor: c.rule,
+    textStyle: { color: c.ink, fontFamily: LETTERS, fontSize: 12 },
+    axisPointer: { lineStyle: { color: c.muted } },
+    confine: true,
+    ...rest,
+  };
+}
+
+export function legend(c, data) {
+  return { data, top: 0, left: 0, itemWidth: 18, itemHeight: 8, icon: "roundRect", textStyle: { color: c.ink, fontSize: 12 }, inactiveColor: c.muted };
+}
+
+export function axis(c, name, rest = {}) {
+  return {
+    name,
+    nameLocation: "middle",
+    nameGap: rest.gap ?? 26,
+    nameTextStyle: { color: c.ink, fontSize: 12 },
+    axisLine: { show: true, onZero: false, lineStyle: { color: c.muted } },
+    axisTick: { lineStyle: { color: c.muted } },
+    axisLabel: { color: c.ink, fontSize: 11, hideOverlap: true, ...rest.label },
+    splitLine: { show: true, lineStyle: { color: c.rule, width: 0.6 } },
+    ...rest,
+  };
+}
+
+export function line(name, data, colour, rest = {}) {
+  return { type: "line", name, data, color: colour, showSymbol: false, lineStyle: { width: 1.4, color: colour, ...rest.stroke }, ...rest };
+}
+
+// The outline of an ellipse around a point: half axes, and the angle of the first of them.
+export function outline(x, y, a, b, angle, steps = 64) {
+  return Array.from({ length: steps + 1 }, (_, i) => {
+    const phi = (2 * Math.PI * i) / steps;
+    const p = a * Math.cos(phi);
+    const q = b * Math.sin(phi);
+    return [x + p * Math.cos(angle) - q * Math.sin(angle), y + p * Math.sin(angle) + q * Math.cos(angle)];
+  });
+}

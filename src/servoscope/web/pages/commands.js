@@ -1,0 +1,83 @@
+// What an operator can do about an alarm: buttons for what means something now, and questions where an answer is needed.
+import { mayChange, part, post } from "./api.js";
+import { complaint, field, h } from "./dom.js";
+
+const WORDS = {
+  acknowledge: "Acknowledge",
+  reset: "Reset",
+  shelve: "Shelve",
+  unshelve: "Unshelve",
+  remove_from_service: "Out of service",
+  return_to_service: "Back in service",
+};
+const NEEDS = { shelve: "How long, and why?", remove_from_service: "Why is it taken out of service?" };
+const HOURS = { "15 min": 900, "1 h": 3600, "8 h": 28800, "24 h": 86400, "7 d": 604800 };
+export const STATES = {
+  normal: "normal",
+  unacknowledged: "to acknowledge",
+  acknowledged: "acknowledged",
+  returned_unacknowledged: "gone, to acknowledge",
+  latched_unacknowledged: "latched, to acknowledge",
+  latched_acknowledged: "latched, to reset",
+  shelved: "shelved",
+  suppressed_by_design: "suppressed by design",
+  out_of_service: "out of service",
+};
+
+// Buttons for an alarm; `said` hears what became of a command, `null` once it was carried out.
+export function commands(alarm, session, said) {
+  if (!mayChange(session.role, "operator")) return h("small", {}, "operators answer");
+  const send = async (command, body) => {
+    const answer = await post(`/assets/${part(alarm.asset)}/alarms/${part(alarm.alarm)}/${command}`, body);
+    said(answer.outcome === null ? "Asked for: the service carries it out as soon as it runs." : null);
+  };
+  const press = async (command) => {
+    try {
+      if (command in NEEDS) await question(alarm, command, send);
+      else await send(command, {});
+    } catch (error) {
+      said(error.message);
+    }
+  };
+  const made = alarm.commands.map((command) => {
+    const label = `${WORDS[command]}: ${alarm.alarm} of ${alarm.asset}`;
+    return h("button", { type: "button", "aria-label": label, class: command === "acknowledge" && "first", onclick: () => press(command) }, WORDS[command]);
+  });
+  return h("div", { class: "actions" }, made);
+}
+
+// A dialog that stays until the command was taken, or is given up.
+function question(alarm, command, send) {
+  return new Promise((resolve) => {
+    const why = h("input", { name: "why", maxlength: "200" });
+    const long = h("select", { name: "for" }, Object.entries(HOURS).map(([words, seconds]) => h("option", { value: seconds, selected: words === "8 h" }, words)));
+    const failed = h("div", {});
+    const dialog = h("dialog", { "aria-labelledby": "asked" });
+    const submit = async (event) => {
+      event.preventDefault();
+      try {
+        await send(command, { why: why.value, ...(command === "shelve" ? { for_s: Number(long.value) } : {}) });
+        dialog.close();
+      } catch (error) {
+        failed.replaceChildren(complaint(error));
+      }
+    };
+    dialog.append(
+      h(
+        "form",
+        { onsubmit: submit },
+        h("h2", { id: "asked" }, `${WORDS[command]}: ${alarm.alarm} of ${alarm.asset}`),
+        h("p", { class: "note" }, NEEDS[command]),
+        h("div", { class: "fields" }, command === "shelve" && field("For", long), field("Why", why)),
+        failed,
+        h("div", { class: "actions" }, h("button", { class: "first" }, WORDS[command]), h("button", { type: "button", onclick: () => dialog.close() }, "Cancel")),
+      ),
+    );
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      resolve();
+    });
+    document.body.append(dialog);
+    dialog.showModal();
+  });
+}

@@ -1,0 +1,79 @@
+// Curves over time: both tests against their limit, and signals; live or of a recording, they look the same.
+import { axis, legend, line, tooltip } from "./charts.js";
+import { moment, multiple, number, unit } from "./words.js";
+
+// Both tests as multiples of their limits, on a logarithmic axis; marks are [time, words] of what happened.
+export function tests(c, { t, statistic, level, marks = [], clock = true, range = [null, null] }) {
+  const pairs = (values) => t.map((at, i) => [clock ? 1000 * at : at, values[i] > 0 ? values[i] : null]);
+  const highest = Math.max(2, ...[...statistic, ...level].filter((value) => value > 0));
+  const lowest = Math.min(0.1, ...statistic.filter((value) => value > 0));
+  const limit = {
+    silent: true,
+    symbol: "none",
+    label: { show: false },
+    lineStyle: { color: c.alarm, type: [6, 3], width: 1.2 },
+    data: [{ yAxis: 1 }, ...marks.map(([at]) => ({ xAxis: clock ? 1000 * at : at, lineStyle: { color: c.ink, type: [2, 3], width: 1 } }))],
+  };
+  return {
+    grid: { left: 62, right: 14, top: 30, bottom: clock ? 28 : 40 },
+    legend: legend(c, ["statistic T²", "sequential test"]),
+    tooltip: tooltip(c, {
+      formatter: (points) => [clock ? moment(points[0].value[0] / 1000) : `${number(points[0].value[0], 5)} s`, ...points.map((one) => `${one.seriesName} ${multiple(one.value[1])} × limit`)].join("\n"),
+    }),
+    xAxis: axis(c, clock ? "" : "time [s]", { type: clock ? "time" : "value", min: at(range[0], clock), max: at(range[1], clock), splitNumber: 8, label: { showMinLabel: false, ...(clock ? {} : { formatter: short }) } }),
+    yAxis: axis(c, "multiple of the limit", { type: "log", min: 10 ** Math.floor(Math.log10(lowest)), max: 10 ** Math.ceil(Math.log10(1.2 * highest)), gap: 44, label: { formatter: String } }),
+    series: [
+      line("sequential test", pairs(level), c.healthy, { stroke: { width: 1.1 } }),
+      line("statistic T²", pairs(statistic), c.measured, { markLine: limit }),
+    ],
+  };
+}
+
+const at = (t, clock) => (t === null ? undefined : clock ? 1000 * t : t);
+
+// Reference and output above, input beneath, on one time axis.
+export function signals(c, { t, r, u, y, units, name = "time [s]", marks = [] }) {
+  const pairs = (values) => t.map((at, i) => [at, values[i]]);
+  const time = { type: "value", min: t[0] ?? 0, max: t.at(-1) ?? 1 };
+  const lines = { silent: true, symbol: "none", label: { show: false }, lineStyle: { color: c.alarm, type: [2, 3], width: 1 }, data: marks.map(([at]) => ({ xAxis: at })) };
+  const upper = axis(c, "", { ...time, gridIndex: 0, label: { show: false } });
+  return {
+    grid: [
+      { left: 70, right: 14, top: 30, height: "36%" },
+      { left: 70, right: 14, bottom: 40, height: "32%" },
+    ],
+    legend: legend(c, ["output y", "reference r"]),
+    tooltip: tooltip(c, { formatter: (points) => [`${number(points[0].value[0], 5)} s`, ...points.map((one) => `${one.seriesName} ${number(one.value[1], 4)} ${one.seriesName === "input u" ? (units?.u ?? "") : (units?.y ?? "")}`)].join("\n") }),
+    axisPointer: { link: [{ xAxisIndex: "all" }] },
+    xAxis: [upper, axis(c, name, { ...time, gridIndex: 1, label: { formatter: short, showMinLabel: false } })],
+    yAxis: [axis(c, `r, y${unit(units?.y)}`, { type: "value", scale: true, gridIndex: 0, gap: 52, splitNumber: 3, label: { formatter: short } }), axis(c, `u${unit(units?.u)}`, { type: "value", scale: true, gridIndex: 1, gap: 52, splitNumber: 3, label: { formatter: short } })],
+    series: [
+      line("output y", pairs(y), c.measured, { xAxisIndex: 0, yAxisIndex: 0, stroke: { width: 2.2 }, markLine: lines }),
+      line("reference r", pairs(r), c.reference, { xAxisIndex: 0, yAxisIndex: 0, stroke: { width: 1 } }),
+      line("input u", pairs(u), c.measured, { xAxisIndex: 1, yAxisIndex: 1, stroke: { width: 1.2 } }),
+    ],
+  };
+}
+
+export const short = (value) => (value === 0 ? "0" : number(Number(value.toPrecision(3)), 3).replace(/(\.\d*?)0+(?=$| )/, "$1").replace(/\.(?=$| )/, ""));
+
+// An estimate relative to healthy over time, with its band of two standard deviations.
+export function coefficient(c, { t, one }) {
+  const usable = one.nominal.map((nominal, i) => nominal && Math.abs(nominal) > one.std[i]);
+  const relative = usable.filter(Boolean).length > t.length / 2;
+  const scale = (value, i) => (value === null ? null : relative ? (100 * value) / Math.abs(one.nominal[i]) : value);
+  const middle = t.map((_, i) => (one.value[i] === null ? null : scale(one.value[i] - one.nominal[i], i)));
+  const half = t.map((_, i) => scale(2 * (one.std[i] ?? 0), i));
+  const band = { showSymbol: false, silent: true, lineStyle: { opacity: 0 }, stack: "band", stackStrategy: "all", symbol: "none", type: "line" };
+  return {
+    grid: { left: 62, right: 10, top: 10, bottom: 38 },
+    tooltip: tooltip(c, { formatter: (points) => `${number(points[0].value[0], 5)} s\n${number(points.find((p) => p.seriesName === "estimate")?.value[1], 3)} ${relative ? "%" : one.unit}` }),
+    xAxis: axis(c, "time [s]", { type: "value", min: t[0], max: t.at(-1) }),
+    yAxis: axis(c, `deviation${unit(relative ? "%" : one.unit)}`, { type: "value", scale: true, gap: 44, splitNumber: 3, label: { formatter: short } }),
+    series: [
+      { ...band, name: "low", data: t.map((at, i) => [at, middle[i] === null ? null : middle[i] - half[i]]) },
+      { ...band, name: "width", data: t.map((at, i) => [at, middle[i] === null ? null : 2 * half[i]]), areaStyle: { color: c.measured, opacity: 0.2 } },
+      line("estimate", t.map((at, i) => [at, middle[i]]), c.measured, { markLine: { silent: true, symbol: "none", label: { show: false }, lineStyle: { color: c.healthy, type: [5, 3] }, data: [{ yAxis: 0 }] } }),
+    ],
+  };
+}

@@ -1,0 +1,82 @@
+// A recording from a file to its verdict: drop it, see what is in it, say which column is what, compare it with a baseline.
+import { get, job, mayChange, part } from "./api.js";
+import { list } from "./asset.js";
+import { complaint, field, h, section, tell } from "./dom.js";
+import { inspected } from "./inspection.js";
+import { dropzone, earlier, mapping, preview } from "./uploads.js";
+
+export async function show(main, { session, signal, values }) {
+  const past = h("div", {});
+  const work = h("div", { class: "steps" });
+  main.replaceChildren(h("div", { class: "head" }, h("h1", {}, "Diagnose a recording")), work, section("Diagnoses of recordings", null, past));
+  const { diagnoses } = await get("/diagnoses?grounds=upload&last=20", signal);
+  past.replaceChildren(list(diagnoses));
+  if (!mayChange(session.role, "operator")) {
+    work.replaceChildren(h("p", { class: "note" }, "Uploading a recording is for operators and engineers; you can look at what they found."));
+    return;
+  }
+  const { baselines } = await get("/baselines", signal);
+  const chosen = h("div", { class: "steps" });
+  const open = (one) => chosen.replaceChildren(...steps(one, baselines, values.get("baseline"), signal));
+  work.append(section("Recording", null, dropzone("Drop a recording here", false, open, signal), (await earlier(open, signal)) ?? ""), chosen);
+  const known = values.get("upload");
+  if (known) open(await get(`/uploads/${part(known)}`, signal));
+}
+
+function steps(one, baselines, wanted, signal) {
+  const columns = mapping(one);
+  const baseline = h("select", { name: "baseline" }, baselines.map((each) => h("option", { value: each.id, selected: each.id === wanted }, `${each.name} (${each.loop})`)));
+  const point = h("select", { name: "point" });
+  const pointed = field("Operating point", point);
+  const [from, to] = ["from_s", "to_s"].map((name) => h("input", { type: "number", step: "any", name, placeholder: name === "from_s" ? "beginning" : "end" }));
+  const said = h("div", { role: "status", class: "working" });
+  const result = h("div", {});
+  const look = h("button", { type: "button" }, "Inspect");
+  const diagnose = h("button", { type: "button", class: "first", disabled: !baselines.length }, "Diagnose");
+
+  const repoint = () => {
+    const points = baselines.find((each) => each.id === baseline.value)?.points ?? [];
+    point.replaceChildren(...points.map((name) => h("option", {}, name)));
+    pointed.hidden = !points.length;
+  };
+  baseline.addEventListener("change", repoint);
+  repoint();
+
+  const part = () => ({ upload: one.id, columns: columns.read(), ...(from.value && { from_s: Number(from.value) }), ...(to.value && { to_s: Number(to.value) }) });
+  const during = async (button, work) => {
+    button.disabled = true;
+    try {
+      await work((step) => tell(said, `${step} …`));
+      said.replaceChildren();
+    } catch (error) {
+      if (error.name !== "AbortError") said.replaceChildren(complaint(error));
+    } finally {
+      button.disabled = false;
+    }
+  };
+  const inspect = (step) =>
+    job("/inspections", { ...part(), ...(baseline.value && { loop: { baseline: baseline.value } }) }, { signal, step }).then((found) => {
+      const shown = inspected(found, null, signal);
+      result.replaceChildren(section("Is it usable?", null, shown.element));
+      shown.draw();
+    });
+  look.addEventListener("click", () => during(look, inspect));
+  diagnose.addEventListener("click", () =>
+    during(diagnose, async (step) => {
+      const { diagnosis } = await job("/diagnoses", { ...part(), baseline: baseline.value, ...(point.value && { point: point.value }) }, { signal, step });
+      location.assign(`/diagnoses/${encodeURIComponent(diagnosis)}`);
+    }),
+  );
+  if (columns.read().input && columns.read().output) during(look, inspect);
+  return [
+    section(
+      "What is what",
+      null,
+      preview(one),
+      columns.element,
+      h("div", { class: "fields" }, baselines.length ? field("Compare with the baseline", baseline) : h("p", { class: "complaint" }, "There is no baseline yet: ", h("a", { href: "/learn" }, "learn one"), "."), pointed, field("From [s]", from), field("To [s]", to)),
+      h("div", { class: "actions" }, diagnose, look, said),
+    ),
+    result,
+  ];
+}

@@ -1,0 +1,73 @@
+// Elements without markup in strings: what comes from outside is text, never HTML.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+// h("p", { class: "note", onclick: f }, "text", element, [more]) -> an element; null and false are left out.
+export function h(tag, attributes = {}, ...children) {
+  return filled(document.createElement(tag), attributes, children);
+}
+
+export function s(tag, attributes = {}, ...children) {
+  return filled(document.createElementNS(SVG, tag), attributes, children);
+}
+
+function filled(element, attributes, children) {
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (name === "value") element.value = value;
+    else element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+// Text is only touched where it changes, so that a page at rest costs nothing.
+export function tell(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function mark(element, name, value) {
+  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+}
+
+// A table: head is a list of names, "*Name" for numbers; rows are lists of cells, elements or text.
+export function table(caption, head, rows, attributes = {}) {
+  const numeric = head.map((name) => name.startsWith("*"));
+  const cell = (content, i) =>
+    content instanceof HTMLTableCellElement
+      ? content
+      : i === 0
+        ? h("th", { scope: "row" }, content)
+        : h("td", { class: numeric[i] && "n" }, content);
+  return h(
+    "div",
+    { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },
+    h(
+      "table",
+      attributes,
+      h("caption", { class: "hidden" }, caption),
+      h("thead", {}, h("tr", {}, head.map((name, i) => h("th", { scope: "col", class: numeric[i] && "n" }, name.replace("*", ""))))),
+      h("tbody", {}, rows.map((row) => h("tr", {}, row.map(cell)))),
+    ),
+  );
+}
+
+// A labelled field of a form.
+export function field(label, control, hint = null) {
+  return h("label", { class: "field" }, h("span", {}, label), control, hint && h("small", {}, hint));
+}
+
+export function section(title, note, ...children) {
+  return h("section", {}, h("h2", {}, title), note && h("p", { class: "note" }, note), ...children);
+}
+
+// The same with controls beside the title.
+export function titled(title, controls, ...children) {
+  return h("section", {}, h("div", { class: "titled" }, h("h2", {}, title), controls), ...children);
+}
+
+// What went wrong, said where it matters; screen readers hear it at once.
+export function complaint(error) {
+  return h("p", { class: "complaint", role: "alert" }, error.message ?? String(error));
+}

@@ -1,0 +1,233 @@
+// All assets at a glance, worst first: a map of marks by group, and a table beneath it; both live.
+import { get } from "./api.js";
+import { h, mark as set, tell } from "./dom.js";
+import { follow } from "./live.js";
+import { mark, VERDICTS } from "./marks.js";
+import { DASH, duration, moment, multiple, plain, recent, sentence } from "./words.js";
+
+const STALE_S = 10; // without a sample for so long, the age is told
+const ORDER_MS = 5000; // between two changes of the order: rows must not run away from whoever reads them
+const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² / limit", "CUSUM / limit", "Deviation", "Data", "Alarms", "Sample"];
+// Steps of urgency: what the statistics do below their limits moves no row.
+const rank = (row) => 2 * Math.floor(row.severity / 4) + (row.severity % 4 >= 1 ? 1 : 0);
+const OPEN = ["unacknowledged", "returned_unacknowledged", "latched_unacknowledged"];
+
+export async function show(main, { signal, linked, values }) {
+  const assets = new Map(); // name -> { row, tile, line }
+  const filter = { verdict: values.get("verdict") ?? "", search: values.get("search") ?? "", group: values.get("group") ?? "", open: false };
+  const map = h("div", { class: "map" });
+  const body = h("div", { role: "rowgroup", class: "rows" });
+  const none = h("p", { class: "empty" }, "Loading");
+  const counts = filters();
+  const search = h("input", { type: "search", placeholder: "Search", "aria-label": "Search assets", value: filter.search });
+  const groups = h("select", { "aria-label": "Group" }, h("option", { value: "" }, "All groups"));
+  let now = 0;
+
+  main.replaceChildren(
+    h("div", { class: "head" }, h("h1", {}, "Fleet"), counts.element, h("span", { class: "gap" }), groups, search),
+    map,
+    h(
+      "div",
+      { class: "grid fleet", role: "table", "aria-label": "Assets, worst first" },
+      h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: i > 4 && i < 8 && "n" }, name)))),
+      body,
+    ),
+    none,
+  );
+  search.addEventListener("input", () => ((filter.search = search.value), sift()));
+  groups.addEventListener("change", () => ((filter.group = groups.value), sift()));
+  search.addEventListener("keydown", (event) => event.key === "Enter" && [...assets.values()].find((one) => !one.line.element.hidden)?.line.name.click());
+  map.addEventListener("keydown", walk);
+
+  function filters() {
+    const element = h("div", { class: "filters", role: "group", "aria-label": "Show" });
+    const made = [["", "All"], ...Object.entries(VERDICTS), ["open", "To acknowledge"]].map(([key, words]) => {
+      const amount = h("b", {}, "0");
+      const press = () => {
+        filter.open = key === "open" && !filter.open;
+        filter.verdict = key === "open" || filter.verdict === key ? "" : key;
+        sift();
+      };
+      const button = h("button", { type: "button", onclick: press, class: `filter ${key}` }, key && key !== "open" && mark(key), words, amount);
+      element.append(button);
+      return [key, button, amount];
+    });
+    return { element, made };
+  }
+
+  function recount() {
+    const found = { "": assets.size, fault: 0, undetermined: 0, healthy: 0, open: 0 };
+    for (const { row } of assets.values()) {
+      found[row.verdict] += 1;
+      found.open += row.alarms.some((alarm) => OPEN.includes(alarm.state)) ? 1 : 0;
+    }
+    for (const [key, , amount] of counts.made) tell(amount, String(found[key]));
+  }
+
+  function sift() {
+    const wanted = filter.search.trim().toLowerCase();
+    for (const [name, { row, tile, line }] of assets) {
+      const text = `${name} ${row.group} ${row.summary} ${row.alarms.map((alarm) => alarm.alarm).join(" ")}`.toLowerCase();
+      const shown =
+        (!filter.verdict || row.verdict === filter.verdict) &&
+        (!filter.open || row.alarms.some((alarm) => OPEN.includes(alarm.state))) &&
+        (!filter.group || row.group === filter.group) &&
+        text.includes(wanted);
+      tile.classList.toggle("off", !shown);
+      line.element.hidden = !shown;
+    }
+    for (const [key, button] of counts.made) set(button, "aria-pressed", String(key === "open" ? filter.open : !filter.open && filter.verdict === key));
+    const any = [...assets.values()].some(({ line }) => !line.element.hidden);
+    none.hidden = any;
+    tell(none, assets.size ? "No asset is like this." : "No assets yet: `servoscope run` follows them, and writes what it finds to this store.");
+    const told = new URLSearchParams(Object.entries({ verdict: filter.verdict, search: filter.search, group: filter.group }).filter(([, value]) => value));
+    history.replaceState(null, "", told.size ? `/?${told}` : "/");
+  }
+
+  // Rows are put where they belong, but not under somebody's hands.
+  function order(forced = false) {
+    if (!forced && (body.matches(":hover") || body.contains(document.activeElement))) return;
+    const worst = [...assets.values()].sort((a, b) => rank(b.row) - rank(a.row) || (a.row.asset < b.row.asset ? -1 : 1));
+    worst.forEach(({ line }, i) => body.children[i] !== line.element && body.insertBefore(line.element, body.children[i] ?? null));
+  }
+
+  function chart() {
+    const named = [...new Set([...assets.values()].map(({ row }) => row.group))].sort();
+    groups.replaceChildren(h("option", { value: "" }, "All groups"), ...named.filter(Boolean).map((name) => h("option", { value: name }, name)));
+    groups.value = filter.group;
+    groups.hidden = named.filter(Boolean).length < 2;
+    map.replaceChildren(
+      ...named.map((name) => {
+        const tiles = [...assets.values()].filter(({ row }) => row.group === name).sort((a, b) => (a.row.asset < b.row.asset ? -1 : 1));
+        return h("div", { class: "group" }, name && h("h2", {}, name), h("div", { class: "tiles" }, tiles.map(({ tile }) => tile)));
+      }),
+    );
+    const first = map.querySelector("a");
+    for (const tile of map.querySelectorAll("a")) tile.tabIndex = tile === first ? 0 : -1; // one stop; arrows walk
+  }
+
+  function walk(event) {
+    const tiles = [...map.querySelectorAll("a:not(.off)")];
+    const at = tiles.indexOf(document.activeElement);
+    const across = tiles.filter((tile) => tile.offsetTop === tiles[at]?.offsetTop).length;
+    const steps = { ArrowRight: 1, ArrowLeft: -1, ArrowDown: across, ArrowUp: -across, Home: -at, End: tiles.length - 1 - at };
+    const next = tiles[at + steps[event.key]];
+    if (at < 0 || !next) return;
+    event.preventDefault();
+    document.activeElement.tabIndex = -1;
+    next.tabIndex = 0;
+    next.focus();
+  }
+
+  function take(rows) {
+    let fresh = false;
+    for (const row of rows) {
+      const known = assets.get(row.asset);
+      if (!known) {
+        const one = { row, tile: h("a", { class: "tile", href: `/assets/${encodeURIComponent(row.asset)}` }), line: lineOf(row) };
+        assets.set(row.asset, one);
+        dress(one);
+        fresh = true;
+      } else {
+        fresh ||= known.row.group !== row.group;
+        const changed = known.row.verdict !== row.verdict || known.row.summary !== row.summary || known.row.alarms.length || row.alarms.length;
+        known.row = row;
+        if (changed) dress(known);
+      }
+      assets.get(row.asset).line.update(row, now);
+    }
+    if (fresh) {
+      chart();
+      order(true);
+    }
+    recount();
+    sift();
+  }
+
+  const first = await get("/assets", signal);
+  now = first.now;
+  take(first.assets);
+  recount();
+  sift();
+  follow(
+    "",
+    ["assets"],
+    ({ assets: told = [] }) => {
+      now = told.at(-1)?.now ?? now;
+      take([...new Map(told.flatMap((each) => each.assets).map((row) => [row.asset, row])).values()]);
+    },
+    linked,
+    signal,
+  );
+  const timer = setInterval(() => order(), ORDER_MS);
+  const clock = setInterval(() => {
+    now += 1;
+    for (const { row, line } of assets.values()) line.age(row, now);
+  }, 1000);
+  signal.addEventListener("abort", () => [timer, clock].forEach(clearInterval));
+}
+
+// What a mark on the map says: verdict by shape and colour, an alarm to answer by its frame.
+function dress({ row, tile }) {
+  const open = row.alarms.some((alarm) => OPEN.includes(alarm.state));
+  const look = `tile ${row.verdict} ${open ? "open" : ""}`;
+  const words = `${row.asset}: ${VERDICTS[row.verdict]}${open ? ", alarm to acknowledge" : ""}`;
+  if (tile.dataset.look !== look) {
+    tile.dataset.look = look;
+    for (const name of ["fault", "healthy", "undetermined"]) tile.classList.toggle(name, name === row.verdict);
+    tile.classList.toggle("open", open);
+    tile.replaceChildren(mark(row.verdict));
+  }
+  set(tile, "aria-label", words);
+  set(tile, "title", `${row.asset}\n${sentence(row.summary)}`);
+}
+
+function gauge() {
+  const bar = h("i");
+  const value = h("span");
+  return { bar, value, element: h("span", { role: "cell", class: "n gauge" }, h("span", { class: "bar", "aria-hidden": "true" }, bar), value) };
+}
+
+// One asset's row; only what has changed is touched.
+function lineOf(first) {
+  const cell = (kind = "") => h("span", { role: "cell", class: kind });
+  const name = h("a", { href: `/assets/${encodeURIComponent(first.asset)}` }, first.asset);
+  const state = cell("state");
+  const [group, what, since, deviation, data, alarms, last] = [cell(), cell("what"), cell(), cell("n"), cell(), cell(), cell("n")];
+  const statistic = gauge();
+  const level = gauge();
+  const element = h("div", { role: "row", class: "line" }, state, h("span", { role: "cell", class: "name" }, name), group, what, since, statistic.element, level.element, deviation, data, alarms, last);
+  const drawn = (one, value) => {
+    tell(one.value, multiple(value));
+    const share = Math.round(Math.min((value ?? 0) / 1.5, 1) * 48); // px; the limit is at 32
+    if (one.share !== share) one.bar.style.width = `${(one.share = share)}px`;
+    one.element.classList.toggle("over", value >= 1);
+  };
+  let verdict = null;
+  const age = (row, now) => tell(last, row.at === null ? DASH : now - row.at < STALE_S ? "now" : `${duration(now - row.at)} ago`);
+  const update = (row, now) => {
+    if (verdict !== row.verdict) {
+      verdict = row.verdict;
+      element.classList.remove("fault", "healthy", "undetermined");
+      element.classList.add(verdict);
+      state.replaceChildren(mark(verdict), VERDICTS[verdict]);
+    }
+    const open = row.alarms.filter((alarm) => OPEN.includes(alarm.state)).length;
+    const told = sentence(row.summary).replace(/^(Fault|Healthy|Undetermined): /, "");
+    tell(group, row.group || DASH);
+    tell(what, told);
+    set(what, "title", told);
+    const from = row.verdict === "fault" ? Math.min(row.onset ?? row.since, row.since) : row.since;
+    tell(since, recent(from, now));
+    set(since, "title", moment(from));
+    drawn(statistic, row.statistic);
+    drawn(level, row.level);
+    tell(deviation, row.deviation === null ? DASH : `${(100 * row.deviation).toFixed(1)} %`);
+    tell(data, row.quality.map(plain).join(", ") || "sound");
+    data.classList.toggle("bad", row.quality.length > 0);
+    tell(alarms, open ? `${open} to answer` : row.alarms.length ? `${row.alarms.length} answered` : DASH);
+    alarms.classList.toggle("bad", open > 0);
+    age(row, now);
+  };
+  return { element, name, update, age };
+}

@@ -1,0 +1,148 @@
+// Healthy recordings to a baseline: choose the loop, choose recordings, see excitation and quality, learn, save.
+import { get, job, mayChange, part, post } from "./api.js";
+import { complaint, field, h, section, table, tell } from "./dom.js";
+import { findings, inspected } from "./inspection.js";
+import { loopChoice } from "./loops.js";
+import { mark, prose } from "./marks.js";
+import { dropzone, earlier, mapping, preview } from "./uploads.js";
+import { change, count, DASH, duration, general, moment, number, plain, withStd } from "./words.js";
+
+const KINDS = { usable: "healthy", "usable with care": "care", "not usable": "stop" };
+
+export async function show(main, { session, signal }) {
+  const saved = h("div", {});
+  const work = h("div", { class: "steps" });
+  main.replaceChildren(h("div", { class: "head" }, h("h1", {}, "Learn a baseline")), work, section("Baselines", null, saved));
+  const refresh = async () => saved.replaceChildren(baselines((await get("/baselines", signal)).baselines));
+  await refresh();
+  if (!mayChange(session.role, "engineer")) {
+    work.replaceChildren(h("p", { class: "note" }, "Learning a baseline is for engineers; these are known."));
+    return;
+  }
+  const loop = await loopChoice("learn", signal);
+  const chosen = []; // { upload, point, box, said }
+  const listed = h("div", {});
+  const columns = h("div", {});
+  const said = h("div", { role: "status", class: "working" });
+  const result = h("div", {});
+  const look = h("button", { type: "button" }, "Inspect them");
+  const learn = h("button", { type: "button", class: "first" }, "Learn");
+  let mapped = null;
+
+  const add = (one) => {
+    if (chosen.some((each) => each.upload.id === one.id)) return;
+    const entry = { upload: one, point: h("input", { size: "10", "aria-label": `Operating point of ${one.name}`, placeholder: "all" }), box: h("input", { type: "checkbox", checked: true, "aria-label": `Use ${one.name}` }), said: h("div", {}, h("small", {}, "not inspected")) };
+    entry.box.addEventListener("change", enable);
+    chosen.push(entry);
+    listed.replaceChildren(table("Recordings to learn from", ["Recording", "Use", "*Rows", "Operating point", "Quality"], chosen.map((each) => [each.upload.name, each.box, count(each.upload.rows), each.point, each.said])));
+    if (!mapped) {
+      mapped = mapping(one);
+      columns.replaceChildren(h("h3", {}, "What is what, in all of them"), preview(one), mapped.element);
+    }
+    enable();
+  };
+  const used = () => chosen.filter((each) => each.box.checked);
+  function enable() {
+    learn.disabled = look.disabled = !used().length;
+  }
+  enable();
+
+  const during = async (button, what) => {
+    button.disabled = true;
+    try {
+      await what((step) => tell(said, `${step} …`));
+      said.replaceChildren();
+    } catch (error) {
+      if (error.name !== "AbortError") said.replaceChildren(complaint(error));
+    } finally {
+      enable();
+    }
+  };
+  look.addEventListener("click", () =>
+    during(look, async () => {
+      for (const each of used()) {
+        tell(said, `Inspecting ${each.upload.name} …`);
+        const found = await job("/inspections", { upload: each.upload.id, columns: mapped.read(), loop: loop.read() }, { signal });
+        judged(each, found.inspection, () => {
+          const shown = inspected(found, null, signal);
+          result.replaceChildren(section(each.upload.name, null, shown.element));
+          shown.draw();
+        });
+      }
+    }),
+  );
+  learn.addEventListener("click", () =>
+    during(learn, async (step) => {
+      const recordings = used().map((each) => ({ upload: each.upload.id, ...(each.point.value.trim() && { point: each.point.value.trim() }) }));
+      const found = await job("/learnings", { loop: loop.read(), recordings, columns: mapped.read() }, { signal, step });
+      for (const one of found.recordings) judged(chosen.find((each) => each.upload.id === one.upload), one.inspection);
+      result.replaceChildren(learned(found, refresh));
+      result.scrollIntoView({ block: "start" });
+    }),
+  );
+  work.append(
+    section("Loop", "What is known of it: sampling, plant, controller. A baseline has it inside.", loop.element),
+    section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, h("div", { class: "actions" }, learn, look, said)),
+    result,
+  );
+}
+
+function judged(each, inspection, open = null) {
+  if (!each) return;
+  const kind = KINDS[inspection.verdict];
+  const words = h("span", { class: `badge ${kind}`, title: inspection.summary }, mark(kind), inspection.verdict);
+  each.said.replaceChildren(words, open ? h("button", { type: "button", class: "quiet", onclick: open }, "show") : findings({ findings: inspection.findings.filter((one) => one.severity !== "note") }));
+}
+
+function learned(found, refresh) {
+  const points = found.summary.points ? Object.entries(found.summary.points) : [["", found.summary]];
+  const name = h("input", { required: true, pattern: "[\\w][\\w.:\\-]*", title: "letters, digits, . : - _" });
+  const said = h("div", { role: "status", class: "working" });
+  const save = async (event) => {
+    event.preventDefault();
+    try {
+      const made = await post("/baselines", { name: name.value, learning: found.learning });
+      said.replaceChildren(`Saved as ${made.name}: `, h("a", { href: `/diagnose?baseline=${part(made.id)}` }, "diagnose a recording with it"));
+      await refresh();
+    } catch (error) {
+      said.replaceChildren(complaint(error));
+    }
+  };
+  return section(
+    "What was learned",
+    null,
+    points.map(([point, summary]) => [point && h("h3", {}, `Operating point ${point}`), told(summary)]),
+    h("form", { class: "actions", onsubmit: save }, field("Save as", name), h("button", { class: "first" }, "Save"), said),
+  );
+}
+
+function told(summary) {
+  const promises = (summary.promises ?? []).map((one) => [plain(one.name), h("span", {}, prose(one.parameter)), one.change === null ? "never" : change(1 + one.change)]);
+  const values = Object.entries(summary.parameters ?? {}).map(([name, one]) => [h("span", {}, prose(name)), ...withStd(one.value, one.std)]);
+  return h(
+    "div",
+    {},
+    h("p", {}, `Explains ${number(100 * summary.explained, 4)} % of the input; threshold of T² ${number(summary.threshold, 4)}, for ${general(summary.false_alarms_per_year)} false alarms a year.`),
+    promises.length > 0 && table("The smallest change that this baseline promises to see", ["Fault", "Parameter", "*Seen from"], promises),
+    values.length > 0 && table("Learned coefficients", ["Name", "*Value", "*Standard deviation"], values),
+    (summary.notes ?? []).length > 0 && h("ul", { class: "why" }, summary.notes.map((words) => h("li", {}, prose(typeof words === "string" ? words : (words.message ?? ""))))),
+  );
+}
+
+function baselines(all) {
+  if (!all.length) return h("p", { class: "empty" }, "No baseline yet.");
+  return table(
+    "Baselines that are known",
+    ["Name", "Loop", "Of", "Assets", "*Recordings", "*Length", "Since", ""],
+    all.map((one) => [
+      one.name,
+      one.loop,
+      one.origin === "service" ? "the service" : (one.who ?? "saved"),
+      one.assets.join(", ") || DASH,
+      String(one.recordings),
+      duration(one.duration_s),
+      one.at ? moment(one.at, { seconds: false }) : DASH,
+      h("span", {}, h("a", { href: `/diagnose?baseline=${part(one.id)}` }, "diagnose"), ", ", h("a", { href: `/design?baseline=${part(one.id)}` }, "study"), ", ", h("a", { href: `/api/v1/baselines/${part(one.id)}/file`, download: true, "aria-label": `Download ${one.name}` }, "download")),
+    ]),
+  );
+}

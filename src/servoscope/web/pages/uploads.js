@@ -1,0 +1,82 @@
+// Recordings on their way in: dropped or chosen files, what is in them, which column is what.
+import { get, part, upload } from "./api.js";
+import { complaint, field, h, table } from "./dom.js";
+import { count, moment, number } from "./words.js";
+
+const UNITS = ["s", "ms", "us", "ns", "min"];
+const SIGNALS = [
+  ["time", "Time"],
+  ["reference", "Reference r"],
+  ["input", "Input u"],
+  ["output", "Output y"],
+];
+
+// A place for files; `taken(upload)` is called for each that could be read.
+export function dropzone(words, several, taken, signal) {
+  const said = h("div", { role: "status", class: "working" });
+  const input = h("input", { type: "file", class: "hidden", id: "files", multiple: several, "aria-label": words });
+  const choose = h("button", { type: "button", class: "first", onclick: () => input.click() }, several ? "Choose files" : "Choose a file");
+  const element = h("div", { class: "drop" }, h("span", {}, words), choose, input, h("small", {}, "CSV, Parquet, MAT, MDF4, TDMS, HDF5"), said);
+  const take = async (files) => {
+    for (const file of several ? files : [...files].slice(0, 1)) {
+      said.replaceChildren(`Reading ${file.name}`);
+      try {
+        await taken(await upload(file, signal));
+        said.replaceChildren();
+      } catch (error) {
+        said.replaceChildren(complaint(error));
+        return;
+      }
+    }
+  };
+  input.addEventListener("change", () => take([...input.files]));
+  element.addEventListener("dragover", (event) => (event.preventDefault(), element.classList.add("over")));
+  element.addEventListener("dragleave", () => element.classList.remove("over"));
+  element.addEventListener("drop", (event) => {
+    event.preventDefault();
+    element.classList.remove("over");
+    take([...event.dataTransfer.files]);
+  });
+  return element;
+}
+
+// Those that are still here, as choices.
+export async function earlier(chosen, signal) {
+  const { uploads } = await get("/uploads", signal);
+  if (!uploads.length) return null;
+  const select = h("select", {}, h("option", { value: "" }, "choose"), [...uploads].reverse().map((one) => h("option", { value: one.id }, `${one.name}, ${moment(one.at)}`)));
+  select.addEventListener("change", async () => select.value && chosen(await get(`/uploads/${part(select.value)}`, signal)));
+  return field("or one that was uploaded before", select);
+}
+
+export function preview(one) {
+  const about = h("p", { class: "note" }, `${one.name}: ${count(one.rows)} rows, ${(one.bytes / 1e6).toFixed(2)} MB. The first rows, and the range of each column:`);
+  const range = (column) => (column.min === null ? column.type : `${number(column.min, 3)} to ${number(column.max, 3)}`);
+  const head = one.preview.columns.map((name) => `*${name}`);
+  const ranges = one.preview.columns.map((name) => h("td", { class: "n" }, h("small", {}, range(one.columns.find((each) => each.name === name) ?? { min: null, type: "" }))));
+  const rows = one.preview.rows.map((row) => row.map((cell) => h("td", { class: "n" }, typeof cell === "number" ? number(cell, 5) : String(cell ?? ""))));
+  const made = table(`The first rows of ${one.name}`, head, [ranges, ...rows]);
+  made.classList.add("preview");
+  return h("div", {}, about, made);
+}
+
+// Which column is what; `read()` returns it as the interface wants it.
+export function mapping(one) {
+  const names = one.columns.map((column) => column.name);
+  const id = `columns-${one.id}`;
+  const known = one.mapping ?? {};
+  const fields = Object.fromEntries(SIGNALS.map(([key]) => [key, h("input", { list: id, name: key, value: known[key] ?? "", autocomplete: "off" })]));
+  const unit = h("select", { name: "time_unit" }, UNITS.map((name) => h("option", { value: name, selected: name === known.time_unit }, name)));
+  const element = h(
+    "div",
+    {},
+    h("datalist", { id }, names.map((name) => h("option", { value: name }))),
+    h("div", { class: "fields" }, SIGNALS.map(([key, words]) => field(words, fields[key])), field("Unit of time", unit)),
+    h("p", { class: "note" }, "A column, or a combination of columns: 0.025 * counts, set_point - error. Units are those that the baseline was learned in."),
+  );
+  const read = () => {
+    const said = Object.fromEntries(SIGNALS.map(([key]) => [key, fields[key].value.trim()]).filter(([, value]) => value));
+    return { ...said, time_unit: unit.value, ...(known.segment?.length ? { segment: known.segment } : {}) };
+  };
+  return { element, read };
+}

@@ -1,0 +1,345 @@
+"""The pages in a real browser, in front of a hall that is really followed: what a person sees and can do.
+
+SCREENSHOTS=docs/images/pages writes the pictures of README and docs while the tests pass through the pages.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import screens
+from screens import asked, until
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
+expect = playwright.expect
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
+
+SIZE = {"width": 1366, "height": 768}
+THEMES = ("light", "dark")
+PATIENCE_MS = 30_000.0
+LONG_MS = 180_000.0  # learning and designing, on a busy machine
+Open = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    found = screens.browser()
+    if found is None:
+        pytest.skip("there is no Chromium: scripts/install-test-servers installs it")
+    with playwright.sync_playwright() as driver:
+        launched = driver.chromium.launch(executable_path=found, args=["--no-sandbox", "--disable-dev-shm-usage"])
+        expect.set_options(timeout=PATIENCE_MS)
+        yield launched
+        launched.close()
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("hall")
+    screens.recordings(folder)
+    return screens.hall(folder)
+
+
+@pytest.fixture(scope="module")
+def base(chromium: Any, config: Path) -> Iterator[str]:
+    """The address of the pages, once the hall has its faults and what is wrong with them is known in full."""
+    with screens.process("run", config.name, cwd=config.parent), screens.serving(config) as address:
+        until(lambda: asked(address, "/assets/press-1")["sizes"] and asked(address, "/assets/rig-1")["sizes"], 240.0)
+        until(lambda: asked(address, "/alarms")["alarms"])
+        yield address
+
+
+@pytest.fixture
+def open_page(chromium: Any, base: str) -> Iterator[Open]:
+    """Opens pages; whatever a page complains of in its console, its policy included, fails the test."""
+    contexts, complaints = [], []
+
+    def opened(path: str, theme: str = "light", address: str = base, *, quiet: tuple[str, ...] = ()) -> Any:
+        context = chromium.new_context(viewport=SIZE, color_scheme=theme, locale="en-GB", timezone_id="UTC")
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE_MS)
+
+        def heard(message: Any) -> None:
+            if message.type == "error" and not any(word in message.text for word in quiet):
+                complaints.append(message.text)
+
+        page.on("console", heard)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.goto(address + path)
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def shot(page: Any, name: str, **how: Any) -> None:
+    """Write a picture for the docs, where one is asked for."""
+    folder = os.environ.get("SCREENSHOTS")
+    if folder:
+        page.mouse.move(0, 0)
+        page.wait_for_timeout(600)
+        page.screenshot(path=str(Path(folder) / f"{name}.png"), **how)
+
+
+def accessible(page: Any) -> None:
+    """No serious finding of axe-core: contrast, names, roles, order of headings and so on."""
+    from axe_playwright_python.sync_playwright import Axe
+
+    found = Axe().run(page, options={"resultTypes": ["violations"]}).response["violations"]
+    serious = [one for one in found if one["impact"] in ("serious", "critical")]
+    told = [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes'][:3]]}" for one in serious]
+    assert told == []
+
+
+def diagnosis_of(base: str, asset: str) -> str:
+    return str(
+        [one for one in asked(base, f"/diagnoses?asset={asset}")["diagnoses"] if one["grounds"] == "full"][-1]["id"]
+    )
+
+
+def test_the_fleet_shows_the_worst_first(open_page: Open) -> None:
+    page = open_page("/")
+    rows = page.get_by_role("table", name="Assets, worst first").get_by_role("row")
+    expect(rows).to_have_count(1 + 12)
+    expect(rows.nth(1)).to_contain_text("Fault")
+    assert {rows.nth(i).get_by_role("link").inner_text() for i in (1, 2)} == {"press-1", "rig-1"}
+    expect(page.get_by_role("link", name=re.compile("press-1: Fault"))).to_be_visible()
+    shot(page, "fleet")
+    page.get_by_role("button", name=re.compile("^Fault")).click()
+    expect(rows.filter(visible=True)).to_have_count(1 + 2)
+    page.get_by_role("button", name=re.compile("^All")).click()
+    page.get_by_label("Search assets").fill("lift")
+    expect(rows.filter(visible=True)).to_have_count(1 + 5)
+    page.get_by_label("Search assets").fill("")
+    page.get_by_label("Group").select_option("Test rigs")
+    expect(rows.filter(visible=True)).to_have_count(1 + 3)
+    assert page.url.endswith("group=Test+rigs")  # what is looked at can be sent to somebody
+
+
+def test_the_fleet_is_live_and_nothing_jumps(open_page: Open) -> None:
+    page = open_page("/")
+    expect(page.get_by_role("status").first).to_have_text("Live")
+    row = page.get_by_role("row").filter(has=page.get_by_role("link", name="lift-3", exact=True))
+    value = row.get_by_role("cell").nth(5)
+    told, seen, places = value.inner_text(), set(), set()
+    for _ in range(40):
+        seen.add(value.inner_text())
+        places.add(tuple(row.bounding_box().values()))
+        page.wait_for_timeout(100)
+    assert told and len(seen) > 2
+    assert len(places) == 1
+
+
+def test_the_fleet_is_walked_with_the_keyboard(open_page: Open) -> None:
+    page = open_page("/")
+    first = page.locator(".map a").first
+    expect(first).to_be_visible()
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="Skip to content")).to_be_focused()
+    first.focus()
+    page.keyboard.press("ArrowRight")
+    expect(page.locator(".map a").nth(1)).to_be_focused()
+    name = page.locator(".map a").nth(1).get_attribute("aria-label").split(":")[0]
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", level=1)).to_have_text(name)
+
+
+def test_an_asset_says_what_is_wrong_how_much_and_since_when(open_page: Open) -> None:
+    page = open_page("/assets/press-1")
+    verdict = page.get_by_role("region", name="Verdict on press-1")
+    expect(verdict).to_contain_text("Internal leakage")
+    expect(verdict).to_contain_text("Since")
+    expect(verdict).to_contain_text(re.compile(r"Cie \+(19|20)"))
+    expect(page.get_by_role("img", name=re.compile("complex plane"))).to_have_count(3)
+    expect(page.get_by_role("row", name=re.compile("θ₀"))).to_contain_text("A/m")
+    expect(page.get_by_text("samples in")).to_be_visible()
+    page.wait_for_timeout(3000)
+    shot(page, "asset", full_page=True)
+    painted = "c => [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data].some(Boolean)"
+    assert all(page.locator("canvas").evaluate_all(f"all => all.map({painted})"))
+
+
+def test_an_asset_is_live(open_page: Open) -> None:
+    page = open_page("/assets/lift-1")
+    last = page.locator(".facts dd").last
+    expect(last).to_contain_text(":")
+    before, height = last.inner_text(), page.locator(".verdict").bounding_box()["height"]
+    expect(last).not_to_have_text(before)
+    page.get_by_role("button", name="24 h").click()
+    expect(page.get_by_role("button", name="24 h")).to_have_attribute("aria-pressed", "true")
+    assert page.locator(".verdict").bounding_box()["height"] == height
+
+
+def test_an_alarm_is_acknowledged_and_another_shelved(open_page: Open, base: str) -> None:
+    page, watching = open_page("/alarms"), open_page("/assets/press-1")
+    row = page.get_by_role("row").filter(has=page.get_by_role("link", name="press-1")).first
+    expect(row).to_contain_text("plan an inspection")
+    shot(page, "alarms")
+    row.get_by_role("button", name=re.compile("^Acknowledge")).click()
+    expect(row).to_contain_text("acknowledged")
+    expect(row.get_by_role("button", name=re.compile("^Acknowledge"))).to_have_count(0)
+    expect(watching.get_by_role("region", name="Alarms of this asset")).to_contain_text("acknowledged")
+    other = page.get_by_role("row").filter(has=page.get_by_role("link", name="rig-1")).first
+    other.get_by_role("button", name=re.compile("^Shelve")).click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Why").fill("waiting for the spare part")
+    dialog.get_by_label("For").select_option("1 h")
+    dialog.get_by_role("button", name="Shelve").click()
+    expect(other).to_contain_text("shelved until")
+    steps = {(one["asset"], one["after"]): one["who"] for one in asked(base, "/alarms/history")["transitions"]}
+    assert steps["press-1", "acknowledged"] == steps["rig-1", "shelved"] == "local"
+
+
+def test_a_recording_is_dropped_inspected_and_diagnosed(open_page: Open, eha_cases: Path) -> None:
+    page = open_page("/diagnose")
+    page.get_by_label("Drop a recording here").set_input_files(eha_cases / "multisine_C_iex1.2_11.csv")
+    expect(page.get_by_role("heading", name="Is it usable?")).to_be_visible(timeout=LONG_MS)
+    expect(page.get_by_label("Input u")).to_have_value("u")
+    page.wait_for_timeout(500)
+    shot(page, "diagnose", full_page=True)
+    accessible(page)
+    page.get_by_label("Compare with the baseline").select_option(index=0)
+    page.get_by_role("button", name="Diagnose").click()
+    page.wait_for_url("**/diagnoses/*", timeout=LONG_MS)
+    verdict = page.get_by_role("region", name="Verdict")
+    expect(verdict).to_contain_text("Internal leakage")
+    expect(page.get_by_role("heading", name="Candidates")).to_be_visible()
+    shot(page, "diagnosis", full_page=True)
+    page.reload()  # its address is permanent
+    expect(verdict).to_contain_text("Internal leakage")
+    for theme in THEMES:
+        page.emulate_media(color_scheme=theme)
+        accessible(page)
+    with page.expect_popup() as report:
+        page.get_by_role("link", name="Report as one file").click()
+    expect(report.value.get_by_role("heading", name="Internal leakage")).to_be_visible()
+
+
+def test_a_diagnosis_prints_in_black_on_white(open_page: Open, base: str, tmp_path: Path) -> None:
+    page = open_page(f"/diagnoses/{diagnosis_of(base, 'press-1')}", "dark")
+    expect(page.get_by_role("region", name="Verdict")).to_contain_text("Internal leakage")
+    pdf = page.pdf(path=tmp_path / "diagnosis.pdf", format="A4", print_background=True)
+    assert pdf.startswith(b"%PDF-") and len(pdf) > 20_000
+    page.emulate_media(media="print")
+    assert page.evaluate("getComputedStyle(document.body).color") == "rgb(28, 37, 48)"
+    expect(page.locator("header.top")).to_be_hidden()
+
+
+def test_what_cannot_be_read_is_said(open_page: Open, tmp_path: Path) -> None:
+    page = open_page("/diagnose", quiet=("422",))
+    broken = tmp_path / "broken.csv"
+    broken.write_bytes(b"\x00\xff nothing that a log would be")
+    page.get_by_label("Drop a recording here").set_input_files(broken)
+    expect(page.get_by_role("alert")).to_contain_text("broken.csv")
+
+
+def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: Path, project: Path) -> None:
+    log = shared_data / "real" / "emps" / "DATA_EMPS.mat"
+    page = open_page("/learn")
+    page.get_by_role("combobox", name="Loop", exact=True).select_option("a loop file of your own")
+    page.get_by_label("Loop file (TOML)").last.fill((project / "examples" / "emps.toml").read_text())
+    page.get_by_label("Drop healthy recordings here").set_input_files(log)
+    expect(page.get_by_role("region", name="Recordings to learn from")).to_contain_text("DATA_EMPS.mat")
+    page.get_by_role("button", name="Inspect them").click()
+    expect(page.get_by_role("region", name="Recordings to learn from")).to_contain_text("usable", timeout=LONG_MS)
+    page.get_by_role("button", name="Learn").click()
+    expect(page.get_by_role("heading", name="What was learned")).to_be_visible(timeout=LONG_MS)
+    shot(page, "learn", full_page=True)
+    accessible(page)
+    page.get_by_label("Save as").fill("emps")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_role("link", name="diagnose a recording with it").click()
+    page.get_by_label("Drop a recording here").set_input_files(log)
+    expect(page.get_by_label("Compare with the baseline")).to_be_visible()
+    page.get_by_label("From [s]").fill("12.4")
+    page.get_by_role("button", name="Diagnose").click()
+    page.wait_for_url("**/diagnoses/*", timeout=LONG_MS)
+    expect(page.get_by_role("region", name="Verdict")).to_contain_text("Healthy")
+
+
+def test_a_study_says_what_can_be_told_apart(open_page: Open) -> None:
+    page = open_page("/design")
+    page.get_by_role("combobox", name="Loop", exact=True).select_option(index=0)
+    page.get_by_role("button", name="Study").click()
+    expect(page.get_by_role("heading", name="How alike they look")).to_be_visible(timeout=LONG_MS)
+    expect(page.get_by_role("region", name="Radii of faults")).to_contain_text("Leakage up")
+    shot(page, "design", full_page=True)
+    accessible(page)
+
+
+@pytest.mark.parametrize("theme", THEMES)
+@pytest.mark.parametrize(
+    "path", ["/", "/assets/press-1", "/alarms", "/diagnose", "/learn", "/design", "/nowhere", "diagnosis"]
+)
+def test_every_page_is_accessible(open_page: Open, base: str, path: str, theme: str) -> None:
+    page = open_page(f"/diagnoses/{diagnosis_of(base, 'press-1')}" if path == "diagnosis" else path, theme)
+    expect(page.get_by_role("heading", level=1)).to_be_visible()
+    page.wait_for_timeout(1000)
+    accessible(page)
+    assert page.evaluate("document.documentElement.scrollWidth") <= SIZE["width"]
+    if theme == "dark" and path in ("/", "/assets/press-1"):
+        shot(page, "fleet-dark" if path == "/" else "asset-dark")
+
+
+def test_the_switch_changes_colours_and_is_remembered(open_page: Open) -> None:
+    page = open_page("/")
+    paper = "getComputedStyle(document.documentElement).backgroundColor"
+    light = page.evaluate(paper)
+    page.get_by_role("button", name="Switch to dark colours").click()
+    dark = page.evaluate(paper)
+    assert light != dark
+    page.reload()
+    assert page.evaluate(paper) == dark
+
+
+def test_the_page_says_when_the_service_is_gone_and_when_it_is_back(
+    chromium: Any, config: Path, open_page: Open
+) -> None:
+    with screens.serving(config) as address:
+        page = open_page("/", address=address, quiet=("ERR_", "Failed to load"))
+        link = page.locator(".link")
+        expect(link).to_have_text("Live")
+        port = address.rsplit(":", 1)[1]
+    expect(link).to_have_text("Connection lost, trying again")
+    with screens.process("serve", config.name, "--listen", f"127.0.0.1:{port}", cwd=config.parent):
+        expect(link).to_have_text("Live")
+
+
+def test_login_is_refused_and_granted_by_role(open_page: Open, config: Path) -> None:
+    users = config.parent / "users.json"
+    for name, role in (("vera", "viewer"), ("otto", "operator")):
+        command = [sys.executable, "-m", "servoscope", "users", "add", name, "--role", role, "--users", str(users)]
+        environment = os.environ | {"PYTHONPATH": screens.SOURCES}
+        subprocess.run([*command, "--password-stdin"], input=b"correct horse battery\n", check=True, env=environment)
+    with screens.serving(config, "--users", "users.json") as address:
+        page = open_page("/alarms", address=address, quiet=("401", "ERR_"))
+        expect(page.get_by_role("heading", name="Log in")).to_be_visible()
+        accessible(page)
+        shot(page, "login")
+        page.get_by_label("User").fill("vera")
+        page.get_by_label("Password").fill("wrong")
+        page.get_by_role("button", name="Log in").click()
+        expect(page.get_by_role("alert")).to_be_visible()
+        page.get_by_label("Password").fill("correct horse battery")
+        page.get_by_role("button", name="Log in").click()
+        page.wait_for_url("**/alarms")  # where she wanted to be
+        expect(page.get_by_text("vera, viewer")).to_be_visible()
+        expect(page.get_by_role("region", name="Alarms, the most urgent first")).to_contain_text("operators answer")
+        expect(page.get_by_role("button", name=re.compile("^Acknowledge"))).to_have_count(0)
+        page.get_by_role("button", name="Log out").click()
+        page.get_by_label("User").fill("otto")
+        page.get_by_label("Password").fill("correct horse battery")
+        page.get_by_role("button", name="Log in").click()
+        expect(page.get_by_text("otto, operator")).to_be_visible()
