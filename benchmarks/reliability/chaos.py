@@ -106,6 +106,19 @@ class Chaos:
         self._broker.start()
         self.plc.start()
         self._service, self._publisher = self._start("run", self.config), self._start("publish", self._publish)
+        try:
+            return self._run()
+        finally:
+            for process in (self._service, self._publisher):
+                process.kill()
+                process.wait()
+            self._broker.stop()
+            self.plc.kill()
+            for cable in self._cables.values():
+                cable.close()
+            self._log.close()
+
+    def _run(self) -> int:
         self._until_more({"press": 0.0, "plc": 0.0})  # the service has subscribed by then
         plain = Plain(self._fleet, self._cables["publisher"].port)
         due, deck = time.monotonic() + self._wait(), list[str]()
@@ -129,11 +142,6 @@ class Chaos:
         time.sleep(2.0)
         self._service.send_signal(signal.SIGTERM)
         assert self._service.wait(120) == 0
-        self._broker.stop()
-        self.plc.kill()
-        for cable in self._cables.values():
-            cable.close()
-        self._log.close()
         return plain.sent
 
     def _disturb(self, what: str) -> tuple[str, ...]:
@@ -269,6 +277,7 @@ def main() -> None:
     if given.render:
         render()
         return
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # whatever has been started is ended then
     found = trial(given.hours, given.assets, given.speed, given.every)
     RESULTS.mkdir(exist_ok=True)
     atomic_write(RESULTS / "chaos.json", (json.dumps(found, indent=1) + "\n").encode())

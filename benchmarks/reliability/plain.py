@@ -24,7 +24,7 @@ class Plain:
         self._client.loop_start()
         self._over, self._every = threading.Event(), BLOCK_S / fleet.speed
         self.sent = 0
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
