@@ -246,7 +246,7 @@ def markdown(one: dict[str, Any]) -> str:
                 f"{found['sent']}; {found['stored']}, {found['named']}",
             ),
             (
-                "lost and not named, named and not lost; assets with other samples",
+                "lost and not named; assets with other samples",
                 f"{found['unnamed']}, {found['other']}",
             ),
         ]
