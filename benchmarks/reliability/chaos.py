@@ -239,16 +239,13 @@ def markdown(one: dict[str, Any]) -> str:
         ("assets whose rows are not numbered through", f"{one['misnumbered']}"),
         ("sent once more and left out", f"{one['left out as repeated']}"),
     ]
-    for words, found in (("a sender that keeps nothing", plain), ("the OPC UA server", plc)):
+    for words, found in (
+        ("sent by who keeps nothing; stored, named as lost", plain),
+        ("written by the OPC UA server; stored, named as lost or never written", plc),
+    ):
         rows += [
-            (
-                f"blocks of {words}: sent; stored, named as lost",
-                f"{found['sent']}; {found['stored']}, {found['named']}",
-            ),
-            (
-                "lost and not named; assets with other samples",
-                f"{found['unnamed']}, {found['other']}",
-            ),
+            (f"blocks {words}", f"{found['sent']}; {found['stored']}, {found['named']}"),
+            ("lost and not named; assets with other samples", f"{found['unnamed']}, {found['other']}"),
         ]
     full = settings["hours"] * settings["assets"] >= 1000.0
     words = "" if full else " **Reduced: not ten hours of 100 assets yet.**"
