@@ -1,8 +1,9 @@
-"""Publisher, broker and service, each killed at random, and the cables between them pulled: what is lost, what doubled.
+"""Publisher, broker, OPC UA server and service, killed at random, and cables pulled: what is lost, what doubled.
 
     python benchmarks/reliability/chaos.py [--hours 10] [--assets 100] [--every 20] [--render]
 
-One more asset, `plain`, has a sender that keeps nothing: what it loses has to be counted, block by block.
+The assets are sent by `servoscope publish`. One more, `plain`, has a sender that keeps nothing, and some are nodes of
+an OPC UA server whose history dies with it: what these lose has to be named, block by block.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ import argparse
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import urllib.request
 from http.client import HTTPException
@@ -28,59 +29,26 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from tables import machine  # noqa: E402
 
-from reliability.checks import NUMBERED, numbers_of, opened  # noqa: E402
+from reliability.aftermath import looked_at  # noqa: E402
 from reliability.fleet import BLOCK_S, LOOP, Fleet  # noqa: E402
+from reliability.plain import Plain  # noqa: E402
+from reliability.plc import Plc, names, node  # noqa: E402
 from reliability.run import PAGE, RESULTS, free_port  # noqa: E402
 from reliability.servers import Cable, Mosquitto, mosquitto  # noqa: E402
-from reliability.trial import COUNTED  # noqa: E402
-from servoscope.broker import BrokerSettings, reach  # noqa: E402
-from servoscope.live.checkpoint import unpack  # noqa: E402
-from servoscope.live.mqtt import payload, topics  # noqa: E402
-from servoscope.live.replay import Tape  # noqa: E402
-from servoscope.loop import Loop  # noqa: E402
 from servoscope.output import atomic_write  # noqa: E402
-from servoscope.readers import read  # noqa: E402
 
 LONGEST_S = 900.0  # until results are stored again
 AHEAD = 10  # blocks that the publisher keeps per asset
-BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
 START = "2026-01-01T00:00:00Z"
 PULLED_S = 3.0
-
-
-class Plain:
-    """A sender that keeps nothing: what its broker forgets is gone."""
-
-    def __init__(self, fleet: Fleet, port: int) -> None:
-        loop = Loop.load(LOOP)
-        recording = read(fleet.folder / "healthy-0.csv", loop)
-        self._tape = Tape((recording,), round(BLOCK_S * loop.sample_rate), True)
-        self._client = reach(BrokerSettings(host="127.0.0.1", port=port), Path(), "plain")
-        self._client.connect_async("127.0.0.1", port, keepalive=5)
-        self._client.loop_start()
-        self._over, self._every = threading.Event(), BLOCK_S / fleet.speed
-        self.sent = 0
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._over.wait(self._every):
-            block = self._tape.block("plain", self.sent, BEGAN)
-            assert block is not None
-            self._client.publish(topics.data("servoscope", "plain"), payload.encode(block), qos=1)
-            self.sent += 1
-
-    def close(self) -> None:
-        """Stop, and give the last one time to arrive."""
-        self._over.set()
-        self._thread.join()
-        time.sleep(2.0)
-        self._client.disconnect()
-        self._client.loop_stop()
+CABLES = ("cable of the publisher", "cable of the service", "cable of the server")
+EVENTS = ("service", "broker", "server", "publisher", *CABLES)  # they come in turn, in an order that chance makes
+PLC = 4  # assets of the OPC UA server
+COUNTED = re.compile(r'servoscope_blocks_total\{asset="(\w+)[^"]*"\} (\S+)')
 
 
 class Chaos:
-    """Three processes and two cables.
+    """Four processes and three cables.
 
     Parameters
     ----------
@@ -97,18 +65,27 @@ class Chaos:
         assert program is not None, "mosquitto is missing: scripts/install-test-servers installs it"
         self._fleet, self._every, self._chance = fleet, every_s, random.Random(seed)
         self._broker = Mosquitto(fleet.folder, program)
-        self._cables = {"publisher": Cable(self._broker.port), "service": Cable(self._broker.port)}
+        self.plc = Plc(free_port(), fleet.folder, PLC, fleet.speed)
+        ports = {"publisher": self._broker.port, "service": self._broker.port, "server": self.plc.port}
+        self._cables = {name: Cable(port) for name, port in ports.items()}
         self._port, self._log = free_port(), (fleet.folder / "chaos.log").open("ab")
         self.config, self._publish = self._files()
         self.happened: dict[str, list[float]] = {}
 
     def _files(self) -> tuple[Path, Path]:
-        names = [*self._fleet.names, "plain"]
         service = [
             f'name = "fleet"\n[service]\nlisten = "127.0.0.1:{self._port}"\nlog = "warning"',
             '[store]\nurl = "chaos.sqlite"\n[diagnosis]\nevery_s = 3600.0',
             f'[sources.line]\nkind = "mqtt"\nhost = "127.0.0.1"\nport = {self._cables["service"].port}',
-            *(f'[assets.{name}]\nbaseline = "baseline.json"\nsource = "line"' for name in names),
+            f'[sources.plc]\nkind = "opcua"\nurl = "opc.tcp://127.0.0.1:{self._cables["server"].port}/plc"',
+            *(
+                f'[assets.{name}]\nbaseline = "baseline.json"\nsource = "line"'
+                for name in [*self._fleet.names, "plain"]
+            ),
+            *(
+                f'[assets.{name}]\nbaseline = "baseline.json"\nsource = "plc"\nnodes = {{ block = "{node(name)}" }}'
+                for name in names(PLC)
+            ),
         ]
         publish = [
             f"ahead = {AHEAD}\nagain_s = 2.0\n[replay]\nspeed = {self._fleet.speed}",
@@ -127,47 +104,71 @@ class Chaos:
     def run(self) -> int:
         """Run until all that was published is safe; return how many blocks the plain sender has sent."""
         self._broker.start()
-        service, publisher = self._start("run", self.config), self._start("publish", self._publish)
-        self._until_more(0.0, publisher)  # the service has subscribed by then
+        self.plc.start()
+        self._service, self._publisher = self._start("run", self.config), self._start("publish", self._publish)
+        try:
+            return self._run()
+        finally:
+            for process in (self._service, self._publisher):
+                process.kill()
+                process.wait()
+            self._broker.stop()
+            self.plc.kill()
+            for cable in self._cables.values():
+                cable.close()
+            self._log.close()
+
+    def _run(self) -> int:
+        self._until_more({"press": 0.0, "plc": 0.0})  # the service has subscribed by then
         plain = Plain(self._fleet, self._cables["publisher"].port)
-        due = time.monotonic() + self._wait()
-        while publisher.poll() is None:
+        due, deck = time.monotonic() + self._wait(), list[str]()
+        while self._publisher.poll() is None:
             time.sleep(0.2)
-            assert service.poll() is None, f"the service has ended, see {self._log.name}"
+            assert self._service.poll() is None, f"the service has ended, see {self._log.name}"
             if time.monotonic() < due:
                 continue
-            what = self._chance.choice(["service", "broker", "publisher", "cable"])
-            before = self._counted()
-            if what == "broker":
-                self._broker.stop(signal.SIGKILL)
-                self._broker.start()
-            elif what == "cable":
-                cable = self._cables[self._chance.choice(["publisher", "service"])]
-                cable.pulled.set()
-                time.sleep(PULLED_S)
-                cable.pulled.clear()
-            else:
-                victim = service if what == "service" else publisher
-                victim.kill()
-                victim.wait()
-                if what == "service":
-                    service, before = self._start("run", self.config), 0.0
-                else:
-                    publisher = self._start("publish", self._publish)
+            deck = deck or self._chance.sample(EVENTS, len(EVENTS))
+            what, before = deck.pop(), self._counted()
+            touched = self._disturb(what)
             ended = time.monotonic()
-            self._until_more(before, publisher)
-            self.happened.setdefault(what, []).append(round(time.monotonic() - ended, 2))
+            if what != "service":
+                before = self._counted()  # what was under way has arrived
+            self._until_more({name: before.get(name, 0.0) for name in touched})
+            self.happened.setdefault(what.split()[0], []).append(round(time.monotonic() - ended, 2))
             due = time.monotonic() + self._wait()
-        assert publisher.returncode == 0, f"the publisher has ended with {publisher.returncode}, see {self._log.name}"
+        code = self._publisher.returncode
+        assert code == 0, f"the publisher has ended with {code}, see {self._log.name}"
         plain.close()
         time.sleep(2.0)
-        service.send_signal(signal.SIGTERM)
-        assert service.wait(120) == 0
-        self._broker.stop()
-        for cable in self._cables.values():
-            cable.close()
-        self._log.close()
+        self._service.send_signal(signal.SIGTERM)
+        assert self._service.wait(120) == 0
         return plain.sent
+
+    def _disturb(self, what: str) -> tuple[str, ...]:
+        """Let something happen, and end; return whose results then have to come again."""
+        if what == "broker":
+            self._broker.stop(signal.SIGKILL)
+            self._broker.start()
+        elif what == "server":
+            self.plc.kill()
+            self.plc.start()
+            return ("plc",)
+        elif what in CABLES:
+            cable = self._cables[what.split()[-1]]
+            cable.pulled.set()
+            time.sleep(PULLED_S)
+            cable.pulled.clear()
+            return ("plc",) if what == "cable of the server" else ("press",)
+        elif what == "service":
+            self._service.kill()
+            self._service.wait()
+            self._service = self._start("run", self.config)
+            return ("press", "plc")
+        else:
+            self._publisher.kill()
+            self._publisher.wait()
+            self._publisher = self._start("publish", self._publish)
+        return ("press",)
 
     def _wait(self) -> float:
         return self._chance.uniform(0.5, 1.5) * self._every
@@ -176,17 +177,23 @@ class Chaos:
         command = [sys.executable, "-m", "servoscope", *map(str, words)]
         return subprocess.Popen(command, stderr=self._log, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
 
-    def _counted(self) -> float:
-        """Return how many blocks are stored, 0 where nobody answers."""
+    def _counted(self) -> dict[str, float]:
+        """Return how many blocks are counted, of the assets of each kind; nothing where nobody answers."""
+        found: dict[str, float] = {}
         try:
             with urllib.request.urlopen(f"http://127.0.0.1:{self._port}/metrics", timeout=5.0) as answer:
-                return sum(float(count) for count in COUNTED.findall(answer.read().decode()))
+                for kind, count in COUNTED.findall(answer.read().decode()):
+                    found[kind] = found.get(kind, 0.0) + float(count)
         except (OSError, HTTPException):
-            return 0.0
+            pass
+        return found
 
-    def _until_more(self, before: float, publisher: subprocess.Popen[bytes]) -> None:
+    def _until_more(self, before: dict[str, float]) -> None:
         deadline = time.monotonic() + LONGEST_S
-        while self._counted() <= before and publisher.poll() is None:
+        while self._publisher.poll() is None:
+            now = self._counted()
+            if all(now.get(name, 0.0) > count for name, count in before.items()):
+                return
             assert time.monotonic() < deadline, f"nothing is stored any more, see {self._log.name}"
             time.sleep(0.05)
 
@@ -197,67 +204,52 @@ def trial(hours: float, assets: int, speed: float, every_s: float, seed: int = 1
         fleet = Fleet(Path(folder), assets, hours, speed)
         fleet.make()
         chaos = Chaos(fleet, every_s, seed)
-        begun = time.monotonic()
+        begun, load = time.monotonic(), round(os.getloadavg()[0], 1)
         sent = chaos.run()
-        found = looked_at(fleet, chaos.config, sent)
+        seconds = round(time.monotonic() - begun, 1)
+        found = looked_at(fleet, chaos.config, sent, chaos.plc.blocks())
     settings = {"hours": hours, "assets": assets, "speed": speed, "block_s": BLOCK_S, "every_s": every_s, "seed": seed}
-    seconds = round(time.monotonic() - begun, 1)
-    return {"machine": machine(), "settings": settings, "seconds": seconds, "happened": chaos.happened, **found}
-
-
-def looked_at(fleet: Fleet, config: Path, sent: int) -> dict[str, Any]:
-    """Hold the store against what was sent."""
-    store = opened(config)
-    rows = store.checkpoints([*fleet.names, "plain"])
-    status = {name: row["status"]["counted"] for name, row in rows.items()}
-    lost = doubled = other = misnumbered = repeated = blocks = 0
-    for name, (expected, _, digest) in fleet.expected().items():
-        counted = status[name]
-        blocks += expected
-        lost += max(0, expected - counted["blocks"]) + counted["lost"]
-        doubled += max(0, counted["blocks"] - expected)
-        other += counted["digest"] != digest
-        repeated += counted["repeated"]
-        numbers = [row["number"] for table in NUMBERED for row in store.rows(numbers_of(table, name))]
-        numbers += [window.number for window in unpack(rows[name]["state"], name).windows]  # still to be diagnosed
-        misnumbered += sorted(numbers) != list(range(1, counted["rows"] + 1))
-    plain = status["plain"]
-    store.close()
-    return {
-        "blocks": blocks,
-        "lost": lost,
-        "doubled": doubled,
-        "other": other,
-        "misnumbered": misnumbered,
-        "left out as repeated": repeated,
-        "plain": {
-            "sent": sent,
-            "stored": plain["blocks"],
-            "named as lost": plain["lost"],
-            "unnamed": sent - plain["blocks"] - plain["lost"] - (sent - 1 - plain["sequence"]),
-            "behind the last one stored": sent - 1 - plain["sequence"],
-        },
-    }
+    happened = {name: times for name, times in sorted(chaos.happened.items())}
+    told = {"machine": machine(), "load": load, "settings": settings, "seconds": seconds, "happened": happened}
+    return {**told, **found}
 
 
 def markdown(one: dict[str, Any]) -> str:
     """Return the table."""
-    settings, plain = one["settings"], one["plain"]
-    size = f"{settings['hours']:g} h, {settings['assets']} assets, {settings['speed']:g} times true speed"
+    settings, plain, plc = one["settings"], one["plain"], one["plc"]
+    size = f"{settings['hours']:g} h, {settings['assets']} assets at 100 Hz, {settings['speed']:g} times true speed"
+    names = {
+        "service": "kill -9 of the service",
+        "broker": "kill -9 of the broker",
+        "publisher": "kill -9 of the publisher",
+        "server": "kill -9 of the OPC UA server",
+        "cable": f"cable pulled for {PULLED_S:g} s",
+    }
     happened = [
-        (f"{what}: times, longest recovery", f"{len(x)}, {max(x):.1f} s") for what, x in one["happened"].items()
+        (f"{words}: times, longest recovery", f"{len(times)}, {max(times):.1f} s" if times else "0")
+        for what, words in names.items()
+        for times in [one["happened"].get(what, [])]
     ]
-    wrong, named = f"{one['lost']}, {one['doubled']}, {one['other']}", f"{plain['stored']}, {plain['named as lost']}"
+    wrong = f"{one['lost']}, {one['doubled']}, {one['other']}"
     rows = [
         ("simulated", f"{size}, in {one['seconds']:.0f} s"),
         *happened,
-        ("blocks published and kept; lost, doubled, other samples", f"{one['blocks']}; {wrong}"),
+        ("blocks sent by `servoscope publish`", f"{one['blocks']}"),
+        ("of them lost, counted twice; assets with other samples", wrong),
         ("assets whose rows are not numbered through", f"{one['misnumbered']}"),
         ("sent once more and left out", f"{one['left out as repeated']}"),
-        ("by a sender that keeps nothing: sent; stored, named as lost", f"{plain['sent']}; {named}"),
-        ("not named; sent after the last one stored", f"{plain['unnamed']}; {plain['behind the last one stored']}"),
     ]
-    words = "" if settings["hours"] * settings["assets"] >= 1000.0 else " **Reduced: not ten hours of 100 assets yet.**"
+    for words, found in (
+        ("sent by who keeps nothing; stored, named as lost", plain),
+        ("written by the OPC UA server; stored, named as lost or never written", plc),
+    ):
+        rows += [
+            (f"blocks {words}", f"{found['sent']}; {found['stored']}, {found['named']}"),
+            ("lost and not named; assets with other samples", f"{found['unnamed']}, {found['other']}"),
+        ]
+    full = settings["hours"] * settings["assets"] >= 1000.0
+    words = "" if full else " **Reduced: not ten hours of 100 assets yet.**"
+    words += f" Load of the machine by other work, before: {one['load']:g}."
     lines = ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
     return "\n".join(lines) + f"\n\n{one['machine']}.{words}"
 
@@ -282,6 +274,7 @@ def main() -> None:
     if given.render:
         render()
         return
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # whatever has been started is ended then
     found = trial(given.hours, given.assets, given.speed, given.every)
     RESULTS.mkdir(exist_ok=True)
     atomic_write(RESULTS / "chaos.json", (json.dumps(found, indent=1) + "\n").encode())

@@ -11,6 +11,7 @@ from typing import TextIO
 __all__ = ["log", "set_up"]
 
 LOGGER = logging.getLogger("servoscope")
+LIBRARIES = ("psycopg", "asyncua")  # they tell of lost connections on their own
 
 
 class _Lines(logging.Formatter):
@@ -31,7 +32,7 @@ def set_up(level: str, stream: TextIO | None = None) -> None:
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(_Lines())
     LOGGER.setLevel(level.upper())
-    for logger in (LOGGER, logging.getLogger("psycopg")):  # the driver tells of lost connections on its own
+    for logger in (LOGGER, *map(logging.getLogger, LIBRARIES)):
         logger.handlers[:] = [handler]
         logger.propagate = False
 

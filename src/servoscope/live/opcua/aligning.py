@@ -10,7 +10,7 @@ import numpy as np
 
 from servoscope.plants import FloatArray
 
-__all__ = ["Aligned", "Aligner", "Gap"]
+__all__ = ["SET_BACK_S", "Aligned", "Aligner", "Gap"]
 
 MOST = 100_000  # samples of constant values that are believed at once
 SET_BACK_S = 10.0  # a value that is older than the last sample by more tells that the clock was set back

@@ -13,7 +13,7 @@ import numpy as np
 from servoscope.errors import MessageError
 from servoscope.live.block import Block, Resume
 from servoscope.live.mqtt.payload import LATEST
-from servoscope.live.opcua.aligning import Aligner, Gap
+from servoscope.live.opcua.aligning import SET_BACK_S, Aligner, Gap
 from servoscope.live.refusals import Refusals
 
 __all__ = ["Arrays", "Followed", "Scalars", "block_of"]
@@ -134,6 +134,7 @@ class Scalars:
         self._sequence = resume.sequence
         self._aligner = Aligner(len(nodes), 1.0 / rate, resume.t)
         self._t, self._values = np.zeros(0), np.zeros((len(nodes), 0))
+        self._read = [-math.inf] * len(nodes)  # up to which time each node was read from history
         self._hand_on, self._refusals = hand_on, refusals
 
     @property
@@ -156,21 +157,27 @@ class Scalars:
             self._aligner.cut(now)
             return
         for k, values in enumerate(found):
-            for value in values or []:
-                self.take(k, value)
+            self._read[k] = max((self._add(k, value) for value in values or []), default=-math.inf)
         self._aligner.cut(last, complete=True)
 
     def take(self, node: int, value: Any) -> None:
-        """Take a value."""
+        """Take a value, unless history has told it."""
+        self._add(node, value, self._read[node])
+
+    def _add(self, node: int, value: Any, read: float = -math.inf) -> float:
+        """Take a value unless it was read; return its time [UTC s]."""
         try:
             t, number = single(value)
         except MessageError as error:
             self._refusals.add(self.asset, error.kind, str(error))
-            return
+            return -math.inf
+        if read - SET_BACK_S < t <= read:
+            return t
         status = value.StatusCode.value if value.StatusCode is not None else 0
         if status & OVERFLOW == OVERFLOW:
             self._refusals.add(self.asset, "overflow", f"the server's queue of {self.nodes[node]} was too short")
         self._aligner.add(node, t, number)
+        return t
 
     def make(self, alive: float) -> None:
         """Make blocks of what is complete."""
