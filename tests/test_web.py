@@ -6,6 +6,8 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +18,7 @@ import numpy as np
 import pytest
 
 import halls
-from browsing import Served, events, finished, upload
+from browsing import SOURCE, Served, events, finished, upload
 from halls import hall
 from servoscope import writers
 from servoscope.simulation import FaultEvent
@@ -24,6 +26,8 @@ from servoscope.store import Store
 from servoscope.store.history import coarse
 from servoscope.web.guessing import mapping
 from servoscope.web.signals import chosen
+
+pytestmark = pytest.mark.xdist_group("web")  # one service for all of them, heard from its beginning on
 
 LEAKING = 60  # minutes of it, by the clock of the samples
 WEB = """
@@ -44,20 +48,37 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def service(folder: Path) -> Iterator[Served]:
-    """A service at ten times true speed, with pages beside it: the press leaks from 90 s on, and goes on leaking."""
-    config = hall(folder, "live", speed=10.0, more=WEB)
-    text = config.read_text().replace("[assets.lift]", '[assets.lift]\ngroup = "north"')
-    text = text.replace('"leaky.csv", "healthy.csv"]', '"leaky.csv"' + LEAKING * ', "leaking.csv"' + "]")
-    text = text.replace(", ".join(3 * ['"healthy.csv"']), ", ".join((2 + LEAKING) * ['"healthy.csv"']))
-    config.write_text(text.replace("residual_every_s = 2.0", "residual_every_s = 0.5"))
-    with Served(folder, "run", str(config)) as served:
+def server(folder: Path) -> Iterator[Served]:
+    """Pages over a store that no service has written to yet."""
+    config = hall(folder, "pages", store="live.sqlite", more=WEB)
+    config.write_text(longer(config.read_text()))
+    with Served(folder, "serve", str(config)) as served:
         yield served
 
 
+@pytest.fixture(scope="module")
+def followed(server: Served, folder: Path) -> Iterator[Served]:
+    """The service, at ten times true speed: the press leaks from 90 s on, and goes on leaking."""
+    config = hall(folder, "live", speed=10.0)
+    config.write_text(longer(config.read_text()))
+    command = [sys.executable, "-m", "servoscope", "run", str(config)]
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(SOURCE)})
+    yield server
+    process.terminate()
+    assert process.wait(30) == 0
+
+
+def longer(text: str) -> str:
+    """Return a service file with more to replay, a group, and residuals at a finer resolution."""
+    text = text.replace("[assets.lift]", '[assets.lift]\ngroup = "north"')
+    text = text.replace('"leaky.csv", "healthy.csv"]', '"leaky.csv"' + LEAKING * ', "leaking.csv"' + "]")
+    text = text.replace(", ".join(3 * ['"healthy.csv"']), ", ".join((2 + LEAKING) * ['"healthy.csv"']))
+    return text.replace("residual_every_s = 2.0", "residual_every_s = 0.5")
+
+
 @pytest.fixture
-def client(service: Served) -> Iterator[httpx.Client]:
-    with service.client() as found:
+def client(followed: Served) -> Iterator[httpx.Client]:
+    with followed.client() as found:
         yield found
 
 
@@ -73,27 +94,32 @@ def until(client: httpx.Client, path: str, **wanted: object) -> dict[str, object
     raise AssertionError(f"{path}: {wanted} never came: {said.text[:500]}")
 
 
-def test_it_says_that_there_is_no_login_on_loopback(service: Served, client: httpx.Client) -> None:
-    assert "no login" in service.said and service.url.startswith("http://127.0.0.1:")
-    said = client.get("/session").json()
+def test_it_says_that_there_is_no_login_on_loopback(server: Served) -> None:
+    assert "no login" in server.said and server.url.startswith("http://127.0.0.1:")
+    with server.client() as client:
+        said = client.get("/session").json()
     assert (said["login_required"], said["user"], said["role"], said["csrf"]) == (False, "local", "engineer", None)
 
 
-def test_live_updates_arrive_until_the_leak_is_told(client: httpx.Client) -> None:
-    """From the first event on: the whole fleet, then what changes, the alarm and the full diagnosis of the leak."""
+def test_live_updates_arrive_until_the_leak_is_told(server: Served, request: pytest.FixtureRequest) -> None:
+    """Who listens from before the first sample hears of assets, then what changes, alarm and full diagnosis."""
     heard: dict[str, list[dict[str, object]]] = {}
-    with client.stream("GET", "/live") as stream:
+    with server.client() as client, client.stream("GET", "/live") as stream:
         assert stream.headers["content-type"].startswith("text/event-stream")
+        request.getfixturevalue("followed")
+        begun = time.monotonic()
         for kind, data in events(stream):
+            assert time.monotonic() - begun < 120.0, heard
             heard.setdefault(kind, []).append(json.loads(data))
             if any(one["grounds"] == "full" for one in heard.get("diagnosis", [])):
                 break
-    assert {row["asset"] for row in heard["assets"][0]["assets"]} <= {"press", "lift"}  # type: ignore[attr-defined]
+    assert {row["asset"] for event in heard["assets"] for row in event["assets"]} == {"press", "lift"}  # type: ignore[attr-defined]
     assert len(heard["assets"]) > 5
     assert [one["asset"] for one in heard["alarm"] if one["after"] == "unacknowledged"] == ["press"]
     (full,) = [one for one in heard["diagnosis"] if one["grounds"] == "full"]
     assert full["asset"] == "press" and "leakage" in str(full["summary"])
-    told = client.get(f"/diagnoses/{full['id']}").json()
+    with server.client() as client:
+        told = client.get(f"/diagnoses/{full['id']}").json()
     assert told["document"]["faults"][0]["name"] == "leakage" and told["words"]["leakage"]
     assert told["units"] == {"r": "m", "u": "A", "y": "m", "response": "A/m"}
 
@@ -245,7 +271,7 @@ def test_a_hostile_file_is_refused_and_the_server_goes_on(client: httpx.Client, 
     assert client.get("/session").status_code == 200
 
 
-def test_too_much_is_refused_while_it_comes(client: httpx.Client, service: Served) -> None:
+def test_too_much_is_refused_while_it_comes(client: httpx.Client) -> None:
     assert upload(client, "big.csv", b"t,r,u,y\n" + b"1,2,3,4\n" * 200_000).status_code == 413
 
     def endless() -> Iterator[bytes]:
@@ -262,13 +288,13 @@ def test_too_much_is_refused_while_it_comes(client: httpx.Client, service: Serve
     assert client.get("/uploads").status_code == 200
 
 
-def test_pages_and_metrics(service: Served, client: httpx.Client) -> None:
+def test_pages_and_metrics(server: Served, client: httpx.Client) -> None:
     client.get("/assets")
-    metrics = httpx.get(f"{service.url}/metrics").text
+    metrics = httpx.get(f"{server.url}/metrics").text
     assert 'servoscope_verdict{asset="press"' in metrics and "servoscope_http_requests_total{" in metrics
-    assert httpx.get(f"{service.url}/health/ready").json()["ok"]
+    assert httpx.get(f"{server.url}/health/ready").json()["ok"]
     for path in ("/static/none.js", "/api/v1/none", "/api", "/static/../guard.py", "/static/%2e%2e/guard.py"):
-        said = httpx.get(f"{service.url}{path}")
+        said = httpx.get(f"{server.url}{path}")
         assert said.status_code == 404 and said.headers["content-type"] == "application/problem+json", path
     policy = client.get("/session").headers["content-security-policy"]
     assert "default-src 'none'" in policy and "unsafe" not in policy

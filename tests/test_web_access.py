@@ -22,6 +22,8 @@ from servoscope.live.assembling import assemble
 from servoscope.live.config import Config
 from servoscope.live.service import Service
 
+pytestmark = pytest.mark.xdist_group("access")
+
 PASSWORDS = {"vera": "a long password of hers", "otto": "a long password of his", "enno": "one more long password"}
 ROLES = {"vera": "viewer", "otto": "operator", "enno": "engineer"}
 
