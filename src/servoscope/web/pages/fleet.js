@@ -29,7 +29,7 @@ export async function show(main, { signal, linked, values }) {
     h(
       "div",
       { class: "grid fleet", role: "table", "aria-label": "Assets, worst first" },
-      h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: i > 4 && i < 8 && "n" }, name)))),
+      h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: ((i > 4 && i < 8) || i === 10) && "n" }, name)))),
       body,
     ),
     none,
