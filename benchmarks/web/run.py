@@ -54,7 +54,7 @@ EventSource.prototype.addEventListener = function (kind, told) {
 };
 """
 SERVE = (
-    "import sys, servoscope.web.hub as hub; hub.EVERY_S /= {speed}; from servoscope.cli import main; main(sys.argv[1:])"
+    "import sys, servoscope.web.hub as hub; hub.EVERY_S /= {speed}; from servoscope.cli import main; main()"
 )
 
 
@@ -65,7 +65,7 @@ def load(folder: Path, browser: Browser, assets: int, pages: int, seconds: float
         opened = [browser.new_context(viewport={"width": 1366, "height": 768}).new_page() for _ in range(pages)]
         for i, page in enumerate(opened):  # one in four looks at an asset
             page.goto(base + ("/assets/axis-000" if i % 4 == 3 else "/"))
-            page.wait_for_function("document.documentElement.dataset.told")
+            page.locator("html[data-told]").wait_for(state="attached")
         before, begun = processor(server.pid), time.monotonic()
         ages: list[list[float]] = [[] for _ in opened]
         while time.monotonic() < begun + seconds:
@@ -73,6 +73,7 @@ def load(folder: Path, browser: Browser, assets: int, pages: int, seconds: float
                 of.append(float(page.evaluate(AGE)))
             time.sleep(0.2)
         share = (processor(server.pid) - before) / (time.monotonic() - begun)
+        memory = resident(server.pid)
         for page in opened:
             page.context.close()
     half = [len(of) // 2 for of in ages]
@@ -86,7 +87,7 @@ def load(folder: Path, browser: Browser, assets: int, pages: int, seconds: float
         "age_second_half_s": round(late, 3),
         "age_99_s": round(every[int(0.99 * (len(every) - 1))], 3),
         "server_share": round(share, 3),
-        "server_mb": round(resident(server.pid)),
+        "server_mb": round(memory),
     }
 
 
@@ -100,7 +101,7 @@ def hour(folder: Path, browser: Browser, hour_s: float) -> dict[str, Any]:
         for name, page in pages.items():
             page.add_init_script(COUNT)
             page.goto(base + ("/" if name == "fleet" else "/assets/axis-000"))
-            page.wait_for_function("document.documentElement.dataset.told")
+            page.locator("html[data-told]").wait_for(state="attached")
         time.sleep(wall / 10.0)
         early = {name: held(page) for name, page in pages.items()}
         time.sleep(0.9 * wall)
@@ -117,7 +118,7 @@ def first_view(browser: Browser, base: str, assets: int) -> float:
     page = context.new_page()
     begun = time.monotonic()
     page.goto(base, wait_until="commit")
-    page.wait_for_function(f"document.querySelectorAll('.rows .line').length === {assets}", polling="raf")
+    page.locator(".rows .line").nth(assets - 1).wait_for(state="attached")
     took = time.monotonic() - begun
     context.close()
     return took
