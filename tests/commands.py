@@ -21,9 +21,10 @@ class Run:
     err: str
 
 
-def run(*words: object) -> Run:
+def run(*words: object, input: str | None = None) -> Run:
     """Run ``servoscope`` with some words; an unexpected exception is raised here."""
-    result = CliRunner(env={"COLUMNS": "80"}).invoke(app, [str(word) for word in words], catch_exceptions=False)
+    runner = CliRunner(env={"COLUMNS": "80"})
+    result = runner.invoke(app, [str(word) for word in words], input=input, catch_exceptions=False)
     return Run(result.exit_code, result.stdout, result.stderr)
 
 

@@ -184,6 +184,9 @@ def test_stored_residuals_do_not_depend_on_how_the_blocks_are_cut() -> None:
     whole = rows([])
     assert len(whole) == 23 and max(row["statistic"] for row in whole) > 5.0  # type: ignore[type-var,operator]
     assert rows([1, 7, 777, 2000, 2001, 5990]) == whole
+    # cut where a period begins: that evaluation is the last of its block, and makes one row all the same
+    ends = [round((row["t"] - BEGAN) * 100.0) + 1 for row in whole]  # type: ignore[operator]
+    assert rows(ends) == whole
 
 
 class TestAsset:

@@ -42,7 +42,8 @@ def thin(state: Thinned, trace: Trace, t: FloatArray, every_s: float) -> tuple[T
     excess = np.nan_to_num(np.where(trace.ready, trace.statistic / trace.threshold, 0.0))
     before = int(periods[0]) if state.period is None else state.period
     rows, first, peaks = [], 0, (state.excess, state.level)
-    for k in [*np.flatnonzero(np.diff(periods, prepend=before)).tolist(), t.size - 1]:
+    # the last evaluation may be one that begins a period: it counts once
+    for k in dict.fromkeys([*np.flatnonzero(np.diff(periods, prepend=before)).tolist(), t.size - 1]):
         new = excess[first : k + 1], trace.level[first : k + 1]
         peaks = max(peaks[0], float(new[0].max(initial=0.0))), max(peaks[1], float(new[1].max(initial=0.0)))
         first = k + 1

@@ -71,7 +71,11 @@ def transitions(context: In, _: Viewer, query: Annotated[OfAlarmRows, Query()]) 
     return {"transitions": [telling.transition(row) for row in rows]}
 
 
-@router.post("/assets/{asset}/alarms/{alarm}/{command}", response_model=Commanded)
+@router.post(
+    "/assets/{asset}/alarms/{alarm}/{command}",
+    response_model=Commanded,
+    responses={202: {"model": Commanded, "description": "Asked for; the service does not run now"}},
+)
 async def command(
     context: In, who: Operator, response: Response, asset: str, alarm: str, command: CommandName, reasons: Reasons
 ) -> Plain:

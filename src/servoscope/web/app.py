@@ -18,7 +18,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from servoscope import __version__
-from servoscope.web import alarms, assets, baselines, designs, diagnoses, live, models, problems, session, uploads
+from servoscope.web import alarms, assets, baselines, description, designs, diagnoses, live, problems, session, uploads
 from servoscope.web.context import Context
 from servoscope.web.guard import API, Guard
 from servoscope.web.metrics import Metrics
@@ -52,10 +52,10 @@ def application(context: Context) -> ASGIApp:
         docs_url=None,  # they would load scripts from elsewhere
         redoc_url=None,
         lifespan=running,
-        responses={"default": {"model": models.Problem, "description": "What went wrong"}},
     )
     app.state.context, app.state.metrics = context, metrics
     problems.install(app)
+    description.install(app)
     router = APIRouter(prefix=API)
     for part in PARTS:
         router.include_router(part.router)

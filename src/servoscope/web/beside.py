@@ -1,4 +1,4 @@
-"""The server beside a running service, in a process of its own: it never holds up samples, and ends with the service."""
+"""The server beside a running service, in a process of its own: samples never wait for it, it ends with the service."""
 
 from __future__ import annotations
 

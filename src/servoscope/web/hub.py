@@ -104,7 +104,7 @@ class Hub:
 
     def changed(self, asset: str, since: int) -> bool:
         """Tell whether an asset is news to a reader who last heard at this tick."""
-        return self._ticks.get(asset, 0) > since
+        return self._ticks.get(asset, -1) > since
 
     def since(self, tick: int) -> bytes:
         """Return the events that bring a reader up to date."""

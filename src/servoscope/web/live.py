@@ -60,7 +60,7 @@ async def _events(context: Context, asset: str | None, allowed: Callable[[], boo
         if hub.unavailable != unavailable:
             unavailable, told = hub.unavailable, True
             yield event("store", {"available": not unavailable, "why": unavailable})
-        if hub.tick != seen and hub.tick:
+        if hub.tick != seen:
             since, seen = seen, hub.tick
             text = await _news(context, asset, since)
             told |= bool(text)

@@ -14,7 +14,7 @@ from starlette.responses import JSONResponse, Response
 
 from servoscope.errors import AlarmError, ServoscopeError, StoreError
 
-__all__ = ["answer", "describe", "install", "problem"]
+__all__ = ["KIND", "answer", "describe", "install", "problem"]
 
 KIND = "application/problem+json"
 

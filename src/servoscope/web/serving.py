@@ -26,6 +26,7 @@ __all__ = ["serve"]
 
 STORE_PATIENCE = 5.0  # s
 STOPS_WITHIN_S = 5
+BACKLOG = 1024
 
 
 class Server(uvicorn.Server):
@@ -125,6 +126,7 @@ def _listen(address: str) -> socket.socket:
         try:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listening.bind(where)
+            listening.listen(BACKLOG)  # who reads where it is to be found may come at once
         except BaseException:
             listening.close()
             raise

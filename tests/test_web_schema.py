@@ -1,0 +1,47 @@
+"""Requests made up from the OpenAPI description: whatever is sent, the server answers as described, and never fails."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import halls
+from browsing import Served
+from servoscope.live.assembling import assemble
+from servoscope.live.config import Config
+from servoscope.live.service import Service
+
+CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
+SECONDS = 30
+WEB = """
+[web]
+listen = "127.0.0.1:0"
+job_s = 2.0
+"""
+
+
+@pytest.mark.slow
+def test_no_request_makes_the_server_fail(tmp_path: Path) -> None:
+    halls.files(tmp_path)
+    config = Config.load(halls.hall(tmp_path, "done", more=WEB))
+    Service(config, assemble(config)).run()
+    with Served(tmp_path, "serve", "done.toml") as served:
+        command = ["--checks", CHECKS, "--max-time", str(SECONDS), "--max-examples", "20", "--seed", "1"]
+        command += ["--phases", "coverage,fuzzing", "--generation-database", "none", "--request-timeout", "10"]
+        command += ["--exclude-path", "/api/v1/live", "--no-color", "--continue-on-failure"]
+        done = subprocess.run(
+            [sys.executable, "-m", "schemathesis.cli", "run", f"{served.url}/api/v1/openapi.json", *command],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONWARNINGS": "default"},
+            capture_output=True,
+            text=True,
+            timeout=8 * SECONDS,
+            check=False,
+        )
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
+    assert "Tested:" in done.stdout
+    assert "Traceback" not in served.log, served.log
