@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 CODE := src tests
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format clean
+.PHONY: help install demo test lint format pictures clean
 .DELETE_ON_ERROR:
 
 help:           ## list the targets
@@ -29,6 +29,9 @@ lint: $(STAMP)  ## format, lint and types, without changing a file
 format: $(STAMP)  ## put the code into shape
 	$(BIN)/python -m ruff check --fix $(CODE)
 	$(BIN)/python -m ruff format $(CODE)
+
+pictures: $(STAMP)  ## the pictures of the pages in docs/images/pages, from the browser's tests
+	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/test_web_pages.py
 
 clean:          ## remove what the other targets made
 	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

@@ -17,30 +17,32 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import halls
 from servoscope import writers
-from servoscope.recording import Recording
 from servoscope.simulation import FaultEvent
 
 SOURCES = str(Path(__file__).parents[1] / "src")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-SPEED = 5.0
+SPEED = 4.0
 STANDS = 60  # recordings one after the other: long enough for all tests
 # group -> asset -> what it replays
 HALL = {
     "Press line": {
         "press-1": ["leaky", *["leaking"] * STANDS],
         "press-2": ["healthy"] * STANDS,
-        "press-3": ["healthy", "frozen", *["healthy"] * STANDS],
-        "press-4": ["healthy"] * STANDS,
+        "press-3": ["healthy", *["stuck"] * STANDS],
+        **{f"press-{i}": ["healthy"] * STANDS for i in range(4, 9)},
     },
     "Test rigs": {
         "rig-1": ["weak", *["weakened"] * STANDS],
         "rig-2": ["healthy"] * STANDS,
         "rig-3": ["healthy"] * STANDS,
     },
-    "Lifts": {f"lift-{i}": ["healthy"] * STANDS for i in range(1, 6)},
+    "Lifts": {f"lift-{i}": ["healthy"] * STANDS for i in range(1, 10)},
 }
+ASSETS = sum(map(len, HALL.values()))
 
 
 def browser() -> str | None:
@@ -48,14 +50,8 @@ def browser() -> str | None:
     return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
-def _frozen(recording: Recording) -> Recording:
-    y = recording.y.copy()
-    y[2000:] = y[2000]
-    return replace(recording, y=y)
-
-
 def recordings(folder: Path) -> None:
-    """Put what the hall replays into a folder: healthy, two faults that begin and that stand, a frozen sensor."""
+    """Put what the hall replays into a folder: healthy, two faults that begin and that stand, a sensor that sticks."""
     halls.files(folder)
     for name, event in {
         "leaky": "C_ie=1.2@20",
@@ -64,7 +60,8 @@ def recordings(folder: Path) -> None:
         "weakened": "p_s=0.9@0",
     }.items():
         writers.write(folder / f"{name}.csv", halls.recorded(2, FaultEvent.parse(event)))
-    writers.write(folder / "frozen.csv", _frozen(halls.recorded(1)))
+    healthy = halls.recorded(1)
+    writers.write(folder / "stuck.csv", replace(healthy, y=np.where(healthy.t < 3.0, healthy.y, 0.01)))
 
 
 def hall(folder: Path, *, speed: float = SPEED) -> Path:

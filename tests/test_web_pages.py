@@ -52,9 +52,14 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def base(chromium: Any, config: Path) -> Iterator[str]:
     """The address of the pages, once the hall has its faults and what is wrong with them is known in full."""
-    with screens.process("run", config.name, cwd=config.parent), screens.serving(config) as address:
-        until(lambda: asked(address, "/assets/press-1")["sizes"] and asked(address, "/assets/rig-1")["sizes"], 240.0)
-        until(lambda: asked(address, "/alarms")["alarms"])
+    with screens.process("run", config.name, cwd=config.parent) as running, screens.serving(config) as address:
+
+        def known() -> bool:
+            assert running.poll() is None, (config.parent / "run.log").read_text()
+            named = all(asked(address, f"/assets/{asset}")["sizes"] for asset in ("press-1", "rig-1"))
+            return named and bool(asked(address, "/assets/press-3")["quality"])
+
+        until(known, 240.0)
         yield address
 
 
@@ -112,7 +117,7 @@ def diagnosis_of(base: str, asset: str) -> str:
 def test_the_fleet_shows_the_worst_first(open_page: Open) -> None:
     page = open_page("/")
     rows = page.get_by_role("table", name="Assets, worst first").get_by_role("row")
-    expect(rows).to_have_count(1 + 12)
+    expect(rows).to_have_count(1 + screens.ASSETS)
     expect(rows.nth(1)).to_contain_text("Fault")
     assert {rows.nth(i).get_by_role("link").inner_text() for i in (1, 2)} == {"press-1", "rig-1"}
     expect(page.get_by_role("link", name=re.compile("press-1: Fault"))).to_be_visible()
@@ -121,10 +126,10 @@ def test_the_fleet_shows_the_worst_first(open_page: Open) -> None:
     expect(rows.filter(visible=True)).to_have_count(1 + 2)
     page.get_by_role("button", name=re.compile("^All")).click()
     page.get_by_label("Search assets").fill("lift")
-    expect(rows.filter(visible=True)).to_have_count(1 + 5)
+    expect(rows.filter(visible=True)).to_have_count(1 + len(screens.HALL["Lifts"]))
     page.get_by_label("Search assets").fill("")
     page.get_by_label("Group").select_option("Test rigs")
-    expect(rows.filter(visible=True)).to_have_count(1 + 3)
+    expect(rows.filter(visible=True)).to_have_count(1 + len(screens.HALL["Test rigs"]))
     assert page.url.endswith("group=Test+rigs")  # what is looked at can be sent to somebody
 
 

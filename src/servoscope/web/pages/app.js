@@ -49,7 +49,7 @@ function change() {
 
 function surround() {
   named();
-  const pages = NAVIGATION.map(([address, words, of]) => h("a", { href: address, "aria-current": of.includes(name) && "page" }, words));
+  const pages = name === "login" ? [] : NAVIGATION.map(([address, words, of]) => h("a", { href: address, "aria-current": of.includes(name) && "page" }, words));
   document
     .querySelector("header.top")
     .append(

@@ -125,11 +125,10 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   await Promise.all([chosen(span).then(() => (plane.past(past24), plane.take(asset.responses, asset.t, began(asset)))), look(), sample()]);
 }
 
-// Since when there is a fault: as the full diagnosis has it; a window that it fills knows no better than its beginning.
+// Since when there is a fault: as the full diagnosis has it, before that as the tests tell it.
 function began({ verdict, onset, since, diagnosis }) {
   if (verdict !== "fault") return null;
-  if (diagnosis?.grounds === "full" && diagnosis.onset) return diagnosis.onset;
-  return Math.min(onset ?? since, since);
+  return (diagnosis?.grounds === "full" ? diagnosis.onset : null) ?? onset ?? since;
 }
 
 // What is known of a fault once it has a name; before that, what the service says.

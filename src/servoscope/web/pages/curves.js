@@ -68,7 +68,7 @@ export function coefficient(c, { t, one }) {
   return {
     grid: { left: 62, right: 10, top: 10, bottom: 38 },
     tooltip: tooltip(c, { formatter: (points) => `${number(points[0].value[0], 5)} s\n${number(points.find((p) => p.seriesName === "estimate")?.value[1], 3)} ${relative ? "%" : one.unit}` }),
-    xAxis: axis(c, "time [s]", { type: "value", min: t[0], max: t.at(-1) }),
+    xAxis: axis(c, "time [s]", { type: "value", min: t[0], max: t.at(-1), label: { formatter: short, showMinLabel: false, showMaxLabel: false } }),
     yAxis: axis(c, `deviation${unit(relative ? "%" : one.unit)}`, { type: "value", scale: true, gap: 44, splitNumber: 3, label: { formatter: short } }),
     series: [
       { ...band, name: "low", data: t.map((at, i) => [at, middle[i] === null ? null : middle[i] - half[i]]) },

@@ -2,8 +2,8 @@
 import { get } from "./api.js";
 import { h, mark as set, tell } from "./dom.js";
 import { follow } from "./live.js";
-import { mark, VERDICTS } from "./marks.js";
-import { DASH, duration, moment, multiple, plain, recent, sentence } from "./words.js";
+import { mark, say, VERDICTS } from "./marks.js";
+import { DASH, duration, moment, multiple, plain, recent, sentence, size } from "./words.js";
 
 const STALE_S = 10; // without a sample for so long, the age is told
 const ORDER_MS = 5000; // between two changes of the order: rows must not run away from whoever reads them
@@ -29,7 +29,7 @@ export async function show(main, { signal, linked, values }) {
     h(
       "div",
       { class: "grid fleet", role: "table", "aria-label": "Assets, worst first" },
-      h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: i > 4 && i < 8 && "n" }, name)))),
+      h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: ((i > 4 && i < 8) || i === 10) && "n" }, name)))),
       body,
     ),
     none,
@@ -182,6 +182,12 @@ function dress({ row, tile }) {
   set(tile, "title", `${row.asset}\n${sentence(row.summary)}`);
 }
 
+// What is known, without the verdict, which stands beside it.
+function known(row) {
+  const named = (row.sizes ?? []).map((one) => `${one.words.replace(/ \(.*/, "")}, ${one.parameter} ${size({ ...one, interval: [one.low, one.high] })[0]}`);
+  return row.verdict === "fault" && named.length ? named.join("; ") : sentence(row.summary).replace(/^(Fault|Healthy|Undetermined): /, "");
+}
+
 function gauge() {
   const bar = h("i");
   const value = h("span");
@@ -213,11 +219,11 @@ function lineOf(first) {
       state.replaceChildren(mark(verdict), VERDICTS[verdict]);
     }
     const open = row.alarms.filter((alarm) => OPEN.includes(alarm.state)).length;
-    const told = sentence(row.summary).replace(/^(Fault|Healthy|Undetermined): /, "");
+    const told = known(row);
     tell(group, row.group || DASH);
-    tell(what, told);
+    say(what, told);
     set(what, "title", told);
-    const from = row.verdict === "fault" ? Math.min(row.onset ?? row.since, row.since) : row.since;
+    const from = row.verdict === "fault" ? (row.onset ?? row.since) : row.since;
     tell(since, recent(from, now));
     set(since, "title", moment(from));
     drawn(statistic, row.statistic);

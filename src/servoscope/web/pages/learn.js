@@ -123,8 +123,12 @@ function told(summary) {
     "div",
     {},
     h("p", {}, `Explains ${number(100 * summary.explained, 4)} % of the input; threshold of T² ${number(summary.threshold, 4)}, for ${general(summary.false_alarms_per_year)} false alarms a year.`),
-    promises.length > 0 && table("The smallest change that this baseline promises to see", ["Fault", "Parameter", "*Seen from"], promises),
-    values.length > 0 && table("Learned coefficients", ["Name", "*Value", "*Standard deviation"], values),
+    h(
+      "div",
+      { class: "columns" },
+      promises.length > 0 && h("div", { class: "half" }, h("h3", {}, "The smallest change that it promises to see"), table("Promises", ["Fault", "Parameter", "*Seen from"], promises)),
+      values.length > 0 && h("div", { class: "half" }, h("h3", {}, "Coefficients, in units of u per derivative of y [s]"), table("Learned coefficients", ["Name", "*Value", "*Standard deviation"], values)),
+    ),
     (summary.notes ?? []).length > 0 && h("ul", { class: "why" }, summary.notes.map((words) => h("li", {}, prose(typeof words === "string" ? words : (words.message ?? ""))))),
   );
 }

@@ -10,6 +10,9 @@ export function follow(path, events, heard, state, signal) {
     const told = waiting;
     waiting = {};
     heard(told);
+    // When the newest of what is shown was told [UTC s]: an attribute, for whoever wants to know whether the page keeps up.
+    const last = told.assets?.at(-1)?.now ?? told.asset?.at(-1)?.at;
+    if (last) document.documentElement.dataset.told = last;
   };
   const open = () => {
     source = new EventSource(`/api/v1/live${path}`);

@@ -1,0 +1,1 @@
+"""How the pages bear many assets and many readers; see run.py."""
