@@ -77,6 +77,23 @@ def test_a_batch_is_written_whole_or_not_at_all(store: Store) -> None:
     assert store.last_commit("hall") == 1 and store.last_commit("another") == 0
 
 
+def test_of_the_outbox_a_service_gets_its_own_and_not_what_is_for_busy_sinks(store: Store) -> None:
+    made = Batch()
+    made.rows["outbox"] = [
+        {"key": key, "sink": sink, "event": {"service": of}, "created": 0.0, "due": due, "attempts": 0, "outcome": ""}
+        for key, sink, of, due in (
+            ("a", "desk", "hall", 1.0),
+            ("b", "pager", "hall", 1.0),
+            ("c", "desk", "yard", 1.0),
+            ("d", "desk", "hall", 9.0),
+            ("e", "desk", "hall", None),
+        )
+    ]
+    store.write(made, "hall", 1)
+    assert [row["key"] for row in store.due_deliveries(2.0, 9, "hall")] == ["a", "b"]
+    assert [row["key"] for row in store.due_deliveries(2.0, 9, "hall", {"desk"})] == ["b"]
+
+
 class Forgetful(Store):
     """Loses the connection when a commit has been made, before it could say so."""
 

@@ -6,7 +6,7 @@ delivery = deliver(row, settings, now)                      # delivery.again tak
 """
 
 from servoscope.actions.delivery import deliver, signature
-from servoscope.actions.outbox import Delivery, Outgoing, outgoing, outgoing_flood
+from servoscope.actions.outbox import Delivery, Outgoing, key_of, outgoing, outgoing_flood
 from servoscope.actions.settings import (
     ActionSettings,
     CommandSettings,
@@ -28,6 +28,7 @@ __all__ = [
     "WebhookSettings",
     "begin",
     "deliver",
+    "key_of",
     "outgoing",
     "outgoing_flood",
     "respond",
