@@ -187,6 +187,9 @@ def test_a_migration_that_fails_leaves_all_as_it_was(url: str, monkeypatch: pyte
         ("mysql://somewhere/x", "mysql is not supported, give a path for SQLite or postgresql://"),
         ("postgresql://user:secret@127.0.0.1:1/x", "connection refused"),
         ("://", "cannot be read as a URL"),
+        ("postgresql://u@localhost:abc/x", "cannot be read as a URL"),
+        ("sqlite://", "would be lost with the process, give a path"),
+        (".", "is a folder, give the name of a file in it"),
     ],
 )
 def test_what_cannot_be_opened_is_one_line_without_passwords(url: str, said: str, tmp_path: Path) -> None:
@@ -211,7 +214,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 class TestCommands:
     def test_check_reads_all_that_is_named(self, hall: Path) -> None:
-        assert "2 assets, 1 sources; all can be used" in run("run", hall, "--check").out
+        assert "2 assets, 1 source; all can be used" in run("run", hall, "--check").out
         wrong = hall.with_name("wrong.toml")
         wrong.write_text(hall.read_text().replace("leaky.csv", "weak.csv"))
         one_line(run("run", wrong, "--check"), "weak.csv")

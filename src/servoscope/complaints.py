@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
+from datetime import datetime
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -21,6 +22,10 @@ TYPES = {
     "model_type": "is not a table of settings",
     "model_attributes_type": "is not a table of settings",
     "finite_number": "is not a finite number",
+    "timezone_aware": "has no time zone, write it as in 2026-01-31T12:00:00Z",
+    "datetime_type": "is not a time, write it as in 2026-01-31T12:00:00Z",
+    "datetime_parsing": "is not a time, write it as in 2026-01-31T12:00:00Z",
+    "datetime_from_date_parsing": "is not a time, write it as in 2026-01-31T12:00:00Z",
 }
 RELATIONS = {
     "gt": "must be greater than",
@@ -51,7 +56,8 @@ def describe(error: ValidationError, model: type[BaseModel], section: str = "") 
     found = error.errors(include_url=False)
     # A misspelt key is reported twice, as unknown and as missing: the first says more.
     first = min(found, key=lambda detail: detail["type"] != "extra_forbidden")
-    path = ([section] if section else []) + [str(part) for part in first["loc"] if not isinstance(part, int)]
+    words = [str(part) for part in first["loc"] if not isinstance(part, int) and part != "[key]"]
+    path = ([section] if section else []) + words
     entry = next((int(part) + 1 for part in first["loc"] if isinstance(part, int)), None)
     if not path or (path == [section] and first["type"] == "value_error"):
         return _one_line(f"[{section}] {_text(first)}" if section else _text(first))
@@ -118,6 +124,8 @@ def _text(detail: ErrorDetails) -> str:
 
 def _shown(value: Any) -> str:
     text = {True: "true", False: "false"}[value] if isinstance(value, bool) else repr(value)
+    if isinstance(value, datetime):
+        text = value.isoformat()
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 

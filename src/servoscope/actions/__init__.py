@@ -5,7 +5,7 @@ rows = outgoing(settings, transition, priority, details)    # stored with the tr
 delivery = deliver(row, settings, now)                      # delivery.again takes the row's place; None: it goes
 """
 
-from servoscope.actions.delivery import deliver, signature
+from servoscope.actions.delivery import deliver, secret_of, signature
 from servoscope.actions.outbox import Delivery, Outgoing, key_of, outgoing, outgoing_flood
 from servoscope.actions.settings import (
     ActionSettings,
@@ -32,5 +32,6 @@ __all__ = [
     "outgoing",
     "outgoing_flood",
     "respond",
+    "secret_of",
     "signature",
 ]

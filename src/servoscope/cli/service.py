@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +17,7 @@ from servoscope.cli.moments import moment
 from servoscope.cli.options import AsJson
 from servoscope.cli.outputs import check_output
 from servoscope.cli.shell import print_json
+from servoscope.errors import ConfigError
 
 if TYPE_CHECKING:
     from servoscope.store import Store
@@ -64,17 +67,21 @@ def run(
 
     settings = Config.load(config)
     if check:
-        rehearse(settings)
-        typer.echo(f"{config}: {len(settings.assets)} assets, {len(settings.sources)} sources; all can be used")
+        with naming(config):
+            rehearse(settings)
+        found = {"asset": len(settings.assets), "source": len(settings.sources)}
+        counted = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in found.items())
+        typer.echo(f"{config}: {counted}; all can be used")
         return
     logs.set_up(settings.service.log)
     from servoscope.live.service import Service
     from servoscope.live.serving import serve
 
-    service = Service(settings, assemble(settings, anew or ()))
+    with naming(config):
+        service = Service(settings, assemble(settings, anew or ()))
+        server = serve(service, settings.service.listen) if settings.service.listen else None
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
-    server = serve(service, settings.service.listen) if settings.service.listen else None
     try:
         service.run()
     finally:
@@ -143,6 +150,15 @@ def history(
             print_json(plain(row), lines=True)
     else:
         terminal.console().print(watching.rows(rows, COLUMNS[kind]))
+
+
+@contextmanager
+def naming(config: Path) -> Iterator[None]:
+    """Put the name of the service file before what is wrong in it."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{config}: {error}") from None
 
 
 def open_store(text: str) -> Store:

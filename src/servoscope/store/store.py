@@ -54,6 +54,8 @@ class Store:
             raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
         if found.get_backend_name() == "sqlite" and not write and not Path(found.database or "").exists():
             raise StoreError(f"{store.name}: no such store, servoscope run makes it")
+        if found.get_backend_name() == "sqlite":
+            opening.check_folder(Path(str(found.database)))
         try:
             with store._transaction() as connection:
                 schema.prepare(connection, store.name, write=write)
