@@ -25,7 +25,7 @@ from servoscope.live.rows import Row
 from servoscope.live.service import Service
 from servoscope.live.writing import Writer
 from servoscope.store import Batch, Store, schema, tables
-from servoscope.store.history import history
+from servoscope.store.history import dated, history
 
 
 @pytest.fixture(scope="module")
@@ -202,6 +202,10 @@ def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
     one_line(run("history", tmp_path / "x.sqlite"), "x.sqlite", "file is not a database")
 
 
+def test_a_time_that_no_calendar_has_is_a_number() -> None:
+    assert dated(0.0) == "1970-01-01 00:00:00" and dated(3e11) == "300000000000 s"
+
+
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A service file whose service has run."""
@@ -223,6 +227,8 @@ class TestCommands:
     def test_watch_shows_assets_as_they_are(self, hall: Path) -> None:
         shown = run("watch", hall, "--once").out
         assert "press" in shown and "lift" in shown and "fault" in shown
+        told = " ".join(shown.split())
+        assert "press: Fault: leakage. C_ie is 1.2" in told and "since 2026-01-01 00:01:3" in told  # and 0 or so
         found = {one["asset"]: one["status"] for one in json.loads(run("watch", hall, "--json").out)}
         assert found["lift"]["verdict"] == "healthy" and found["press"]["alarms"]["fault"]["state"] == "unacknowledged"
         (only,) = json.loads(run("watch", hall, "--json", "--asset", "lift").out)
@@ -237,6 +243,8 @@ class TestCommands:
         before = run("history", hall, "--kind", "alarms", "--to", "2026-01-01T00:01", "--json")
         assert before.out == ""
         assert "started" in run("history", hall, "--kind", "audit", "--from", "1h").out
+        assert "version: 0.1" in run("history", hall, "--kind", "audit", "--from", "1h").out
+        one_line(run("history", hall, "--asset", "pres"), "no such asset", "press")
         wrong = run("history", hall, "--from", "yesterday")
         assert wrong.code == 2 and "2026-01-31T12:00" in " ".join(wrong.err.split())
 
