@@ -212,7 +212,8 @@ def test_the_key_says_which_event_it_is() -> None:
     again = outgoing(settings, NEW, "high", NOW + 100.0)
     later = outgoing(settings, Transition(**{**vars(NEW), "sequence": 8}), "high", NOW)
     assert [row.key for row in rows] == [row.key for row in again]
-    assert len({row.key for row in (*rows, *later)}) == 4
+    other = outgoing(settings, Transition(**{**vars(NEW), "time": NEW.time + 1.0}), "high", NOW)  # counted anew
+    assert len({row.key for row in (*rows, *later, *other)}) == 6
     assert Outgoing(**json.loads(json.dumps(rows[0].to_dict()))) == rows[0]
 
 

@@ -271,14 +271,25 @@ class TestConfig:
         ("old", "new", "said"),
         [
             ("speed =", "sped =", "[sources] line.sped: unknown key, did you mean 'speed'?"),
-            ("window_s = 40.0", "window_s = 0", "[diagnosis] window_s: 0 must be greater than 0"),
+            ("window_s = 40.0", "window_s = 0", "[diagnosis] window_s: 0 must be at least 0.001"),
             ('source = "line"', 'source = "lime"', "there is no source 'lime', only line"),
             ('kind = "replay"', 'kind = "mqt"', "[sources] line.kind: 'mqt' is not one of 'replay', 'mqtt', 'opcua'"),
             ('kind = "replay"', "", "[sources] line.kind: missing, add it"),
             ('kind = "replay"', 'kind = "mqtt"', "[sources] line.speed: unknown key, choose from host, port"),
             ('name = "hall"', 'name = "press"', "'press' is an asset's name too"),
             ("[store]", "[stor]", "stor: unknown key, did you mean 'store'?"),
-            ("start = 2026-01-01T00:00:00Z", "start = 2026-01-01T00:00:00", "[sources] line.start: "),
+            (
+                "start = 2026-01-01T00:00:00Z",
+                "start = 2026-01-01T00:00:00",
+                "line.start: 2026-01-01T00:00:00 has no time zone",
+            ),
+            ("[assets.press]", '[assets."press 1"]', "[assets] press 1: 'press 1' is no name: letters, digits, _ and"),
+            (
+                'listen = ""',
+                'listen = "localhost"',
+                "[service] listen: 'localhost' is no address, write \"127.0.0.1:9464\"",
+            ),
+            ('listen = ""', 'listen = "localhost:99999"', "'localhost:99999' is no address"),
             ('name = "hall"', "name = hall", "not valid TOML"),
         ],
     )

@@ -25,7 +25,7 @@ from servoscope.live.rows import Row
 from servoscope.live.service import Service
 from servoscope.live.writing import Writer
 from servoscope.store import Batch, Store, schema, tables
-from servoscope.store.history import history
+from servoscope.store.history import dated, history
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +75,23 @@ def test_a_batch_is_written_whole_or_not_at_all(store: Store) -> None:
         store.write(batch(residual(3, 2.0), residual(2, 1.0)), "hall", 2)  # number 2 is there already
     assert [row["number"] for row in history(store, "residuals")] == [1, 2]
     assert store.last_commit("hall") == 1 and store.last_commit("another") == 0
+
+
+def test_of_the_outbox_a_service_gets_its_own_and_not_what_is_for_busy_sinks(store: Store) -> None:
+    made = Batch()
+    made.rows["outbox"] = [
+        {"key": key, "sink": sink, "event": {"service": of}, "created": 0.0, "due": due, "attempts": 0, "outcome": ""}
+        for key, sink, of, due in (
+            ("a", "desk", "hall", 1.0),
+            ("b", "pager", "hall", 1.0),
+            ("c", "desk", "yard", 1.0),
+            ("d", "desk", "hall", 9.0),
+            ("e", "desk", "hall", None),
+        )
+    ]
+    store.write(made, "hall", 1)
+    assert [row["key"] for row in store.due_deliveries(2.0, 9, "hall")] == ["a", "b"]
+    assert [row["key"] for row in store.due_deliveries(2.0, 9, "hall", {"desk"})] == ["b"]
 
 
 class Forgetful(Store):
@@ -170,6 +187,9 @@ def test_a_migration_that_fails_leaves_all_as_it_was(url: str, monkeypatch: pyte
         ("mysql://somewhere/x", "mysql is not supported, give a path for SQLite or postgresql://"),
         ("postgresql://user:secret@127.0.0.1:1/x", "connection refused"),
         ("://", "cannot be read as a URL"),
+        ("postgresql://u@localhost:abc/x", "cannot be read as a URL"),
+        ("sqlite://", "would be lost with the process, give a path"),
+        (".", "is a folder, give the name of a file in it"),
     ],
 )
 def test_what_cannot_be_opened_is_one_line_without_passwords(url: str, said: str, tmp_path: Path) -> None:
@@ -180,6 +200,10 @@ def test_what_cannot_be_opened_is_one_line_without_passwords(url: str, said: str
 def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.sqlite").write_bytes(b"not a database, but long enough to be looked at as if it were one" * 20)
     one_line(run("history", tmp_path / "x.sqlite"), "x.sqlite", "file is not a database")
+
+
+def test_a_time_that_no_calendar_has_is_a_number() -> None:
+    assert dated(0.0) == "1970-01-01 00:00:00" and dated(3e11) == "300000000000 s"
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +218,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 class TestCommands:
     def test_check_reads_all_that_is_named(self, hall: Path) -> None:
-        assert "2 assets, 1 sources; all can be used" in run("run", hall, "--check").out
+        assert "2 assets, 1 source; all can be used" in run("run", hall, "--check").out
         wrong = hall.with_name("wrong.toml")
         wrong.write_text(hall.read_text().replace("leaky.csv", "weak.csv"))
         one_line(run("run", wrong, "--check"), "weak.csv")
@@ -203,6 +227,8 @@ class TestCommands:
     def test_watch_shows_assets_as_they_are(self, hall: Path) -> None:
         shown = run("watch", hall, "--once").out
         assert "press" in shown and "lift" in shown and "fault" in shown
+        told = " ".join(shown.split())
+        assert "press: Fault: leakage. C_ie is 1.2" in told and "since 2026-01-01 00:01:3" in told  # and 0 or so
         found = {one["asset"]: one["status"] for one in json.loads(run("watch", hall, "--json").out)}
         assert found["lift"]["verdict"] == "healthy" and found["press"]["alarms"]["fault"]["state"] == "unacknowledged"
         (only,) = json.loads(run("watch", hall, "--json", "--asset", "lift").out)
@@ -217,6 +243,8 @@ class TestCommands:
         before = run("history", hall, "--kind", "alarms", "--to", "2026-01-01T00:01", "--json")
         assert before.out == ""
         assert "started" in run("history", hall, "--kind", "audit", "--from", "1h").out
+        assert "version: 0.1" in run("history", hall, "--kind", "audit", "--from", "1h").out
+        one_line(run("history", hall, "--asset", "pres"), "no such asset", "press")
         wrong = run("history", hall, "--from", "yesterday")
         assert wrong.code == 2 and "2026-01-31T12:00" in " ".join(wrong.err.split())
 

@@ -53,9 +53,7 @@ EventSource.prototype.addEventListener = function (kind, told) {
   listen.call(this, kind, (event) => { window.heard += kind.startsWith("asset") ? 1 : 0; told(event); });
 };
 """
-SERVE = (
-    "import sys, servoscope.web.hub as hub; hub.EVERY_S /= {speed}; from servoscope.cli import main; main()"
-)
+SERVE = "import sys, servoscope.web.hub as hub; hub.EVERY_S /= {speed}; from servoscope.cli import main; main()"
 
 
 def load(folder: Path, browser: Browser, assets: int, pages: int, seconds: float) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import types
 from collections.abc import Iterable, Mapping
+from datetime import datetime
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
@@ -22,6 +23,10 @@ TYPES = {
     "model_type": "is not a table of settings",
     "model_attributes_type": "is not a table of settings",
     "finite_number": "is not a finite number",
+    "timezone_aware": "has no time zone, write it as in 2026-01-31T12:00:00Z",
+    "datetime_type": "is not a time, write it as in 2026-01-31T12:00:00Z",
+    "datetime_parsing": "is not a time, write it as in 2026-01-31T12:00:00Z",
+    "datetime_from_date_parsing": "is not a time, write it as in 2026-01-31T12:00:00Z",
 }
 RELATIONS = {
     "gt": "must be greater than",
@@ -53,7 +58,9 @@ def describe(error: ValidationError, model: type[BaseModel], section: str = "") 
     # A misspelt key is reported twice, as unknown and as missing: the first says more.
     first = min(found, key=lambda detail: detail["type"] != "extra_forbidden")
     place, owner = _walk(model, first["loc"])
-    path = ([section] if section else []) + [str(part) for part in place if not isinstance(part, int)]
+    path = ([section] if section else []) + [
+        str(part) for part in place if not isinstance(part, int) and part != "[key]"
+    ]
     entry = next((int(part) + 1 for part in place if isinstance(part, int)), None)
     if first["type"] in ("union_tag_invalid", "union_tag_not_found"):
         path.append(first["ctx"]["discriminator"].strip("'"))
@@ -152,6 +159,8 @@ def _text(detail: ErrorDetails) -> str:
 
 def _shown(value: Any) -> str:
     text = {True: "true", False: "false"}[value] if isinstance(value, bool) else repr(value)
+    if isinstance(value, datetime):
+        text = value.isoformat()
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 

@@ -5,8 +5,8 @@ rows = outgoing(settings, transition, priority, details)    # stored with the tr
 delivery = deliver(row, settings, now)                      # delivery.again takes the row's place; None: it goes
 """
 
-from servoscope.actions.delivery import deliver, signature
-from servoscope.actions.outbox import Delivery, Outgoing, outgoing, outgoing_flood
+from servoscope.actions.delivery import deliver, secret_of, signature
+from servoscope.actions.outbox import Delivery, Outgoing, key_of, outgoing, outgoing_flood
 from servoscope.actions.settings import (
     ActionSettings,
     CommandSettings,
@@ -30,8 +30,10 @@ __all__ = [
     "WebhookSettings",
     "begin",
     "deliver",
+    "key_of",
     "outgoing",
     "outgoing_flood",
     "respond",
+    "secret_of",
     "signature",
 ]

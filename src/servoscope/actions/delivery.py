@@ -16,7 +16,7 @@ from servoscope.actions.settings import PLACEHOLDERS, ActionSettings, CommandSet
 from servoscope.broker import reach
 from servoscope.errors import ConfigError
 
-__all__ = ["deliver", "signature"]
+__all__ = ["deliver", "secret_of", "signature"]
 
 SHOWN = 200  # characters of an answer that are kept
 
@@ -95,7 +95,10 @@ def _post(row: Outgoing, sink: WebhookSettings, now: float) -> str:
         raise _Failed("webhooks need httpx: pip install 'servoscope[service]'") from None
     body = json.dumps(row.event, allow_nan=False).encode()
     headers = {"Content-Type": "application/json", "Idempotency-Key": row.key}
-    secret = _secret(sink)
+    try:
+        secret = secret_of(sink)
+    except ValueError as error:
+        raise _Failed(str(error)) from None
     if secret is not None:
         stamp = str(int(now))
         headers |= {"X-Servoscope-Timestamp": stamp, "X-Servoscope-Signature": signature(secret, stamp, body)}
@@ -111,20 +114,27 @@ def _post(row: Outgoing, sink: WebhookSettings, now: float) -> str:
     return f"answered {status}"
 
 
-def _secret(sink: WebhookSettings) -> bytes | None:
+def secret_of(sink: WebhookSettings) -> bytes | None:
+    """Return the secret that a webhook is signed with; None where it is not signed.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be had; the message says why.
+    """
     if sink.secret_env is not None:
         value = os.environ.get(sink.secret_env, "")
         if not value:
-            raise _Failed(f"the environment variable {sink.secret_env} holds no secret")
+            raise ValueError(f"the environment variable {sink.secret_env} holds no secret, set it")
         return value.encode()
     if sink.secret_file is None:
         return None
     try:
         content = Path(sink.secret_file).read_bytes().strip()
     except OSError as error:
-        raise _Failed(f"{sink.secret_file}: cannot be read ({error.strerror})") from None
+        raise ValueError(f"{sink.secret_file}: cannot be read ({error.strerror})") from None
     if not content:
-        raise _Failed(f"{sink.secret_file}: holds no secret")
+        raise ValueError(f"{sink.secret_file}: holds no secret, write it there")
     return content
 
 

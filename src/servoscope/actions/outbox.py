@@ -102,7 +102,8 @@ def outgoing(
     rows = []
     for name, sink in settings.sinks.items():
         if _concerns(sink, transition, priority):
-            key = key_of(name, transition.asset, transition.alarm, transition.sequence)
+            # the time, for an asset that begins anew, or in another store, counts its transitions from 1 again
+            key = key_of(name, transition.asset, transition.alarm, transition.sequence, repr(transition.time))
             event = {"key": key, **transition.to_dict(), "priority": priority, "details": dict(details or {})}
             rows.append(Outgoing(key, name, event, created=now, due=now))
     return tuple(rows)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from pathlib import Path
 from typing import Annotated, Literal, Self
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from servoscope.alarms import Event, Priority, State
 from servoscope.broker import BrokerSettings
@@ -26,7 +27,15 @@ __all__ = [
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 Word = Annotated[str, Field(strict=True, min_length=1)]
-Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
+
+
+def _is_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", value):
+        raise ValueError(f"{value!r} is no name for an action: a letter, then letters, digits, _ and -")
+    return value
+
+
+Name = Annotated[str, Field(strict=True), AfterValidator(_is_name)]
 Whole = Annotated[int, Field(strict=True, ge=1)]
 
 BELIEVED = 1e3  # ratio to healthy, or its inverse, beyond which a change is not left to a formula
@@ -242,6 +251,23 @@ class ActionSettings(_Settings):
             if one.sink is not None and one.sink not in self.sinks:
                 raise ValueError(f"tolerance.{name}: sink: no webhook, command or mqtt is called {one.sink!r}")
         return self
+
+    def beside(self, folder: Path) -> ActionSettings:
+        """Return the same with the paths of programs and secrets relative to a folder; plain names stay names."""
+
+        def there(path: str) -> str:
+            return str(folder / path)
+
+        def hook(one: WebhookSettings) -> WebhookSettings:
+            return one if one.secret_file is None else one.model_copy(update={"secret_file": there(one.secret_file)})
+
+        def tool(one: CommandSettings) -> CommandSettings:
+            program, *rest = one.argv
+            return one.model_copy(update={"argv": (there(program), *rest)}) if "/" in program else one
+
+        webhook = {name: hook(one) for name, one in self.webhook.items()}
+        command = {name: tool(one) for name, one in self.command.items()}
+        return self.model_copy(update={"webhook": webhook, "command": command})
 
     @property
     def sinks(self) -> dict[str, WebhookSettings | CommandSettings | MessageSettings]:

@@ -146,6 +146,6 @@ def respond(
     )
     row = None
     if change.executed and settings.sink is not None:
-        key = key_of(name, asset, change.sequence)
+        key = key_of(name, asset, change.sequence, repr(time))
         row = Outgoing(key, settings.sink, {"key": key, "event": "change", **change.to_dict()}, now, now)
     return ToleranceState(value, (*changed, time), change.sequence), change, row

@@ -11,7 +11,7 @@ import typer
 from servoscope.cli.app import app
 from servoscope.cli.moments import duration
 from servoscope.cli.options import AsJson
-from servoscope.cli.service import OfAsset, StoreText, open_store
+from servoscope.cli.service import OfAsset, StoreText, known, open_store
 from servoscope.cli.shell import print_json
 from servoscope.errors import AlarmError
 
@@ -24,6 +24,7 @@ Who = Annotated[str | None, typer.Option(metavar="NAME", help="Who asks; default
 Why = Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in the history.")]
 
 PATIENCE_S = 5.0
+LONGEST_S = 366 * 86400.0  # shelving has an end
 COLUMNS = ("asset", "alarm", "state", "since", "priority")
 
 
@@ -32,7 +33,9 @@ def list_(store: StoreText, asset: OfAsset = None, as_json: AsJson = False) -> N
     """List the alarms that are not normal."""
     from servoscope.cli import terminal, watching
 
-    found = watching.alarm_rows(open_store(store).statuses(asset))
+    opened = open_store(store)
+    known(opened, asset or ())
+    found = watching.alarm_rows(opened.statuses(asset))
     if as_json:
         print_json(found, lines=False)
     else:
@@ -61,7 +64,10 @@ def shelve(
     why: Why = "",
 ) -> None:
     """Put it on the shelf for a time: it is not announced until that has passed."""
-    ask(store, asset, alarm, "shelve", who, {"why": why, "for_s": duration(time_, "--for")})
+    for_s = duration(time_, "--for")
+    if for_s > LONGEST_S:
+        raise typer.BadParameter(f"--for {time_!r}: at most 366d; what is to stay silent longer is out-of-service")
+    ask(store, asset, alarm, "shelve", who, {"why": why, "for_s": for_s})
 
 
 @alarms.command()
@@ -85,9 +91,7 @@ def return_(store: StoreText, asset: Asset, alarm: Alarm, who: Who = None, why: 
 def ask(store: str, asset: str, alarm: str, command: str, who: str | None, document: dict[str, str | float]) -> None:
     """Write a command into the store, and wait a little for the service to carry it out."""
     opened = open_store(store)
-    if asset not in opened.statuses([asset]):
-        known = ", ".join(opened.statuses()) or "none yet"
-        raise AlarmError(f"{asset}: no such asset in {opened.name}, only {known}")
+    known(opened, [asset])
     row = {"who": who or getpass.getuser(), "asset": asset, "alarm": alarm, "command": command, "document": document}
     asked = opened.ask(row)
     deadline = time.monotonic() + PATIENCE_S

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,8 +17,11 @@ from servoscope.cli.moments import moment
 from servoscope.cli.options import AsJson
 from servoscope.cli.outputs import check_output
 from servoscope.cli.shell import print_json
+from servoscope.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
+    from rich.console import Group
+
     from servoscope.store import Store
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Service file (TOML).")]
@@ -44,7 +49,7 @@ COLUMNS = {
     Kinds.alarms: ("t", "asset", "alarm", "after", "who", "cause"),
     Kinds.audit: ("at", "who", "asset", "what", "document"),
     Kinds.residuals: ("t", "asset", "statistic", "level"),
-    Kinds.deliveries: ("created", "sink", "attempts", "due", "outcome"),
+    Kinds.deliveries: ("created", "sink", "asset", "alarm", "event", "attempts", "due", "outcome"),
 }
 
 
@@ -64,18 +69,22 @@ def run(
 
     settings = Config.load(config)
     if check:
-        rehearse(settings)
-        typer.echo(f"{config}: {len(settings.assets)} assets, {len(settings.sources)} sources; all can be used")
+        with naming(config):
+            rehearse(settings)
+        found = {"asset": len(settings.assets), "source": len(settings.sources)}
+        counted = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in found.items())
+        typer.echo(f"{config}: {counted}; all can be used")
         return
     logs.set_up(settings.service.log)
     from servoscope.live.service import Service
     from servoscope.live.serving import serve
     from servoscope.web.beside import Beside
 
-    service = Service(settings, assemble(settings, anew or ()))
+    with naming(config):
+        service = Service(settings, assemble(settings, anew or ()))
+        server = serve(service, settings.service.listen) if settings.service.listen else None
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
-    server = serve(service, settings.service.listen) if settings.service.listen else None
     pages = Beside(config) if settings.web is not None else None
     try:
         if pages is not None:
@@ -98,18 +107,26 @@ def watch(
 ) -> None:
     """Show assets as they are now: verdict, since when, residuals, alarms; read from the store."""
     from servoscope.cli import terminal, watching
+    from servoscope.store.history import standing
 
     opened, out = open_store(store), terminal.console()
+
+    def page() -> Group:
+        statuses = opened.statuses(asset)
+        ill = [name for name, row in statuses.items() if row["status"].get("verdict") == "fault"]
+        return watching.page(statuses, standing(opened, ill), out.width)
+
+    known(opened, asset or ())
     if as_json:
         print_json(list(opened.statuses(asset).values()), lines=False)
     elif once:
-        out.print(watching.page(opened.statuses(asset), out.width))
+        out.print(page())
     else:
         from rich.live import Live
 
         with Live(console=out, auto_refresh=False) as live:
             while True:
-                live.update(watching.page(opened.statuses(asset), out.width), refresh=True)
+                live.update(page(), refresh=True)
                 time.sleep(every)
 
 
@@ -140,7 +157,9 @@ def history(
     from servoscope.store.history import plain
 
     shown = last if last is not None or as_json or output is not None else SHOWN
-    rows = rows_of(open_store(store), kind, assets=asset or (), span=span, last=shown)
+    opened = open_store(store)
+    known(opened, asset or ())
+    rows = rows_of(opened, kind, assets=asset or (), span=span, last=shown)
     if output is not None:
         export(output, rows)
         terminal.written(terminal.console(stderr=True), output)
@@ -149,6 +168,15 @@ def history(
             print_json(plain(row), lines=True)
     else:
         terminal.console().print(watching.rows(rows, COLUMNS[kind]))
+
+
+@contextmanager
+def naming(config: Path) -> Iterator[None]:
+    """Put the name of the service file before what is wrong in it."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{config}: {error}") from None
 
 
 def open_store(text: str) -> Store:
@@ -161,6 +189,14 @@ def open_store(text: str) -> Store:
         config = Config.load(text)
         return Store.open(config.store.url, config.folder, patience=5.0)
     return Store.open(text, patience=5.0)
+
+
+def known(store: Store, assets: Sequence[str]) -> None:
+    """Refuse assets that the store knows nothing of: an empty answer would look like peace."""
+    there = store.statuses() if assets else {}
+    for name in assets:
+        if name not in there:
+            raise StoreError(f"{name}: no such asset in {store.name}, only {', '.join(there) or 'none yet'}")
 
 
 def export(path: Path, rows: list[Any]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 from rich.console import Group
@@ -13,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from servoscope.cli.terminal import COLOURS, span
+from servoscope.store.history import dated
 
 __all__ = ["alarm_rows", "page", "rows"]
 
@@ -29,7 +29,7 @@ NE107 = {
 
 def clock(t: float | None) -> str:
     """Return a time, UTC, to the second."""
-    return "-" if t is None else datetime.fromtimestamp(t, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    return "-" if t is None else dated(t)
 
 
 def assets(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
@@ -51,7 +51,7 @@ def assets(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
         residual = {f: (real, imaginary, healthy) for f, real, imaginary, healthy in status.get("residual", ())}
         tests = number(status.get("statistic")), number(status.get("level"))
         ne107 = Text(status["ne107"].replace("_", " "), NE107.get(status["ne107"], ""))
-        more = ne107, clock(status["counted"]["t"]), f"{span(max(0.0, now - row['at']))} ago"
+        more = ne107, clock(status["counted"]["t"]), f"{span(round(max(0.0, now - row['at']), 1))} ago"
         table.add_row(
             name,
             Text(status["verdict"], COLOURS.get(status["verdict"], "")),
@@ -77,9 +77,20 @@ def services(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def page(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Group:
+def faults(statuses: Mapping[str, Mapping[str, Any]], diagnoses: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line for each asset with a fault: what its full diagnosis says, or what is known until then."""
+    lines = []
+    for name, row in statuses.items():
+        status, full = row["status"], diagnoses.get(name)
+        if status.get("verdict") == "fault":
+            known = full is not None and full["verdict"] == "fault" and full["t"] >= status["since"]
+            lines.append(f"{name}: {full['summary'] if known and full is not None else status['summary']}")
+    return lines
+
+
+def page(statuses: Mapping[str, Mapping[str, Any]], diagnoses: Mapping[str, Mapping[str, Any]], width: int) -> Group:
     """Return all of it."""
-    return Group(assets(statuses, width), *services(statuses))
+    return Group(assets(statuses, width), *faults(statuses, diagnoses), *services(statuses))
 
 
 def standing(alarms: Mapping[str, Mapping[str, Any]]) -> str:
@@ -117,14 +128,19 @@ def rows(found: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
     for name in columns:
         table.add_column(name.replace("_", " "), overflow="fold", no_wrap=name in ("t", "at", "created", "asset"))
     for row in found:
-        cells = [row.get(name) for name in columns]
-        table.add_row(*(_cell(name, value) for name, value in zip(columns, cells, strict=True)))
+        event = row.get("event")
+        told = {**event, **row, "event": event.get("event")} if isinstance(event, Mapping) else row  # of a delivery
+        table.add_row(*(_cell(name, told.get(name)) for name in columns))
     return table
 
 
 def _cell(name: str, value: Any) -> str:
     if value is None:
         return "-"
-    if name in ("t", "at", "created", "onset", "since", "due"):
+    if name in ("t", "at", "created", "onset", "since", "due", "asked", "from", "time"):
         return clock(value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key.replace('_', ' ')}: {_cell(key, one)}" for key, one in value.items() if one != "")
+    if name in ("state", "after", "what", "event"):
+        return str(value).replace("_", " ")
     return number(value) if isinstance(value, float) else str(value)

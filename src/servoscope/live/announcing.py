@@ -108,7 +108,7 @@ class Announcer:
             if notice.transition is None or notice.priority is None:  # of a flood
                 words = {"t": notice.time, "counted": notice.counted, "peak": notice.peak}
                 rows.append(Row("audit", {"who": "servoscope", "what": notice.kind, "document": words}))
-                rows += map(posted, actions.outgoing_flood(self._settings, notice, now))
+                rows += map(self._posted, actions.outgoing_flood(self._settings, notice, now))
                 continue
             definition = self._alarms.definitions[notice.transition.alarm]
             advice = {
@@ -117,7 +117,7 @@ class Announcer:
                 "response_time_s": definition.response_time_s,
             }
             found = actions.outgoing(self._settings, notice.transition, notice.priority, now, {**advice, **details})
-            rows += map(posted, found)
+            rows += map(self._posted, found)
         return rows
 
     def watch(self, buffered: float, now: float) -> Outcome:
@@ -162,10 +162,11 @@ class Announcer:
             if change is not None:
                 what = "change executed" if change.executed else "change recommended"
                 rows.append(Row("audit", {"who": "servoscope", "what": what, "document": change.to_dict()}))
-            rows += [posted(out)] if out is not None else []
+            rows += [self._posted(out)] if out is not None else []
         return rows
 
-
-def posted(one: Outgoing) -> Row:
-    """Return the row of the outbox for something that goes out."""
-    return Row("outbox", {**one.to_dict(), "outcome": ""})
+    def _posted(self, one: Outgoing) -> Row:
+        """Return the row of the outbox for something that goes out; services on one store must not mix theirs up."""
+        key = actions.key_of(self.name, one.key)
+        event = {**one.event, "key": key, "service": self.name}
+        return Row("outbox", {**one.to_dict(), "key": key, "event": event, "outcome": ""})

@@ -11,6 +11,7 @@ from servoscope.errors import BaselineError, ConfigError
 from servoscope.live.announcing import Announcer
 from servoscope.live.asset import Asset, Following
 from servoscope.live.block import Block, Resume
+from servoscope.live.checking import check
 from servoscope.live.checkpoint import Counted, unpack
 from servoscope.live.config import Config
 from servoscope.live.mqtt.outlet import MqttOutlet, MqttOutletSettings
@@ -56,6 +57,7 @@ def assemble(config: Config, anew: Collection[str] = ()) -> Assembly:
     if strange := set(anew) - set(config.assets):
         raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(config.assets)}")
     assets = _assets(config)
+    check(config, assets)
     sources, outlets = _sources(config, assets), _outlets(config)
     store = Store.open(config.store.url, config.folder, write=True)
     try:
@@ -89,7 +91,9 @@ def rehearse(config: Config) -> None:
     ServoscopeError
         If something cannot be used.
     """
-    _sources(config, _assets(config))
+    assets = _assets(config)
+    check(config, assets)
+    _sources(config, assets)
     _outlets(config)
 
 
@@ -109,7 +113,10 @@ def _assets(config: Config) -> dict[str, Asset]:
         if path not in files:
             files[path] = Baseline.load(path)
         if (path, point) not in shared:
-            baseline = files[path] if point is None else files[path].at(point)
+            try:
+                baseline = files[path] if point is None else files[path].at(point)
+            except BaselineError as error:
+                raise ConfigError(f"[assets] {name}.point: {path.name}: {error}") from None
             try:
                 shared[path, point] = baseline, Monitor(baseline)
             except BaselineError:

@@ -18,12 +18,11 @@ from servoscope.live.mqtt.source import MqttSettings
 from servoscope.live.opcua.outlet import OpcuaOutletSettings
 from servoscope.live.opcua.settings import Nodes, OpcuaSettings
 from servoscope.live.replay import ReplaySettings
-from servoscope.live.settings import NotNegative, Seconds, Settings, Word
+from servoscope.live.settings import Address, Name, NotNegative, Seconds, Settings, Word
 from servoscope.quality import QualitySettings
 
 __all__ = ["AssetSettings", "Config", "DiagnosisSettings", "ServiceSettings", "StoreSettings"]
 
-Name = Annotated[str, Field(strict=True, pattern=r"^[\w][\w.:-]*$", max_length=100)]
 Paths = Annotated[tuple[Word, ...], Field(min_length=1)]
 Outlet = Annotated[MqttOutletSettings | OpcuaOutletSettings, Field(discriminator="kind")]
 Source = Annotated[ReplaySettings | MqttSettings | OpcuaSettings, Field(discriminator="kind")]
@@ -46,8 +45,8 @@ class ServiceSettings(Settings):
         What is logged, at least.
     """
 
-    listen: Annotated[str, Field(strict=True, pattern=r"^(?:|.+:\d{1,5})$")] = "127.0.0.1:9464"
-    commit_every_s: NotNegative = 0.5
+    listen: Address = "127.0.0.1:9464"
+    commit_every_s: Annotated[NotNegative, Field(le=3600.0)] = 0.5
     buffer: Annotated[int, Field(strict=True, ge=1)] = 10_000
     stop_within_s: NotNegative = 10.0
     log: Literal["debug", "info", "warning", "error"] = "info"

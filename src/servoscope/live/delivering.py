@@ -1,14 +1,15 @@
-"""Takes what is due from the outbox to webhooks and commands, in a thread of its own: a slow receiver delays nobody."""
+"""Takes what is due from the outbox to webhooks and commands, each in a thread of its own: a slow one delays nobody."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from queue import SimpleQueue
 
 from servoscope.actions import ActionSettings, Delivery, Outgoing, deliver
 from servoscope.errors import StoreError
-from servoscope.store import Store
+from servoscope.store import Row, Store
 
 __all__ = ["Courier"]
 
@@ -23,14 +24,17 @@ class Courier:
     ----------
     store
         With the outbox.
+    service
+        Name of the service: what others on the same store have to deliver is theirs.
     settings
         Where to.
     """
 
-    def __init__(self, store: Store, settings: ActionSettings) -> None:
-        self._store, self._settings = store, settings
+    def __init__(self, store: Store, service: str, settings: ActionSettings) -> None:
+        self._store, self._service, self._settings = store, service, settings
         self._done: SimpleQueue[Delivery] = SimpleQueue()
-        self._handed: set[tuple[str, int]] = set()  # key and try: not yet written down, not to be tried once more
+        self._handed: dict[tuple[str, int], str] = {}  # key and try, not yet written down, not to be tried once more
+        self._busy: set[str] = set()  # sinks that something is being delivered to
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="delivery", daemon=True)
         self.idle = not settings.sinks  # whether nothing was due when it looked last
@@ -54,16 +58,28 @@ class Courier:
 
     def _run(self) -> None:
         while not self._over.wait(EVERY_S):
+            busy = set(self._busy)
             try:
-                rows = self._store.due_deliveries(time.time(), AT_ONCE)
+                rows = self._store.due_deliveries(time.time(), AT_ONCE, self._service, busy)
             except StoreError:
                 continue  # the service notices for itself
-            fresh = [row for row in rows if (row["key"], row["attempts"]) not in self._handed]
-            self._handed &= {(row["key"], row["attempts"]) for row in rows}
-            for row in fresh:
+            due = {(row["key"], row["attempts"]): row for row in rows}
+            self._handed = {one: sink for one, sink in self._handed.items() if one in due or sink in busy}
+            fresh = [row for one, row in due.items() if one not in self._handed]
+            self._handed |= {(row["key"], row["attempts"]): row["sink"] for row in fresh}
+            for sink in {row["sink"] for row in fresh}:
+                self._busy.add(sink)
+                work = sink, [row for row in fresh if row["sink"] == sink]
+                threading.Thread(target=self._bring, args=work, name=f"delivery to {sink}", daemon=True).start()
+            self.idle = not rows and not self._busy
+
+    def _bring(self, sink: str, rows: Sequence[Row]) -> None:
+        """Deliver to one sink, one after the other."""
+        try:
+            for row in rows:
                 if self._over.is_set():
                     return
                 plain = {name: row[name] for name in ("key", "sink", "event", "created", "due", "attempts")}
-                self._handed.add((row["key"], row["attempts"]))
                 self._done.put(deliver(Outgoing(**plain), self._settings, time.time()))
-            self.idle = not rows
+        finally:
+            self._busy.discard(sink)

@@ -13,6 +13,7 @@ from servoscope.diagnosis import Verdict
 from servoscope.errors import ServoscopeError
 from servoscope.live.block import Block
 from servoscope.recording import Recording, clean
+from servoscope.store.history import dated
 
 __all__ = ["Examined", "Told", "diagnose_in_full", "examine"]
 
@@ -99,7 +100,7 @@ def examine(baseline: Baseline, name: str, blocks: Sequence[Block]) -> Examined:
 def diagnose_in_full(baseline: Baseline, name: str, blocks: Sequence[Block]) -> Told:
     """Diagnose a window; seconds, refit included.
 
-    Times in summary and document count from the beginning of the window, which the document tells as ``began``.
+    Times in the document count from the beginning of the window, which it tells as ``began``; the summary has dates.
     """
     from servoscope.monitor import diagnose
 
@@ -108,5 +109,11 @@ def diagnose_in_full(baseline: Baseline, name: str, blocks: Sequence[Block]) -> 
         said = diagnose(baseline, recording)
     except ServoscopeError as error:
         return Told("undetermined", f"Undetermined: {error}.", None, {})
-    onset = begins + said.onset_s[1] if said.onset_s is not None else None
-    return Told(said.verdict, said.summary, onset, {"began": begins, **said.model_dump(mode="json")})
+    document = {"began": begins, **said.model_dump(mode="json")}
+    if said.onset_s is None:
+        return Told(said.verdict, said.summary, None, document)
+    onset = begins + said.onset_s[1]
+    # months later nobody knows when the window began
+    summary = said.summary.replace(f"since {said.onset_s[1]:.1f} s", f"since {dated(onset)} UTC")
+    summary = summary.replace("since the start of the recording or before", f"since {dated(begins)} UTC or before")
+    return Told(said.verdict, summary, onset, document)

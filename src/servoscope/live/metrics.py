@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Metrics"]
 
-SECONDS = tuple(base * 10.0**power for power in (-3, -2, -1, 0, 1) for base in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0))
+SECONDS = tuple(float(f"{base}e{power}") for power in (-3, -2, -1, 0, 1) for base in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0))
 COUNTED = {
     "blocks": "Blocks that were counted",
     "samples": "Samples that were counted",

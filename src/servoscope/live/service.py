@@ -47,7 +47,7 @@ class Service:
         self.assets, self.announcer = assembly.assets, assembly.announcer
         self.writer = Writer(self.store, config.name, config.service.buffer)
         self.metrics = Metrics(self)
-        self.courier = Courier(self.store, config.actions)
+        self.courier = Courier(self.store, config.name, config.actions.beside(config.folder))
         self._looker = Looker()
         self._looking: dict[tuple[str, Window], Future[Told]] = {}
         self._listened = 0.0  # s: that it has been ready to hear; being busy, or full, is no silence of a sensor

@@ -13,7 +13,7 @@ from servoscope.store import tables
 from servoscope.store.batch import Row
 from servoscope.store.store import Store
 
-__all__ = ["KINDS", "coarse", "history", "plain", "spread"]
+__all__ = ["KINDS", "coarse", "dated", "history", "plain", "spread", "standing"]
 
 KINDS: Mapping[str, tuple[sa.Table, str]] = {  # the table, and which of its columns is the time
     "diagnoses": (tables.diagnoses, "t"),
@@ -49,8 +49,9 @@ def history(
     """
     table, clock = KINDS[kind]
     query = sa.select(table)
-    if assets and "asset" in table.c:
-        query = query.where(table.c.asset.in_(assets))
+    if assets:
+        of = table.c.asset if "asset" in table.c else table.c.event["asset"].as_string()  # of a delivery
+        query = query.where(of.in_(assets))
     if span[0] is not None:
         query = query.where(table.c[clock] >= span[0])
     if span[1] is not None:
@@ -88,10 +89,29 @@ def coarse(store: Store, asset: str, span: tuple[float, float], points: int) -> 
     return rows, sum(row["rows"] for row in rows)
 
 
+def standing(store: Store, assets: Sequence[str]) -> dict[str, Row]:
+    """Return the last full diagnosis of each of these assets that has one."""
+    table, found = tables.diagnoses, {}
+    for asset in assets:
+        query = sa.select(table).where((table.c.asset == asset) & (table.c.grounds == "full"))
+        for row in store.rows(query.order_by(table.c.t.desc(), table.c.number.desc()).limit(1)):
+            found[asset] = row
+    return found
+
+
+def dated(t: float, timespec: str = "seconds") -> str:
+    """Return a time [UTC s] as date and time; as a number where a clock was set to what is in no calendar."""
+    try:
+        return datetime.fromtimestamp(t, UTC).replace(tzinfo=None).isoformat(" ", timespec)
+    except (OverflowError, ValueError, OSError):
+        return f"{t:.0f} s"
+
+
 def plain(row: Row) -> dict[str, Any]:
     """Return a row with its times as text as well: ``time`` beside ``t``."""
     clock = next(row[name] for name in ("t", "at", "created") if name in row)
-    return {"time": datetime.fromtimestamp(clock, UTC).isoformat(timespec="milliseconds"), **row}
+    date = dated(clock, "milliseconds")
+    return {"time": date if date.endswith("s") else f"{date.replace(' ', 'T')}+00:00", **row}
 
 
 def spread(rows: Sequence[Row]) -> dict[str, list[Any]]:

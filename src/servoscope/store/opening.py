@@ -42,23 +42,43 @@ def url_of(text: str, folder: Path) -> URL:
     StoreError
         If it is neither.
     """
+    if "\0" in text:
+        raise StoreError(f"store: {text!r} holds a zero byte, give another path")
     if "://" not in text:
         return URL.create("sqlite", database=str((folder / text).absolute()))
     try:
         url = make_url(text)
-    except exc.ArgumentError:
+    except (exc.ArgumentError, ValueError):
         raise StoreError("store: cannot be read as a URL, write postgresql://user@host/database, or a path") from None
     kind = url.get_backend_name()
     if kind not in ("sqlite", "postgresql"):
         raise StoreError(f"store: {kind} is not supported, give a path for SQLite or postgresql://...")
-    if kind == "sqlite" and url.database:
-        return url.set(database=str((folder / url.database).absolute()))
+    if kind == "sqlite" and not url.database:
+        raise StoreError(f"store: {text} would be lost with the process, give a path")
+    if kind == "sqlite":
+        return url.set(database=str((folder / str(url.database)).absolute()))
     return url.set(drivername="postgresql+psycopg") if kind == "postgresql" else url
+
+
+def check_folder(path: Path) -> None:
+    """Check that SQLite can have a file there; it says itself no more than that it cannot open it.
+
+    Raises
+    ------
+    StoreError
+        If it cannot.
+    """
+    if path.is_dir():
+        raise StoreError(f"{path}: is a folder, give the name of a file in it")
+    if not path.parent.is_dir():
+        raise StoreError(f"{path}: the folder {path.parent} does not exist, make it, or give another path")
 
 
 def shown(url: URL) -> str:
     """Return what messages call a store: never its password."""
-    return str(url.database) if url.get_backend_name() == "sqlite" else url.render_as_string(hide_password=True)
+    if url.get_backend_name() == "sqlite":
+        return str(url.database)
+    return url.set(drivername="postgresql").render_as_string(hide_password=True)
 
 
 def engine_of(url: URL, *, patience: float = PATIENCE) -> sa.Engine:

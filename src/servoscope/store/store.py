@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,8 @@ class Store:
             raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
         if found.get_backend_name() == "sqlite" and not write and not Path(found.database or "").exists():
             raise StoreError(f"{store.name}: no such store, servoscope run makes it")
+        if found.get_backend_name() == "sqlite":
+            opening.check_folder(Path(str(found.database)))
         try:
             with store._transaction() as connection:
                 schema.prepare(connection, store.name, write=write)
@@ -160,11 +162,15 @@ class Store:
         table = tables.commands
         return self.rows(sa.select(table).where(table.c.outcome.is_(None)).order_by(table.c.id))
 
-    def due_deliveries(self, now: float, most: int) -> list[Row]:
-        """Return up to `most` rows of the outbox whose next attempt is due, the oldest first."""
+    def due_deliveries(self, now: float, most: int, service: str, busy: Collection[str] = ()) -> list[Row]:
+        """Return up to `most` rows of a service's outbox whose next attempt is due, the oldest first.
+
+        Without those for sinks that are busy.
+        """
         table = tables.outbox
-        due = table.c.due.is_not(None) & (table.c.due <= now)
-        return self.rows(sa.select(table).where(due).order_by(table.c.due, table.c.key).limit(most))
+        due = table.c.due.is_not(None) & (table.c.due <= now) & table.c.sink.not_in(busy)
+        own = table.c.event["service"].as_string() == service
+        return self.rows(sa.select(table).where(due & own).order_by(table.c.due, table.c.key).limit(most))
 
     def forget(self, table: str, before: Mapping[str, float]) -> int:
         """Delete rows of a table that are older, by the asset's own clock; return how many."""
