@@ -25,7 +25,7 @@ from opcua_plant import NODES
 from servoscope.errors import ConfigError, MessageError
 from servoscope.live.block import Block, Resume
 from servoscope.live.opcua.aligning import Aligner
-from servoscope.live.opcua.following import block_of, single
+from servoscope.live.opcua.following import block_of, history, single
 from servoscope.live.opcua.outlet import OpcuaOutlet, OpcuaOutletSettings
 from servoscope.live.opcua.settings import Nodes, OpcuaSettings
 from servoscope.live.opcua.source import OpcuaSource
@@ -193,7 +193,7 @@ def test_a_cable_that_was_pulled_costs_nothing_where_there_is_history(plant: Pla
     one.more(30)
     one.source.close()
     k = one.samples()
-    assert (np.diff(k) == 1).all() and "gap" not in one.refused
+    assert (np.diff(k) == 1).all() and not one.refused
     assert [block.sequence for block in one.blocks] == list(range(len(one.blocks)))
     # another process goes on behind what was stored
     last = one.blocks[-3]
@@ -229,6 +229,21 @@ def test_arrays_come_as_they_are_written(plant: Plant) -> None:
     one.source.close()
     assert (np.diff(one.samples()) == 1).all()
     assert (np.diff([block.sequence for block in one.blocks]) == 1).all()
+
+
+def test_a_server_in_trouble_is_asked_again_and_one_without_history_is_not() -> None:
+    from asyncua.ua import uaerrors
+
+    def answer(error: Exception) -> list[Any] | None:
+        async def read(*_: object, **__: object) -> list[Any]:
+            raise error
+
+        client = SimpleNamespace(get_node=lambda _: SimpleNamespace(read_raw_history=read))
+        return asyncio.run(history(client, "i=1", 0.0, 1.0))
+
+    assert answer(uaerrors.BadHistoryOperationUnsupported()) is None
+    with pytest.raises(uaerrors.BadTimeout):
+        answer(uaerrors.BadTimeout())
 
 
 def test_settings_that_cannot_work_are_told() -> None:

@@ -57,7 +57,8 @@ class PublishSettings(Settings):
     ahead
         How many blocks are kept per asset while they wait for their acknowledgement.
     again_s
-        How long an acknowledgement is waited for before blocks are sent again; doubled as long as there is none [s].
+        How long an acknowledgement is waited for, at least, before the oldest block is sent again; twice as long as the
+        last one took, and doubled as long as there is none [s].
     assets
         Tables by name: ``[assets.NAME]``.
     """
@@ -102,21 +103,23 @@ class PublishSettings(Settings):
 
 @dataclass
 class _Kept:
-    """A block that is not known to be safe, and its last way to the broker."""
+    """A block that is not known to be safe, its last way to the broker, and when it was sent, if it was so once."""
 
     sequence: int
     message: bytes
     info: MQTTMessageInfo | None = None
+    once: float | None = None
 
 
 @dataclass
 class _Line:
-    """The blocks of one asset on their way: kept, of which `sent` were sent; sent again at `again`."""
+    """The blocks of one asset on their way: kept, of which `sent` were sent; at `again` the oldest is, as a `probe`."""
 
     wait: float
     kept: deque[_Kept] = field(default_factory=deque)
     sent: int = 0
     again: float = math.inf
+    probe: int | None = None
 
 
 class Publisher:
@@ -209,12 +212,7 @@ class Publisher:
     def _turn(self) -> None:
         now = time.monotonic()
         for asset, sequence in self._heard_of().items():
-            line = self._lines[asset]
-            while line.kept and line.kept[0].sequence <= sequence:
-                line.kept.popleft()
-                line.sent = max(0, line.sent - 1)
-                line.wait, line.again = self.settings.again_s, now + self.settings.again_s
-                self.safe += 1
+            self._let_go(self._lines[asset], sequence, now)
         if not self._up:
             return
         room = self.settings.ahead * len(self._lines) - sum(len(line.kept) for line in self._lines.values())
@@ -222,24 +220,41 @@ class Publisher:
             self._keep(replace(block, stream=self._stream))
         fresh, self._fresh = self._fresh, False
         for asset, line in self._lines.items():
-            if line.sent and (fresh or now >= line.again):
-                line.sent, line.wait = 0, line.wait if fresh else min(2.0 * line.wait, LONGEST_S)
-            if line.sent < len(line.kept):
-                self._send(asset, line)
+            if fresh:
+                line.sent = 0
+            elif line.sent and now >= line.again:
+                # only slow, or lost? All of them again would make what is slow slower
+                self._send(asset, line.kept[0])
+                line.probe, line.wait = line.kept[0].sequence, min(2.0 * line.wait, LONGEST_S)
                 line.again = now + line.wait
+            if line.sent < len(line.kept):
+                for one in list(line.kept)[line.sent :]:
+                    self._send(asset, one)
+                line.sent, line.again = len(line.kept), now + line.wait
+
+    def _let_go(self, line: _Line, sequence: int, now: float) -> None:
+        """Take note that an asset's blocks are safe, up to this one."""
+        while line.kept and line.kept[0].sequence <= sequence:
+            one = line.kept.popleft()
+            line.sent = max(0, line.sent - 1)
+            if one.once is not None:  # of one that was sent again, nobody knows which was answered (Karn, 1987)
+                line.wait = max(self.settings.again_s, min(2.0 * (now - one.once), LONGEST_S))
+            self.safe += 1
+        if sequence == line.probe:
+            line.sent = 0  # it was answered, and none behind it: they are lost as well
+        line.probe, line.again = None, now + line.wait
 
     def _keep(self, block: Block) -> None:
         kept = self._lines[block.asset].kept
         encode = payload.encode if self.settings.format == "binary" else payload.to_json
         kept.append(_Kept(block.sequence, encode(block, kept[0].sequence if kept else block.sequence)))
 
-    def _send(self, asset: str, line: _Line) -> None:
-        topic = topics.data(self.settings.topic, asset)
-        for one in list(line.kept)[line.sent :]:
-            if one.info is None or one.info.is_published():  # what the broker has not taken yet, the client sends again
-                self.repeated += one.info is not None
-                one.info = self._client.publish(topic, one.message, qos=1)
-        line.sent = len(line.kept)
+    def _send(self, asset: str, one: _Kept) -> None:
+        """Send a block, unless the broker has not taken it yet: then the client does so itself."""
+        if one.info is None or one.info.is_published():
+            self.repeated += one.info is not None
+            one.once = time.monotonic() if one.info is None else None
+            one.info = self._client.publish(topics.data(self.settings.topic, asset), one.message, qos=1)
 
     def _connected(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:

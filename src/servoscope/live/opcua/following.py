@@ -21,6 +21,11 @@ __all__ = ["Arrays", "Followed", "Scalars", "block_of"]
 AHEAD_S = 10.0  # a server's clock may stand still for a second or more
 OVERFLOW = 0x480  # info type "data value" and its bit "overflow": the server's queue was too short
 MARGIN = 2  # times what a queue has to hold for two publishing intervals
+PASSING = {  # what a server says, or the library for it, while something is wrong that will not stay
+    "BadTimeout", "BadRequestTimeout", "BadConnectionClosed", "BadSessionClosed", "BadSessionIdInvalid",
+    "BadSecureChannelClosed", "BadSecureChannelIdInvalid", "BadCommunicationError", "BadServerNotConnected",
+    "BadShutdown", "BadServerHalted", "BadDisconnect", "BadNotConnected", "BadTooManyOperations", "BadTcpServerTooBusy",
+}  # fmt: skip
 LARGEST_EXACT = 2.0**53  # beyond, a binary64 cannot count
 
 
@@ -203,13 +208,18 @@ def words_of(gap: Gap) -> str:
 
 
 async def history(client: Any, node: str, begins: float, ends: float) -> list[Any] | None:
-    """Return the values of a node over a time, or None where the server keeps none."""
-    from asyncua.ua.uaerrors import UaError
+    """Return the values of a node over a time, or None where the server keeps none.
+
+    Trouble that passes is raised: the connection is made anew then, and history is asked for again.
+    """
+    from asyncua.ua.uaerrors import UaStatusCodeError
 
     begin, end = (datetime.fromtimestamp(t, UTC) for t in (begins, ends + AHEAD_S))
     try:
         return list(await client.get_node(node).read_raw_history(begin, end, return_bounds=False))
-    except UaError:
+    except UaStatusCodeError as error:
+        if type(error).__name__ in PASSING:
+            raise
         return None
 
 
