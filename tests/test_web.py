@@ -348,14 +348,10 @@ def test_the_pages_end_with_a_service_that_is_killed(folder: Path) -> None:
     pytest.fail("the pages outlive their service")
 
 
-@pytest.mark.parametrize(
-    ("limits", "what"),
-    [(Limits(1.0, 3000.0), "1 s of processor time"), (Limits(60.0, 300.0), "300 MB of memory")],
-)
-def test_work_beyond_its_limits_ends(tmp_path: Path, limits: Limits, what: str) -> None:
+def test_work_that_takes_too_long_is_ended(tmp_path: Path) -> None:
     study = {"loop": {"example": "reference-rig"}, "files": [], "columns": None, "out": str(tmp_path)}
-    with pytest.raises(RecordingError, match=what):
-        asyncio.run(carry_out("design", study, tmp_path, limits, lambda _: None))
+    with pytest.raises(RecordingError, match="more than 1 s of processor time"):
+        asyncio.run(carry_out("design", study, tmp_path, Limits(1.0, 3000.0), lambda _: None))
 
 
 def test_a_reader_that_is_late_hears_the_newest_state_and_no_backlog(tmp_path: Path) -> None:
