@@ -90,16 +90,15 @@ async function start() {
   addEventListener("pagehide", (event) => event.persisted || left.abort());
   addEventListener("pageshow", (event) => event.persisted && location.reload());
   try {
-    const session = await api.session();
+    const [title, load] = PAGES[name] ?? ["No such page", () => import("./missing.js")];
+    entitle(title);
+    const [session, page] = await Promise.all([api.session(), load()]);
     introduce(session);
     if (session.login_required && !session.user && name !== "login") return logIn();
     addEventListener("streamclosed", async () => {
       const again = await api.session().catch(() => session); // no answer: not a matter of who is asking
       if (!again.user) logIn();
     });
-    const [title, load] = PAGES[name] ?? ["No such page", () => import("./missing.js")];
-    entitle(title);
-    const page = await load();
     await page.show(main, { session, entitle, linked, signal: left.signal, part: rest.join("/"), values: new URLSearchParams(location.search) });
   } catch (error) {
     if (left.signal.aborted) return;
