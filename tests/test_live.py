@@ -160,6 +160,14 @@ class TestJudging:
     def test_one_that_is_confirmed_is_looked_at_once(self) -> None:
         assert self.course([False] * 5 + [True] * 50, "fault") == [5]
 
+    def test_the_beginning_of_a_fault_stays_what_it_was_first_seen_to_be(self) -> None:
+        first, _ = judge(Judged(due=0.0), self.settings, 10.0, True, lambda: Examined("fault", "x", onset=8.0))
+        later, _ = judge(
+            replace(first, due=20.0), self.settings, 20.0, True, lambda: Examined("fault", "x", onset=15.0)
+        )
+        over, _ = judge(replace(later, due=30.0), self.settings, 30.0, False, lambda: Examined("healthy", "fine"))
+        assert (first.onset, later.onset, over.onset) == (8.0, 8.0, None)
+
     def test_quiet_assets_are_looked_at_now_and_then(self) -> None:
         state, found = judge(Judged(due=50.0), self.settings, 51.0, False, lambda: Examined("healthy", "fine"))
         assert found is not None and (state.verdict, state.since, state.due) == ("healthy", 51.0, 200.0)

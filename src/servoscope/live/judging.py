@@ -105,7 +105,8 @@ def judge(
     else:
         wait = min(FIRST_DOUBT_S * 2.0**state.doubts, settings.every_s)
         state = replace(state, doubts=min(state.doubts + 1, 30), retry=t + wait)
-    since = state.since if found.verdict == state.verdict else t
+    same = found.verdict == state.verdict
+    since = state.since if same else t
     every = settings.every_s
     # the asset's own next turn, half a period away at least
     due = every * (math.floor((t + every / 2.0) / every - phase) + 1.0 + phase)
@@ -118,7 +119,8 @@ def judge(
             verdict=found.verdict,
             summary=found.summary,
             since=since,
-            onset=found.onset,
+            # a window that is above its limits throughout says nothing of the beginning, which an earlier one has seen
+            onset=state.onset if same and state.onset is not None else found.onset,
             examined=t,
         ),
         found,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Annotated, Any
+from typing import Annotated
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Query
@@ -14,7 +14,7 @@ from servoscope.store.history import coarse, history
 from servoscope.web import telling
 from servoscope.web.baselines import id_of_asset
 from servoscope.web.context import Context, In, Plain, Viewer
-from servoscope.web.hub import of_assets, of_services
+from servoscope.web.hub import of_assets, of_services, sizes_of
 from servoscope.web.models import (
     AssetDetail,
     Fleet,
@@ -31,7 +31,6 @@ from servoscope.web.signals import last_signals
 router = APIRouter(tags=["assets"])
 
 DAY_S = 86400.0
-LOOKED_AT = 10  # newest diagnoses among which one with sizes is looked for
 
 
 def known(context: Context, asset: str) -> Row:
@@ -51,39 +50,22 @@ def known(context: Context, asset: str) -> Row:
 def detail(context: Context, asset: str, row: Row) -> Plain:
     """Return all that is known of an asset now."""
     query = sa.select(tables.diagnoses).where(tables.diagnoses.c.asset == asset)
-    newest = context.store.rows(query.order_by(tables.diagnoses.c.t.desc()).limit(LOOKED_AT))
+    newest = context.store.rows(query.order_by(tables.diagnoses.c.t.desc()).limit(1))
+    found = sizes_of(context.store, {asset: row})
     return {
-        **telling.detail_of(asset, row["at"], row["status"]),
+        **telling.detail_of(asset, row["at"], row["status"], found.get(asset, ())),
         "baseline": id_of_asset(context, asset),
         "diagnosis": telling.diagnosis_row(newest[0]) if newest else None,
-        "sizes": _sizes(row["status"], newest),
     }
-
-
-def _sizes(said: Row, newest: list[Row]) -> list[Plain]:
-    """Return the sizes of the faults that the newest diagnosis names, as long as there is a fault."""
-    words = said.get("about", {}).get("faults", {})
-    found: list[dict[str, Any]] = []
-    if said["verdict"] == "fault":
-        found = next((row["document"]["faults"] for row in newest if row["document"].get("faults")), [])
-    return [
-        {
-            "name": fault["name"],
-            "words": words.get(fault["name"], fault["name"]),
-            "parameter": fault["parameter"],
-            "ratio": fault["ratio"],
-            "low": fault["interval"][0],
-            "high": fault["interval"][1],
-        }
-        for fault in found
-    ]
 
 
 @router.get("/assets", response_model=Fleet)
 def fleet(context: In, _: Viewer, query: Annotated[OfFleet, Query()]) -> Plain:
     """List the assets, the most urgent first."""
     statuses = context.store.statuses()
-    rows = [telling.asset_row(name, row["at"], row["status"]) for name, row in of_assets(statuses).items()]
+    followed = of_assets(statuses)
+    sizes = sizes_of(context.store, followed)
+    rows = [telling.asset_row(name, row["at"], row["status"], sizes.get(name, ())) for name, row in followed.items()]
     groups = sorted({row["group"] for row in rows if row["group"]})
     rows = [
         row

@@ -21,7 +21,7 @@ from servoscope.errors import StoreError
 from servoscope.store import Row, Store, tables
 from servoscope.web import telling
 
-__all__ = ["Hub", "Note", "event"]
+__all__ = ["Hub", "Note", "event", "of_assets", "of_services", "sizes_of"]
 
 EVERY_S = 0.5
 NOTES = 2000  # that a reader may be behind
@@ -54,6 +54,7 @@ class Hub:
     rows: dict[str, Row] = field(default_factory=dict)  # newest checkpoint's status by asset
     notes: deque[Note] = field(default_factory=lambda: deque(maxlen=NOTES))
     noted: int = 0
+    sizes: dict[str, list[dict[str, Any]]] = field(default_factory=dict)  # of named faults
     _ticks: dict[str, int] = field(default_factory=dict)  # when each asset was last news
     _texts: dict[int, bytes] = field(default_factory=dict)  # the newest tick's event by what the reader last heard
     _news: asyncio.Event = field(default_factory=asyncio.Event)
@@ -114,7 +115,10 @@ class Hub:
             names = [name for name, when in self._ticks.items() if when > tick]
             said = {name: self.rows[name] for name in names}
             now = time.time()
-            assets = [telling.asset_row(name, row["at"], row["status"]) for name, row in of_assets(said).items()]
+            assets = [
+                telling.asset_row(name, row["at"], row["status"], self.sizes.get(name, ()))
+                for name, row in of_assets(said).items()
+            ]
             text = event("assets", {"now": now, "assets": telling.worst_first(assets)}) if assets or tick < 0 else b""
             if services := [telling.service_row(name, row["status"]) for name, row in of_services(said).items()]:
                 text += event("services", {"now": now, "services": services})
@@ -134,7 +138,16 @@ class Hub:
             for name, row in changed.items()
             if name in names and not (row["status"].get("service") and self._same(name, row))
         }
+        news = {name: row for name, row in of_assets(changed).items() if self._is_news(name, row)}
+        found = sizes_of(self.store, news)
+        self.sizes.update({name: found.get(name, []) for name in news})
         return changed, self._happened(changed) if self.tick else []
+
+    def _is_news(self, name: str, row: Row) -> bool:
+        """Tell whether a fault may have begun, ended, or been named."""
+        before = self.rows.get(name)
+        keys = ("verdict", "since", "awaited")
+        return before is None or any(before["status"].get(key) != row["status"].get(key) for key in keys)
 
     def _same(self, name: str, row: Row) -> bool:
         return name in self.rows and self.rows[name]["status"] == row["status"]
@@ -170,6 +183,22 @@ def _count(row: Row) -> int:
     """Return the number of an asset's, or a service's, last row."""
     counted = row["status"].get("counted")
     return int(counted["rows"] if counted else row["sequence"])
+
+
+def sizes_of(store: Store, rows: Mapping[str, Row]) -> dict[str, list[dict[str, Any]]]:
+    """Return sizes of faults by asset, of those that have a fault which a full diagnosis has named since it began."""
+    faulty = {name: row["status"] for name, row in rows.items() if row["status"]["verdict"] == "fault"}
+    found: dict[str, list[dict[str, Any]]] = {}
+    if not faulty:
+        return found
+    table = tables.diagnoses
+    wanted = table.c.asset.in_(faulty) & (table.c.t >= min(said["since"] for said in faulty.values()))
+    query = sa.select(table.c.asset, table.c.t, table.c.document).where(wanted & (table.c.verdict == "fault"))
+    for row in store.rows(query.order_by(table.c.t)):
+        said = faulty[row["asset"]]
+        if row["t"] >= said["since"] and row["document"].get("faults"):
+            found[row["asset"]] = telling.sizes(said, row["document"])
+    return found
 
 
 def of_assets(rows: Mapping[str, Row]) -> dict[str, Row]:

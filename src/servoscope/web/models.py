@@ -125,6 +125,17 @@ class Alarms(Said):
     flood: Flood | None
 
 
+class Size(Said):
+    """A fault's size: a parameter as a multiple of its healthy value, with its 95 % interval."""
+
+    name: str
+    words: str
+    parameter: str
+    ratio: float
+    low: float
+    high: float
+
+
 class AssetRow(Said):
     """An asset as the fleet shows it."""
 
@@ -142,6 +153,7 @@ class AssetRow(Said):
     level: float | None
     deviation: float | None
     alarms: list[Alarm]
+    sizes: list[Size]
     t: float
     at: float
     severity: float
@@ -187,17 +199,6 @@ class ParameterNow(Said):
     unit: str
 
 
-class Size(Said):
-    """A fault's size: a parameter as a multiple of its healthy value, with its 95 % interval."""
-
-    name: str
-    words: str
-    parameter: str
-    ratio: float
-    low: float
-    high: float
-
-
 class DiagnosisRow(Said):
     """A diagnosis in a line."""
 
@@ -223,7 +224,6 @@ class AssetDetail(AssetRow):
     baseline: str | None
     awaited: list[int]
     diagnosis: DiagnosisRow | None
-    sizes: list[Size]
     window_s: float | None
 
 

@@ -9,7 +9,17 @@ from typing import Any, get_args
 from servoscope.alarms import COMMANDS, PRIORITIES, TABLE, Ne107, State
 from servoscope.ifrf import CHI2_95
 
-__all__ = ["alarm", "asset_row", "detail_of", "diagnosis_row", "live_id", "service_row", "transition", "worst_first"]
+__all__ = [
+    "alarm",
+    "asset_row",
+    "detail_of",
+    "diagnosis_row",
+    "live_id",
+    "service_row",
+    "sizes",
+    "transition",
+    "worst_first",
+]
 
 Plain = dict[str, Any]
 TWO_SIDED = 1.959963984540054  # standard deviations that hold 95 %
@@ -38,8 +48,8 @@ def alarms(asset: str, said: Mapping[str, Any]) -> list[Plain]:
     return [alarm(asset, name, one) for name, one in found if one["state"] != State.NORMAL]
 
 
-def asset_row(name: str, at: float, said: Mapping[str, Any]) -> Plain:
-    """Return an asset as the fleet shows it."""
+def asset_row(name: str, at: float, said: Mapping[str, Any], found_sizes: Sequence[Plain] = ()) -> Plain:
+    """Return an asset as the fleet shows it; with the sizes of its faults, where a full diagnosis has named them."""
     standing = alarms(name, said)
     found = {
         "asset": name,
@@ -51,10 +61,27 @@ def asset_row(name: str, at: float, said: Mapping[str, Any]) -> Plain:
         "level": said.get("level"),
         "deviation": deviation(said.get("residual", ())),
         "alarms": standing,
+        "sizes": list(found_sizes),
         "t": said["counted"]["t"],
         "at": at,
     }
     return {**found, "severity": _severity(found)}
+
+
+def sizes(said: Mapping[str, Any], document: Mapping[str, Any]) -> list[Plain]:
+    """Return the sizes of the faults that a diagnosis of an asset names, in the words of its status."""
+    words = said.get("about", {}).get("faults", {})
+    return [
+        {
+            "name": fault["name"],
+            "words": words.get(fault["name"], fault["name"]),
+            "parameter": fault["parameter"],
+            "ratio": fault["ratio"],
+            "low": fault["interval"][0],
+            "high": fault["interval"][1],
+        }
+        for fault in document.get("faults", ())
+    ]
 
 
 def deviation(residual: Iterable[Sequence[float | None]]) -> float | None:
@@ -87,12 +114,12 @@ def service_row(name: str, said: Mapping[str, Any]) -> Plain:
     return {"service": name, "flood": said["flood"], "alarms": alarms(name, said)}
 
 
-def detail_of(name: str, at: float, said: Mapping[str, Any]) -> Plain:
+def detail_of(name: str, at: float, said: Mapping[str, Any], found_sizes: Sequence[Plain]) -> Plain:
     """Return an asset with all that its status says."""
     about = said.get("about", {})
     units = about.get("coefficient_units", ())
     return {
-        **asset_row(name, at, said),
+        **asset_row(name, at, said, found_sizes),
         "exceeded": said.get("exceeded"),
         "responses": [_response(*row) for row in said.get("responses", ())],
         "parameters": [
