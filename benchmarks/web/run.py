@@ -1,9 +1,10 @@
 """Let many pages look at many assets, and write the table of docs/how-to/dashboard.md.
 
-    python benchmarks/web/run.py [--assets 500] [--pages 20] [--seconds 60] [--hour 3600] [--render]
+    python benchmarks/web/run.py [--assets 500] [--pages 4] [--readers 16] [--seconds 60] [--hour 3600] [--render]
 
-The server has one core to itself, all pages share the others. Reduced runs are marked as such. --render writes the
-table from the results that are there; alone, it measures nothing.
+The server has one core to itself; pages in a real browser, readers of the same events without one, and what moves the
+assets share the others. Reduced runs are marked as such. --render writes the table from the results that are there;
+alone, it measures nothing.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ RESULTS = BENCHMARKS / "web" / "results.json"
 PAGE = BENCHMARKS.parent / "docs" / "how-to" / "dashboard.md"
 SOURCES = str(BENCHMARKS.parent / "src")
 RATE = 2.0  # Hz: of the statuses in the store
-FULL = {"assets": 500, "pages": 20, "seconds": 60.0, "hour": 3600.0}
+FULL = {"assets": 500, "pages": 4, "readers": 16, "seconds": 60.0, "hour": 3600.0}
+SETTLED = 0.2  # of the hour: by then all that a page keeps a bounded number of is full
 SPEEDUP = 20.0  # of the hour: the server looks and tells so many times as often
 OF_THE_HOUR = 100  # assets in it, so that one core carries the speed
 VIEWS = 7
@@ -56,7 +58,16 @@ EventSource.prototype.addEventListener = function (kind, told) {
 SERVE = "import sys, servoscope.web.hub as hub; hub.EVERY_S /= {speed}; from servoscope.cli import main; main()"
 
 
-def load(folder: Path, browser: Browser, assets: int, pages: int, seconds: float) -> dict[str, Any]:
+READ = """
+import sys, threading, urllib.request
+def read():
+    with urllib.request.urlopen(sys.argv[1]) as told:
+        while told.read1(1 << 20): pass
+for _ in range(int(sys.argv[2])): threading.Thread(target=read).start()
+"""
+
+
+def load(folder: Path, browser: Browser, assets: int, pages: int, readers: int, seconds: float) -> dict[str, Any]:
     """Open pages on a moving fleet: how old is what they show, and what does the server need for it."""
     with moving(folder, assets, RATE, seconds + 120.0), serving(folder, 1.0) as (server, base):
         views = [first_view(browser, base, assets) for _ in range(VIEWS)]
@@ -64,14 +75,16 @@ def load(folder: Path, browser: Browser, assets: int, pages: int, seconds: float
         for i, page in enumerate(opened):  # one in four looks at an asset
             page.goto(base + ("/assets/axis-000" if i % 4 == 3 else "/"))
             page.locator("html[data-told]").wait_for(state="attached")
-        before, begun = processor(server.pid), time.monotonic()
         ages: list[list[float]] = [[] for _ in opened]
-        while time.monotonic() < begun + seconds:
-            for page, of in zip(opened, ages, strict=True):
-                of.append(float(page.evaluate(AGE)))
-            time.sleep(0.2)
-        share = (processor(server.pid) - before) / (time.monotonic() - begun)
-        memory = resident(server.pid)
+        with child([sys.executable, "-c", READ, f"{base}/api/v1/live", str(readers)], cores=others()):
+            time.sleep(2.0)
+            before, begun = processor(server.pid), time.monotonic()
+            while time.monotonic() < begun + seconds:
+                for page, of in zip(opened, ages, strict=True):
+                    of.append(float(page.evaluate(AGE)))
+                time.sleep(0.2)
+            share = (processor(server.pid) - before) / (time.monotonic() - begun)
+            memory = resident(server.pid)
         for page in opened:
             page.context.close()
     half = [len(of) // 2 for of in ages]
@@ -90,7 +103,7 @@ def load(folder: Path, browser: Browser, assets: int, pages: int, seconds: float
 
 
 def hour(folder: Path, browser: Browser, hour_s: float) -> dict[str, Any]:
-    """Leave two pages open while an hour of updates passes: what they hold after its first tenth, and at the end."""
+    """Leave two pages open while an hour of updates passes: what they hold after a fifth of it, and at the end."""
     found: dict[str, Any] = {}
     wall = hour_s / SPEEDUP
     with moving(folder, OF_THE_HOUR, RATE * SPEEDUP, wall + 60.0), serving(folder, SPEEDUP) as (_, base):
@@ -100,9 +113,9 @@ def hour(folder: Path, browser: Browser, hour_s: float) -> dict[str, Any]:
             page.add_init_script(COUNT)
             page.goto(base + ("/" if name == "fleet" else "/assets/axis-000"))
             page.locator("html[data-told]").wait_for(state="attached")
-        time.sleep(wall / 10.0)
+        time.sleep(SETTLED * wall)
         early = {name: held(page) for name, page in pages.items()}
-        time.sleep(0.9 * wall)
+        time.sleep((1.0 - SETTLED) * wall)
         late = {name: held(page) for name, page in pages.items()}
         for name, page in pages.items():
             found[name] = {"early": early[name], "late": late[name], "updates": page.evaluate("window.heard")}
@@ -201,7 +214,10 @@ def markdown(found: dict[str, Any]) -> str:
     busy = f" **The machine was busy (load {found['busy']}): to be repeated.**" if found["busy"] >= BUSY else ""
     rows = [
         ("assets, each moving twice a second", f"{settings['assets']}"),
-        ("pages open, one in four on an asset, the others on the fleet", f"{settings['pages']}"),
+        (
+            "pages open in a browser, one in four on an asset; readers of the same events",
+            f"{settings['pages']}; {settings['readers']}",
+        ),
         (
             "first view of the fleet, empty cache: median, worst",
             f"{loaded['first_view_s']} s, {loaded['first_view_worst_s']} s",
@@ -216,7 +232,7 @@ def markdown(found: dict[str, Any]) -> str:
     for name, one in left.items():
         early, late = one["early"], one["late"]
         words = f"{early['mb']} MB, {early['nodes']} nodes; {late['mb']} MB, {late['nodes']} nodes"
-        rows.append((f"{name} page after a tenth of an hour's updates; after all {one['updates']}", words))
+        rows.append((f"{name} page after a fifth of an hour's updates; after all {one['updates']}", words))
     table = "\n".join(f"| {what} | {value} |" for what, value in rows)
     return f"{found['machine']}.{reduced}{busy}\n\n| | |\n|---|---|\n{table}"
 
@@ -249,7 +265,7 @@ def main() -> None:
             os.sched_setaffinity(0, others())  # the browser too, which is started now
             browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
             os.sched_setaffinity(0, others() | server_core)
-            load_ = load(Path(name), browser, given.assets, given.pages, given.seconds)
+            load_ = load(Path(name), browser, given.assets, given.pages, given.readers, given.seconds)
             hour_ = hour(Path(name), browser, given.hour)
             browser.close()
         found = {"machine": machine(), "busy": busy, "settings": settings, "load": load_, "hour": hour_}

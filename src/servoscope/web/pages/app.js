@@ -65,12 +65,12 @@ function introduce(session) {
   if (!session.login_required) {
     person.replaceChildren(h("span", { title: "Only this machine reaches the pages, and it may do everything" }, "no login: this machine only"));
   } else if (session.user) {
-    const out = h("button", { type: "button", class: "quiet", onclick: async () => (await api.logout(), log_in()) }, "Log out");
+    const out = h("button", { type: "button", class: "quiet", onclick: async () => (await api.logout(), logIn()) }, "Log out");
     person.replaceChildren(h("span", {}, `${session.user}, ${session.role}`), out);
   }
 }
 
-function log_in() {
+function logIn() {
   location.assign(`/login?next=${encodeURIComponent(location.pathname + location.search)}`);
 }
 
@@ -90,17 +90,19 @@ async function start() {
   addEventListener("pagehide", (event) => event.persisted || left.abort());
   addEventListener("pageshow", (event) => event.persisted && location.reload());
   try {
-    const session = await api.session();
-    introduce(session);
-    if (session.login_required && !session.user && name !== "login") return log_in();
-    addEventListener("streamclosed", async () => (await api.session()).user ?? log_in());
     const [title, load] = PAGES[name] ?? ["No such page", () => import("./missing.js")];
     entitle(title);
-    const page = await load();
+    const [session, page] = await Promise.all([api.session(), load()]);
+    introduce(session);
+    if (session.login_required && !session.user && name !== "login") return logIn();
+    addEventListener("streamclosed", async () => {
+      const again = await api.session().catch(() => session); // no answer: not a matter of who is asking
+      if (!again.user) logIn();
+    });
     await page.show(main, { session, entitle, linked, signal: left.signal, part: rest.join("/"), values: new URLSearchParams(location.search) });
   } catch (error) {
     if (left.signal.aborted) return;
-    if (error.status === 401) return log_in();
+    if (error.status === 401) return logIn();
     if (!(error instanceof api.Problem)) console.error(error);
     main.append(complaint(error));
   }

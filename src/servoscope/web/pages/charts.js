@@ -33,7 +33,7 @@ export function plot(element, label, describe, signal) {
   watcher.observe(element);
   element.setAttribute("role", "img");
   element.setAttribute("aria-label", label);
-  const one = { draw, chart };
+  const one = { draw, print: () => (now(), chart.getZr().flush()) };
   plots.add(one);
   signal.addEventListener("abort", () => {
     cancelAnimationFrame(wanted);
@@ -50,7 +50,19 @@ export function redraw() {
 }
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 addEventListener("themechange", redraw);
-addEventListener("beforeprint", redraw);
+
+// Paper is light, and does not wait for the next frame.
+let chosen = null;
+addEventListener("beforeprint", () => {
+  chosen = document.documentElement.dataset.theme ?? null;
+  document.documentElement.dataset.theme = "light";
+  for (const one of plots) one.print();
+});
+addEventListener("afterprint", () => {
+  if (chosen) document.documentElement.dataset.theme = chosen;
+  else delete document.documentElement.dataset.theme;
+  redraw();
+});
 
 function base(c) {
   return {

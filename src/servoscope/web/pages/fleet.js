@@ -34,8 +34,8 @@ export async function show(main, { signal, linked, values }) {
     ),
     none,
   );
-  search.addEventListener("input", () => ((filter.search = search.value), sift()));
-  groups.addEventListener("change", () => ((filter.group = groups.value), sift()));
+  search.addEventListener("input", () => ((filter.search = search.value), chosen()));
+  groups.addEventListener("change", () => ((filter.group = groups.value), chosen()));
   search.addEventListener("keydown", (event) => event.key === "Enter" && [...assets.values()].find((one) => !one.line.element.hidden)?.line.name.click());
   map.addEventListener("keydown", walk);
 
@@ -46,7 +46,7 @@ export async function show(main, { signal, linked, values }) {
       const press = () => {
         filter.open = key === "open" && !filter.open;
         filter.verdict = key === "open" || filter.verdict === key ? "" : key;
-        sift();
+        chosen();
       };
       const button = h("button", { type: "button", onclick: press, class: `filter ${key}` }, key && key !== "open" && mark(key), words, amount);
       element.append(button);
@@ -64,24 +64,33 @@ export async function show(main, { signal, linked, values }) {
     for (const [key, , amount] of counts.made) tell(amount, String(found[key]));
   }
 
+  function wanted({ row }) {
+    if (filter.verdict && row.verdict !== filter.verdict) return false;
+    if (filter.group && row.group !== filter.group) return false;
+    if (filter.open && !row.alarms.some((alarm) => OPEN.includes(alarm.state))) return false;
+    const text = filter.search && `${row.asset} ${row.group} ${row.summary} ${row.alarms.map((alarm) => alarm.alarm).join(" ")}`;
+    return !filter.search || text.toLowerCase().includes(filter.search.trim().toLowerCase());
+  }
+
+  function showIfWanted(one) {
+    const shown = wanted(one);
+    if (one.line.element.hidden !== shown) return shown;
+    one.tile.classList.toggle("off", !shown);
+    one.line.element.hidden = !shown;
+    return shown;
+  }
+
   function sift() {
-    const wanted = filter.search.trim().toLowerCase();
-    for (const [name, { row, tile, line }] of assets) {
-      const text = `${name} ${row.group} ${row.summary} ${row.alarms.map((alarm) => alarm.alarm).join(" ")}`.toLowerCase();
-      const shown =
-        (!filter.verdict || row.verdict === filter.verdict) &&
-        (!filter.open || row.alarms.some((alarm) => OPEN.includes(alarm.state))) &&
-        (!filter.group || row.group === filter.group) &&
-        text.includes(wanted);
-      tile.classList.toggle("off", !shown);
-      line.element.hidden = !shown;
-    }
-    for (const [key, button] of counts.made) set(button, "aria-pressed", String(key === "open" ? filter.open : !filter.open && filter.verdict === key));
-    const any = [...assets.values()].some(({ line }) => !line.element.hidden);
-    none.hidden = any;
+    const shown = [...assets.values()].filter(showIfWanted);
+    none.hidden = shown.length > 0;
     tell(none, assets.size ? "No asset is like this." : "No assets yet: `servoscope run` follows them, and writes what it finds to this store.");
+  }
+
+  function chosen() {
+    for (const [key, button] of counts.made) set(button, "aria-pressed", String(key === "open" ? filter.open : !filter.open && filter.verdict === key));
     const told = new URLSearchParams(Object.entries({ verdict: filter.verdict, search: filter.search, group: filter.group }).filter(([, value]) => value));
     history.replaceState(null, "", told.size ? `/?${told}` : "/");
+    sift();
   }
 
   // Rows are put where they belong, but not under somebody's hands.
@@ -147,8 +156,7 @@ export async function show(main, { signal, linked, values }) {
   const first = await get("/assets", signal);
   now = first.now;
   take(first.assets);
-  recount();
-  sift();
+  chosen();
   follow(
     "",
     ["assets"],
