@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import json
 import os
 import sqlite3
 import time
@@ -119,7 +120,10 @@ def guarded(url: URL) -> Iterator[None]:
         said = " ".join(str(error.orig).split())
         if _passes(error):
             raise StoreUnavailable(f"{shown(url)}: {said}") from error
-        raise StoreError(f"{shown(url)}: {said}") from error
+        torn = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_CORRUPT
+        raise StoreError(f"{shown(url)}: {said}{', restore it from a copy' if torn else ''}") from error
+    except json.JSONDecodeError as error:
+        raise StoreError(f"{shown(url)}: a document in it is torn ({error}), restore it from a copy") from None
     except exc.SQLAlchemyError as error:  # for example a pool that waited in vain
         raise StoreUnavailable(f"{shown(url)}: {' '.join(str(error).split())}") from error
 
