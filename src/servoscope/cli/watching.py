@@ -16,6 +16,7 @@ from servoscope.store.history import dated
 
 __all__ = ["alarm_rows", "page", "rows"]
 
+OLD_S = 60.0
 WIDE = 110  # columns of a terminal, and 9 for each frequency
 
 NE107 = {
@@ -88,9 +89,15 @@ def faults(statuses: Mapping[str, Mapping[str, Any]], diagnoses: Mapping[str, Ma
     return lines
 
 
+def silence(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line if what is shown is old: a table that stands still looks like machines that are well."""
+    age = time.time() - max((row["at"] for row in statuses.values()), default=time.time())
+    return [f"Nothing was stored for {span(round(age))}: does servoscope run still run?"] if age > OLD_S else []
+
+
 def page(statuses: Mapping[str, Mapping[str, Any]], diagnoses: Mapping[str, Mapping[str, Any]], width: int) -> Group:
     """Return all of it."""
-    return Group(assets(statuses, width), *faults(statuses, diagnoses), *services(statuses))
+    return Group(assets(statuses, width), *faults(statuses, diagnoses), *services(statuses), *silence(statuses))
 
 
 def standing(alarms: Mapping[str, Mapping[str, Any]]) -> str:

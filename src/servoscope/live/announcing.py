@@ -50,6 +50,10 @@ class Announcer:
         self._own: dict[str, AlarmState] = {}
         self._tolerance: dict[str, ToleranceState] = {}
 
+    def begin(self, rows: int) -> None:
+        """Begin with a new state behind so many rows."""
+        self._rows = rows
+
     def resume(self, state: bytes) -> None:
         """Go on from what `checkpoint` made.
 
@@ -58,12 +62,13 @@ class Announcer:
         StateError
             If it is of another version, or not whole.
         """
+        again = f"run --anew {self.name} begins with a new one, without floods and changes that are under way"
         digest, text = state[:32], state[32:]
         if hashlib.sha256(text).digest() != digest:
-            raise StateError(f"{self.name}: its saved state is torn: restore the store from a copy")
+            raise StateError(f"{self.name}: its saved state is torn: restore the store from a copy, or {again}")
         plain = json.loads(text)
         if plain["version"] != VERSION:
-            raise StateError(f"{self.name}: its saved state is of another version, use the one that wrote it")
+            raise StateError(f"{self.name}: its saved state is of another version: use that one, or {again}")
         self._rows, self._flood = plain["rows"], FloodState.from_dict(plain["flood"])
         self._own = {name: AlarmState.from_dict(one) for name, one in plain["own"].items()}
         self._tolerance = {name: ToleranceState.from_dict(one) for name, one in plain["tolerance"].items()}

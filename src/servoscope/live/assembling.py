@@ -30,13 +30,17 @@ __all__ = ["Assembly", "assemble", "rehearse"]
 
 @dataclass(frozen=True)
 class Assembly:
-    """What a service is made of; sources are open, and go on behind what was counted."""
+    """What a service is made of; sources are open, and go on behind what was counted.
+
+    `anew` are those that begin with a new state.
+    """
 
     assets: dict[str, Asset]
     announcer: Announcer
     sources: dict[str, Source]
     outlets: dict[str, Outlet]
     store: Store
+    anew: tuple[str, ...] = ()
 
 
 def assemble(config: Config, anew: Collection[str] = ()) -> Assembly:
@@ -47,15 +51,16 @@ def assemble(config: Config, anew: Collection[str] = ()) -> Assembly:
     config
         The service file.
     anew
-        Assets that begin with a new state, behind the samples that were counted.
+        Assets that begin with a new state, behind the samples that were counted; the service's name for its own.
 
     Raises
     ------
     ServoscopeError
         If a baseline, a recording, the store or a saved state cannot be used; nothing is left open.
     """
-    if strange := set(anew) - set(config.assets):
-        raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(config.assets)}")
+    known = [*config.assets, config.name]
+    if strange := set(anew) - set(known):
+        raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(known)}")
     assets = _assets(config)
     check(config, assets)
     sources, outlets = _sources(config, assets), _outlets(config)
@@ -64,7 +69,9 @@ def assemble(config: Config, anew: Collection[str] = ()) -> Assembly:
         store.claim([config.name, *assets])
         rows = store.checkpoints([config.name, *assets])
         announcer = Announcer(config.name, config.alarms, config.actions)
-        if config.name in rows:
+        if config.name in anew and config.name in rows:
+            announcer.begin(rows[config.name]["sequence"])
+        elif config.name in rows:
             announcer.resume(rows[config.name]["state"])
         for name, asset in assets.items():
             if name in anew and name in rows:
@@ -80,7 +87,7 @@ def assemble(config: Config, anew: Collection[str] = ()) -> Assembly:
     except BaseException:
         store.close()
         raise
-    return Assembly(assets, announcer, sources, outlets, store)
+    return Assembly(assets, announcer, sources, outlets, store, tuple(name for name in known if name in anew))
 
 
 def rehearse(config: Config) -> None:

@@ -44,7 +44,7 @@ class Service:
     def __init__(self, config: Config, assembly: Assembly) -> None:
         self.config, self.sources, self.store = config, assembly.sources, assembly.store
         self._outlets = assembly.outlets
-        self.assets, self.announcer = assembly.assets, assembly.announcer
+        self.assets, self.announcer, self._anew = assembly.assets, assembly.announcer, assembly.anew
         self.writer = Writer(self.store, config.name, config.service.buffer)
         self.metrics = Metrics(self)
         self.courier = Courier(self.store, config.name, config.actions.beside(config.folder))
@@ -81,6 +81,10 @@ class Service:
         words = {"version": __version__, "assets": len(self.assets), "store": self.store.name}
         log("info", "started", service=self.config.name, **words)
         self._audit("started", words)
+        for name in self._anew:  # written at once: a torn state must not be met again if no block comes
+            self.writer.add(name, [Row("audit", {"who": "servoscope", "what": "began anew", "document": {}})])
+            if name in self.assets:
+                self.writer.stands(self.assets[name])
         self.courier.start()
         try:
             while not self._stopping and not self._ended():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import json
 import os
 import sqlite3
 import time
@@ -30,6 +31,12 @@ PASSING = {  # what SQLite says when trying again may help
     sqlite3.SQLITE_READONLY,
     sqlite3.SQLITE_NOMEM,
     sqlite3.SQLITE_PROTOCOL,
+}
+HINTS = {  # what to do, where SQLite does not say it
+    sqlite3.SQLITE_CORRUPT: ", restore it from a copy",
+    sqlite3.SQLITE_NOTADB: ", give another path",
+    sqlite3.SQLITE_CANTOPEN: ", its folder must be one that servoscope may write to",
+    sqlite3.SQLITE_READONLY: ", file and folder must be ones that servoscope may write to",
 }
 LINGERS = 2.0  # s: the longest that the lock of a killed process is waited for
 
@@ -116,10 +123,12 @@ def guarded(url: URL) -> Iterator[None]:
     try:
         yield
     except exc.DBAPIError as error:
-        said = " ".join(str(error.orig).split())
+        said = " ".join(str(error.orig).split()) + HINTS.get(getattr(error.orig, "sqlite_errorcode", 0) & 0xFF, "")
         if _passes(error):
             raise StoreUnavailable(f"{shown(url)}: {said}") from error
         raise StoreError(f"{shown(url)}: {said}") from error
+    except json.JSONDecodeError as error:
+        raise StoreError(f"{shown(url)}: a document in it is torn ({error}), restore it from a copy") from None
     except exc.SQLAlchemyError as error:  # for example a pool that waited in vain
         raise StoreUnavailable(f"{shown(url)}: {' '.join(str(error).split())}") from error
 
@@ -182,7 +191,9 @@ class Claim:
             ) from None
         except OSError as error:
             self.drop()
-            raise StoreError(f"{path}: cannot be written ({error.strerror}), the store's folder must exist") from None
+            raise StoreError(
+                f"{path}: cannot be written ({error.strerror}), its folder must be one that servoscope may write to"
+            ) from None
 
     def _held(self) -> bool:
         if self._connection is None:

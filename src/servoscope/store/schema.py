@@ -36,7 +36,7 @@ def prepare(connection: sa.Connection, name: str, *, write: bool) -> None:
     Raises
     ------
     StoreError
-        If the store is of a newer version, or holds tables that are none of ours.
+        If the store is of a newer version, lacks a table, or holds tables that are none of ours.
     """
     present = set(sa.inspect(connection).get_table_names())
     if meta.name not in present:
@@ -48,7 +48,9 @@ def prepare(connection: sa.Connection, name: str, *, write: bool) -> None:
         connection.execute(meta.insert(), [{"key": "schema", "value": version()}])
         return
     found = connection.execute(sa.select(meta.c.value).where(meta.c.key == "schema")).scalar()
-    if not isinstance(found, int) or found > version():
+    if not isinstance(found, int) or found < FIRST:
+        raise StoreError(f"{name}: does not say of which version its tables are, restore it from a copy")
+    if found > version():
         raise StoreError(
             f"{name}: its tables are of version {found}, this servoscope knows up to {version()}: install a newer one"
         )
@@ -58,3 +60,5 @@ def prepare(connection: sa.Connection, name: str, *, write: bool) -> None:
         for step in MIGRATIONS[found - FIRST :]:
             step(connection)
         connection.execute(meta.update().where(meta.c.key == "schema").values(value=version()))
+    elif missing := set(TABLES.tables) - present:
+        raise StoreError(f"{name}: its table {min(missing)} is missing, restore it from a copy")
