@@ -38,7 +38,7 @@ from reliability.servers import Cable, Mosquitto, mosquitto  # noqa: E402
 from servoscope.output import atomic_write  # noqa: E402
 
 LONGEST_S = 900.0  # until results are stored again
-AHEAD = 10  # blocks that the publisher keeps per asset
+AHEAD = 4  # blocks that the publisher keeps per asset
 START = "2026-01-01T00:00:00Z"
 PULLED_S = 3.0
 CABLES = ("cable of the publisher", "cable of the service", "cable of the server")
