@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import json
 import os
@@ -22,14 +21,9 @@ import halls
 from browsing import SOURCE, Served, events, finished, upload
 from halls import hall
 from servoscope import writers
-from servoscope.errors import RecordingError
 from servoscope.simulation import FaultEvent
-from servoscope.store import Batch, Store
+from servoscope.store import Store
 from servoscope.store.history import coarse
-from servoscope.web.guessing import mapping
-from servoscope.web.hub import Hub
-from servoscope.web.jobs import Limits, carry_out
-from servoscope.web.signals import chosen
 
 pytestmark = pytest.mark.xdist_group("web")  # one service for all of them, heard from its beginning on
 
@@ -88,7 +82,7 @@ def client(followed: Served) -> Iterator[httpx.Client]:
 
 def until(client: httpx.Client, path: str, **wanted: object) -> dict[str, object]:
     """Return an answer that has these values, as soon as there is one."""
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 180.0
     while time.monotonic() < deadline:
         said = client.get(path)
         if said.is_success and all(said.json()[key] == value for key, value in wanted.items()):
@@ -113,7 +107,7 @@ def test_live_updates_arrive_until_the_leak_is_told(server: Served, request: pyt
         request.getfixturevalue("followed")
         begun = time.monotonic()
         for kind, data in events(stream):
-            assert time.monotonic() - begun < 120.0, heard
+            assert time.monotonic() - begun < 300.0, heard
             heard.setdefault(kind, []).append(json.loads(data))
             if any(one["grounds"] == "full" for one in heard.get("diagnosis", [])):
                 break
@@ -346,65 +340,3 @@ def test_the_pages_end_with_a_service_that_is_killed(folder: Path) -> None:
                 return
             time.sleep(0.1)
     pytest.fail("the pages outlive their service")
-
-
-def test_work_that_takes_too_long_is_ended(tmp_path: Path) -> None:
-    study = {"loop": {"example": "reference-rig"}, "files": [], "columns": None, "out": str(tmp_path)}
-    with pytest.raises(RecordingError, match="more than 1 s of processor time"):
-        asyncio.run(carry_out("design", study, tmp_path, Limits(1.0, 3000.0), lambda _: None))
-
-
-def test_a_reader_that_is_late_hears_the_newest_state_and_no_backlog(tmp_path: Path) -> None:
-    store = Store.open("x.sqlite", tmp_path, write=True)
-    status = {"verdict": "healthy", "summary": "", "since": 0.0, "onset": None, "examined": None, "ne107": "good"}
-    status |= {"reasons": [], "quality": [], "alarms": {}}
-
-    async def look(hub: Hub, commit: int, *assets: str) -> None:
-        batch = Batch()
-        for asset in assets:
-            said = {**status, "counted": {"t": float(commit), "rows": 0}}
-            row = {"asset": asset, "sequence": commit, "state": b"", "status": said, "at": float(commit)}
-            batch.checkpoints[asset] = row
-        store.write(batch, "hall", commit)
-        await hub.look()
-
-    async def story() -> None:
-        hub = Hub(store)
-        await look(hub, 1, "press", "lift")
-        first = hub.tick
-        for commit in range(2, 50):
-            await look(hub, commit, "press")
-        (late,) = [json.loads(line[6:]) for line in hub.since(first).decode().splitlines() if line.startswith("data: ")]
-        assert [(row["asset"], row["t"]) for row in late["assets"]] == [("press", 49.0)]
-        assert hub.since(hub.tick) == b"" and len(hub.since(-1)) > 2 * len(hub.since(first)) * 0.8
-
-    asyncio.run(story())
-    store.close()
-
-
-def test_thinning_keeps_order_and_extremes() -> None:
-    rng = np.random.default_rng(1)
-    signals = rng.normal(size=10_000), np.where(rng.random(10_000) < 0.1, np.nan, rng.normal(size=10_000))
-    at = chosen(signals, 400)
-    assert np.all(np.diff(at) > 0) and at.size <= 402 and at[0] == 0 and at[-1] == 9999
-    for one in signals:
-        assert np.nanmax(one[at]) == np.nanmax(one) and np.nanmin(one[at]) == np.nanmin(one)
-    assert chosen(signals, 20_000).size == 10_000
-
-
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
-        (["t", "r", "u", "y"], ("t", "r", "u", "y")),
-        (
-            ["Time [ms]", "SetPoint", "MotorCurrent", "ActualPosition"],
-            ("Time [ms]", "SetPoint", "MotorCurrent", "ActualPosition"),
-        ),
-        (["time", "qg", "vir", "qm"], ("time", "qg", "vir", "qm")),
-        (["a", "b"], (None, None, None, None)),
-    ],
-)
-def test_columns_are_guessed_by_their_names(names: list[str], found: tuple[str | None, ...]) -> None:
-    said = mapping([{"name": name} for name in names])
-    assert tuple(said[key] for key in ("time", "reference", "input", "output")) == found
-    assert said["time_unit"] == ("ms" if "ms" in names[0] else "s")
