@@ -21,26 +21,31 @@ import numpy as np
 
 import halls
 from servoscope import writers
+from servoscope.learning import learn
+from servoscope.loop import Loop
 from servoscope.simulation import FaultEvent
 
 SOURCES = str(Path(__file__).parents[1] / "src")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SPEED = 4.0
 STANDS = 60  # recordings one after the other: long enough for all tests
+HEALTHY = ("healthy", "second", "third")
+
+
+def _well(asset: int) -> list[str]:
+    return [HEALTHY[(asset + i) % len(HEALTHY)] for i in range(STANDS)]
+
+
 # group -> asset -> what it replays
 HALL = {
     "Press line": {
         "press-1": ["leaky", *["leaking"] * STANDS],
-        "press-2": ["healthy"] * STANDS,
+        "press-2": _well(2),
         "press-3": ["healthy", *["stuck"] * STANDS],
-        **{f"press-{i}": ["healthy"] * STANDS for i in range(4, 9)},
+        **{f"press-{i}": _well(i) for i in range(4, 9)},
     },
-    "Test rigs": {
-        "rig-1": ["weak", *["weakened"] * STANDS],
-        "rig-2": ["healthy"] * STANDS,
-        "rig-3": ["healthy"] * STANDS,
-    },
-    "Lifts": {f"lift-{i}": ["healthy"] * STANDS for i in range(1, 10)},
+    "Test rigs": {"rig-1": ["weak", *["weakened"] * STANDS], "rig-2": _well(1), "rig-3": _well(2)},
+    "Lifts": {f"lift-{i}": _well(i) for i in range(1, 10)},
 }
 ASSETS = sum(map(len, HALL.values()))
 
@@ -52,7 +57,9 @@ def browser() -> str | None:
 
 def recordings(folder: Path) -> None:
     """Put what the hall replays into a folder: healthy, two faults that begin and that stand, a sensor that sticks."""
-    halls.files(folder)
+    learn(Loop.load(halls.LOOP), [halls.recorded(7, seconds=120.0)]).save(folder / "baseline.json")
+    for seed, name in enumerate(HEALTHY, start=1):
+        writers.write(folder / f"{name}.csv", halls.recorded(seed))
     for name, event in {
         "leaky": "C_ie=1.2@20",
         "leaking": "C_ie=1.2@0",
