@@ -20,7 +20,7 @@ from servoscope.live.config import DiagnosisSettings
 from servoscope.live.examining import Examined, Told, examine
 from servoscope.live.judging import Judged, Window, judge, phase_of
 from servoscope.live.rows import Outcome, Row, transition_row
-from servoscope.live.showing import status_of
+from servoscope.live.showing import status_of, summary_of
 from servoscope.live.thinning import gamma, thin
 from servoscope.monitor import Monitor
 
@@ -276,7 +276,7 @@ class Asset:
             quality=findings,
             statistic=peaks[0],
             level=peaks[1],
-            cause=judged.summary,
+            cause=summary_of(judged, findings),
         )
         alarms, transitions = advance(self._definitions, progress.alarms, seen, progress.counted.t if t is None else t)
         self.progress = replace(progress, alarms=alarms)

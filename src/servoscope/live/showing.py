@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
 from servoscope import quality
 from servoscope.alarms import AlarmDefinition, State, status
 from servoscope.live.checkpoint import Progress
+from servoscope.live.judging import Judged
 
-__all__ = ["status_of"]
+__all__ = ["status_of", "summary_of"]
+
+
+def summary_of(judged: Judged, findings: Iterable[str]) -> str:
+    """Return what is said of an asset: its last examination, unless data quality overrules that."""
+    if quality.judged(judged.verdict, findings) == judged.verdict:
+        return judged.summary
+    return f"Undetermined: {quality.told(findings)}."
 
 
 def status_of(progress: Progress, definitions: Mapping[str, AlarmDefinition]) -> dict[str, Any]:
@@ -28,7 +36,7 @@ def status_of(progress: Progress, definitions: Mapping[str, AlarmDefinition]) ->
     ne107 = status(verdict, findings, [(definitions[name], state) for name, state in progress.alarms.items()])
     return {
         "verdict": verdict,
-        "summary": judged.summary,
+        "summary": summary_of(judged, findings),
         "since": judged.since,
         "onset": judged.onset,
         "examined": judged.examined,
