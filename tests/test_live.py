@@ -254,7 +254,9 @@ class TestAsset:
         told = [one for quiet in range(1, 40) for one in followed.tick(float(quiet)).transitions]
         status = followed.status(followed.progress)
         assert status["verdict"] == "undetermined" and "silent" in status["quality"]
-        assert [one.alarm for one in told if one.after is State.UNACKNOWLEDGED] == ["data_quality"]
+        (alarm,) = [one for one in told if one.after is State.UNACKNOWLEDGED]
+        assert (alarm.alarm, alarm.cause) == ("data_quality", "no data come")
+        assert status["summary"] == "Undetermined: no data come."
         assert status["ne107"] == "failure"
 
     def test_a_fault_is_alarmed_and_then_diagnosed_in_full(self) -> None:

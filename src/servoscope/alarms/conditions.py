@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from servoscope import quality
 from servoscope.alarms.definitions import AlarmDefinition
 
-__all__ = ["Condition", "Snapshot", "condition"]
+__all__ = ["Condition", "Snapshot", "because", "condition"]
 
 Condition = Literal["normal", "abnormal", "unknown"]
 BLIND = ("waiting", "silent")  # findings that leave nothing to be seen of the others
@@ -68,3 +69,14 @@ def condition(definition: AlarmDefinition, abnormal: bool, seen: Snapshot) -> Co
     if value is None or math.isnan(value):
         return "unknown"
     return "abnormal" if value >= definition.limit - definition.hysteresis * abnormal else "normal"
+
+
+def because(definition: AlarmDefinition, seen: Snapshot) -> str:
+    """Return what a snapshot says to an alarm, for its transitions."""
+    if definition.source == "quality":
+        return quality.told(seen.quality)
+    if definition.source == "statistic" and seen.statistic is not None:
+        return f"T^2 is {seen.statistic:.3g} times its limit"
+    if definition.source == "level" and seen.level is not None:
+        return f"the sequential test is at {seen.level:.3g} times its limit"
+    return seen.cause

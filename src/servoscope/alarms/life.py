@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from servoscope.alarms.conditions import Snapshot, condition
+from servoscope.alarms.conditions import Snapshot, because, condition
 from servoscope.alarms.definitions import AlarmDefinition
 from servoscope.alarms.records import AlarmState, Command, Transition
 from servoscope.alarms.states import COMMANDS, LATCHED, Event, Found, State, after
@@ -115,7 +115,7 @@ class _Life:
         was = state.condition == "abnormal" or (state.condition == "unknown" and state.active)
         now = condition(definition, was, seen)
         since = state.condition_since if now == state.condition else time
-        self.state = replace(self.state, condition=now, condition_since=since, cause=seen.cause)
+        self.state = replace(self.state, condition=now, condition_since=since, cause=because(definition, seen))
 
     def obey(self, command: Command, time: float) -> None:
         """Do what is commanded, or refuse it."""

@@ -49,7 +49,7 @@ COLUMNS = {
     Kinds.alarms: ("t", "asset", "alarm", "after", "who", "cause"),
     Kinds.audit: ("at", "who", "asset", "what", "document"),
     Kinds.residuals: ("t", "asset", "statistic", "level"),
-    Kinds.deliveries: ("created", "sink", "asset", "alarm", "event", "attempts", "due", "outcome"),
+    Kinds.deliveries: ("created", "sink", "told", "attempts", "due", "outcome"),
 }
 
 

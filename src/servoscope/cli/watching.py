@@ -17,6 +17,7 @@ from servoscope.store.history import dated
 __all__ = ["alarm_rows", "page", "rows"]
 
 OLD_S = 60.0
+OUTCOME = 80  # characters that are shown of what a receiver said
 WIDE = 110  # columns of a terminal, and 9 for each frequency
 
 NE107 = {
@@ -133,12 +134,19 @@ def rows(found: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
     """Return a table of some columns of rows; times as dates."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in columns:
-        table.add_column(name.replace("_", " "), overflow="fold", no_wrap=name in ("t", "at", "created", "asset"))
+        table.add_column(
+            name.replace("_", " "), overflow="fold", no_wrap=name in ("t", "at", "created", "due", "asset")
+        )
     for row in found:
-        event = row.get("event")
-        told = {**event, **row, "event": event.get("event")} if isinstance(event, Mapping) else row  # of a delivery
-        table.add_row(*(_cell(name, told.get(name)) for name in columns))
+        table.add_row(*(_cell(name, _told(row) if name == "told" else row.get(name)) for name in columns))
     return table
+
+
+def _told(row: Mapping[str, Any]) -> str:
+    """Return what a delivery tells: asset, alarm and event, as far as it has them."""
+    event = row["event"]
+    words = (event.get("asset"), event.get("alarm"), str(event.get("event", "")).replace("_", " "))
+    return " ".join(word for word in words if word)
 
 
 def _cell(name: str, value: Any) -> str:
@@ -146,8 +154,10 @@ def _cell(name: str, value: Any) -> str:
         return "-"
     if name in ("t", "at", "created", "onset", "since", "due", "asked", "from", "time"):
         return clock(value)
+    if name == "outcome":
+        return str(value) if len(value) <= OUTCOME else f"{value[: OUTCOME - 3]}..."
     if isinstance(value, Mapping):
         return ", ".join(f"{key.replace('_', ' ')}: {_cell(key, one)}" for key, one in value.items() if one != "")
-    if name in ("state", "after", "what", "event"):
+    if name in ("state", "after", "what"):
         return str(value).replace("_", " ")
     return number(value) if isinstance(value, float) else str(value)

@@ -21,7 +21,7 @@ from servoscope.live.examining import Examined, Told, examine
 from servoscope.live.judging import Judged, Window, judge, phase_of
 from servoscope.live.numbering import Place, place
 from servoscope.live.rows import Outcome, Row, transition_row
-from servoscope.live.showing import about, shown, status_of
+from servoscope.live.showing import about, shown, status_of, summary_of
 from servoscope.live.thinning import thin
 from servoscope.monitor import Monitor
 
@@ -277,7 +277,7 @@ class Asset:
             quality=findings,
             statistic=peaks[0],
             level=peaks[1],
-            cause=judged.summary,
+            cause=summary_of(judged, findings),
         )
         alarms, transitions = advance(self._definitions, progress.alarms, seen, progress.counted.t if t is None else t)
         self.progress = replace(progress, alarms=alarms)

@@ -99,7 +99,11 @@ class Service:
             for outlet in self._outlets.values():
                 outlet.close()
             self.store.close()
-        log("info", "stopped", service=self.config.name)
+        log("info", "stopped", service=self.config.name, why=self._why)
+
+    @property
+    def _why(self) -> str:
+        return "it was asked to" if self._stopping else "all sources have ended"
 
     def _audit(self, what: str, words: dict[str, Any]) -> None:
         self.writer.add(self.config.name, [Row("audit", {"who": "servoscope", "what": what, "document": words})])
@@ -216,7 +220,7 @@ class Service:
 
     def _finish(self) -> None:
         """Commit what is in hand."""
-        self._audit("stopped", {})
+        self._audit("stopped", {"why": self._why})
         deadline = time.monotonic() + self.config.service.stop_within_s
         while not self.writer.empty:
             self._commit()

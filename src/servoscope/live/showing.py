@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -13,9 +13,10 @@ from servoscope.alarms import AlarmDefinition, State, status
 from servoscope.baseline import Baseline
 from servoscope.diagnosis import Trace
 from servoscope.live.checkpoint import Progress
+from servoscope.live.judging import Judged
 from servoscope.live.thinning import gamma
 
-__all__ = ["about", "shown", "status_of"]
+__all__ = ["about", "shown", "status_of", "summary_of"]
 
 
 def about(baseline: Baseline, group: str, window_s: float) -> dict[str, Any]:
@@ -64,6 +65,13 @@ def shown(trace: Trace, t: float) -> dict[str, Any]:
     }
 
 
+def summary_of(judged: Judged, findings: Iterable[str]) -> str:
+    """Return what is said of an asset: its last examination, unless data quality overrules that."""
+    if quality.judged(judged.verdict, findings) == judged.verdict:
+        return judged.summary
+    return f"Undetermined: {quality.told(findings)}."
+
+
 def status_of(progress: Progress, definitions: Mapping[str, AlarmDefinition]) -> dict[str, Any]:
     """Return the status of an asset as plain values.
 
@@ -79,7 +87,7 @@ def status_of(progress: Progress, definitions: Mapping[str, AlarmDefinition]) ->
     ne107 = status(verdict, findings, [(definitions[name], state) for name, state in progress.alarms.items()])
     return {
         "verdict": verdict,
-        "summary": judged.summary,
+        "summary": summary_of(judged, findings),
         "since": judged.since,
         "onset": judged.onset,
         "faults": judged.faults,

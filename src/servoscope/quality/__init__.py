@@ -7,7 +7,7 @@ state, findings = tick(limits, state, now)              # each second, and with 
 verdict = judged(verdict, standing(state))              # never healthy on bad data
 """
 
-from servoscope.quality.findings import KINDS, Finding, judged
+from servoscope.quality.findings import KINDS, Finding, judged, told
 from servoscope.quality.settings import Limits, QualitySettings
 from servoscope.quality.watching import examine, init, listen, standing, tick
 
@@ -22,4 +22,5 @@ __all__ = [
     "listen",
     "standing",
     "tick",
+    "told",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-__all__ = ["KINDS", "Finding", "judged"]
+__all__ = ["KINDS", "Finding", "judged", "told"]
 
 KINDS = ("waiting", "silent", "frozen_y", "frozen_u", "gap", "jitter", "rate", "clock")
 
@@ -18,6 +18,17 @@ WORDS = {
     "jitter": "{value:.2%} of the time steps jitter, {limit:.2%} are allowed",
     "rate": "the time stamps say a sample rate off by {value:+.3%}, {limit:.3%} are allowed",
     "clock": "the time stamps jump by {value:+.6g} s: the clock was set, or the log was cut",
+}
+
+SHORT = {
+    "waiting": "the first window of data is not complete",
+    "silent": "no data come",
+    "frozen_y": "y stays the same, sensor or axis is stuck",
+    "frozen_u": "u stays the same, its logging is stuck",
+    "gap": "samples are missing",
+    "jitter": "the time steps jitter",
+    "rate": "the time stamps say another sample rate",
+    "clock": "the time stamps jump",
 }
 
 
@@ -60,3 +71,8 @@ def judged(verdict: str, standing: Iterable[str]) -> str:
     """
     kinds = set(standing)
     return verdict if not kinds or (verdict == "fault" and kinds == {"gap"}) else "undetermined"
+
+
+def told(standing: Iterable[str]) -> str:
+    """Return what is wrong with the data, in a few words."""
+    return ", ".join(SHORT[kind] for kind in standing) or "the data are sound"

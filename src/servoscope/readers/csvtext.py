@@ -16,6 +16,7 @@ __all__ = ["Layout", "layout_of", "read_csv"]
 COMMENTS = ("#", "%", "//")
 SNIFFED = 20  # lines
 PIECE = 1 << 23  # bytes that are read at a time
+SMALL = 1 << 20  # bytes that Arrow parses as one block anyway
 MOST_BROKEN = 0.01  # share of rows that may not fit the columns
 
 
@@ -157,7 +158,8 @@ def _parsed(
         )
 
     try:
-        table = parse(True)
+        # threads that still let go of a small text while Python ends would abort the process
+        table = parse(len(text) > SMALL)
         if torn or comments:
             # row numbers, which messages name, exist without threads only
             torn.clear()
