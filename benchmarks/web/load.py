@@ -30,7 +30,7 @@ RATE = 2.0  # Hz
 WARM_S = 5.0
 STATUS = {
     "verdict": "healthy",
-    "summary": "Healthy: no change that would have shown here (from p_s 1.61 %, C_ie 2.29 %, beta 110 %, b_p 112 % on).",
+    "summary": "Healthy: no change that would have shown here (p_s 1.61 %, C_ie 2.29 %, beta 110 %, b_p 112 % on).",
     "since": 1.79e9,
     "onset": None,
     "examined": 1.79e9,
