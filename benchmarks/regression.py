@@ -24,7 +24,7 @@ def main() -> int:
     given = command.parse_args()
     found = bench.run(given.repeats)
     peak = found.facts["peak multiply-adds per ns, one core, double"]
-    ours = [x for x in found.figures if x.name.startswith(("one log", "fleet")) or "servoscope" in x.name]
+    ours = [x for x in found.figures if x.name.startswith(("log", "fleet")) or "servoscope" in x.name]
     ratios = {figure.name: figure.processor * peak for figure in ours}
     if given.store:
         STORED.write_text(json.dumps(ratios, indent=1) + "\n", encoding="utf-8")

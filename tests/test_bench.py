@@ -10,15 +10,15 @@ from commands import run
 from servoscope.bench import Measured, interleaved
 
 FIGURES = (
-    "one log, NumPy, sample by sample",
-    "one log, without the sequential test",
-    "one log, everything",
-    "one log, two stages, FIR of 40, without the sequential test",
+    "log, NumPy",
+    "log, bare",
+    "log, everything",
+    "log, bare, with a FIR of 40",
     *(
         f"fleet of 100, {precision}, {what}{cores}"
         for precision in ("double", "single")
-        for what in ("without the sequential test", "everything")
-        for cores in ("", ", one core")
+        for what in ("bare", "everything")
+        for cores in ("", ", 1 core")
     ),
     "Kalman filter, servoscope",
     "Kalman filter, numpy loop",

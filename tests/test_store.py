@@ -25,7 +25,7 @@ from servoscope.live.rows import Row
 from servoscope.live.service import Service
 from servoscope.live.writing import Writer
 from servoscope.store import Batch, Store, schema, tables
-from servoscope.store.history import history
+from servoscope.store.history import coarse, history
 
 
 @pytest.fixture(scope="module")
@@ -254,3 +254,32 @@ class TestCommands:
             (row["who"], row["what"], row["document"]["outcome"][:8]) for row in audit if "outcome" in row["document"]
         ]
         assert told[0] == ("ann", "acknowledge", "done") and told[1][2] == "refused:"
+
+
+def test_a_long_history_is_thinned_by_the_database_to_what_was_largest(store: Store) -> None:
+    batch = Batch()
+    for number in range(1000):
+        row = {"asset": "press", "number": number, "t": 100.0 + number, "level": number % 7 / 10.0}
+        batch.rows["residuals"].append(
+            {**row, "statistic": float(number == 555), "residual": [[1.0, number, 0.0, 1.0]]}
+        )
+    store.write(batch, "hall", 1)
+    rows, count = coarse(store, "press", (100.0, 1100.0), 10)
+    assert count == 1000 and [row["rows"] for row in rows] == [100] * 10
+    assert rows[5]["t"] == 655.0 and rows[5]["statistic"] == 1.0 and rows[5]["residual"] == [[1.0, 555, 0.0, 1.0]]
+    assert all(row["level"] == 0.6 for row in rows)
+    rows, count = coarse(store, "press", (100.0, 110.0), 1000)
+    assert count == len(rows) == 10 and [row["t"] for row in rows] == [100.0 + k for k in range(10)]
+    assert coarse(store, "lift", (0.0, 1e9), 10) == ([], 0)
+
+
+def test_what_others_change_is_told_in_the_audit(store: Store) -> None:
+    store.note("vera", "", "baseline saved", {"baseline": "mine"})
+    (row,) = history(store, "audit")
+    assert (row["who"], row["asset"], row["what"], row["document"]) == (
+        "vera",
+        "",
+        "baseline saved",
+        {"baseline": "mine"},
+    )
+    assert abs(row["at"] - time.time()) < 60.0

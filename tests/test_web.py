@@ -24,8 +24,6 @@ from servoscope import writers
 from servoscope.simulation import FaultEvent
 from servoscope.store import Store
 from servoscope.store.history import coarse
-from servoscope.web.guessing import mapping
-from servoscope.web.signals import chosen
 
 pytestmark = pytest.mark.xdist_group("web")  # one service for all of them, heard from its beginning on
 
@@ -65,7 +63,7 @@ def followed(server: Served, folder: Path) -> Iterator[Served]:
     process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(SOURCE)})
     yield server
     process.terminate()
-    assert process.wait(30) == 0
+    assert process.wait(30) in (0, -signal.SIGTERM)  # it may not have begun yet
 
 
 def longer(text: str) -> str:
@@ -84,7 +82,7 @@ def client(followed: Served) -> Iterator[httpx.Client]:
 
 def until(client: httpx.Client, path: str, **wanted: object) -> dict[str, object]:
     """Return an answer that has these values, as soon as there is one."""
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 180.0
     while time.monotonic() < deadline:
         said = client.get(path)
         if said.is_success and all(said.json()[key] == value for key, value in wanted.items()):
@@ -109,7 +107,7 @@ def test_live_updates_arrive_until_the_leak_is_told(server: Served, request: pyt
         request.getfixturevalue("followed")
         begun = time.monotonic()
         for kind, data in events(stream):
-            assert time.monotonic() - begun < 120.0, heard
+            assert time.monotonic() - begun < 300.0, heard
             heard.setdefault(kind, []).append(json.loads(data))
             if any(one["grounds"] == "full" for one in heard.get("diagnosis", [])):
                 break
@@ -131,6 +129,9 @@ def test_the_fleet_has_the_worst_first(client: httpx.Client) -> None:
     assert [row["asset"] for row in client.get("/assets", params={"group": "north"}).json()["assets"]] == ["lift"]
     assert [row["asset"] for row in client.get("/assets", params={"search": "PRES"}).json()["assets"]] == ["press"]
     assert fleet["services"][0]["service"] == "hall"
+    until(client, "/assets/press", verdict="fault", awaited=[])
+    press, lift = client.get("/assets").json()["assets"]
+    assert press["sizes"][0]["low"] < 1.2 < press["sizes"][0]["high"] and lift["sizes"] == []
 
 
 def test_an_asset_in_detail(client: httpx.Client) -> None:
@@ -339,31 +340,3 @@ def test_the_pages_end_with_a_service_that_is_killed(folder: Path) -> None:
                 return
             time.sleep(0.1)
     pytest.fail("the pages outlive their service")
-
-
-def test_thinning_keeps_order_and_extremes() -> None:
-    rng = np.random.default_rng(1)
-    signals = rng.normal(size=10_000), np.where(rng.random(10_000) < 0.1, np.nan, rng.normal(size=10_000))
-    at = chosen(signals, 400)
-    assert np.all(np.diff(at) > 0) and at.size <= 402 and at[0] == 0 and at[-1] == 9999
-    for one in signals:
-        assert np.nanmax(one[at]) == np.nanmax(one) and np.nanmin(one[at]) == np.nanmin(one)
-    assert chosen(signals, 20_000).size == 10_000
-
-
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
-        (["t", "r", "u", "y"], ("t", "r", "u", "y")),
-        (
-            ["Time [ms]", "SetPoint", "MotorCurrent", "ActualPosition"],
-            ("Time [ms]", "SetPoint", "MotorCurrent", "ActualPosition"),
-        ),
-        (["time", "qg", "vir", "qm"], ("time", "qg", "vir", "qm")),
-        (["a", "b"], (None, None, None, None)),
-    ],
-)
-def test_columns_are_guessed_by_their_names(names: list[str], found: tuple[str | None, ...]) -> None:
-    said = mapping([{"name": name} for name in names])
-    assert tuple(said[key] for key in ("time", "reference", "input", "output")) == found
-    assert said["time_unit"] == ("ms" if "ms" in names[0] else "s")

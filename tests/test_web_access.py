@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import http.client
 import json
+import shutil
+import ssl
 import stat
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -185,6 +188,25 @@ def test_the_same_holds_on_loopback_without_login(folder: Path) -> None:
             # nobody follows the assets: what was asked for waits for the service
             said = client.post("/assets/press/alarms/fault/acknowledge", json={})
             assert said.status_code == 202 and said.json()["outcome"] is None
+
+
+def test_with_tls_the_cookie_is_bound_to_the_host(folder: Path) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not on this machine")
+    make = "openssl req -x509 -newkey rsa:2048 -nodes -keyout key.pem -out cert.pem -days 2 -subj /CN=localhost"
+    subprocess.run(make.split(), cwd=folder, check=True, capture_output=True)
+    options = ("--store", "done.sqlite", "--users", "users.json", "--certificate", "cert.pem", "--key", "key.pem")
+    trusted = ssl.create_default_context(cafile=str(folder / "cert.pem"))
+    trusted.check_hostname = False
+    with Served(folder, "serve", *options, "--listen", "127.0.0.1:0") as served:
+        assert served.url.startswith("https://")
+        with served.client(verify=trusted) as client:
+            said = login(client, "vera", PASSWORDS["vera"])
+            assert (
+                said.headers["set-cookie"].startswith("__Host-servoscope=") and "Secure" in said.headers["set-cookie"]
+            )
+            assert "strict-transport-security" in said.headers
+            assert client.get("/assets", headers={"Origin": served.url}).status_code == 200
 
 
 def test_a_removed_user_is_out_at_once_and_streams_end(server: Served, folder: Path) -> None:

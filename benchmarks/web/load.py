@@ -30,7 +30,7 @@ RATE = 2.0  # Hz
 WARM_S = 5.0
 STATUS = {
     "verdict": "healthy",
-    "summary": "Healthy: no change that would have shown here (from p_s 1.61 %, C_ie 2.29 %, beta 110 %, b_p 112 % on).",
+    "summary": "Healthy: no change that would have shown here (p_s 1.61 %, C_ie 2.29 %, beta 110 %, b_p 112 % on).",
     "since": 1.79e9,
     "onset": None,
     "examined": 1.79e9,
@@ -118,6 +118,13 @@ def usage(pid: int) -> tuple[float, float]:
     return (int(fields[11]) + int(fields[12])) / ticks, memory / 1e6
 
 
+def timed(url: str) -> float:
+    """Return how long an answer takes [s]."""
+    begun = time.monotonic()
+    httpx.get(url).raise_for_status()
+    return time.monotonic() - begun
+
+
 def measure(seconds: float, assets: int, count: int) -> dict[str, float]:
     """Return what was measured."""
     with tempfile.TemporaryDirectory() as folder:
@@ -139,9 +146,10 @@ def measure(seconds: float, assets: int, count: int) -> dict[str, float]:
             reader = multiprocessing.Process(target=pages, args=(url, count, until, theirs))
             reader.start()
             time.sleep(2.0)
+            asked = [timed(f"{url}/api/v1/assets") for _ in range(10)]
             before, memory = usage(server.pid)
             begun = time.monotonic()
-            time.sleep(seconds - 4.0)
+            time.sleep(max(1.0, until - time.time() - 2.0))
             after, later = usage(server.pid)
             wall = time.monotonic() - begun
             heard, made = ours.recv(), done.recv()
@@ -164,6 +172,7 @@ def measure(seconds: float, assets: int, count: int) -> dict[str, float]:
         "lag, median [s]": float(np.median(lags)),
         "lag, 99 % [s]": float(np.quantile(lags, 0.99)),
         "lag, largest [s]": float(lags.max()),
+        "the fleet on request, median [s]": float(np.median(asked)),
         "processor of the server [%]": 100.0 * (after - before) / wall,
         "memory of the server [MB]": later,
         "growth of it [MB]": later - memory,
@@ -178,7 +187,7 @@ def main() -> None:
     parser.add_argument("--pages", type=int, default=20)
     said = parser.parse_args()
     for name, value in measure(said.seconds, said.assets, said.pages).items():
-        print(f"{name:32}{value:10.4g}")
+        print(f"{name:36}{value:10.4g}")
 
 
 if __name__ == "__main__":

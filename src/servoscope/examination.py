@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -201,15 +201,24 @@ def _followed(baseline: Baseline, recording: Recording, pipeline: Pipeline, grow
         return np.asarray(walk.advance(_course(recording, rows, 0)) + (tuning.theta - np.array(baseline.model_theta)))
 
     estimating, columns = Estimating(pipeline, tuning, watch), defaultdict[str, spool.Growing](spool.Growing)
-    with ThreadPoolExecutor(1) as beside:
+
+    def keep(e: Estimates, shown: Future[FloatArray]) -> None:
+        expected = np.broadcast_to(shown.result(), e.theta.shape)
+        T2 = np.where(e.updates > 0, statistic(e.theta, expected, growth * e.S + C), 0.0)
+        for name, piece in {**vars(e), "expected": expected, "statistic": T2}.items():
+            columns[name].append(piece)
+
+    with ThreadPoolExecutor(1) as beside:  # it does one thing after the other, in order
+        kept: Future[None] | None = None
         for rows in spool.pieces(0, recording.samples):
             shown = beside.submit(healthy, rows)
             e = estimating.advance(recording.rows(rows))
-            expected = np.broadcast_to(shown.result(), e.theta.shape)
-            T2 = np.where(e.updates > 0, statistic(e.theta, expected, growth * e.S + C), 0.0)
-            for name, piece in {**vars(e), "expected": expected, "statistic": T2}.items():
-                columns[name].append(piece)
+            if kept is not None:
+                kept.result()
+            kept = beside.submit(keep, e, shown)
             spool.release(*recording.columns)
+        if kept is not None:
+            kept.result()
     found = {name: column.whole() for name, column in columns.items()}
     expected, T2 = found.pop("expected"), found.pop("statistic")
     estimates = Estimates(**found)

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope import ifrf
 from servoscope.baseline import Baseline
 from servoscope.diagnosis import UNKNOWN, Diagnosis, Trace, Warning
 from servoscope.errors import BaselineError, RecordingError
 from servoscope.examination import Examination
+from servoscope.followed import Followed, clock
 from servoscope.ifrf import Response
 from servoscope.meaning import Meaning, trace
-from servoscope.pipeline import Pipeline
 from servoscope.plants import FloatArray
 from servoscope.recording import Recording
-from servoscope.twostage import Stage
 from servoscope.verdict import judge
 
 if TYPE_CHECKING:
-    from servoscope.recursion import Constants, Recursion
+    from servoscope.recursion import Recursion
 
 DOUBTFUL = 0.05  # probability of an unknown change, from which an operating point does not explain a recording
 
@@ -162,13 +159,13 @@ class Monitor:
             shared = {key: each.shared(len(self.baselines)) for key, each in kinds.items()}
             self.baselines = tuple(shared[id(each)] for each in self.baselines)
             kinds = {id(each): each for each in self.baselines}
-        if len({_clock(each) for each in kinds.values()}) > 1:
+        if len({clock(each) for each in kinds.values()}) > 1:
             raise BaselineError(
                 "the baselines of one monitor must share sample rate, evaluation rate, coefficients and frequencies: "
                 "make one monitor for each kind of loop"
             )
         self.loop = self.baselines[0].loop
-        followed = {key: _Followed.of(each) for key, each in kinds.items()}
+        followed = {key: Followed.of(each) for key, each in kinds.items()}
         self._followed = tuple(followed[id(each)] for each in self.baselines)
         self.pipeline = self._followed[0].pipeline
         self._narrow = precision == "single"
@@ -369,35 +366,3 @@ def _begun(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
 def _once(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
     """Return arrays as one, or that which all of them are, with a first axis of length one."""
     return np.array(values if len({id(value) for value in values}) > 1 else values[:1])
-
-
-def _clock(baseline: Baseline) -> Hashable:
-    """Return what all assets of one monitor must have in common."""
-    loop = baseline.loop
-    return loop.sample_rate, loop.monitor.evaluation_rate, baseline.names, loop.monitor.frequencies
-
-
-@dataclass(frozen=True, eq=False)
-class _Followed:
-    """What a monitor keeps of one baseline: everything but state."""
-
-    pipeline: Pipeline
-    stage: Stage
-    head: int
-    constants: Constants
-    origin: FloatArray
-    healthy: Response
-
-    @classmethod
-    def of(cls, baseline: Baseline) -> _Followed:
-        """Turn a baseline into constants; the bias under its references is taken out of estimate and expectation."""
-        from servoscope.recursion import View
-
-        pipeline, stage = baseline.pipeline(), Stage(baseline.loop, baseline.stage_one)
-        frequencies, origin = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
-        E = pipeline.bank.E(frequencies)
-        response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
-        view = View(baseline.cov(), origin, response, baseline.loop.sample_rate)
-        constants = pipeline.constants(baseline.tuning, baseline.watch(pipeline), view)
-        healthy = ifrf.response(pipeline.bank, frequencies, origin, baseline.cov())
-        return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, origin, healthy)

@@ -154,12 +154,12 @@ def _log(baseline: Baseline, recording: Recording, repeats: int, amount: Amount)
     n = len(theta)
     ours = rows[0, -1, 5 : 5 + n], rows[0, -1, 5 + n : 5 + n + n * n].reshape(n, n)
     error = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(ours, (theta, S), strict=True))
-    base = "one log, NumPy, sample by sample", found["numpy"], amount.few
-    bare = _figure("one log, without the sequential test", found["bare"], amount.log, base)
+    base = "log, NumPy", found["numpy"], amount.few
+    bare = _figure("log, bare", found["bare"], amount.log, base)
     return [
         _figure(base[0], found["numpy"], amount.few),
         replace(bare, error=error),
-        _figure("one log, everything", found["whole"], amount.log, base),
+        _figure("log, everything", found["whole"], amount.log, base),
     ]
 
 
@@ -170,7 +170,7 @@ def _two_stages(recording: Recording, repeats: int, amount: Amount) -> list[Figu
     monitor = Monitor(_without_test(learn(rig(two_stage="adaptive"), [recording])))
     signals = _tiled(recording, amount.log)
     found = interleaved({"two": lambda: monitor.run(monitor.init(), *signals)}, repeats)
-    return [_figure("one log, two stages, FIR of 40, without the sequential test", found["two"], amount.log)]
+    return [_figure("log, bare, with a FIR of 40", found["two"], amount.log)]
 
 
 def _steps(baseline: Baseline, recording: Recording, amount: Amount) -> dict[str, float]:
@@ -215,7 +215,7 @@ def _fleet(
     jobs: dict[str, Callable[[], object]] = {}
     for precision, number in (("double", np.float64), ("single", np.float32)):
         signals = [signal[at].astype(number) for signal in (recording.r, recording.u, recording.y)]
-        for what, each in (("without the sequential test", _without_test(baseline)), ("everything", baseline)):
+        for what, each in (("bare", _without_test(baseline)), ("everything", baseline)):
             monitor = Monitor([each] * amount.fleet, precision=precision)  # type: ignore[arg-type]
             state, _ = monitor.run(monitor.init(), *signals)
             name = f"fleet of {amount.fleet}, {precision}, {what}"
@@ -228,13 +228,13 @@ def _fleet(
                     job()
 
             jobs[name] = job
-            jobs[f"{name}, one core"] = alone
+            jobs[f"{name}, 1 core"] = alone
     found = interleaved(jobs, repeats)
     figures = [_figure(name, measured, total) for name, measured in found.items()]
     from servoscope.recursion import _cores
 
     first = next(iter(found))
-    single, whole = found[f"{first}, one core"], found[first]
+    single, whole = found[f"{first}, 1 core"], found[first]
     return figures, {
         "scaling of a fleet over cores, share of the ideal": single.median / whole.median / _cores(),
         "processor time of a fleet on one core, share of that on all": single.processor / whole.processor,

@@ -226,14 +226,14 @@ def claims(out: Console, found: Sequence[tuple[str, str, str]]) -> None:
 
 def speed(out: Console, found: Result) -> None:
     """Print what was measured of speed: per sample, beside what it is compared with, and single numbers."""
-    table = Table("", "ns per sample", "quartiles", "processor time", "times", "as long as", "difference", box=None)
+    rows = []
     for figure in found.figures:
-        median, low, high = figure.ns
-        times = f"{median:.1f}", f"{low:.1f} to {high:.1f}", f"{figure.processor:.1f}"
+        median, low, high = (f"{x:.1f}" if x < 1000.0 else f"{x:.0f}" for x in figure.ns)
         ratio = "" if figure.ratio is None else f"{figure.ratio:.3g}"
-        error = "" if figure.error is None else f"{figure.error:.1g}"
-        table.add_row(figure.name, *times, ratio, figure.to, error)
-    out.print(table)
+        error = "" if figure.error is None else f"{figure.error:.0e}"
+        rows.append((figure.name, median, f"{low}-{high}", ratio, error))
+    table(out, ("ns per sample", "median", "quartiles", "times", "error"), rows)
+    notes(out, ["bare: without the sequential test; times as long as the first of its kind"], "dim", " ")
     out.print()
     for name, number in found.facts.items():
         out.print(f"{name}: {number:.4g}")

@@ -13,19 +13,10 @@ from starlette.exceptions import HTTPException
 from servoscope.alarms import PRIORITIES
 from servoscope.store.history import history
 from servoscope.web import telling
+from servoscope.web.asked import CommandName, OfAlarmRows, OfAlarms, OfAudit, Reasons
 from servoscope.web.context import Context, In, Operator, Plain, Viewer
 from servoscope.web.hub import of_services
-from servoscope.web.models import (
-    Alarms,
-    Audit,
-    Commanded,
-    CommandName,
-    OfAlarmRows,
-    OfAlarms,
-    OfAudit,
-    Reasons,
-    Transitions,
-)
+from servoscope.web.said import Alarms, Audit, Commanded, Transitions
 
 router = APIRouter(tags=["alarms"])
 

@@ -12,20 +12,11 @@ from starlette.exceptions import HTTPException
 from servoscope.store import Row, tables
 from servoscope.store.history import coarse, history
 from servoscope.web import telling
+from servoscope.web.asked import OfFleet, OfHistory, OfRows, OfSignals
 from servoscope.web.baselines import id_of_asset
 from servoscope.web.context import Context, In, Plain, Viewer
 from servoscope.web.hub import of_assets, of_services, sizes_of
-from servoscope.web.models import (
-    AssetDetail,
-    Fleet,
-    OfFleet,
-    OfHistory,
-    OfRows,
-    OfSignals,
-    ResidualHistory,
-    Signals,
-    Transitions,
-)
+from servoscope.web.said import AssetDetail, Fleet, ResidualHistory, Signals, Transitions
 from servoscope.web.signals import last_signals
 
 router = APIRouter(tags=["assets"])

@@ -20,7 +20,8 @@ from starlette.status import HTTP_201_CREATED, HTTP_202_ACCEPTED, HTTP_204_NO_CO
 from servoscope import summaries
 from servoscope.baseline import Baseline
 from servoscope.loop import Loop
-from servoscope.web import models_work as models
+from servoscope.web import asked as asks
+from servoscope.web import outcomes as answers
 from servoscope.web import telling
 from servoscope.web.context import Context, Engineer, In, Plain, Viewer
 from servoscope.web.jobs import Job
@@ -105,7 +106,7 @@ def _loaded(path: Path, _: int) -> Baseline:
     return Baseline.load(path)
 
 
-def loop_arguments(context: Context, ref: models.LoopRef) -> dict[str, str]:
+def loop_arguments(context: Context, ref: asks.LoopRef) -> dict[str, str]:
     """Return a loop for a task, which reads it."""
     if ref.baseline is not None:
         return {"baseline": str(baseline_of(context, ref.baseline).path)}
@@ -119,13 +120,13 @@ def _all(context: Context) -> list[Kept]:
     return found + [_saved(context, about) for about in context.folder.all("baselines")]
 
 
-@router.get("/baselines", response_model=models.Baselines)
+@router.get("/baselines", response_model=answers.Baselines)
 def baselines(context: In, _: Viewer) -> Plain:
     """List the baselines."""
     return {"baselines": [one.row for one in _all(context)]}
 
 
-@router.get("/baselines/{id}", response_model=models.Baseline)
+@router.get("/baselines/{id}", response_model=answers.Baseline)
 def one(context: In, _: Viewer, id: str) -> Plain:
     """Tell a baseline: what was learned, and what it promises."""
     kept = baseline_of(context, id)
@@ -153,7 +154,7 @@ def remove(context: In, who: Engineer, id: str) -> None:
     context.folder.remove("baselines", id)
 
 
-@router.get("/loops", response_model=models.Loops)
+@router.get("/loops", response_model=answers.Loops)
 def loops(context: In, _: Viewer) -> Plain:
     """List the loops that come with the program, and those of the baselines."""
     found = []
@@ -169,8 +170,8 @@ def _loop(ref: dict[str, str], loop: Loop, toml: str | None) -> Plain:
     return {"ref": ref, "name": loop.name, **facts, "toml": toml}
 
 
-@router.post("/learnings", response_model=models.JobSaid, status_code=HTTP_202_ACCEPTED)
-async def learn(context: In, who: Engineer, asked: models.AskedLearning) -> Plain:
+@router.post("/learnings", response_model=answers.JobSaid, status_code=HTTP_202_ACCEPTED)
+async def learn(context: In, who: Engineer, asked: asks.AskedLearning) -> Plain:
     """Learn from healthy uploads, and inspect each of them; a job. What it learned waits to be saved."""
     recordings = []
     for healthy in asked.recordings:
@@ -201,8 +202,8 @@ async def learn(context: In, who: Engineer, asked: models.AskedLearning) -> Plai
     return context.jobs.submitted(job).plain()
 
 
-@router.post("/baselines", response_model=models.BaselineRow, status_code=HTTP_201_CREATED)
-def save(context: In, who: Engineer, new: models.NewBaseline) -> Plain:
+@router.post("/baselines", response_model=answers.BaselineRow, status_code=HTTP_201_CREATED)
+def save(context: In, who: Engineer, new: asks.NewBaseline) -> Plain:
     """Save what was learned under a name."""
     learned = context.folder.path("learnings", new.learning) / "baseline.json"
     facts = _facts(Baseline.load(learned))

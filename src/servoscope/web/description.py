@@ -6,8 +6,8 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from servoscope.web.models import Problem
 from servoscope.web.problems import KIND
+from servoscope.web.said import Problem
 
 __all__ = ["install"]
 

@@ -11,11 +11,12 @@ from starlette.responses import Response
 from starlette.status import HTTP_202_ACCEPTED
 
 from servoscope.simulation.closed_loop import NOISE_U_STD, NOISE_Y_STD
+from servoscope.web.asked import AskedDesign
 from servoscope.web.baselines import loop_arguments
 from servoscope.web.context import Engineer, In, Plain, Viewer
 from servoscope.web.diagnoses import HTML, shown_page
 from servoscope.web.jobs import Job
-from servoscope.web.models_work import AskedDesign, Design, Designs, JobSaid
+from servoscope.web.outcomes import Design, Designs, JobSaid
 from servoscope.web.parts import upload_of
 
 router = APIRouter(tags=["designs"])

@@ -16,11 +16,12 @@ from starlette.status import HTTP_202_ACCEPTED
 from servoscope.store import tables
 from servoscope.store.history import history
 from servoscope.web import telling
+from servoscope.web.asked import AskedDiagnosis, OfDiagnoses
 from servoscope.web.baselines import baseline_of, id_of_asset
 from servoscope.web.context import Context, In, Operator, Plain, Viewer
 from servoscope.web.guard import API
 from servoscope.web.jobs import Job
-from servoscope.web.models_work import AskedDiagnosis, Diagnoses, Diagnosis, JobSaid, OfDiagnoses
+from servoscope.web.outcomes import Diagnoses, Diagnosis, JobSaid
 from servoscope.web.parts import part_of, upload_of
 
 __all__ = ["HTML", "router", "shown_page"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from hmac import compare_digest
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
@@ -11,7 +12,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from servoscope.access import Hosts, Sessions, Users, WebSettings
+from servoscope.access import Hosts, Session, Sessions, Users, WebSettings
 from servoscope.web.context import LOCAL, Who
 from servoscope.web.metrics import Metrics
 from servoscope.web.problems import problem
@@ -115,13 +116,14 @@ class Guard:
                 scope["who"] = who
             elif path not in OPEN:
                 raise Refused(401, "log in first")
-            if method not in SAFE and who is not None and who.session is not None and path not in OPEN[:1]:
-                self._check_token(headers, who)
+            begins = path in OPEN and method == "POST"  # a login has no token yet
+            if method not in SAFE and who is not None and who.session is not None and not begins:
+                self._check_token(headers, who.session)
         return self._check_size(headers, path)
 
     @staticmethod
-    def _check_token(headers: Headers, who: Who) -> None:
-        if who.session is None or headers.get(CSRF) != who.session.csrf:
+    def _check_token(headers: Headers, session: Session) -> None:
+        if not compare_digest(headers.get(CSRF, "").encode(), session.csrf.encode()):
             raise Refused(403, f"the header {CSRF} must repeat what GET {API}/session tells")
 
     def _check_size(self, headers: Headers, path: str) -> int:

@@ -188,6 +188,8 @@ async def carry_out(task: str, arguments: Plain, cwd: Path, limits: Limits, tell
         If it failed, or needed more than its limits.
     """
     environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
+    if paths := environment.get("PYTHONPATH"):  # it runs in another folder
+        environment["PYTHONPATH"] = os.pathsep.join(str(Path(path).absolute()) for path in paths.split(os.pathsep))
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-c",

@@ -10,12 +10,12 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import StreamingResponse
 
 from servoscope.errors import StoreError
+from servoscope.web.asked import OfLive
 from servoscope.web.assets import detail, known
 from servoscope.web.context import Context, In, Viewer
 from servoscope.web.guard import identify
 from servoscope.web.hub import event
 from servoscope.web.metrics import Metrics
-from servoscope.web.models import OfLive
 
 router = APIRouter(tags=["live"])
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from servoscope.web.asked import Part
 from servoscope.web.context import Context
-from servoscope.web.models_work import Part
 
 __all__ = ["part_of", "upload_of"]
 

@@ -12,9 +12,10 @@ from starlette.status import HTTP_204_NO_CONTENT
 
 from servoscope import __version__
 from servoscope.access import Attempts
+from servoscope.web.asked import Login
 from servoscope.web.context import In, Who
 from servoscope.web.guard import cookie_name
-from servoscope.web.models import Login, SessionSaid
+from servoscope.web.said import SessionSaid
 
 router = APIRouter(tags=["session"])
 _attempts = Attempts()

@@ -13,10 +13,11 @@ from starlette.exceptions import HTTPException
 from starlette.status import HTTP_201_CREATED, HTTP_202_ACCEPTED, HTTP_204_NO_CONTENT
 
 from servoscope.readers import SUFFIXES
+from servoscope.web.asked import AskedInspection, OfJob, OfUpload
 from servoscope.web.baselines import loop_arguments
 from servoscope.web.context import In, Operator, Plain, Viewer
 from servoscope.web.jobs import Job
-from servoscope.web.models_work import AskedInspection, JobSaid, OfJob, OfUpload, Upload, Uploads
+from servoscope.web.outcomes import JobSaid, Upload, Uploads
 from servoscope.web.parts import part_of, upload_of
 
 router = APIRouter(tags=["uploads"])

@@ -1,56 +1,41 @@
-"""What the interface takes and answers: followed assets, alarms, sessions; what OpenAPI says of it comes from here."""
+"""What the interface answers of sessions, assets and alarms; what OpenAPI says of answers comes from here."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.access import Role
+from servoscope.web.asked import CommandName, Verdict
 
 __all__ = [
+    "AdvisedAlarm",
     "Alarm",
     "Alarms",
-    "Asked",
     "AssetDetail",
     "AssetRow",
     "Audit",
-    "CommandName",
     "Commanded",
+    "DiagnosisRow",
+    "Entry",
     "Fleet",
-    "Login",
-    "OfAlarmRows",
-    "OfAlarms",
-    "OfAudit",
-    "OfFleet",
-    "OfHistory",
-    "OfLive",
-    "OfRows",
-    "OfSignals",
+    "Flood",
+    "ParameterNow",
     "Problem",
-    "Reasons",
+    "ResidualColumns",
     "ResidualHistory",
+    "ResponseNow",
     "Said",
+    "ServiceRow",
     "SessionSaid",
     "Signals",
-    "Text",
+    "Size",
     "Transition",
     "Transitions",
 ]
 
-MOST_ROWS = 10_000
 Numbers = list[float | None]
-Text = Annotated[str, Field(max_length=1000)]
-Moment = Annotated[float, Field(allow_inf_nan=False, ge=-1e11, le=1e11)]  # [UTC s]
-Last = Annotated[int, Field(ge=1, le=MOST_ROWS)]
-CommandName = Literal["acknowledge", "reset", "shelve", "unshelve", "remove_from_service", "return_to_service"]
-Verdict = Literal["healthy", "fault", "undetermined"]
-
-
-class Asked(BaseModel):
-    """What is asked: unknown keys are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
 
 class Said(BaseModel):
@@ -68,13 +53,6 @@ class Problem(Said):
     detail: str
     instance: str | None = None
     errors: list[dict[str, str]] | None = None
-
-
-class Login(Asked):
-    """Name and password."""
-
-    user: Annotated[str, Field(min_length=1, max_length=64)]
-    password: Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class SessionSaid(Said):
@@ -309,65 +287,3 @@ class Audit(Said):
     """Lines of the audit, the newest last."""
 
     entries: list[Entry]
-
-
-class Reasons(Asked):
-    """Why, and for shelving for how long [s]."""
-
-    why: Text = ""
-    for_s: Annotated[float, Field(gt=0.0, le=366.0 * 86400.0, allow_inf_nan=False)] | None = None
-
-
-class OfFleet(Asked):
-    """Which assets."""
-
-    search: Text = ""
-    group: Text | None = None
-    verdict: Verdict | None = None
-
-
-class OfLive(Asked):
-    """Of which asset; None: of all."""
-
-    asset: Text | None = None
-
-
-class OfAlarms(Asked):
-    """Of which asset, or service; None: of all."""
-
-    asset: Text | None = None
-
-
-class OfHistory(Asked):
-    """From, and before, a time [UTC s], in so many parts."""
-
-    since: Moment | None = Field(None, alias="from")
-    until: Moment | None = Field(None, alias="to")
-    points: Annotated[int, Field(ge=10, le=5000)] = 500
-
-
-class OfRows(Asked):
-    """From, and before, a time [UTC s]; the newest so many."""
-
-    since: Moment | None = Field(None, alias="from")
-    until: Moment | None = Field(None, alias="to")
-    last: Last = 200
-
-
-class OfAudit(OfRows):
-    """Of one asset, or of all."""
-
-    asset: Text | None = None
-
-
-class OfAlarmRows(OfAudit):
-    """Of one alarm, or of all."""
-
-    alarm: Text | None = None
-
-
-class OfSignals(Asked):
-    """How many seconds, at most, and with how many points."""
-
-    seconds: Annotated[float, Field(gt=0.0, le=3600.0, allow_inf_nan=False)] = 30.0
-    points: Annotated[int, Field(ge=10, le=20_000)] = 1000

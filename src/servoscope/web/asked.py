@@ -1,36 +1,45 @@
-"""What the interface takes and answers: uploads, jobs, diagnoses, baselines, designs."""
+"""What the interface takes: bodies and queries; what OpenAPI says of requests comes from here."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
-
-from servoscope.web.models import Asked, DiagnosisRow, Moment, Said, Text
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = [
+    "Asked",
     "AskedDesign",
     "AskedDiagnosis",
     "AskedInspection",
     "AskedLearning",
-    "Baseline",
-    "BaselineRow",
-    "Baselines",
-    "Design",
-    "Designs",
-    "Diagnoses",
-    "Diagnosis",
-    "JobSaid",
+    "ColumnsAsked",
+    "CommandName",
+    "Healthy",
+    "Login",
     "LoopRef",
-    "Loops",
     "NewBaseline",
+    "OfAlarmRows",
+    "OfAlarms",
+    "OfAudit",
     "OfDiagnoses",
+    "OfFleet",
+    "OfHistory",
     "OfJob",
+    "OfLive",
+    "OfRows",
+    "OfSignals",
     "OfUpload",
-    "Upload",
-    "Uploads",
+    "Part",
+    "Reasons",
+    "Verdict",
 ]
 
+MOST_ROWS = 10_000
+Text = Annotated[str, Field(max_length=1000)]
+Moment = Annotated[float, Field(allow_inf_nan=False, ge=-1e11, le=1e11)]  # [UTC s]
+Last = Annotated[int, Field(ge=1, le=MOST_ROWS)]
+CommandName = Literal["acknowledge", "reset", "shelve", "unshelve", "remove_from_service", "return_to_service"]
+Verdict = Literal["healthy", "fault", "undetermined"]
 Id = Annotated[str, Field(min_length=1, max_length=150)]
 Where = Annotated[dict[Annotated[str, Field(max_length=200)], Text], Field(max_length=20)]
 Seconds = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
@@ -38,6 +47,81 @@ Noise = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=1e9)]
 Signal = Annotated[str, Field(min_length=1, max_length=500)]
 # kinds of motion, never a file: it would be one of the server's
 Motion = Literal["profile", "multisine", "trapezoid", "steps", "chirp"]
+
+
+class Asked(BaseModel):
+    """What is asked: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+
+class Login(Asked):
+    """Name and password."""
+
+    user: Annotated[str, Field(min_length=1, max_length=64)]
+    password: Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+class Reasons(Asked):
+    """Why, and for shelving for how long [s]."""
+
+    why: Text = ""
+    for_s: Annotated[float, Field(gt=0.0, le=366.0 * 86400.0, allow_inf_nan=False)] | None = None
+
+
+class OfFleet(Asked):
+    """Which assets."""
+
+    search: Text = ""
+    group: Text | None = None
+    verdict: Verdict | None = None
+
+
+class OfLive(Asked):
+    """Of which asset; None: of all."""
+
+    asset: Text | None = None
+
+
+class OfAlarms(Asked):
+    """Of which asset, or service; None: of all."""
+
+    asset: Text | None = None
+
+
+class OfHistory(Asked):
+    """From, and before, a time [UTC s], in so many parts."""
+
+    since: Moment | None = Field(None, alias="from")
+    until: Moment | None = Field(None, alias="to")
+    points: Annotated[int, Field(ge=10, le=5000)] = 500
+
+
+class OfRows(Asked):
+    """From, and before, a time [UTC s]; the newest so many."""
+
+    since: Moment | None = Field(None, alias="from")
+    until: Moment | None = Field(None, alias="to")
+    last: Last = 200
+
+
+class OfAudit(OfRows):
+    """Of one asset, or of all."""
+
+    asset: Text | None = None
+
+
+class OfAlarmRows(OfAudit):
+    """Of one alarm, or of all."""
+
+    alarm: Text | None = None
+
+
+class OfSignals(Asked):
+    """How many seconds, at most, and with how many points."""
+
+    seconds: Annotated[float, Field(gt=0.0, le=3600.0, allow_inf_nan=False)] = 30.0
+    points: Annotated[int, Field(ge=10, le=20_000)] = 1000
 
 
 class ColumnsAsked(Asked):
@@ -152,118 +236,3 @@ class OfDiagnoses(Asked):
     since: Moment | None = Field(None, alias="from")
     until: Moment | None = Field(None, alias="to")
     last: Annotated[int, Field(ge=1, le=10_000)] = 100
-
-
-class JobSaid(Said):
-    """A job: how far it is, and what came of it."""
-
-    id: str
-    kind: str
-    state: Literal["queued", "running", "done", "failed"]
-    step: str | None
-    created: float
-    finished: float | None
-    result: dict[str, Any] | None
-    problem: dict[str, Any] | None
-
-
-class UploadRow(Said):
-    """An upload in a line."""
-
-    id: str
-    name: str
-    bytes: int
-    at: float
-    who: str
-
-
-class Upload(UploadRow):
-    """An upload with its columns, first rows, and what they may mean."""
-
-    rows: int
-    columns: list[dict[str, Any]]
-    preview: dict[str, Any]
-    mapping: dict[str, Any]
-
-
-class Uploads(Said):
-    """Uploads, the newest last."""
-
-    uploads: list[UploadRow]
-
-
-class Diagnoses(Said):
-    """Diagnoses, the newest last."""
-
-    diagnoses: list[DiagnosisRow]
-
-
-class Diagnosis(DiagnosisRow):
-    """A diagnosis with all that it says."""
-
-    document: dict[str, Any]
-    words: dict[str, str]
-    began: float | None
-    who: str | None
-    baseline: dict[str, Any] | None
-    units: dict[str, str] | None
-    signals: dict[str, Any] | None
-    trace: dict[str, Any] | None
-    report: str | None
-
-
-class BaselineRow(Said):
-    """A baseline in a line."""
-
-    id: str
-    name: str
-    origin: Literal["service", "saved"]
-    loop: str
-    hash: str
-    points: list[str]
-    assets: list[str]
-    recordings: int
-    duration_s: float
-    at: float | None
-    who: str | None
-
-
-class Baselines(Said):
-    """All baselines."""
-
-    baselines: list[BaselineRow]
-
-
-class Baseline(BaselineRow):
-    """A baseline with what was learned."""
-
-    summary: dict[str, Any]
-    units: dict[str, str] | None
-
-
-class Loops(Said):
-    """Loops that come with the program, and those of baselines."""
-
-    loops: list[dict[str, Any]]
-
-
-class DesignRow(Said):
-    """A study in a line."""
-
-    id: str
-    loop: str
-    reference: str
-    at: float
-    who: str
-
-
-class Designs(Said):
-    """Studies, the newest last."""
-
-    designs: list[DesignRow]
-
-
-class Design(DesignRow):
-    """A study before deployment."""
-
-    study: dict[str, Any]
