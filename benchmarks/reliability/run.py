@@ -45,13 +45,14 @@ CALM = 0.25  # share of the run at the end that is left in peace
 EVERY_S = 25.0  # mean time between disturbances
 FULL_DAY = 24.0 * 200
 DISK_MB = 256
+DISK_MB_OF_ASSET_HOUR = 0.25  # rows and their log; the disk must be full only when it is filled on purpose
 BUSY = 1.0  # load from which times mean little
 
 
 def trial(name: str, fleet_of: tuple[int, float, float], every_s: float, seed: int = 1) -> dict[str, Any]:
     """Run one trial, of so many assets, hours and times the true speed; return what was measured, ready for JSON."""
     load = round(os.getloadavg()[0], 1)
-    with workplace() as (folder, disk):
+    with workplace(fleet_of[0] * fleet_of[1]) as (folder, disk):
         fleet = Fleet(folder, *fleet_of)
         fleet.make()
         port = free_port()
@@ -95,12 +96,12 @@ def told(measured: Measured) -> dict[str, Any]:
 
 
 @contextmanager
-def workplace() -> Iterator[tuple[Path, Path | None]]:
+def workplace(asset_hours: float) -> Iterator[tuple[Path, Path | None]]:
     """Make a folder, and a small disk in memory, which only root can: None where that is not possible."""
     folder = Path(tempfile.mkdtemp(prefix="servoscope-reliability-"))
     disk = folder / "disk"
     disk.mkdir()
-    size = f"size={DISK_MB}m"
+    size = f"size={DISK_MB + round(DISK_MB_OF_ASSET_HOUR * asset_hours)}m"
     mounted = (
         not os.geteuid()
         and not subprocess.run(

@@ -52,12 +52,16 @@ def machine(plan: Plan, lanes: int, width: int, own: int) -> SimpleNamespace:
         each = inlined(filled(move, names), heap)
         names[f"_{move.__name__}_each"] = each
         names[f"_{move.__name__}"] = inlined(filled(square, names), heap) if fits else each
+    calm = (lanes > 1 or sizes.watched) and sizes.steady and not sizes.speed
+    roles = {  # which part does what for these sizes
+        "settled" if sizes.steady else "refreshed": "take",
+        "together" if sizes.steady else "apart": "take_all",
+        "gliding" if calm else "never": "glided",
+        "plain" if sizes.start else "complete": "write",
+    }
     for template in stretch.PARTS:
-        names[f"_{template.__name__}"] = inlined(filled(template, names), heap)
-        names["_take"] = names.get("_settled" if sizes.steady else "_refreshed")
-        names["_take_all"] = names.get("_together" if sizes.steady else "_apart")
-        calm = (lanes > 1 or sizes.watched) and sizes.steady and not sizes.speed
-        names["_glided"] = names.get("_gliding" if calm else "_never")
-        names["_write"] = names.get("_plain" if sizes.start else "_complete")
+        name = template.__name__
+        made = inlined(filled(template, names), heap)
+        names |= {f"_{name}": made, f"_{roles.get(name, name)}": made}
     what = repr((plan, lanes, width, own))
     return SimpleNamespace(**{driver.__name__: kernel(filled(driver, names, what), heap) for driver in drive.DRIVERS})

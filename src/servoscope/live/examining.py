@@ -91,7 +91,9 @@ def examine(baseline: Baseline, name: str, blocks: Sequence[Block]) -> Examined:
     onset = begins + float(recording.t[crossed if crossed >= 0 else int(x.estimates.index[first])])
     excess = float((x.statistic / baseline.limit)[first:].max())
     level = float(x.estimates.level[first:].max())
-    tests = f"T^2 at {excess:.3g} and the sequential test at {level:.3g} times their limits"
+    tests = f"T^2 is {excess:.3g} times its limit"
+    if baseline.members:
+        tests += f", the sequential test {level:.3g} times"
     return Examined("fault", f"Fault: {tests}; the full diagnosis follows.", onset=onset)
 
 
