@@ -272,6 +272,7 @@ class TestCommands:
             said = run("alarms", "ack", hall, "press", "fault", "--who", "ann", "--why", "on my way")
             assert said.out == "press: fault: done\n"
             one_line(run("alarms", "ack", hall, "press", "fault"), "means nothing there")
+            assert run("alarms", "shelve", hall, "press", "fault", "--for", "999d").code == 2
             assert run("alarms", "shelve", hall, "press", "fault", "--for", "8h").code == 0
             assert json.loads(run("alarms", "list", hall, "--json").out)[0]["state"] == "shelved"
         finally:

@@ -59,6 +59,8 @@ class Looker:
                 _send(process.stdin, job)
                 return Told(*pickle.loads(_receive(process.stdout)))
             except (OSError, EOFError):
+                if self._closed:  # on purpose, then
+                    break
                 log("error", "full diagnosis lost its process", asset=name, code=process.poll())
                 self._end()
         return Told("undetermined", "Undetermined: the full diagnosis took its process down.", None, {})
