@@ -28,6 +28,7 @@ import numpy as np
 SOURCE = Path(__file__).parents[2] / "src"
 RATE = 2.0  # Hz
 WARM_S = 5.0
+HEAD = b"event: assets\ndata: "
 STATUS = {
     "verdict": "healthy",
     "summary": "Healthy: no change that would have shown here (p_s 1.61 %, C_ie 2.29 %, beta 110 %, b_p 112 % on).",
@@ -84,18 +85,18 @@ def write(path: str, assets: int, seconds: float, answer: Any) -> None:
 async def read(url: str, until: float, heard: dict[str, Any]) -> None:
     """Be a page: take events as they come, and the time that they took."""
     async with httpx.AsyncClient(timeout=30.0) as client, client.stream("GET", f"{url}/api/v1/live") as stream:
-        kind = ""
-        async for line in stream.aiter_lines():
-            if line.startswith("event: "):
-                kind = line[7:]
-            elif line.startswith("data: ") and kind == "assets":
-                rows = json.loads(line[6:])["assets"]
-                now = time.time()
-                if rows:
+        parts: list[bytes] = []
+        async for chunk in stream.aiter_bytes():
+            parts.append(chunk)
+            if not chunk.endswith(b"\n\n"):
+                continue
+            now, whole, parts = time.time(), b"".join(parts), []
+            for text in whole.split(b"\n\n"):
+                if text.startswith(HEAD) and (rows := json.loads(text[len(HEAD) :])["assets"]):
                     heard["at"].append((now, max(row["at"] for row in rows)))
-                    heard["bytes"] += len(line)
+                    heard["bytes"] += len(text)
                     heard["rows"] += len(rows)
-            if time.time() > until:
+            if now > until:
                 return
 
 

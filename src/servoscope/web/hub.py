@@ -56,6 +56,8 @@ class Hub:
     noted: int = 0
     sizes: dict[str, list[dict[str, Any]]] = field(default_factory=dict)  # of named faults
     _ticks: dict[str, int] = field(default_factory=dict)  # when each asset was last news
+    # urgency, name and text of each asset, made once however far behind readers are
+    _assets: dict[str, tuple[float, str, str]] = field(default_factory=dict)
     _texts: dict[int, bytes] = field(default_factory=dict)  # the newest tick's event by what the reader last heard
     _news: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -82,6 +84,9 @@ class Hub:
             self.rows.update(changed)
             self._ticks.update(dict.fromkeys(changed, self.tick))
             self._texts = {}
+            for name, row in of_assets(changed).items():
+                shown = telling.asset_row(name, row["at"], row["status"], self.sizes.get(name, ()))
+                self._assets[name] = -shown["severity"], name, _json(shown)
             for kind, asset, plain in notes:
                 self.noted += 1
                 self.notes.append(Note(self.noted, kind, asset, event(kind, plain)))
@@ -115,11 +120,11 @@ class Hub:
             names = [name for name, when in self._ticks.items() if when > tick]
             said = {name: self.rows[name] for name in names}
             now = time.time()
-            assets = [
-                telling.asset_row(name, row["at"], row["status"], self.sizes.get(name, ()))
-                for name, row in of_assets(said).items()
-            ]
-            text = event("assets", {"now": now, "assets": telling.worst_first(assets)}) if assets or tick < 0 else b""
+            assets = sorted(self._assets[name] for name in said if name in self._assets)
+            text = b""
+            if assets or tick < 0:
+                rows = ",".join(asset for _, _, asset in assets)
+                text = f'event: assets\ndata: {{"now":{now!r},"assets":[{rows}]}}\n\n'.encode()
             if services := [telling.service_row(name, row["status"]) for name, row in of_services(said).items()]:
                 text += event("services", {"now": now, "services": services})
             self._texts[tick] = text
@@ -213,4 +218,8 @@ def of_services(rows: Mapping[str, Row]) -> dict[str, Row]:
 
 def event(kind: str, plain: Mapping[str, Any]) -> bytes:
     """Return a server-sent event."""
-    return f"event: {kind}\ndata: {json.dumps(plain, separators=(',', ':'), allow_nan=False)}\n\n".encode()
+    return f"event: {kind}\ndata: {_json(plain)}\n\n".encode()
+
+
+def _json(plain: Mapping[str, Any]) -> str:
+    return json.dumps(plain, separators=(",", ":"), allow_nan=False)
