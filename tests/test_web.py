@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from http.client import HTTPConnection
 from pathlib import Path
 
 import h5py
@@ -291,12 +292,18 @@ def test_too_much_is_refused_while_it_comes(client: httpx.Client) -> None:
 
 def test_pages_and_metrics(server: Served, client: httpx.Client) -> None:
     client.get("/assets")
-    metrics = httpx.get(f"{server.url}/metrics").text
+    until, metrics = time.monotonic() + 30.0, ""
+    while 'servoscope_verdict{asset="press"' not in metrics and time.monotonic() < until:  # as soon as it is stored
+        metrics = httpx.get(f"{server.url}/metrics").text
     assert 'servoscope_verdict{asset="press"' in metrics and "servoscope_http_requests_total{" in metrics
     assert httpx.get(f"{server.url}/health/ready").json()["ok"]
+    address = httpx.URL(server.url)
     for path in ("/static/none.js", "/api/v1/none", "/api", "/static/../guard.py", "/static/%2e%2e/guard.py"):
-        said = httpx.get(f"{server.url}{path}")
-        assert said.status_code == 404 and said.headers["content-type"] == "application/problem+json", path
+        connection = HTTPConnection(address.host, address.port or 80)  # it sends dots as they are
+        connection.request("GET", path)
+        said = connection.getresponse()
+        assert said.status == 404 and said.headers["content-type"] == "application/problem+json", path
+        connection.close()
     policy = client.get("/session").headers["content-security-policy"]
     assert "default-src 'none'" in policy and "unsafe" not in policy
 
