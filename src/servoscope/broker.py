@@ -6,9 +6,10 @@ import ssl
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from servoscope.errors import ConfigError
+from servoscope.settings import Settings, Word
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -18,10 +19,9 @@ __all__ = ["KEEPALIVE_S", "BrokerSettings", "reach"]
 PLAIN, SECURE = 1883, 8883
 KEEPALIVE_S = 15  # a cable that was pulled is noticed after one and a half of these
 LONGEST_WAIT_S = 5  # between two attempts to connect
-Word = Annotated[str, Field(strict=True, min_length=1)]
 
 
-class BrokerSettings(BaseModel):
+class BrokerSettings(Settings):
     """Where a broker is, and who we are to it.
 
     Parameters
@@ -37,8 +37,6 @@ class BrokerSettings(BaseModel):
     cert_file, key_file
         Our own certificate, where the broker asks for one (PEM).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     host: Word
     port: Annotated[int, Field(strict=True, ge=1, le=65535)] | None = None

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     SerializeAsAny,
     ValidationError,
@@ -22,24 +19,17 @@ from pydantic import (
 from servoscope import plants
 from servoscope.complaints import describe
 from servoscope.errors import LoopError
+from servoscope.settings import Finite, NotNegative, Positive, Settings, Word, parsed, text_of
 
 __all__ = ["DEFAULT_FREQUENCIES", "Columns", "Controller", "Loop", "MonitorSettings"]
 
 DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
 LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a rule
 
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
-Word = Annotated[str, Field(strict=True, min_length=1)]
 Interval = tuple[Finite, Finite]
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Columns(_Settings):
+class Columns(Settings):
     """Where the signals stand in a recording.
 
     Parameters
@@ -62,7 +52,7 @@ class Columns(_Settings):
     segment: tuple[Word, ...] = ()
 
 
-class Controller(_Settings):
+class Controller(Settings):
     """Discrete PI controller, u(k) = k_p e(k) + k_i T sum e, e = r - y."""
 
     kind: Literal["pi"]
@@ -70,7 +60,7 @@ class Controller(_Settings):
     k_i: NotNegative
 
 
-class MonitorSettings(_Settings):
+class MonitorSettings(Settings):
     """How the loop is watched; every setting has a default.
 
     Parameters
@@ -130,7 +120,7 @@ class MonitorSettings(_Settings):
     off_delay: NotNegative | None = None
 
 
-class Loop(_Settings):
+class Loop(Settings):
     """One closed loop: sampling, columns, plant, controller and how it is monitored.
 
     Parameters
@@ -240,21 +230,7 @@ class Loop(_Settings):
             If the file cannot be read, is not TOML, or a setting in it is wrong.
         """
         path = Path(path)
-        if path.is_dir():
-            raise LoopError(f"{path}: is a directory, give the loop file in it")
-        try:
-            text = path.read_bytes().decode("utf-8-sig")
-        except FileNotFoundError:
-            raise LoopError(f"{path}: no such file, check the path of the loop file") from None
-        except OSError as error:
-            raise LoopError(f"{path}: cannot be read ({error.strerror or error})") from None
-        except UnicodeDecodeError:
-            raise LoopError(f"{path}: is not a text file, a loop file is TOML in UTF-8") from None
-        try:
-            mapping = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise LoopError(f"{path}: not valid TOML: {' '.join(str(error).split())}") from None
-        return cls.from_dict(mapping, source=str(path))
+        return cls.from_dict(parsed(text_of(path, "loop file", LoopError), path, LoopError), source=str(path))
 
     @classmethod
     def from_dict(cls, mapping: Mapping[str, Any], source: str = "loop") -> Loop:

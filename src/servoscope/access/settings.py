@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from servoscope.access.hosts import LOOPBACK, is_loopback, split
+from servoscope.settings import Positive, Settings, Word
 
 __all__ = ["WebSettings"]
 
-Word = Annotated[str, Field(strict=True, min_length=1)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 
-
-class WebSettings(BaseModel):
+class WebSettings(Settings):
     """Where pages and HTTP interface are served; every key has a default.
 
     Parameters
@@ -38,8 +36,6 @@ class WebSettings(BaseModel):
     job_s, job_memory_mb
         Processor time [s] and memory [MB] of one diagnosis, learning or design.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     listen: Annotated[str, Field(strict=True, pattern=r"^.+:\d{1,5}$")] = "127.0.0.1:8080"
     hosts: tuple[Word, ...] = ()

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from servoscope.alarms import Event, Priority, State
 from servoscope.broker import BrokerSettings
+from servoscope.settings import Finite, Positive, Settings, Word
 
 __all__ = [
     "PLACEHOLDERS",
@@ -23,10 +24,6 @@ __all__ = [
     "ToleranceSettings",
     "WebhookSettings",
 ]
-
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
-Word = Annotated[str, Field(strict=True, min_length=1)]
 
 
 def _is_name(value: str) -> str:
@@ -42,11 +39,7 @@ BELIEVED = 1e3  # ratio to healthy, or its inverse, beyond which a change is not
 PLACEHOLDERS = ("key", "time", "asset", "alarm", "event", "after", "priority", "quantity", "value", "previous")
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class RetrySettings(_Settings):
+class RetrySettings(Settings):
     """How often, and for how long, an action is tried again.
 
     Parameters
@@ -63,7 +56,7 @@ class RetrySettings(_Settings):
     give_up_s: Positive = 7 * 86400.0
 
 
-class _Sink(_Settings):
+class _Sink(Settings):
     """What webhook and command have in common.
 
     Parameters
@@ -163,7 +156,7 @@ class MessageSettings(_Sink):
     topic: Annotated[str, Field(strict=True, pattern=r"^[^#+\x00]+$", max_length=1000)]
 
 
-class ToleranceSettings(_Settings):
+class ToleranceSettings(Settings):
     """A change of a set-point or a gain that lets the loop live with a fault; off unless told otherwise.
 
     Parameters
@@ -225,7 +218,7 @@ class ToleranceSettings(_Settings):
         return self.value if self.value is not None else self.nominal * math.pow(ratio, self.exponent or 0.0)
 
 
-class ActionSettings(_Settings):
+class ActionSettings(Settings):
     """The section `[actions]`.
 
     Parameters

@@ -6,16 +6,14 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from servoscope.complaints import describe
 from servoscope.quality import KINDS
+from servoscope.settings import Finite, NotNegative, Positive, Settings
 
 __all__ = ["DEFAULTS", "PRIORITIES", "AlarmDefinition", "AlarmSettings", "FloodSettings", "Ne107", "Priority"]
 
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Text = Annotated[str, Field(strict=True)]
 
 Source = Literal["verdict", "quality", "statistic", "level", "buffered"]
@@ -28,11 +26,7 @@ OWN: tuple[Source, ...] = ("buffered",)  # sources of the service itself
 WORDS: dict[str, tuple[str, ...]] = {"verdict": ("fault", "undetermined"), "quality": KINDS}
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class AlarmDefinition(_Settings):
+class AlarmDefinition(Settings):
     """One alarm of an asset.
 
     Parameters
@@ -95,7 +89,7 @@ class AlarmDefinition(_Settings):
         return {"verdict": ("fault",), "quality": KINDS}.get(self.source, ())
 
 
-class FloodSettings(_Settings):
+class FloodSettings(Settings):
     """When the alarms of a fleet are a flood, and what is still announced in it.
 
     Parameters
@@ -168,7 +162,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 }  # a table of the same name changes keys of one of them, another name adds an alarm
 
 
-class AlarmSettings(_Settings):
+class AlarmSettings(Settings):
     """The section `[alarms]`: keys of the flood, and one table per alarm, laid over `DEFAULTS`.
 
     Parameters

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -18,8 +17,9 @@ from servoscope.live.mqtt.source import MqttSettings
 from servoscope.live.opcua.outlet import OpcuaOutletSettings
 from servoscope.live.opcua.settings import Nodes, OpcuaSettings
 from servoscope.live.replay import ReplaySettings
-from servoscope.live.settings import Address, Name, NotNegative, Seconds, Settings, Word
+from servoscope.live.settings import Address, Name, Seconds
 from servoscope.quality import QualitySettings
+from servoscope.settings import NotNegative, Settings, Word, parsed, text_of
 
 __all__ = ["AssetSettings", "Config", "DiagnosisSettings", "ServiceSettings", "StoreSettings"]
 
@@ -170,16 +170,7 @@ class Config(Settings):
             If the file cannot be read, is not TOML, or a key in it is wrong.
         """
         path = Path(path)
-        try:
-            mapping = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-        except FileNotFoundError:
-            raise ConfigError(f"{path}: no such file, check the path of the service file") from None
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from None
-        except UnicodeDecodeError:
-            raise ConfigError(f"{path}: is not a text file, a service file is TOML in UTF-8") from None
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise ConfigError(f"{path}: not valid TOML: {' '.join(str(error).split())}") from None
+        mapping = parsed(text_of(path, "service file", ConfigError), path, ConfigError)
         try:
             found = cls.model_validate(mapping)
         except ValidationError as error:

@@ -15,10 +15,11 @@ from pydantic import AwareDatetime
 
 from servoscope.live.block import Block, Resume
 from servoscope.live.refusals import Refusal
-from servoscope.live.settings import NotNegative, Seconds, Settings
+from servoscope.live.settings import Seconds
 from servoscope.loop import Loop
 from servoscope.readers import read
 from servoscope.recording import Recording
+from servoscope.settings import NotNegative, Settings
 
 __all__ = ["Replay", "ReplaySettings", "Tape"]
 

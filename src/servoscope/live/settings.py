@@ -1,17 +1,15 @@
-"""What the settings classes of a service file have in common."""
+"""Values in several sections of a service file: names, addresses, times."""
 
 from __future__ import annotations
 
 import re
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
-__all__ = ["Address", "Name", "NotNegative", "Seconds", "Settings", "Word"]
+__all__ = ["Address", "Name", "Seconds"]
 
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e9)]  # what means something as a time
-Word = Annotated[str, Field(strict=True, min_length=1)]
 
 
 def _is_name(value: str) -> str:
@@ -31,9 +29,3 @@ def _is_address(value: str) -> str:
 
 Name = Annotated[str, Field(strict=True), AfterValidator(_is_name)]
 Address = Annotated[str, Field(strict=True), AfterValidator(_is_address)]
-
-
-class Settings(BaseModel):
-    """Frozen; unknown keys are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from servoscope.errors import RecordingError
+from servoscope.settings import Positive, Settings
 
 __all__ = ["Limits", "QualitySettings"]
 
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 Share = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0, lt=1.0)]
 
 FEWEST = 200  # samples of a window: fewer do not tell a rate to 0.1 %
@@ -30,7 +30,7 @@ class Limits(NamedTuple):
     rate_error: float  # relative
 
 
-class QualitySettings(BaseModel):
+class QualitySettings(Settings):
     """When data are too bad to judge an asset by; every key has a default.
 
     Parameters
@@ -51,8 +51,6 @@ class QualitySettings(BaseModel):
     rate_error
         How far the measured sample rate may be off, relative.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     window_s: Positive = 10.0
     silent_s: Positive = 10.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -19,6 +18,7 @@ from servoscope.diagnosis import Trace
 from servoscope.errors import LoopError, RecordingError
 from servoscope.loop import Columns, Loop
 from servoscope.recording import Recording
+from servoscope.settings import parsed
 from servoscope.web.guessing import mapping
 from servoscope.web.signals import chosen, plain
 
@@ -161,11 +161,7 @@ def loop_of(ref: Mapping[str, str]) -> Loop:
     if "example" in ref:
         name = f"{ref['example']}.toml"
         text = files("servoscope.examples").joinpath(name).read_text(encoding="utf-8")
-    try:
-        mapping_ = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise LoopError(f"{name}: not valid TOML: {' '.join(str(error).split())}") from None
-    return Loop.from_dict(mapping_, name)
+    return Loop.from_dict(parsed(text, name, LoopError), name)
 
 
 def read(

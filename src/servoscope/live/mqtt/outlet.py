@@ -13,7 +13,7 @@ from pydantic import Field
 from servoscope.broker import KEEPALIVE_S, BrokerSettings, reach
 from servoscope.live.mqtt import topics
 from servoscope.live.outlet import Statuses
-from servoscope.live.settings import NotNegative
+from servoscope.settings import NotNegative
 
 __all__ = ["MqttOutlet", "MqttOutletSettings"]
 

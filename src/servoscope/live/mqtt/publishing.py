@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import tomllib
 from collections import deque
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -21,8 +20,9 @@ from servoscope.live.block import Block, Resume
 from servoscope.live.logs import log
 from servoscope.live.mqtt import payload, topics
 from servoscope.live.replay import Replay, ReplaySettings
-from servoscope.live.settings import Seconds, Settings, Word
+from servoscope.live.settings import Seconds
 from servoscope.loop import Loop
+from servoscope.settings import Settings, Word, parsed, text_of
 
 if TYPE_CHECKING:
     from paho.mqtt.client import MQTTMessage, MQTTMessageInfo
@@ -87,14 +87,9 @@ class PublishSettings(Settings):
             If it cannot be read, is not TOML, or a key in it is wrong.
         """
         path = Path(path)
+        mapping = parsed(text_of(path, "file of what to publish", ConfigError), path, ConfigError)
         try:
-            found = cls.model_validate(tomllib.loads(path.read_bytes().decode("utf-8-sig")))
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from None
-        except UnicodeDecodeError:
-            raise ConfigError(f"{path}: is not a text file, write TOML in UTF-8") from None
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise ConfigError(f"{path}: not valid TOML: {' '.join(str(error).split())}") from None
+            found = cls.model_validate(mapping)
         except ValidationError as error:
             raise ConfigError(f"{path}: {describe(error, cls)}") from None
         found._folder = path.absolute().parent

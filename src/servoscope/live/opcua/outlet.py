@@ -16,7 +16,7 @@ from servoscope.errors import ConfigError, SourceError
 from servoscope.live.logs import log
 from servoscope.live.opcua.settings import asyncua
 from servoscope.live.outlet import Statuses
-from servoscope.live.settings import Settings, Word
+from servoscope.settings import Settings, Word
 
 __all__ = ["NAMESPACE", "VARIABLES", "OpcuaOutlet", "OpcuaOutletSettings", "shown"]
 

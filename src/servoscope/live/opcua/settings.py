@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from servoscope.errors import ConfigError
-from servoscope.live.settings import Seconds, Settings, Word
+from servoscope.live.settings import Seconds
+from servoscope.settings import Settings, Word
 
 __all__ = ["Nodes", "OpcuaSettings", "asyncua", "password", "reach"]
 
