@@ -9,12 +9,13 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
 import hypothesis
 import pytest
+from reliability.servers import Postgres, programs
 
 PROJECT = Path(__file__).resolve().parent.parent
 
@@ -75,6 +76,18 @@ def eha_cases(shared_data: Path) -> Path:
 def eha_truth(eha_cases: Path) -> dict[str, dict[str, Any]]:
     """What was injected into each of them: file name -> {"reference", "fault_at_s", "ratios", ...}."""
     return {case["file"]: case for case in json.loads((eha_cases / "truth.json").read_text())}
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[Postgres]:
+    """A PostgreSQL server of the module's own."""
+    found = programs()
+    if found is None:
+        pytest.skip("PostgreSQL is not on this machine: scripts/install-test-servers installs it")
+    server = Postgres.temporary(found)
+    server.start()
+    yield server
+    server.remove()
 
 
 @pytest.fixture

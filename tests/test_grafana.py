@@ -10,9 +10,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
 import sqlalchemy as sa
-from reliability.servers import Postgres, programs
+from reliability.servers import Postgres
 
 from servoscope.live.metrics import Metrics
 from servoscope.store import Batch, Store
@@ -45,17 +44,6 @@ def test_every_metric_is_there_and_every_metric_is_shown() -> None:
     assert used == known
     labels = {label for part in re.findall(r"by \(([^)]*)\)", asked) for label in re.split(r",\s*", part)}
     assert labels <= LABELS
-
-
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[Postgres]:
-    found = programs()
-    if found is None:
-        pytest.skip("PostgreSQL is not on this machine: scripts/install-test-servers installs it")
-    server = Postgres.temporary(found)
-    server.start()
-    yield server
-    server.remove()
 
 
 def test_every_query_runs_and_finds_what_is_there(postgres: Postgres) -> None:

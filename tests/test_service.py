@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from reliability.servers import Postgres, programs
+from reliability.servers import Postgres
 
 import halls
 from carrying import Carrier
@@ -37,17 +37,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("hall")
     halls.files(made)
     return made
-
-
-@pytest.fixture(scope="module")
-def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Postgres]:
-    found = programs()
-    if found is None:
-        pytest.skip("PostgreSQL is not on this machine: scripts/install-test-servers installs it")
-    server = Postgres.temporary(found)
-    server.start()
-    yield server
-    server.remove()
 
 
 def service_of(config: Path) -> Service:

@@ -14,7 +14,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 import sqlalchemy as sa
-from reliability.servers import Postgres, programs
+from reliability.servers import Postgres
 
 import halls
 from commands import one_line, run
@@ -26,17 +26,6 @@ from servoscope.live.service import Service
 from servoscope.live.writing import Writer
 from servoscope.store import Batch, Store, schema, tables
 from servoscope.store.history import coarse, dated, history
-
-
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[Postgres]:
-    found = programs()
-    if found is None:
-        pytest.skip("PostgreSQL is not on this machine: scripts/install-test-servers installs it")
-    server = Postgres.temporary(found)
-    server.start()
-    yield server
-    server.remove()
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
