@@ -1,7 +1,7 @@
 // A recording from a file to its verdict: drop it, see what is in it, say which column is what, compare it with a baseline.
 import { get, job, mayChange, part } from "./api.js";
 import { list } from "./asset.js";
-import { complaint, field, h, section, tell } from "./dom.js";
+import { during, field, h, section } from "./dom.js";
 import { inspected } from "./inspection.js";
 import { dropzone, earlier, mapping, preview } from "./uploads.js";
 
@@ -43,31 +43,20 @@ function steps(one, baselines, wanted, signal) {
   repoint();
 
   const part = () => ({ upload: one.id, columns: columns.read(), ...(from.value && { from_s: Number(from.value) }), ...(to.value && { to_s: Number(to.value) }) });
-  const during = async (button, work) => {
-    button.disabled = true;
-    try {
-      await work((step) => tell(said, `${step} …`));
-      said.replaceChildren();
-    } catch (error) {
-      if (error.name !== "AbortError") said.replaceChildren(complaint(error));
-    } finally {
-      button.disabled = false;
-    }
-  };
   const inspect = (step) =>
     job("/inspections", { ...part(), ...(baseline.value && { loop: { baseline: baseline.value } }) }, { signal, step }).then((found) => {
       const shown = inspected(found, null, signal);
       result.replaceChildren(section("Is it usable?", null, shown.element));
       shown.draw();
     });
-  look.addEventListener("click", () => during(look, inspect));
+  look.addEventListener("click", () => during(look, said, inspect));
   diagnose.addEventListener("click", () =>
-    during(diagnose, async (step) => {
+    during(diagnose, said, async (step) => {
       const { diagnosis } = await job("/diagnoses", { ...part(), baseline: baseline.value, ...(point.value && { point: point.value }) }, { signal, step });
       location.assign(`/diagnoses/${encodeURIComponent(diagnosis)}`);
     }),
   );
-  if (columns.read().input && columns.read().output) during(look, inspect);
+  if (columns.read().input && columns.read().output) during(look, said, inspect);
   return [
     section(
       "What is what",

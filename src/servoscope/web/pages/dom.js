@@ -71,3 +71,16 @@ export function titled(title, controls, ...children) {
 export function complaint(error) {
   return h("p", { class: "complaint", role: "alert" }, error.message ?? String(error));
 }
+
+// Does what a button asks for: its steps are told, what goes wrong is said, and at the end it can be pressed again.
+export async function during(button, said, work, settle = () => (button.disabled = false)) {
+  button.disabled = true;
+  try {
+    await work((step) => tell(said, `${step} …`));
+    said.replaceChildren();
+  } catch (error) {
+    if (error.name !== "AbortError") said.replaceChildren(complaint(error));
+  } finally {
+    settle();
+  }
+}

@@ -1,6 +1,6 @@
 // Healthy recordings to a baseline: choose the loop, choose recordings, see excitation and quality, learn, save.
 import { get, job, mayChange, part, post } from "./api.js";
-import { complaint, field, h, section, table, tell } from "./dom.js";
+import { complaint, during, field, h, section, table, tell } from "./dom.js";
 import { findings, inspected } from "./inspection.js";
 import { loopChoice } from "./loops.js";
 import { mark, prose } from "./marks.js";
@@ -47,19 +47,8 @@ export async function show(main, { session, signal }) {
   }
   enable();
 
-  const during = async (button, what) => {
-    button.disabled = true;
-    try {
-      await what((step) => tell(said, `${step} …`));
-      said.replaceChildren();
-    } catch (error) {
-      if (error.name !== "AbortError") said.replaceChildren(complaint(error));
-    } finally {
-      enable();
-    }
-  };
   look.addEventListener("click", () =>
-    during(look, async () => {
+    during(look, said, async () => {
       for (const each of used()) {
         tell(said, `Inspecting ${each.upload.name} …`);
         const found = await job("/inspections", { upload: each.upload.id, columns: mapped.read(), loop: loop.read() }, { signal });
@@ -69,16 +58,16 @@ export async function show(main, { session, signal }) {
           shown.draw();
         });
       }
-    }),
+    }, enable),
   );
   learn.addEventListener("click", () =>
-    during(learn, async (step) => {
+    during(learn, said, async (step) => {
       const recordings = used().map((each) => ({ upload: each.upload.id, ...(each.point.value.trim() && { point: each.point.value.trim() }) }));
       const found = await job("/learnings", { loop: loop.read(), recordings, columns: mapped.read() }, { signal, step });
       for (const one of found.recordings) judged(chosen.find((each) => each.upload.id === one.upload), one.inspection);
       result.replaceChildren(learned(found, refresh));
       result.scrollIntoView({ block: "start" });
-    }),
+    }, enable),
   );
   work.append(
     section("Loop", "What is known of it: sampling, plant, controller. A baseline has it inside.", loop.element),
