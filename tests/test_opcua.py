@@ -195,12 +195,16 @@ def test_a_cable_that_was_pulled_costs_nothing_where_there_is_history(plant: Pla
     k = one.samples()
     assert (np.diff(k) == 1).all() and not one.refused
     assert [block.sequence for block in one.blocks] == list(range(len(one.blocks)))
-    # another process goes on behind what was stored
-    last = one.blocks[-3]
-    again = Following(plant, SCALARS, {"press": Resume(last.sequence, 0.0, 0, float(last.t[-1]))})
-    again.more(3)
-    again.source.close()
-    assert again.samples()[0] == k[-11] + 1 and again.blocks[0].sequence == last.sequence + 1
+    # another process goes on behind what was stored, also where u holds what it was before: it changes at every third
+    for held in range(3):
+        last, ends = next(
+            (block, end) for block, end in zip(one.blocks[::-1], k[::-5], strict=True) if (end + 1) % 3 == held
+        )
+        again = Following(plant, SCALARS, {"press": Resume(last.sequence, 0.0, 0, float(last.t[-1]))})
+        again.more(3)
+        again.source.close()
+        assert again.samples()[0] == ends + 1 and again.blocks[0].sequence == last.sequence + 1
+        assert not again.refused
 
 
 @pytest.mark.parametrize("plant", ["nothing"], indirect=True)

@@ -87,7 +87,7 @@ class Arrays:
         """Read from the server's history what was missed."""
         if math.isnan(self._last):
             return
-        for value in await history(client, self.nodes[0], self._last, now) or []:
+        for value in await history(client, self.nodes[0], self._last, now + AHEAD_S) or []:
             self.take(0, value)
 
     def take(self, node: int, value: Any) -> None:
@@ -157,10 +157,13 @@ class Scalars:
         if math.isnan(last):
             self._aligner.cut(now)
             return
-        found = [await history(client, node, last, now) for node in self.nodes]
+        found = [await history(client, node, last, now + AHEAD_S) for node in self.nodes]
         if None in found or not any(found):  # a signal that did not change has none, and that is well
             self._aligner.cut(now)
             return
+        for k, node in enumerate(self.nodes):  # what held then: the subscription tells what holds now
+            for value in await history(client, node, last, 0.0, most=1) or []:
+                self._add(k, value)
         for k, values in enumerate(found):
             self._read[k] = max((self._add(k, value) for value in values or []), default=-math.inf)
         self._aligner.cut(last, complete=True)
@@ -207,16 +210,17 @@ def words_of(gap: Gap) -> str:
     return f"{gap.samples} samples between {begins} and {ends} are known to nobody"
 
 
-async def history(client: Any, node: str, begins: float, ends: float) -> list[Any] | None:
+async def history(client: Any, node: str, begins: float, ends: float, most: int = 0) -> list[Any] | None:
     """Return the values of a node over a time, or None where the server keeps none.
 
-    Trouble that passes is raised: the connection is made anew then, and history is asked for again.
+    Backwards where the time ends before it begins (OPC 10000-11, 6.5.3.2); 0: as many as there are. Trouble that passes
+    is raised: the connection is made anew then, and history is asked for again.
     """
     from asyncua.ua.uaerrors import UaStatusCodeError
 
-    begin, end = (datetime.fromtimestamp(t, UTC) for t in (begins, ends + AHEAD_S))
+    begin, end = (datetime.fromtimestamp(t, UTC) for t in (begins, ends))
     try:
-        return list(await client.get_node(node).read_raw_history(begin, end, return_bounds=False))
+        return list(await client.get_node(node).read_raw_history(begin, end, most, return_bounds=False))
     except UaStatusCodeError as error:
         if type(error).__name__ in PASSING:
             raise
