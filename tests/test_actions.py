@@ -27,12 +27,13 @@ from servoscope.actions import (
     begin,
     deliver,
     outgoing,
+    outgoing_diagnosis,
     outgoing_flood,
     respond,
 )
 from servoscope.actions.outbox import put_off
 from servoscope.actions.settings import RetrySettings
-from servoscope.alarms import Event, Notice, State, Transition
+from servoscope.alarms import AlarmState, Event, Notice, State, Transition
 from servoscope.complaints import describe
 from servoscope.errors import StateError
 
@@ -230,6 +231,20 @@ def test_a_sink_hears_what_it_asks_for() -> None:
     assert not heard(acknowledged)
     assert heard(acknowledged, states=["acknowledged"])
     assert not heard(unseen, states=["shelved"])
+
+    alarm = AlarmState("press 1", "fault", NOW, NOW, NOW, State.ACKNOWLEDGED, sequence=8)
+
+    def named(**sink: Any) -> list[dict[str, Any]]:
+        settings = webhook("http://desk", **sink)
+        rows = outgoing_diagnosis(settings, alarm, "medium", NOW + 10.0, NOW, "Fault: leakage.", {"faults": ["x"]})
+        return [row.event for row in rows]
+
+    (event,) = named()
+    occurred = outgoing(webhook("http://desk"), NEW, "medium", NOW)[0].event
+    assert event.keys() == occurred.keys() and event["key"] != occurred["key"]
+    assert (event["event"], event["before"], event["after"]) == ("diagnosed", "acknowledged", "acknowledged")
+    assert named(events=["diagnosed"]) and named(states=None)
+    assert not named(events=["occur"]) and not named(states=["normal"]) and not named(alarms=["data_quality"])
     flood = Notice("flood_begins", NOW, counted=11, peak=11)
     assert [row.event["counted"] for row in outgoing_flood(webhook("http://desk"), flood, NOW)] == [11]
     assert not outgoing_flood(webhook("http://desk", assets=["press 1"]), flood, NOW)

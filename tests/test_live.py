@@ -17,20 +17,26 @@ from servoscope.alarms import AlarmSettings, Command, Event, State
 from servoscope.errors import AlarmError, ConfigError, RecordingError, StateError
 from servoscope.live import checkpoint
 from servoscope.live.arrival import arrive
+from servoscope.live.assembling import rehearse
 from servoscope.live.asset import Asset, Following
 from servoscope.live.block import Block, Resume
 from servoscope.live.config import Config, DiagnosisSettings
-from servoscope.live.examining import Examined
-from servoscope.live.judging import Judged, judge
+from servoscope.live.examining import Examined, Told, diagnose_in_full
+from servoscope.live.judging import Judged, Window, ask_in_full, judge
 from servoscope.live.replay import Replay, ReplaySettings, Tape
 from servoscope.live.thinning import Thinned, thin
 from servoscope.monitor import Monitor
 from servoscope.quality import QualitySettings
 from servoscope.recording import Recording
+from servoscope.simulation import FaultEvent
+from servoscope.store.history import dated
 
 BEGAN = 1.7e9
 HOW = Following(
-    DiagnosisSettings(window_s=40.0), QualitySettings(), AlarmSettings.model_validate({}), residual_every_s=1.0
+    DiagnosisSettings(window_s=40.0, every_s=100.0),
+    QualitySettings(),
+    AlarmSettings.model_validate({}),
+    residual_every_s=1.0,
 )
 
 
@@ -168,6 +174,18 @@ class TestJudging:
         over, _ = judge(replace(later, due=30.0), self.settings, 30.0, False, lambda: Examined("healthy", "fine"))
         assert (first.onset, later.onset, over.onset) == (8.0, 8.0, None)
 
+    def test_a_fault_that_stands_is_diagnosed_again_each_time_it_is_twice_as_old(self) -> None:
+        state, asked = Judged(due=0.0, verdict="healthy"), []
+        for t in range(10, 2000):
+            state, found = judge(state, self.settings, float(t), True, lambda: Examined("fault", "x", onset=8.0))
+            state, in_full = ask_in_full(state, 40.0, float(t)) if found else (state, False)
+            asked += [t] if in_full else []
+        assert asked[0] == 10 and asked[1] >= 50  # with the window full of it
+        assert all(2 * (a - 10) <= b - 10 <= 2 * (a - 10) + 150 for a, b in pairwise(asked[1:])) and len(asked) == 6
+        assert ask_in_full(replace(state, again=1e9, since=0.0), 40.0, 1e6)[1] is False
+        late, in_full = ask_in_full(replace(state, since=0.0), 40.0, 1e6)
+        assert in_full and late.again == 1e6 + 86400.0
+
     def test_quiet_assets_are_looked_at_now_and_then(self) -> None:
         state, found = judge(Judged(due=50.0), self.settings, 51.0, False, lambda: Examined("healthy", "fine"))
         assert found is not None and (state.verdict, state.since, state.due) == ("healthy", 51.0, 200.0)
@@ -272,8 +290,31 @@ class TestAsset:
             followed.obey("fault", Command(Event.RESET, "ann"))
         (done,) = followed.obey("fault", Command(Event.ACKNOWLEDGE, "ann", "seen")).transitions
         assert (done.after, done.who, done.cause) == (State.ACKNOWLEDGED, "ann", "seen")
-        with pytest.raises(AlarmError, match=r"press: has no alarm 'falt'"):
+        with pytest.raises(AlarmError, match=r"press: has no alarm 'falt', did you mean 'fault'\?"):
             followed.obey("falt", Command(Event.ACKNOWLEDGE, "ann"))
+
+    def test_a_fault_that_grows_is_diagnosed_in_full_again(self) -> None:
+        followed, told, onsets = asset(), list[tuple[float, bool, float]](), list[float]()
+        grown = FaultEvent.parse("C_ie=1.6@200")
+        for block in blocks(halls.recorded(3, halls.LEAK, grown, seconds=400.0)):
+            followed.take(block)
+            for window, seen in followed.wanted():
+                said = diagnose_in_full(followed.baseline, "press", seen)
+                (fault,) = said.document["faults"]
+                told.append((window.until - BEGAN, followed.is_news(window, said), fault["ratio"]))
+                (row,) = followed.told(window, said).rows
+                onsets.append(row.values["onset"])
+                assert f"since {dated(onsets[0])} UTC" in row.values["summary"]
+        assert [news for _, news, _ in told] == [True, False, False]  # the same fault: nobody is told once more
+        assert [size for *_, size in told] == pytest.approx([1.2, 1.2, 1.6], abs=0.01)
+        assert followed.progress is not None
+        (fault,) = followed.status(followed.progress)["faults"]
+        assert fault["ratio"] == told[-1][2] and followed.progress.judged.onset == onsets[0]
+        assert onsets == [onsets[0]] * 3 and onsets[0] == pytest.approx(BEGAN + 30.0, abs=0.5)
+        other = Told("fault", "Fault: pump.", None, {"faults": [{"name": "pump", "ratio": 0.9}]})
+        nothing = Told("fault", "Fault, unknown.", None, {"faults": []})
+        late = Window(99, 0, BEGAN + 400.0, "full")
+        assert followed.is_news(late, other) and not followed.is_news(late, nothing)
 
 
 class TestConfig:
@@ -311,6 +352,12 @@ class TestConfig:
         with pytest.raises(ConfigError) as caught:
             Config.load(path)
         assert said in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+    def test_a_missing_baseline_says_whose(self, tmp_path: Path) -> None:
+        with pytest.raises(
+            ConfigError, match=r"^\[assets\] press.baseline: .*baseline.json: no such file; make a basel"
+        ):
+            rehearse(Config.load(halls.hall(tmp_path, "bare")))
 
     def test_a_missing_file_says_so(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="no such file"):

@@ -173,7 +173,8 @@ def test_a_migration_that_fails_leaves_all_as_it_was(url: str, monkeypatch: pyte
     ("url", "said"),
     [
         ("nowhere/history.sqlite", "no such store, servoscope run makes it"),
-        ("mysql://somewhere/x", "mysql is not supported, give a path for SQLite or postgresql://"),
+        ("mysql://somewhere/x", "mysql:// is not supported, give a path for SQLite or postgresql://"),
+        ("postgres://somewhere/x", "postgres:// is not supported, write postgresql://"),
         ("postgresql://user:secret@127.0.0.1:1/x", "connection refused"),
         ("://", "cannot be read as a URL"),
         ("postgresql://u@localhost:abc/x", "cannot be read as a URL"),
@@ -250,7 +251,7 @@ class TestCommands:
 
     def test_alarms_are_answered_through_the_store(self, hall: Path) -> None:
         assert "press" in run("alarms", "list", hall).out
-        one_line(run("alarms", "ack", hall, "pres", "fault"), "no such asset", "press")
+        one_line(run("alarms", "ack", hall, "pres", "fault"), "no such asset", "did you mean 'press'?")
         # a service that goes on: the same history with more to replay
         text = hall.read_text().replace("speed = 0.0", "speed = 1.0")
         hall.write_text(text.replace('kind = "replay"', 'kind = "replay"\nrepeat = true'))
@@ -263,7 +264,10 @@ class TestCommands:
             one_line(run("alarms", "ack", hall, "press", "fault"), "means nothing there")
             assert run("alarms", "shelve", hall, "press", "fault", "--for", "999d").code == 2
             assert run("alarms", "shelve", hall, "press", "fault", "--for", "8h").code == 0
-            assert json.loads(run("alarms", "list", hall, "--json").out)[0]["state"] == "shelved"
+            (shelved,) = json.loads(run("alarms", "list", hall, "--json").out)
+            assert shelved["state"] == "shelved" and shelved["until"] - shelved["since"] == 8 * 3600.0
+            assert dated(shelved["until"]) in run("alarms", "list", hall).out
+            one_line(run("alarms", "ack", hall, "press", "falt"), "has no alarm 'falt', did you mean 'fault'?")
         finally:
             service.stop()
             running.join(30.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from datetime import datetime
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -40,6 +40,12 @@ def nearest(name: str, known: Iterable[str], count: int = 1) -> list[str]:
     """Return up to `count` of the known names that look like `name`, whatever their case, best first."""
     folded = {candidate.casefold(): candidate for candidate in known}
     return [folded[match] for match in difflib.get_close_matches(name.casefold(), folded, n=count, cutoff=0.5)]
+
+
+def instead(name: str, known: Collection[str]) -> str:
+    """Return what to say to a name that is not known: the one that looks like it, or all that there are."""
+    guess = nearest(name, known)
+    return f"did you mean {guess[0]!r}?" if guess else f"only {', '.join(known) or 'none yet'}"
 
 
 def describe(error: ValidationError, model: type[BaseModel], section: str = "") -> str:

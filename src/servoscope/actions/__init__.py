@@ -6,7 +6,7 @@ delivery = deliver(row, settings, now)                      # delivery.again tak
 """
 
 from servoscope.actions.delivery import deliver, secret_of, signature
-from servoscope.actions.outbox import Delivery, Outgoing, key_of, outgoing, outgoing_flood
+from servoscope.actions.outbox import Delivery, Outgoing, key_of, outgoing, outgoing_diagnosis, outgoing_flood
 from servoscope.actions.settings import (
     ActionSettings,
     CommandSettings,
@@ -32,6 +32,7 @@ __all__ = [
     "deliver",
     "key_of",
     "outgoing",
+    "outgoing_diagnosis",
     "outgoing_flood",
     "respond",
     "secret_of",

@@ -7,10 +7,17 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from servoscope.actions.settings import ActionSettings, CommandSettings, MessageSettings, RetrySettings, WebhookSettings
-from servoscope.alarms import Notice, Priority, Transition
+from servoscope.actions.settings import (
+    DIAGNOSED,
+    ActionSettings,
+    CommandSettings,
+    MessageSettings,
+    RetrySettings,
+    WebhookSettings,
+)
+from servoscope.alarms import AlarmState, Notice, Priority, State, Transition
 
-__all__ = ["Delivery", "Outgoing", "outgoing", "outgoing_flood"]
+__all__ = ["Delivery", "Outgoing", "outgoing", "outgoing_diagnosis", "outgoing_flood"]
 
 
 @dataclass(frozen=True)
@@ -101,10 +108,55 @@ def outgoing(
     """
     rows = []
     for name, sink in settings.sinks.items():
-        if _concerns(sink, transition, priority):
+        told = transition.asset, transition.alarm, transition.event, transition.after
+        if transition.before is not transition.after and _concerns(sink, priority, *told):
             # the time, for an asset that begins anew, or in another store, counts its transitions from 1 again
             key = key_of(name, transition.asset, transition.alarm, transition.sequence, repr(transition.time))
             event = {"key": key, **transition.to_dict(), "priority": priority, "details": dict(details or {})}
+            rows.append(Outgoing(key, name, event, created=now, due=now))
+    return tuple(rows)
+
+
+def outgoing_diagnosis(
+    settings: ActionSettings,
+    alarm: AlarmState,
+    priority: Priority,
+    time: float,
+    now: float,
+    summary: str,
+    details: Mapping[str, Any],
+) -> tuple[Outgoing, ...]:
+    """Return the rows for a full diagnosis: one for each sink that is told when the alarm is new.
+
+    Parameters
+    ----------
+    settings, priority, now, details
+        As for `outgoing`.
+    alarm
+        Whose cause was diagnosed.
+    time
+        End of the window that was diagnosed (epoch, s).
+    summary
+        What the diagnosis says.
+    """
+    rows = []
+    for name, sink in settings.sinks.items():
+        if _concerns(sink, priority, alarm.asset, alarm.alarm, DIAGNOSED, State.UNACKNOWLEDGED):
+            key = key_of(name, alarm.asset, alarm.alarm, DIAGNOSED, repr(time))
+            event = {
+                "key": key,
+                "time": time,
+                "asset": alarm.asset,
+                "alarm": alarm.alarm,
+                "sequence": alarm.sequence,
+                "before": alarm.state.value,  # it changes nothing about the alarm
+                "after": alarm.state.value,
+                "event": DIAGNOSED,
+                "cause": summary,
+                "who": "system",
+                "priority": priority,
+                "details": dict(details),
+            }
             rows.append(Outgoing(key, name, event, created=now, due=now))
     return tuple(rows)
 
@@ -165,13 +217,18 @@ def put_off(retry: RetrySettings, row: Outgoing, now: float, at_least: float = 0
 
 
 def _concerns(
-    sink: WebhookSettings | CommandSettings | MessageSettings, transition: Transition, priority: Priority
+    sink: WebhookSettings | CommandSettings | MessageSettings,
+    priority: Priority,
+    asset: str,
+    alarm: str,
+    event: str,
+    state: State,
 ) -> bool:
     wanted: tuple[tuple[tuple[str, ...] | None, str], ...] = (
-        (sink.alarms, transition.alarm),
-        (sink.assets, transition.asset),
+        (sink.alarms, alarm),
+        (sink.assets, asset),
         (sink.priorities, priority),
-        (sink.events, transition.event),
-        (sink.states, transition.after),
+        (sink.events, event),
+        (sink.states, state),
     )
-    return transition.before is not transition.after and all(names is None or one in names for names, one in wanted)
+    return all(names is None or one in names for names, one in wanted)

@@ -16,6 +16,7 @@ from servoscope.broker import BrokerSettings
 from servoscope.settings import Finite, Positive, Settings, Word
 
 __all__ = [
+    "DIAGNOSED",
     "PLACEHOLDERS",
     "ActionSettings",
     "CommandSettings",
@@ -35,6 +36,7 @@ def _is_name(value: str) -> str:
 Name = Annotated[str, Field(strict=True), AfterValidator(_is_name)]
 Whole = Annotated[int, Field(strict=True, ge=1)]
 
+DIAGNOSED = "diagnosed"  # an event that is none of the life-cycle: the cause of an alarm is known
 BELIEVED = 1e3  # ratio to healthy, or its inverse, beyond which a change is not left to a formula
 PLACEHOLDERS = ("key", "time", "asset", "alarm", "event", "after", "priority", "quantity", "value", "previous")
 
@@ -65,7 +67,8 @@ class _Sink(Settings):
         Names for which it acts; None: all.
     priorities, events, states
         Which of their transitions: priorities, events of the life-cycle, and states that are entered; None: all. By
-        default those that an operator is told: a new alarm, and its return to normal.
+        default those that an operator is told: a new alarm, and its return to normal. The event ``diagnosed``, that
+        the cause of an alarm is known, is heard where new alarms are.
     timeout_s
         How long one try may take [s].
     """
@@ -73,7 +76,7 @@ class _Sink(Settings):
     alarms: tuple[Word, ...] | None = None
     assets: tuple[Word, ...] | None = None
     priorities: tuple[Priority, ...] | None = None
-    events: tuple[Event, ...] | None = None
+    events: tuple[Event | Literal["diagnosed"], ...] | None = None
     states: tuple[State, ...] | None = (State.UNACKNOWLEDGED, State.RETURNED, State.LATCHED_UNACKNOWLEDGED)
     timeout_s: Positive = 10.0
 

@@ -25,7 +25,7 @@ Why = Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in the history
 
 PATIENCE_S = 5.0
 LONGEST_S = 366 * 86400.0  # shelving has an end
-COLUMNS = ("asset", "alarm", "state", "since", "priority")
+COLUMNS = ("asset", "alarm", "state", "since", "until", "priority")
 
 
 @alarms.command("list")

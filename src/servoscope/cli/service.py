@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from servoscope.cli.moments import moment
 from servoscope.cli.options import AsJson
 from servoscope.cli.outputs import check_output
 from servoscope.cli.shell import print_json
+from servoscope.complaints import instead
 from servoscope.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
@@ -76,6 +78,7 @@ def run(
         typer.echo(f"{config}: {counted}; all can be used")
         return
     logs.set_up(settings.service.log)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # nothing is in hand yet
     from servoscope.live.service import Service
     from servoscope.live.serving import serve
     from servoscope.web.beside import Beside
@@ -113,7 +116,8 @@ def watch(
 
     def page() -> Group:
         statuses = opened.statuses(asset)
-        ill = [name for name, row in statuses.items() if row["status"].get("verdict") == "fault"]
+        of = {name: row["status"] for name, row in statuses.items()}
+        ill = {name: said["since"] for name, said in of.items() if said.get("verdict") == "fault"}
         return watching.page(statuses, standing(opened, ill), out.width)
 
     known(opened, asset or ())
@@ -196,7 +200,7 @@ def known(store: Store, assets: Sequence[str]) -> None:
     there = store.statuses() if assets else {}
     for name in assets:
         if name not in there:
-            raise StoreError(f"{name}: no such asset in {store.name}, only {', '.join(there) or 'none yet'}")
+            raise StoreError(f"{name}: no such asset in {store.name}, {instead(name, there)}")
 
 
 def export(path: Path, rows: list[Any]) -> None:

@@ -85,7 +85,7 @@ def faults(statuses: Mapping[str, Mapping[str, Any]], diagnoses: Mapping[str, Ma
     for name, row in statuses.items():
         status, full = row["status"], diagnoses.get(name)
         if status.get("verdict") == "fault":
-            known = full is not None and full["verdict"] == "fault" and full["t"] >= status["since"]
+            known = full is not None and full["verdict"] == "fault"
             lines.append(f"{name}: {full['summary'] if known and full is not None else status['summary']}")
     return lines
 
@@ -152,7 +152,7 @@ def _told(row: Mapping[str, Any]) -> str:
 def _cell(name: str, value: Any) -> str:
     if value is None:
         return "-"
-    if name in ("t", "at", "created", "onset", "since", "due", "asked", "from", "time"):
+    if name in ("t", "at", "created", "onset", "since", "due", "asked", "from", "until", "time"):
         return clock(value)
     if name == "outcome":
         return str(value) if len(value) <= OUTCOME else f"{value[: OUTCOME - 3]}..."

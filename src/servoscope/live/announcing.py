@@ -16,6 +16,7 @@ from servoscope.alarms import (
     FloodState,
     Notice,
     Snapshot,
+    State,
     Transition,
     advance,
     announce,
@@ -23,6 +24,7 @@ from servoscope.alarms import (
     start,
     step,
 )
+from servoscope.complaints import instead
 from servoscope.errors import AlarmError, StateError
 from servoscope.live.examining import Told
 from servoscope.live.rows import Outcome, Row, transition_row
@@ -30,7 +32,8 @@ from servoscope.live.rows import Outcome, Row, transition_row
 __all__ = ["Announcer"]
 
 VERSION = 1
-FAULT = "fault"  # the alarm that fault-tolerant actions go by
+FAULT = "fault"  # the alarm that diagnoses and fault-tolerant actions go by
+UNTOLD = (State.NORMAL, State.SHELVED, State.SUPPRESSED, State.OUT_OF_SERVICE)
 
 
 class Announcer:
@@ -115,15 +118,32 @@ class Announcer:
                 rows.append(Row("audit", {"who": "servoscope", "what": notice.kind, "document": words}))
                 rows += map(self._posted, actions.outgoing_flood(self._settings, notice, now))
                 continue
-            definition = self._alarms.definitions[notice.transition.alarm]
-            advice = {
-                "consequence": definition.consequence,
-                "operator_action": definition.operator_action,
-                "response_time_s": definition.response_time_s,
-            }
-            found = actions.outgoing(self._settings, notice.transition, notice.priority, now, {**advice, **details})
+            one = notice.transition
+            found = actions.outgoing(self._settings, one, notice.priority, now, {**self._advice(one.alarm), **details})
             rows += map(self._posted, found)
         return rows
+
+    def _advice(self, alarm: str) -> dict[str, Any]:
+        definition = self._alarms.definitions[alarm]
+        return {
+            "consequence": definition.consequence,
+            "operator_action": definition.operator_action,
+            "response_time_s": definition.response_time_s,
+        }
+
+    def diagnosed(self, alarms: Mapping[str, AlarmState], told: Told, t: float, now: float) -> list[Row]:
+        """Take a full diagnosis that is news, and the alarms of its asset; return rows for the outbox.
+
+        Nobody is told of it whom the alarm itself was kept from: put away, or held back in a flood.
+        """
+        alarm = alarms.get(FAULT)
+        if alarm is None or alarm.state in UNTOLD or any(one.whose == (alarm.asset, FAULT) for one in self._flood.held):
+            return []
+        faults = told.document.get("faults", [])
+        words = {"verdict": told.verdict, "diagnosis": told.summary, "onset": told.onset, "faults": faults}
+        priority, details = self._alarms.definitions[FAULT].priority, {**self._advice(FAULT), **words}
+        found = actions.outgoing_diagnosis(self._settings, alarm, priority, t, now, told.summary, details)
+        return [self._posted(one) for one in found]
 
     def watch(self, buffered: float, now: float) -> Outcome:
         """Take how full the buffer is, as a share, and let the service's own alarms follow."""
@@ -142,7 +162,7 @@ class Announcer:
             If there is no such alarm, or the command has no meaning in its state.
         """
         if alarm not in self._own:
-            raise AlarmError(f"{self.name}: has no alarm {alarm!r}, only {', '.join(self._own)}")
+            raise AlarmError(f"{self.name}: has no alarm {alarm!r}, {instead(alarm, self._own)}")
         self._own[alarm], transitions = step(self._alarms.definitions[alarm], self._own[alarm], command, now)
         return self._outcome(list(transitions))
 

@@ -118,7 +118,10 @@ def _assets(config: Config) -> dict[str, Asset]:
     for name, settings in config.assets.items():
         path, point = config.folder / settings.baseline, settings.point
         if path not in files:
-            files[path] = Baseline.load(path)
+            try:
+                files[path] = Baseline.load(path)
+            except BaselineError as error:
+                raise ConfigError(f"[assets] {name}.baseline: {error}") from None
         if (path, point) not in shared:
             try:
                 baseline = files[path] if point is None else files[path].at(point)

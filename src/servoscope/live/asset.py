@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,13 +12,14 @@ import numpy as np
 from servoscope import quality
 from servoscope.alarms import AlarmSettings, Command, Snapshot, Transition, advance, start, step
 from servoscope.baseline import Baseline
+from servoscope.complaints import instead
 from servoscope.errors import AlarmError, StateError
 from servoscope.live.arrival import arrive
 from servoscope.live.block import Block
 from servoscope.live.checkpoint import Counted, Progress
 from servoscope.live.config import DiagnosisSettings
-from servoscope.live.examining import Examined, Told, examine
-from servoscope.live.judging import Judged, Window, judge, phase_of
+from servoscope.live.examining import Examined, Told, begun_at, examine
+from servoscope.live.judging import Judged, Window, ask_in_full, judge, phase_of
 from servoscope.live.numbering import Place, place
 from servoscope.live.rows import Outcome, Row, transition_row
 from servoscope.live.showing import about, shown, status_of, summary_of
@@ -162,7 +163,7 @@ class Asset:
             If there is no such alarm, or the command has no meaning in its state.
         """
         if self.progress is None or alarm not in self._definitions:
-            raise AlarmError(f"{self.name}: has no alarm {alarm!r}, only {', '.join(self._definitions)}")
+            raise AlarmError(f"{self.name}: has no alarm {alarm!r}, {instead(alarm, self._definitions)}")
         progress, self._out = self.progress, Outcome([], [])
         state = progress.alarms[alarm]
         state, transitions = step(self._definitions[alarm], state, command, max(state.at, progress.counted.t))
@@ -179,14 +180,28 @@ class Asset:
         ready = [one for one in self.progress.windows if ended or not one.until - after <= t < one.until]
         return [(one, [b for b in self._window if b.sequence >= one.first and b.t[0] < one.until]) for one in ready]
 
+    def is_news(self, window: Window, said: Told) -> bool:
+        """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
+        found = names_of(said.document.get("faults", []))
+        return self._is_first(window) or bool(found and found != names_of(self._now.judged.faults))
+
+    def _is_first(self, window: Window) -> bool:
+        """Return whether no window of its fault came before."""
+        return window.until <= self._now.judged.since + self.how.diagnosis.after_s
+
     def told(self, window: Window, said: Told) -> Outcome:
         """Take the answer to one of `wanted`, once."""
         progress = self._now
         if window not in progress.windows:
             return Outcome([], [])
         judged = progress.judged
-        if said.verdict == judged.verdict == "fault":
-            judged = replace(judged, faults=said.document.get("faults", []))
+        if judged.verdict == "fault" and window.until > judged.since:
+            # a later window that names nothing, for the fault changes in it, says no less
+            judged = replace(judged, faults=said.document.get("faults") or judged.faults)
+            if not self._is_first(window):
+                said = begun_at(said, judged.onset)
+            elif said.onset is not None:
+                judged = replace(judged, onset=said.onset)
         left = tuple(one for one in progress.windows if one != window)
         self.progress = replace(progress, judged=judged, windows=left)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **said._asdict()}
@@ -255,13 +270,15 @@ class Asset:
 
         judged, found = judge(progress.judged, settings, t, exceeded, look, phase_of(self.name))
         self.progress = replace(progress, judged=judged)
-        if found is None or found.verdict == before:
+        if found is None:
             return
-        told = Told(found.verdict, found.summary, found.onset, found.document or {})
-        self._add("diagnoses", t=t, grounds="examination", **told._asdict())
-        if found.verdict == "fault":
+        if found.verdict != before:
+            told = Told(found.verdict, found.summary, found.onset, found.document or {})
+            self._add("diagnoses", t=t, grounds="examination", **told._asdict())
+        judged, in_full = ask_in_full(judged, settings.window_s, t)
+        if in_full:
             window = Window(self._number(), self._last(settings.window_s)[0].sequence, t + settings.after_s, "full")
-            self.progress = replace(self._now, windows=(*self._now.windows, window))
+            self.progress = replace(self._now, judged=judged, windows=(*self._now.windows, window))
 
     def _last(self, seconds: float) -> list[Block]:
         """Return the blocks of the last seconds."""
@@ -298,3 +315,8 @@ class Asset:
             if not old and held <= 2.0 * window_s * self._rate:
                 return
             held -= self._window.popleft().t.size
+
+
+def names_of(faults: Iterable[Mapping[str, Any]]) -> set[str]:
+    """Return which faults are named."""
+    return {str(one["name"]) for one in faults}

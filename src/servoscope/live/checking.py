@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Collection, Mapping
 
 from servoscope.actions import ActionSettings, CommandSettings, MessageSettings, WebhookSettings, secret_of
-from servoscope.complaints import nearest
+from servoscope.complaints import instead
 from servoscope.errors import ConfigError
 from servoscope.live.asset import Asset
 from servoscope.live.config import Config
@@ -57,6 +57,4 @@ def _usable(where: str, sink: WebhookSettings | CommandSettings | MessageSetting
 def _known(where: str, kind: str, names: Collection[str], known: Collection[str]) -> None:
     for name in names:
         if name not in known:
-            guess = nearest(name, known)
-            what = f"did you mean {guess[0]!r}?" if guess else f"only {', '.join(known) or 'none'}"
-            raise ConfigError(f"{where}: there is no {kind} {name!r}, {what}")
+            raise ConfigError(f"{where}: there is no {kind} {name!r}, {instead(name, known)}")

@@ -15,7 +15,7 @@ from servoscope.live.block import Block
 from servoscope.recording import Recording, clean
 from servoscope.store.history import dated
 
-__all__ = ["Examined", "Told", "diagnose_in_full", "examine"]
+__all__ = ["Examined", "Told", "begun_at", "diagnose_in_full", "examine"]
 
 
 class Told(NamedTuple):
@@ -115,5 +115,18 @@ def diagnose_in_full(baseline: Baseline, name: str, blocks: Sequence[Block]) -> 
     onset = begins + said.onset_s[1]
     # months later nobody knows when the window began
     summary = said.summary.replace(f"since {said.onset_s[1]:.1f} s", f"since {dated(onset)} UTC")
-    summary = summary.replace("since the start of the recording or before", f"since {dated(begins)} UTC or before")
+    summary = summary.replace("since the start of the recording or before", or_before(begins))
     return Told(said.verdict, summary, onset, document)
+
+
+def begun_at(said: Told, onset: float | None) -> Told:
+    """Return the diagnosis of a window, with an onset before it that is known from another one [UTC s]."""
+    words = or_before(said.document.get("began", 0.0))
+    if onset is None or words not in said.summary:
+        return said
+    return said._replace(summary=said.summary.replace(words, f"since {dated(onset)} UTC"), onset=onset)
+
+
+def or_before(begins: float) -> str:
+    """Return what is said of an onset at the beginning of a window, or before it."""
+    return f"since {dated(begins)} UTC or before"

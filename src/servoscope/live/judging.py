@@ -3,7 +3,8 @@
 The recursion watches every sample, against the baseline's own coefficients. An examination compares the last minutes
 with what a healthy loop would have shown under the reference that really ran; it costs milliseconds. So there is one
 from time to time, and one at once when the recursion and the verdict disagree; while they go on disagreeing, the time
-between them doubles. A new fault, and its end, are looked at in full some seconds later (`servoscope.diagnose`).
+between them doubles. A new fault is looked at in full some seconds later (`servoscope.diagnose`), and again each time
+it has become twice as old: it may have grown, and another may have come.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from typing import Any
 from servoscope.live.config import DiagnosisSettings
 from servoscope.live.examining import Examined
 
-__all__ = ["Judged", "Window", "judge", "phase_of"]
+__all__ = ["Judged", "Window", "ask_in_full", "judge", "phase_of"]
 
 FIRST_DOUBT_S = 1.0  # until a disagreement is examined for the second time
+DAY_S = 86400.0  # between two full diagnoses of a fault that stands, at most
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class Judged:
         How often the recursion disagreed in vain, and when it is heard again [UTC s].
     faults
         What the last full diagnosis says of the fault that is there: name, parameter, ratio, interval.
+    again
+        From when on a fault that stands is diagnosed in full once more [UTC s].
     """
 
     due: float
@@ -59,6 +63,7 @@ class Judged:
     doubts: int = 0
     retry: float = 0.0
     faults: list[dict[str, Any]] = field(default_factory=list)
+    again: float = 0.0
 
 
 def phase_of(asset: str) -> float:
@@ -97,7 +102,7 @@ def judge(
         The new state, and the examination if there was one.
     """
     if state.examined is not None and t < state.examined:  # the clock was set back
-        state = replace(state, due=t, retry=t)
+        state = replace(state, due=t, retry=t, again=t)
     disagrees = exceeded != (state.verdict == "fault")
     if not disagrees:
         state = replace(state, doubts=0)
@@ -130,3 +135,20 @@ def judge(
         ),
         found,
     )
+
+
+def ask_in_full(state: Judged, window_s: float, t: float) -> tuple[Judged, bool]:
+    """Return whether a full diagnosis is due after an examination, and the state that remembers it.
+
+    Parameters
+    ----------
+    state
+        Behind the examination.
+    window_s
+        Length of the window [s]; a fault that fills it is diagnosed better than one that has just come.
+    t
+        Now [UTC s].
+    """
+    if state.verdict != "fault" or (t < state.again and t != state.since):
+        return state, False
+    return replace(state, again=t + min(max(t - state.since, window_s), DAY_S)), True

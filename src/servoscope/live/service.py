@@ -163,8 +163,13 @@ class Service:
             del self._looking[name, window]
             asset, said = self.assets[name], job.result()
             log("info", "diagnosis", asset=name, verdict=said.verdict, summary=said.summary)
+            is_news = asset.is_news(window, said)
             self.tell(asset, asset.told(window, said))
-            self.writer.add(self.config.name, self.announcer.respond(name, said, window.until, time.time()))
+            now = time.time()
+            if is_news and asset.progress is not None:
+                alarms = asset.progress.alarms
+                self.writer.add(self.config.name, self.announcer.diagnosed(alarms, said, window.until, now))
+            self.writer.add(self.config.name, self.announcer.respond(name, said, window.until, now))
             self.writer.stands(asset)
 
     def _listen(self) -> None:

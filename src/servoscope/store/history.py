@@ -89,13 +89,14 @@ def coarse(store: Store, asset: str, span: tuple[float, float], points: int) -> 
     return rows, sum(row["rows"] for row in rows)
 
 
-def standing(store: Store, assets: Sequence[str]) -> dict[str, Row]:
-    """Return the last full diagnosis of each of these assets that has one."""
+def standing(store: Store, since: Mapping[str, float]) -> dict[str, Row]:
+    """Return the last full diagnosis of each asset since a time [UTC s] that names a fault; the first if none does."""
     table, found = tables.diagnoses, {}
-    for asset in assets:
-        query = sa.select(table).where((table.c.asset == asset) & (table.c.grounds == "full"))
-        for row in store.rows(query.order_by(table.c.t.desc(), table.c.number.desc()).limit(1)):
-            found[asset] = row
+    for asset, begins in since.items():
+        wanted = (table.c.asset == asset) & (table.c.grounds == "full") & (table.c.t >= begins)
+        for row in store.rows(sa.select(table).where(wanted).order_by(table.c.t, table.c.number)):
+            if row["document"].get("faults") or asset not in found:
+                found[asset] = row
     return found
 
 

@@ -59,7 +59,8 @@ def url_of(text: str, folder: Path) -> URL:
         raise StoreError("store: cannot be read as a URL, write postgresql://user@host/database, or a path") from None
     kind = url.get_backend_name()
     if kind not in ("sqlite", "postgresql"):
-        raise StoreError(f"store: {kind} is not supported, give a path for SQLite or postgresql://...")
+        hint = "write postgresql://" if kind == "postgres" else "give a path for SQLite or postgresql://..."
+        raise StoreError(f"store: {kind}:// is not supported, {hint}")
     if kind == "sqlite" and not url.database:
         raise StoreError(f"store: {text} would be lost with the process, give a path")
     if kind == "sqlite":

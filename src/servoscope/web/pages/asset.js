@@ -125,17 +125,16 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   await Promise.all([chosen(span).then(() => (plane.past(past24), plane.take(asset.responses, asset.t, began(asset)))), look(), sample()]);
 }
 
-// Since when there is a fault: as the full diagnosis has it, before that as the tests tell it.
-function began({ verdict, onset, since, diagnosis }) {
-  if (verdict !== "fault") return null;
-  return (diagnosis?.grounds === "full" ? diagnosis.onset : null) ?? onset ?? since;
+// Since when there is a fault.
+function began({ verdict, onset, since }) {
+  return verdict === "fault" ? (onset ?? since) : null;
 }
 
 // What is known of a fault once it has a name; before that, what the service says.
 function told(asset) {
   if (asset.verdict !== "fault" || !asset.sizes.length) return asset.summary;
   const each = asset.sizes.map((one) => `${one.parameter} is ${number(one.ratio, 4)} times its healthy value (95 %: ${number(one.low, 4)} to ${number(one.high, 4)})`);
-  return `${capital(each.join(", "))}, as the full diagnosis of the moments around its onset says.`;
+  return `${capital(each.join(", "))}, as the last full diagnosis says.`;
 }
 
 const half = (element) => (element.classList.add("half"), element);
