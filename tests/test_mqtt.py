@@ -210,9 +210,9 @@ def test_through_the_whole_service_and_back(tmp_path: Path, broker: Mosquitto, s
     assert status["faults"][0]["ratio"] == pytest.approx(1.2, abs=0.05)
     alarm = until(lambda: sender.heard.get("plant/alarms"))
     assert (alarm["asset"], alarm["alarm"], alarm["after"]) == ("press", "fault", "unacknowledged") and alarm["key"]
-    metrics = service.one.metrics.text().decode()
-    assert 'servoscope_refused_total{asset="press",kind="not a block",source="line"} 1.0' in metrics
-    assert 'servoscope_source_up{source="line"} 1.0' in metrics
+    refused = 'servoscope_refused_total{asset="press",kind="not a block",source="line"} 1.0'
+    until(lambda: refused in service.one.metrics.text().decode())
+    assert 'servoscope_source_up{source="line"} 1.0' in service.one.metrics.text().decode()
     service.end(stop=True)
     (refused,) = asked(subscribed, "SELECT document FROM audit WHERE what = 'refused'")
     assert json.loads(refused[0])["kind"] == "not a block"

@@ -58,6 +58,11 @@ def taken(message: bytes) -> None:
     assert 0 <= block.sequence < 2**63 and 0 <= block.stream < 2**63
 
 
+def test_what_it_quotes_keeps_to_one_line() -> None:
+    taken(b'{"version": "\\n1"}')
+    taken(b'{"\\n": 1}')
+
+
 @given(st.binary(max_size=300) | st.binary(max_size=300).map(lambda x: b"SVSB\x01" + x))
 @settings(max_examples=300)
 def test_any_bytes(message: bytes) -> None:

@@ -16,7 +16,7 @@ from servoscope.live.config import Config
 from servoscope.live.service import Service
 
 CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
-SECONDS = 30
+SECONDS = 15
 WEB = """
 [web]
 listen = "127.0.0.1:0"

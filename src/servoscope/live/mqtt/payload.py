@@ -129,7 +129,7 @@ def _json(asset: str, message: bytes, due: float) -> Received:
     if strange := set(plain) - KEYS:
         raise MessageError("keys", f"unknown key {min(strange)[:40]!r}, choose from {', '.join(sorted(KEYS))}")
     if plain.get("version") != VERSION:
-        raise MessageError("version", f"version {str(plain.get('version'))[:20]}, only {VERSION} is known")
+        raise MessageError("version", f"version {str(plain.get('version'))[:20]!r}, only {VERSION} is known")
     stream, sequence = _whole(plain, "stream", 0), _whole(plain, "sequence", None)
     oldest = None if plain.get("oldest") is None else _whole(plain, "oldest", None)
     numbers = np.stack(_columns(plain, ("r", "u", "y")))
