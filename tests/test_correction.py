@@ -11,6 +11,7 @@ from scipy import stats
 
 import naive
 from servoscope.baseline import Baseline
+from servoscope.inverse import nominal_theta
 from servoscope.learning import learn
 from servoscope.loop import Loop
 from servoscope.monitor import examine
@@ -63,6 +64,21 @@ def test_ifrf_is_that_of_the_actuator(parameter: str, ratio: float) -> None:
     assert np.all(error(np.mean(told, axis=0), plant) <= LARGEST), error(np.mean(told, axis=0), plant)
     if (parameter, ratio) == ("beta", 0.1):  # so much is taken out
         assert error(np.mean(raw, axis=0), plant)[2] > 0.1
+
+
+def test_standard_deviations_hold_before_and_after_a_change() -> None:
+    """All along a trace whose bias comes from its last evaluation; 18 s are a few memories only, hence the margin."""
+    ill = loop().plant.with_ratios({"C_ie": 1.2})
+    before, after = [], []
+    for seed in range(SEEDS):
+        _, trace = examine(learned(0, 600.0), recorded(300 + seed, 60.0, FaultEvent("C_ie", 1.2, 30.0)))
+        std = np.sqrt(np.diagonal(trace.covariance, axis1=1, axis2=2))
+        for found, plant, (begins, ends) in ((before, loop().plant, (10.0, 28.0)), (after, ill, (40.0, 58.0))):
+            off = (trace.theta - nominal_theta(loop(), plant)) / std
+            found.append(off[(trace.t > begins) & (trace.t < ends)])
+    for found in (before, after):
+        rms = np.sqrt(np.mean(np.concatenate(found) ** 2, axis=0))
+        assert np.all((rms > 0.5) & (rms < 1.8)), rms
 
 
 def test_ellipses_hold_the_truth_in_95_of_100_recordings() -> None:

@@ -25,11 +25,14 @@ class Meaning:
 
     After a change the past that theta_hat has not forgotten yet counts as a bias too. The covariance becomes that of
     the estimate alone: the noise in the coefficients under the actuator that was found, and what is left of the start.
+    The actuator was found from one evaluation: its noise is in the bias, and so in the evaluations after the change.
 
     Parameters
     ----------
     gain
-        How an error of theta_hat reaches the corrected coefficients, shape (n, n).
+        How an error of theta_hat at evaluation `at` reaches the coefficients that are corrected there, shape (n, n).
+    at
+        Evaluation from which the actuator was found.
     ill
         The actuator that was found; None where nothing changed.
     since
@@ -37,6 +40,7 @@ class Meaning:
     """
 
     gain: FloatArray
+    at: int
     ill: Plant | None = None
     since: int = 0
 
@@ -55,14 +59,14 @@ def meaning(x: Examination, candidates: Sequence[Candidate], since: Onset | None
     if x.noise is None or not x.evaluations or not e.updates[at] > 0 or baseline.loop.monitor.structure != "svf":
         return None
     if since is None:
-        return Meaning(np.eye(x.pipeline.bank.n))
+        return Meaning(np.eye(x.pipeline.bank.n), at)
     likely = next((c for c in candidates if c.name != UNKNOWN), None)
     guess = {fault.parameter: fault.ratio for fault in likely.faults} if likely else {}
     first, start = x.recalled(at), np.array(baseline.model_theta)
     recalled = x.expectation(first, int(e.index[at]) + 1)
     ill_since = max(since.sample - first, 0)
     found = explain(recalled, baseline.plant, start, e.theta[at], x.covariance(at), ill_since, guess)
-    return Meaning(found.gain, found.plant, since.sample)
+    return Meaning(found.gain, at, found.plant, since.sample)
 
 
 def trace(x: Examination, meant: Meaning | None, at: slice | None = None) -> Trace:
@@ -123,10 +127,24 @@ def _unbiased(
     true = nominal_theta(x.pipeline.loop, plant)
     # the healthy path: what was expected, without what the model leaves unexplained
     bias = shift = expected - (x.tuning.theta - start) - true
-    S = x.growth * e.S[at]
+    S, late = x.growth * e.S[at], np.zeros(len(e.index[at]), dtype=np.bool_)
     if meant.ill is not None and path is not None:
         late = e.index[at] >= meant.since
         bias = path - np.where(late[:, None], nominal_theta(x.pipeline.loop, meant.ill), true)
         S = S if spread is None else np.where(late[:, None, None], spread, S)
-    covariance = meant.gain @ (S + e.Psi[at] @ C @ np.swapaxes(e.Psi[at], -1, -2)) @ meant.gain.T
+    covariance = S + e.Psi[at] @ C @ np.swapaxes(e.Psi[at], -1, -2)
+    if late.any():
+        covariance[late] = _with_bias(x, meant, covariance[late], e.updates[at][late])
     return e.theta[at] - bias, covariance, expected - shift
+
+
+def _with_bias(x: Examination, meant: Meaning, covariance: FloatArray, updates: FloatArray) -> FloatArray:
+    """Return the covariance of theta_hat less a bias that comes from one evaluation, shape (K, n, n).
+
+    With e the error of an evaluation, e_0 that of the one, G the gain: e + (G - 1) e_0. Both errors share the noise that
+    theta_hat has not forgotten between them, exp(-lag / memory) of it.
+    """
+    lag = np.abs(updates - x.estimates.updates[meant.at])
+    shared = np.exp(-lag / x.pipeline.memory)[:, None, None]
+    G, M = meant.gain, meant.gain - np.eye(len(meant.gain))
+    return shared * (G @ covariance @ G.T) + (1.0 - shared) * (covariance + M @ covariance @ M.T)
