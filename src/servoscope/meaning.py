@@ -141,10 +141,11 @@ def _unbiased(
 def _with_bias(x: Examination, meant: Meaning, covariance: FloatArray, updates: FloatArray) -> FloatArray:
     """Return the covariance of theta_hat less a bias that comes from one evaluation, shape (K, n, n).
 
-    With e the error of an evaluation, e_0 that of the one, G the gain: e + (G - 1) e_0. Both errors share the noise that
-    theta_hat has not forgotten between them, exp(-lag / memory) of it.
+    With e the error of an evaluation, e_0 that of the one, G the gain: e + (G - 1) e_0. Both errors share the noise
+    that theta_hat has not forgotten between them, exp(-lag / memory) of it.
     """
     lag = np.abs(updates - x.estimates.updates[meant.at])
     shared = np.exp(-lag / x.pipeline.memory)[:, None, None]
     G, M = meant.gain, meant.gain - np.eye(len(meant.gain))
-    return shared * (G @ covariance @ G.T) + (1.0 - shared) * (covariance + M @ covariance @ M.T)
+    found: FloatArray = shared * (G @ covariance @ G.T) + (1.0 - shared) * (covariance + M @ covariance @ M.T)
+    return found
