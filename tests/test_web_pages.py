@@ -28,6 +28,7 @@ THEMES = ("light", "dark")
 PATIENCE_MS = 30_000.0
 LONG_MS = 180_000.0  # learning and designing, on a busy machine
 Open = Callable[..., Any]
+SIGNALS = ("Time", "Reference r", "Input u", "Output y")
 
 
 @pytest.fixture(scope="module")
@@ -257,9 +258,12 @@ def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: P
     log = shared_data / "real" / "emps" / "DATA_EMPS.mat"
     page = open_page("/learn")
     page.get_by_role("combobox", name="Loop", exact=True).select_option("a loop file of your own")
-    page.get_by_label("Loop file (TOML)").last.fill((project / "examples" / "emps.toml").read_text())
+    text = (project / "examples" / "emps.toml").read_text().replace('output = "qm"', 'output = "1.0 * qm"')
+    page.get_by_label("Loop file (TOML)").last.fill(text)
     page.get_by_label("Drop healthy recordings here").set_input_files(log)
     expect(page.get_by_role("region", name="Recordings to learn from")).to_contain_text("DATA_EMPS.mat")
+    expect(page.get_by_text("As the loop file says.")).to_be_visible()
+    assert [page.get_by_label(name, exact=True).input_value() for name in SIGNALS] == [""] * 4
     page.get_by_role("button", name="Inspect them").click()
     expect(page.get_by_role("region", name="Recordings to learn from")).to_contain_text("usable", timeout=LONG_MS)
     page.get_by_role("button", name="Learn").click()
@@ -271,6 +275,12 @@ def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: P
     page.get_by_role("link", name="diagnose a recording with it").click()
     page.get_by_label("Drop a recording here").set_input_files(log)
     expect(page.get_by_label("Compare with the baseline")).to_be_visible()
+    # the columns are the baseline's, not what their names look like; without one that fits they are guessed
+    assert [page.get_by_label(name, exact=True).input_value() for name in SIGNALS] == ["t", "qg", "vir", "1.0 * qm"]
+    expect(page.get_by_text("As the loop says.")).to_be_visible()
+    page.get_by_label("Compare with the baseline").select_option(index=0)
+    expect(page.get_by_text("Guessed from the names")).to_be_visible()
+    page.get_by_label("Compare with the baseline").select_option("emps")
     page.get_by_label("From [s]").fill("12.4")
     page.get_by_role("button", name="Diagnose").click()
     page.wait_for_url("**/diagnoses/*", timeout=LONG_MS)

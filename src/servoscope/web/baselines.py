@@ -77,7 +77,7 @@ def baseline_of(context: Context, id_: str) -> Kept:
 
 
 def _saved(context: Context, about: Plain) -> Kept:
-    row = {"name": about["id"], "origin": "saved", "assets": [], **about}
+    row = {"name": about["id"], "origin": "saved", "assets": [], "columns": None, **about}
     return Kept(context.folder.path("baselines", about["id"]).absolute() / "baseline.json", row)
 
 
@@ -87,6 +87,7 @@ def _facts(baseline: Baseline) -> Plain:
         "loop": baseline.loop.name,
         "hash": baseline.hash,
         "points": list(baseline.points),
+        "columns": baseline.loop.columns.model_dump(mode="json"),
         "recordings": len(sources),
         "duration_s": sum(source.duration_s for source in sources),
     }
@@ -167,7 +168,7 @@ def loops(context: In, _: Viewer) -> Plain:
 
 def _loop(ref: dict[str, str], loop: Loop, toml: str | None) -> Plain:
     facts = {"plant": loop.plant.kind, "sample_rate_hz": loop.sample_rate, "controller": loop.controller is not None}
-    return {"ref": ref, "name": loop.name, **facts, "toml": toml}
+    return {"ref": ref, "name": loop.name, **facts, "columns": loop.columns.model_dump(mode="json"), "toml": toml}
 
 
 @router.post("/learnings", response_model=answers.JobSaid, status_code=HTTP_202_ACCEPTED)

@@ -90,6 +90,7 @@ class BaselineRow(Said):
     loop: str
     hash: str
     points: list[str]
+    columns: dict[str, Any] | None
     assets: list[str]
     recordings: int
     duration_s: float

@@ -35,7 +35,8 @@ function steps(one, baselines, wanted, signal) {
   const diagnose = h("button", { type: "button", class: "first", disabled: !baselines.length }, "Diagnose");
 
   const repoint = () => {
-    const points = baselines.find((each) => each.id === baseline.value)?.points ?? [];
+    const { points = [], columns: known = null } = baselines.find((each) => each.id === baseline.value) ?? {};
+    columns.suit(known);
     point.replaceChildren(...points.map((name) => h("option", {}, name)));
     pointed.hidden = !points.length;
   };

@@ -37,10 +37,12 @@ export async function show(main, { session, signal }) {
     listed.replaceChildren(table("Recordings to learn from", ["Recording", "Use", "*Rows", "Operating point", "Quality"], chosen.map((each) => [each.upload.name, each.box, count(each.upload.rows), each.point, each.said])));
     if (!mapped) {
       mapped = mapping(one);
+      mapped.suit(loop.columns());
       columns.replaceChildren(h("h3", {}, "What is what, in all of them"), preview(one), mapped.element);
     }
     enable();
   };
+  loop.changed(() => mapped?.suit(loop.columns()));
   const used = () => chosen.filter((each) => each.box.checked);
   function enable() {
     learn.disabled = look.disabled = !used().length;

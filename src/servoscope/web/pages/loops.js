@@ -26,5 +26,8 @@ export async function loopChoice(id, signal, wanted = null) {
   select.addEventListener("change", refresh);
   refresh();
   const element = h("div", {}, h("div", { class: "actions" }, field("Loop", select), edit), shown);
-  return { element, read: () => (select.value === OWN ? { toml: text.value } : loops[select.value].ref) };
+  // As `suit` of a mapping takes them.
+  const columns = () => (select.value === OWN ? /^\s*\[columns\]/m.test(text.value) || null : loops[select.value].columns);
+  const changed = (then) => [select, edit, text].forEach((each) => each.addEventListener(each === edit ? "click" : "change", then));
+  return { element, columns, changed, read: () => (select.value === OWN ? { toml: text.value } : loops[select.value].ref) };
 }

@@ -60,23 +60,50 @@ export function preview(one) {
   return h("div", {}, about, made);
 }
 
-// Which column is what; `read()` returns it as the interface wants it.
+// Which column is what; `read()` returns it as the interface wants it. `suit` takes the columns of the loop that the
+// recording is compared with (null: nothing is known of them; true: they stand in its text, which the server reads): a
+// guess by names must not overrule what somebody has said. What was typed in stays.
 export function mapping(one) {
   const names = one.columns.map((column) => column.name);
   const id = `columns-${one.id}`;
-  const known = one.mapping ?? {};
-  const fields = Object.fromEntries(SIGNALS.map(([key]) => [key, h("input", { list: id, name: key, value: known[key] ?? "", autocomplete: "off" })]));
-  const unit = h("select", { name: "time_unit" }, UNITS.map((name) => h("option", { value: name, selected: name === known.time_unit }, name)));
+  const typed = new Set();
+  const input = (key, more) => h("input", { name: key, autocomplete: "off", ...more, oninput: () => typed.add(key) });
+  const fields = Object.fromEntries(SIGNALS.map(([key]) => [key, input(key, { list: id })]));
+  const segment = input("segment", { placeholder: "none" });
+  const unit = h("select", { name: "time_unit", onchange: () => typed.add("time_unit") }, h("option", { value: "" }, "as in the loop file"), UNITS.map((name) => h("option", { value: name }, name)));
+  const origin = h("p", { class: "note" });
   const element = h(
     "div",
     {},
     h("datalist", { id }, names.map((name) => h("option", { value: name }))),
-    h("div", { class: "fields" }, SIGNALS.map(([key, words]) => field(words, fields[key])), field("Unit of time", unit)),
+    h("div", { class: "fields" }, SIGNALS.map(([key, words]) => field(words, fields[key])), field("Unit of time", unit), field("New run where this changes", segment)),
+    origin,
     h("p", { class: "note" }, "A column, or a combination of columns: 0.025 * counts, set_point - error. Units are those that the baseline was learned in."),
   );
+  const suit = (columns) => {
+    const own = columns === true;
+    const fit = !own && columns !== null && SIGNALS.every(([key]) => fits(columns[key], names));
+    const found = own ? {} : fit ? columns : one.mapping;
+    for (const [key] of SIGNALS) {
+      fields[key].placeholder = own ? "as in the loop file" : "";
+      if (!typed.has(key)) fields[key].value = found[key] ?? "";
+    }
+    if (!typed.has("segment")) segment.value = (found.segment ?? []).join(", ");
+    if (!typed.has("time_unit")) unit.value = found.time_unit ?? "";
+    origin.textContent = own ? "As the loop file says." : fit ? "As the loop says." : "Guessed from the names: look whether this is so.";
+  };
+  suit(null);
   const read = () => {
     const said = Object.fromEntries(SIGNALS.map(([key]) => [key, fields[key].value.trim()]).filter(([, value]) => value));
-    return { ...said, time_unit: unit.value, ...(known.segment?.length ? { segment: known.segment } : {}) };
+    const runs = segment.value.split(",").map((name) => name.trim()).filter(Boolean);
+    return { ...said, ...(unit.value && { time_unit: unit.value }), ...(runs.length && { segment: runs }) };
   };
-  return { element, read };
+  return { element, read, suit };
+}
+
+// Whether an expression is made of these columns alone; null: a recording without time.
+function fits(expression, names) {
+  let rest = expression ?? "";
+  for (const name of [...names].sort((a, b) => b.length - a.length)) rest = rest.replaceAll(name, " ");
+  return !/\p{L}/u.test(rest.replace(/\d\.?e[-+]?\d+/gi, "0"));
 }
