@@ -308,13 +308,22 @@ class TestAsset:
         assert [news for _, news, _ in told] == [True, False, False]  # the same fault: nobody is told once more
         assert [size for *_, size in told] == pytest.approx([1.2, 1.2, 1.6], abs=0.01)
         assert followed.progress is not None
-        (fault,) = followed.status(followed.progress)["faults"]
+        status = followed.status(followed.progress)
+        (fault,) = status["faults"]
+        assert status["summary"] == status["alarms"]["fault"]["cause"] and "leakage. C_ie is 1.6" in status["summary"]
         assert fault["ratio"] == told[-1][2] and followed.progress.judged.onset == onsets[0]
         assert onsets == [onsets[0]] * 3 and onsets[0] == pytest.approx(BEGAN + 30.0, abs=0.5)
         other = Told("fault", "Fault: pump.", None, {"faults": [{"name": "pump", "ratio": 0.9}]})
         nothing = Told("fault", "Fault, unknown.", None, {"faults": []})
         late = Window(99, 0, BEGAN + 400.0, "full")
         assert followed.is_news(late, other) and not followed.is_news(late, nothing)
+        # once it has gone the alarm still says what it was
+        for block in blocks(halls.recorded(1, seconds=120.0)):
+            followed.take(replace(block, sequence=block.sequence + 1000, t=block.t + 401.0))
+        status = followed.status(followed.progress)
+        assert status["verdict"] == "healthy" and status["summary"].startswith("Healthy")
+        assert status["alarms"]["fault"]["state"] == "latched_unacknowledged"
+        assert "leakage. C_ie is 1.6" in status["alarms"]["fault"]["cause"]
 
 
 class TestConfig:

@@ -10,6 +10,7 @@ flood, notices = announce(settings.flood, flood, transition, settings.definition
 from servoscope.alarms.conditions import Condition, Snapshot, condition
 from servoscope.alarms.definitions import (
     DEFAULTS,
+    FAULT,
     PRIORITIES,
     AlarmDefinition,
     AlarmSettings,
@@ -26,6 +27,7 @@ from servoscope.alarms.status import Status, status
 __all__ = [
     "COMMANDS",
     "DEFAULTS",
+    "FAULT",
     "PRIORITIES",
     "TABLE",
     "AlarmDefinition",

@@ -12,7 +12,7 @@ from servoscope.complaints import describe
 from servoscope.quality import KINDS
 from servoscope.settings import Finite, NotNegative, Positive, Settings
 
-__all__ = ["DEFAULTS", "PRIORITIES", "AlarmDefinition", "AlarmSettings", "FloodSettings", "Ne107", "Priority"]
+__all__ = ["DEFAULTS", "FAULT", "PRIORITIES", "AlarmDefinition", "AlarmSettings", "FloodSettings", "Ne107", "Priority"]
 
 Text = Annotated[str, Field(strict=True)]
 
@@ -114,6 +114,7 @@ class FloodSettings(Settings):
         return self
 
 
+FAULT = "fault"  # the alarm that diagnoses and fault-tolerant actions go by
 DEFAULTS: dict[str, dict[str, Any]] = {
     "fault": {
         "source": "verdict",

@@ -10,6 +10,7 @@ from typing import Any
 from servoscope import actions
 from servoscope.actions import ActionSettings, Outgoing, ToleranceState
 from servoscope.alarms import (
+    FAULT,
     AlarmSettings,
     AlarmState,
     Command,
@@ -32,7 +33,6 @@ from servoscope.live.rows import Outcome, Row, transition_row
 __all__ = ["Announcer"]
 
 VERSION = 1
-FAULT = "fault"  # the alarm that diagnoses and fault-tolerant actions go by
 UNTOLD = (State.NORMAL, State.SHELVED, State.SUPPRESSED, State.OUT_OF_SERVICE)
 
 

@@ -195,13 +195,16 @@ class Asset:
         if window not in progress.windows:
             return Outcome([], [])
         judged = progress.judged
-        if judged.verdict == "fault" and window.until > judged.since:
+        if judged.verdict != "fault" or window.until > judged.since:  # else of a fault before this one
             # a later window that names nothing, for the fault changes in it, says no less
-            judged = replace(judged, faults=said.document.get("faults") or judged.faults)
+            faults = said.document.get("faults") or judged.faults
             if not self._is_first(window):
                 said = begun_at(said, judged.onset)
-            elif said.onset is not None:
-                judged = replace(judged, onset=said.onset)
+            named = said.summary if said.document.get("faults") or not judged.named else judged.named
+            judged = replace(judged, named=named)
+            if judged.verdict == "fault":
+                first = self._is_first(window) and said.onset is not None
+                judged = replace(judged, faults=faults, onset=said.onset if first else judged.onset)
         left = tuple(one for one in progress.windows if one != window)
         self.progress = replace(progress, judged=judged, windows=left)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **said._asdict()}

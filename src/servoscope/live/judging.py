@@ -50,6 +50,8 @@ class Judged:
         How often the recursion disagreed in vain, and when it is heard again [UTC s].
     faults
         What the last full diagnosis says of the fault that is there: name, parameter, ratio, interval.
+    named
+        What the last full diagnosis that named something, or the first, says of this fault, or of the last one.
     again
         From when on a fault that stands is diagnosed in full once more [UTC s].
     """
@@ -63,6 +65,7 @@ class Judged:
     doubts: int = 0
     retry: float = 0.0
     faults: list[dict[str, Any]] = field(default_factory=list)
+    named: str = ""
     again: float = 0.0
 
 
@@ -132,6 +135,7 @@ def judge(
             onset=state.onset if same and state.onset is not None else found.onset,
             examined=t,
             faults=state.faults if found.verdict == "fault" else [],
+            named=state.named if same or found.verdict != "fault" else "",
         ),
         found,
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from servoscope import quality
-from servoscope.alarms import AlarmDefinition, State, status
+from servoscope.alarms import FAULT, AlarmDefinition, State, status
 from servoscope.baseline import Baseline
 from servoscope.diagnosis import Trace
 from servoscope.live.checkpoint import Progress
@@ -87,7 +87,7 @@ def status_of(progress: Progress, definitions: Mapping[str, AlarmDefinition]) ->
     ne107 = status(verdict, findings, [(definitions[name], state) for name, state in progress.alarms.items()])
     return {
         "verdict": verdict,
-        "summary": summary_of(judged, findings),
+        "summary": judged.named if verdict == "fault" and judged.named else summary_of(judged, findings),
         "since": judged.since,
         "onset": judged.onset,
         "faults": judged.faults,
@@ -100,7 +100,8 @@ def status_of(progress: Progress, definitions: Mapping[str, AlarmDefinition]) ->
                 "state": state.state.value,
                 "since": state.since,
                 "priority": definitions[name].priority,
-                "cause": state.cause,
+                # what was said at the last sample would be, once the fault has gone, that all is well
+                "cause": judged.named if name == FAULT and judged.named else state.cause,
                 "until": state.shelved_until,
             }
             for name, state in progress.alarms.items()

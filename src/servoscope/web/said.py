@@ -194,6 +194,7 @@ class DiagnosisRow(Said):
 class AssetDetail(AssetRow):
     """An asset with all that is known of it now."""
 
+    now: float
     exceeded: bool | None
     responses: list[ResponseNow]
     parameters: list[ParameterNow]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, get_args
 
@@ -120,6 +121,7 @@ def detail_of(name: str, at: float, said: Mapping[str, Any], found_sizes: Sequen
     units = about.get("coefficient_units", ())
     return {
         **asset_row(name, at, said, found_sizes),
+        "now": time.time(),
         "exceeded": said.get("exceeded"),
         "responses": [_response(*row) for row in said.get("responses", ())],
         "parameters": [

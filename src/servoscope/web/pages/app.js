@@ -74,10 +74,12 @@ function logIn() {
   location.assign(`/login?next=${encodeURIComponent(location.pathname + location.search)}`);
 }
 
+const LINK = { live: "Live", quiet: "Nothing new for a minute: does the service run?", lost: "Connection lost, trying again" };
+
 // Whether what is on the page is still being told: words, beside the navigation.
 function linked(state) {
   mark(link, "data-state", state);
-  tell(link, state === "live" ? "Live" : "Connection lost, trying again");
+  tell(link, LINK[state]);
 }
 
 function entitle(title) {

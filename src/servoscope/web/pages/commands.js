@@ -32,11 +32,14 @@ export function commands(alarm, session, said) {
     said(answer.outcome === null ? "Asked for: the service carries it out as soon as it runs." : null);
   };
   const press = async (command) => {
+    for (const button of made) button.disabled = true; // the service takes a moment
     try {
       if (command in NEEDS) await question(alarm, command, send);
       else await send(command, {});
     } catch (error) {
       said(error.message);
+    } finally {
+      for (const button of made) button.disabled = false;
     }
   };
   const made = alarm.commands.map((command) => {

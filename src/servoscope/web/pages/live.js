@@ -1,14 +1,21 @@
 // Live updates: one stream per page, joined to at most one call per drawn frame; silent while the page is hidden.
 
-// Calls `heard({ event: [data, ...] })`. `state` hears "live" or "lost"; the browser itself connects again.
+const QUIET_S = 60.0; // without news: the server is there, the service perhaps not
+
+// Calls `heard({ event: [data, ...] })`. `state` hears "live", "quiet" or "lost"; the browser itself connects again.
 export function follow(path, events, heard, state, signal) {
   let waiting = {};
   let wanted = 0;
   let source = null;
+  let news = performance.now() / 1000; // when the newest of what is shown was stored [s]
+  const judge = () => source?.readyState === EventSource.OPEN && state(performance.now() / 1000 - news > QUIET_S ? "quiet" : "live");
   const flush = () => {
     wanted = 0;
     const told = waiting;
     waiting = {};
+    const latest = Math.max(...[...(told.assets ?? []).flatMap((each) => each.assets), ...(told.asset ?? [])].map((row) => row.at));
+    if (latest > -Infinity) news = performance.now() / 1000 - ((told.assets ?? told.asset).at(-1).now - latest);
+    judge();
     heard(told);
     // When the newest of what is shown was told [UTC s]: an attribute, for whoever wants to know whether the page keeps up.
     const last = told.assets?.at(-1)?.now ?? told.asset?.at(-1)?.at;
@@ -16,7 +23,7 @@ export function follow(path, events, heard, state, signal) {
   };
   const open = () => {
     source = new EventSource(`/api/v1/live${path}`);
-    source.onopen = () => state("live");
+    source.onopen = judge;
     source.onerror = () => {
       state("lost");
       if (source.readyState === EventSource.CLOSED) retry();
@@ -39,6 +46,7 @@ export function follow(path, events, heard, state, signal) {
   const retry = () => setTimeout(() => (document.hidden || signal.aborted ? null : dispatchEvent(new Event("streamclosed")) && open()), 3000);
   const seen = () => (document.hidden ? close() : source || open());
   document.addEventListener("visibilitychange", seen, { signal });
-  signal.addEventListener("abort", close);
+  const timer = setInterval(judge, 5000);
+  signal.addEventListener("abort", () => (close(), clearInterval(timer)));
   seen();
 }
