@@ -106,6 +106,8 @@ def test_what_is_no_percentage_has_a_unit(loop: Loop) -> None:
     plant = {**AXIS["plant"], "friction": "directional", "offset": True}
     told = Loop.from_dict({**AXIS, "plant": plant}).plant.coefficient_units
     assert told == ("u s²/y", "u s/y", "u s/y", "u", "u")
+    told = Loop.from_dict({**AXIS, "plant": {**plant, "input_gain": 35.15}}).plant.coefficient_units
+    assert told[:1] == ("input_gain u s²/y",)  # newtons, where it is in N/V
 
 
 def test_the_axes_give_way_to_a_path_but_not_to_a_wild_value() -> None:

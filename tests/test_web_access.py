@@ -307,7 +307,17 @@ class TestSettings:
         done = run("serve", "--store", tmp_path / "new.sqlite", "--listen", "0.0.0.0:0")
         assert done.code == 1 and "[web] users: missing" in done.err
         done = run("serve", "--store", tmp_path / "new.sqlite", "--listen", "127.0.0.1:0", "--users", "none.json")
-        assert done.code == 1 and "has no users" in done.err
+        assert done.code == 1 and "none.json: no such file, add one" in done.err
+
+    def test_a_path_of_the_command_line_is_relative_to_where_it_is_said(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "there").mkdir()
+        (tmp_path / "here").mkdir()
+        path = hall(tmp_path / "there", "x")
+        monkeypatch.chdir(tmp_path / "here")
+        done = run("serve", path, "--users", "users.json")
+        assert done.code == 1 and f"{tmp_path / 'here' / 'users.json'}: no such file" in done.err
 
     def test_the_section_is_part_of_the_service_file(self, tmp_path: Path) -> None:
         path = hall(tmp_path, "x", more='[web]\nlisten = "0.0.0.0:80"\n')

@@ -60,8 +60,10 @@ def serve(
     from servoscope.web.serving import serve as run
 
     found = Config.load(config) if config is not None else None
-    given = {"listen": listen, "hosts": host or None, "users": users, "folder": folder}
-    settings = settings_of(found, {**given, "certificate": certificate, "key": key})
+    # what is said here is relative to where it is said, and what the service file says to that file
+    paths = {"users": users, "folder": folder, "certificate": certificate, "key": key}
+    given = {name: None if path is None else str(Path(path).absolute()) for name, path in paths.items()}
+    settings = settings_of(found, {**given, "listen": listen, "hosts": host or None})
     here = found.folder if found is not None else Path.cwd()
     url = found.store.url if found is not None else str(store)
     # a store that is there is never changed; one that is not is made, so that files can be diagnosed at once

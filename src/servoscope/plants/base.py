@@ -90,7 +90,7 @@ class Plant(BaseModel, abc.ABC):
     @property
     def coefficient_units(self) -> tuple[str, ...]:
         """Units of the n coefficients, in u and y themselves where theirs are not known."""
-        of_y, of_u = (unit or letter for unit, letter in zip(self.units, "yu", strict=True))
+        of_y, of_u = self.units[0] or "y", self.units[1] or ("u" if self.input_gain == 1.0 else "input_gain u")
         extra = [f"{of_u} s/{of_y}" if name in ("forward_v", "backward_v") else of_u for name in self.extras]
         return (*(f"{of_u}{('', ' s', ' s²', ' s³', ' s⁴')[power]}/{of_y}" for power in self.powers), *extra)
 

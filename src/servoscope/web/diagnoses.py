@@ -96,6 +96,7 @@ def _of_asset(context: Context, id_: str) -> Plain:
         # of the baseline that the asset has now: which one it had then, the store does not know
         "baseline": {"id": baseline, "name": asset, "hash": about.get("baseline") or ""} if about else None,
         "units": telling.units_of(about.get("units")),
+        "coefficient_units": list(about.get("coefficient_units", ())),
         "signals": None,
         "trace": None,
         "report": None,
@@ -109,6 +110,7 @@ def _of_upload(context: Context, id_: str) -> Plain:
         **_row(about),
         **data,
         "units": telling.units_of(data["units"]),
+        "coefficient_units": [one["unit"] for one in data["trace"]["parameters"]],
         "began": None,
         "who": about["who"],
         "baseline": about["baseline"],

@@ -76,6 +76,7 @@ class Diagnosis(DiagnosisRow):
     who: str | None
     baseline: dict[str, Any] | None
     units: dict[str, str] | None
+    coefficient_units: list[str]
     signals: dict[str, Any] | None
     trace: dict[str, Any] | None
     report: str | None

@@ -74,7 +74,9 @@ def serve(settings: WebSettings, store: Store, config: Config | None, folder: Pa
     """
     users = Users(folder / settings.users) if settings.users is not None else None
     if users is not None and not users.all():
-        raise ConfigError(f"{folder / str(settings.users)}: has no users, add one: servoscope users add NAME")
+        file = folder / str(settings.users)
+        what = "has no users" if file.exists() else "no such file"
+        raise ConfigError(f"{file}: {what}, add one: servoscope users add NAME --users {file}")
     hub = Hub(store)
     context = Context(
         settings=settings,

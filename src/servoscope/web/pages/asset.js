@@ -165,9 +165,8 @@ function verdictOf(name) {
     say(summary, told(asset));
     const since = began(asset) ?? asset.since;
     put("since", moment(since), `for ${duration(asset.t - since)}${asset.verdict === "fault" ? ", onset as estimated" : ""}`);
-    const [first] = asset.sizes;
-    const found = first && size({ ...first, interval: [first.low, first.high] });
-    put("size", found ? `${first.parameter} ${found[0]}` : DASH, found ? `95 %: ${found[1]} to ${found[2]}` : asset.verdict === "fault" && asset.awaited.length ? "the full diagnosis is under way" : "no fault that is named");
+    const found = asset.sizes.map((one) => [one.parameter, ...size({ ...one, interval: [one.low, one.high] })]);
+    put("size", found.map(([parameter, value]) => `${parameter} ${value}`).join(", ") || DASH, found.length ? `95 %: ${found.map(([, , low, high]) => `${low} to ${high}`).join(", ")}` : asset.verdict === "fault" && asset.awaited.length ? "the full diagnosis is under way" : "no fault that is named");
     put("statistic", multiple(asset.statistic), asset.statistic >= 1 ? "above its limit" : "alarm at 1");
     put("level", multiple(asset.level), asset.level >= 1 ? "above its limit" : "alarm at 1");
     put("data", capital(asset.quality.map(plain).join(", ") || "sound"), `${count(asset.counted.lost)} blocks lost`);

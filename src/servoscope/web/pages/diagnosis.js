@@ -40,7 +40,9 @@ export async function show(main, { signal, part: id, entitle }) {
 function verdict(found, said) {
   const facts = [];
   const at = (t) => (found.began ? moment(found.began + t, { fraction: 2 }) : `${number(t, 4)} s`);
-  if (said.onset_s) facts.push(["Since when", at(said.onset_s[1]), `95 %: ${number(said.onset_s[0], 4)} s to ${number(said.onset_s[2], 4)} s of the recording`]);
+  const carried = found.began && found.onset !== null && found.onset < found.began; // an earlier window has seen it
+  if (said.onset_s && (carried || /or before/.test(found.summary))) facts.push(["Since when", carried ? moment(found.onset, { fraction: 2 }) : `${at(0)} or before`, carried ? "as an earlier diagnosis has it" : "it was there from the beginning"]);
+  else if (said.onset_s) facts.push(["Since when", at(said.onset_s[1]), `95 %: ${at(said.onset_s[0])} to ${at(said.onset_s[2])}`]);
   else if (found.onset) facts.push(["Since about", moment(found.onset), "as the tests tell it"]);
   for (const fault of said.faults ?? []) {
     const [value, low, high] = size(fault);
@@ -66,7 +68,8 @@ function sections(found, said, picture, drawn, signal) {
   const units = found.units ?? {};
   const marks = said.onset_s ? [[said.onset_s[1], "onset"]] : [];
   const made = [];
-  if (said.explanation?.length) made.push(section("Why", null, h("ul", { class: "why" }, said.explanation.map((words) => h("li", {}, prose(words))))));
+  const counted = found.began ? `Seconds count from ${moment(found.began, { fraction: 2 })}, where the window begins.` : null;
+  if (said.explanation?.length) made.push(section("Why", counted, h("ul", { class: "why" }, said.explanation.map((words) => h("li", {}, prose(words))))));
   if (said.candidates?.length) made.push(section("Candidates", "What could explain the change, how large each explanation would have to be, how probable it is.", candidates(found, said)));
   if (said.refit?.mimics?.length) {
     const rows = said.refit.mimics.map((one) => [h("span", {}, prose(one.name)), one.words, one.unit === "ratio" ? `× ${number(one.value, 4)}` : `${number(one.value, 3)} ${one.unit}`]);
@@ -88,8 +91,7 @@ function sections(found, said, picture, drawn, signal) {
   }
   const names = Object.entries(said.parameters ?? {});
   if (names.length) {
-    const unit = Object.fromEntries((trace?.parameters ?? []).map((one) => [one.name, one.unit]));
-    const rows = names.map(([name, one]) => ({ name, ...one, low: one.value - 1.96 * one.std, high: one.value + 1.96 * one.std, unit: unit[name] ?? "" }));
+    const rows = names.map(([name, one], i) => ({ name, ...one, low: one.value - 1.96 * one.std, high: one.value + 1.96 * one.std, unit: found.coefficient_units[i] ?? "" }));
     made.push(section("Coefficients at the end", null, parameters(rows).element));
   }
   if (said.warnings?.length) {
