@@ -278,6 +278,14 @@ class TestCommands:
         assert told[0] == ("ann", "acknowledge", "done") and told[1][2] == "refused:"
 
 
+@pytest.mark.parametrize("url", ["postgresql"], indirect=True)
+def test_postgresql_clears_samples_away_by_their_number(store: Store) -> None:
+    """By default it waits for a fifth of what the table held: 50 GB after a day of 200 assets and many crashes."""
+    kept = sa.text("SELECT reloptions FROM pg_class WHERE oid = 'recent'::regclass").columns(sa.column("reloptions"))
+    (row,) = store.rows(sa.select(kept.subquery()))
+    assert "autovacuum_vacuum_threshold=1000" in row["reloptions"]
+
+
 def test_a_long_history_is_thinned_by_the_database_to_what_was_largest(store: Store) -> None:
     batch = Batch()
     for number in range(1000):
