@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import shutil
@@ -35,6 +36,7 @@ from reliability.fleet import BLOCK_S, Fleet  # noqa: E402
 from reliability.servers import Postgres, programs  # noqa: E402
 from reliability.trial import Disturbance, Measured, Trial, quantile  # noqa: E402
 from servoscope.live import logs  # noqa: E402
+from servoscope.live.metrics import SECONDS  # noqa: E402
 from servoscope.output import atomic_write  # noqa: E402
 
 RESULTS = BENCHMARKS / "reliability" / "results"
@@ -217,7 +219,8 @@ def column(one: dict[str, Any]) -> list[tuple[str, str]]:
         times = [time for name, each in one["recoveries"].items() if name in names for time in each]
         rows.append((words, f"{len(times)}, {max(times):.1f} s" if times else "none"))
     p50, p99 = latency["undisturbed"]["p50"], latency["undisturbed"]["p99"]
-    rows.append(("latency undisturbed, p50 and p99", f"{p50:.2g} s, {p99:.2g} s"))
+    of = [f"{x:.2g} s" if math.isfinite(x) else f"over {SECONDS[-1]:g} s" for x in (p50, p99)]
+    rows.append(("latency undisturbed, p50 and p99", ", ".join(of)))
     rows.append(("memory, growth", f"{memory['late_mb']:.0f} MB, {100.0 * growth:+.1f} % in {memory['over_s']:.0f} s"))
     return rows
 
