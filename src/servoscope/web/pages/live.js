@@ -8,7 +8,8 @@ export function follow(path, events, heard, state, signal) {
   let wanted = 0;
   let source = null;
   let news = performance.now() / 1000; // when the newest of what is shown was stored [s]
-  const judge = () => source?.readyState === EventSource.OPEN && state(performance.now() / 1000 - news > QUIET_S ? "quiet" : "live");
+  const dated = events.includes("assets") || events.includes("asset"); // others tell what is rare
+  const judge = () => source?.readyState === EventSource.OPEN && state(dated && performance.now() / 1000 - news > QUIET_S ? "quiet" : "live");
   const flush = () => {
     wanted = 0;
     const told = waiting;
