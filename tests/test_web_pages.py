@@ -311,6 +311,35 @@ def test_every_page_is_accessible(open_page: Open, base: str, path: str, theme: 
         shot(page, "fleet-dark")
 
 
+@pytest.mark.parametrize("width", [1366, 800, 500])
+def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: Path, width: int) -> None:
+    wide = tmp_path / "wide.csv"  # what other columns a log has is its own affair
+    rows = [[str(i / 100) for _ in range(17)] for i in range(300)]
+    heads = ["t", "r", "u", "y", *(f"temperature_sensor_{i}" for i in range(13))]
+    wide.write_text("\n".join(map(",".join, [heads, *rows])))
+    page = open_page("/")
+    page.set_viewport_size({"width": width, "height": SIZE["height"]})
+    pages = [
+        "/",
+        "/assets/press-1",
+        "/alarms",
+        "/diagnose",
+        "/learn",
+        "/design",
+        f"/diagnoses/{diagnosis_of(base, 'press-1')}",
+    ]
+    for path in pages:
+        page.goto(base + path)
+        expect(page.get_by_role("heading", level=1)).to_be_visible()
+        if path in ("/diagnose", "/learn"):
+            page.locator("input[type=file]").set_input_files(wide)
+            expect(page.get_by_role("region", name="The first rows of wide.csv")).to_be_visible()
+        if path == "/alarms":
+            last = page.get_by_role("button", name="Out of service: fault of press-1").bounding_box()
+            assert last["x"] + last["width"] <= width
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+
+
 def test_the_switch_changes_colours_and_is_remembered(open_page: Open) -> None:
     page = open_page("/")
     paper = "getComputedStyle(document.documentElement).backgroundColor"

@@ -32,7 +32,7 @@ export async function show(main, { session, signal, linked, values }) {
 
   const heard = (words) => {
     tell(said, words ?? "Done.");
-    look();
+    look().catch(() => {}); // what went wrong with the command is said already
   };
 
   function draw() {
@@ -50,6 +50,7 @@ export async function show(main, { session, signal, linked, values }) {
             "Alarms, the most urgent first",
             ["Alarm", "Priority", "State", "Since", "Cause", "What to do", "Answer"],
             shown.map((one) => row(one)),
+            { class: "stacked" },
           )
         : h("p", { class: "empty" }, alarms.length ? "No alarm is like this." : "Nothing asks for an answer."),
     );
