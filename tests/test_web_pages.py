@@ -364,13 +364,47 @@ def test_the_page_says_when_the_service_is_gone_and_when_it_is_back(
         expect(link).to_have_text("Live")
 
 
-def test_login_is_refused_and_granted_by_role(open_page: Open, config: Path) -> None:
-    users = config.parent / "users.json"
+@pytest.fixture(scope="module")
+def users(config: Path) -> str:
+    """The name of a file of users beside the service file: vera may look, otto may answer."""
     for name, role in (("vera", "viewer"), ("otto", "operator")):
-        command = [sys.executable, "-m", "servoscope", "users", "add", name, "--role", role, "--users", str(users)]
+        command = [sys.executable, "-m", "servoscope", "users", "add", name, "--role", role, "--users", "users.json"]
         environment = os.environ | {"PYTHONPATH": screens.SOURCES}
-        subprocess.run([*command, "--password-stdin"], input=b"correct horse battery\n", check=True, env=environment)
-    with screens.serving(config, "--users", "users.json") as address:
+        said = [*command, "--password-stdin"]
+        subprocess.run(said, cwd=config.parent, input=b"correct horse battery\n", check=True, env=environment)
+    return "users.json"
+
+
+def test_a_session_that_is_over_begins_again_on_the_page(
+    open_page: Open, config: Path, users: str, eha_cases: Path
+) -> None:
+    def log_in() -> None:
+        page.get_by_label("User").fill("otto")
+        page.get_by_label("Password").fill("correct horse battery")
+        page.get_by_role("button", name="Log in").click()
+
+    with screens.serving(config, "--users", users) as address:
+        page = open_page("/diagnose", address=address, quiet=("401", "ERR_"))
+        log_in()
+        page.get_by_label("Drop a recording here").set_input_files(eha_cases / "multisine_C_iex1.2_11.csv")
+        expect(page.get_by_role("heading", name="Is it usable?")).to_be_visible(timeout=LONG_MS)
+    page.get_by_label("From [s]").fill("2.5")
+    listen = address.removeprefix("http://")
+    with screens.process("serve", config.name, "--listen", listen, "--users", users, cwd=config.parent):
+        until(lambda: asked(address, "/session"))
+        page.get_by_role("button", name="Diagnose").click()
+        expect(page.get_by_role("dialog", name="Log in again")).to_be_visible()
+        accessible(page)
+        page.keyboard.press("Escape")
+        expect(page.get_by_role("alert")).to_contain_text("log in first")
+        page.get_by_role("button", name="Diagnose").click()
+        log_in()
+        page.wait_for_url("**/diagnoses/*", timeout=LONG_MS)  # what was asked for is done
+        expect(page.get_by_role("region", name="Verdict")).to_contain_text("Internal leakage")
+
+
+def test_login_is_refused_and_granted_by_role(open_page: Open, config: Path, users: str) -> None:
+    with screens.serving(config, "--users", users) as address:
         page = open_page("/alarms", address=address, quiet=("401", "ERR_"))
         expect(page.get_by_role("heading", name="Log in")).to_be_visible()
         accessible(page)

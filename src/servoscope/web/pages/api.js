@@ -2,6 +2,7 @@
 
 const ROOT = "/api/v1";
 let known = null;
+let logInAgain = async () => false;
 
 export class Problem extends Error {
   constructor(status, problem) {
@@ -26,8 +27,21 @@ async function ask(method, path, { body, raw, signal } = {}) {
   }
   if (answer.status === 204) return null;
   const plain = await answer.json().catch(() => ({}));
-  if (!answer.ok) throw new Problem(answer.status, { title: answer.statusText, ...plain });
-  return plain;
+  if (answer.ok) return plain;
+  if (path !== "/session" && (await renewed(answer.status, method))) return ask(method, path, { body, raw, signal });
+  throw new Problem(answer.status, { title: answer.statusText, ...plain });
+}
+
+// Whether it is worth asking again: the session was over and another has begun, here or on another page with a token of its own.
+async function renewed(status, method) {
+  if (status === 401) return logInAgain();
+  const before = known?.csrf;
+  return status === 403 && method !== "GET" && (await session()).csrf !== before;
+}
+
+// What asks for a login over the page, so that the work on it stays; it returns whether somebody has logged in.
+export function whenSessionEnds(asks) {
+  logInAgain = asks;
 }
 
 export const get = (path, signal) => ask("GET", path, { signal });

@@ -24,6 +24,7 @@ const left = new AbortController();
 const theme = h("button", { type: "button", class: "quiet theme", onclick: change });
 const person = h("span", { class: "person" });
 const link = h("span", { class: "link", role: "status" });
+let asking = null; // a login that is under way
 
 function dark() {
   const chosen = document.documentElement.dataset.theme;
@@ -74,6 +75,15 @@ function logIn() {
   location.assign(`/login?next=${encodeURIComponent(location.pathname + location.search)}`);
 }
 
+// Over the page, once however many ask; whoever gives up finds the page as it was.
+function logInAgain() {
+  asking ??= import("./login.js")
+    .then(({ again }) => again())
+    .then((session) => session && (introduce(session), true))
+    .finally(() => (asking = null));
+  return asking;
+}
+
 const LINK = { live: "Live", quiet: "Nothing new for a minute: does the service run?", lost: "Connection lost, trying again" };
 
 // Whether what is on the page is still being told: words, beside the navigation.
@@ -97,9 +107,10 @@ async function start() {
     const [session, page] = await Promise.all([api.session(), load()]);
     introduce(session);
     if (session.login_required && !session.user && name !== "login") return logIn();
+    api.whenSessionEnds(logInAgain);
     addEventListener("streamclosed", async () => {
       const again = await api.session().catch(() => session); // no answer: not a matter of who is asking
-      if (!again.user) logIn();
+      if (!again.user) logInAgain();
     });
     await page.show(main, { session, entitle, linked, signal: left.signal, part: rest.join("/"), values: new URLSearchParams(location.search) });
   } catch (error) {

@@ -7,6 +7,25 @@ export async function show(main, { session, values }) {
   const next = new URL(values.get("next") ?? "/", location.origin);
   const target = next.origin === location.origin ? next.pathname + next.search : "/";
   if (!session.login_required || session.user) return location.replace(target);
+  const { element, user } = form("Log in", () => location.replace(target));
+  main.replaceChildren(element);
+  user.focus();
+}
+
+// Asks in a dialog over a page whose session is over; returns the new session, null if nobody logs in.
+export function again() {
+  return new Promise((resolve) => {
+    let begun = null;
+    const { element, user } = form("Log in again", (session) => ((begun = session), dialog.close()), "The session is over. What is on the page stays as it is.");
+    const dialog = h("dialog", { "aria-label": "Log in again" }, element);
+    dialog.addEventListener("close", () => (dialog.remove(), resolve(begun)));
+    document.body.append(dialog);
+    dialog.showModal();
+    user.focus();
+  });
+}
+
+function form(title, done, note = null) {
   const user = h("input", { name: "user", autocomplete: "username", required: true, autofocus: true });
   const password = h("input", { name: "password", type: "password", autocomplete: "current-password", required: true });
   const said = h("div", {});
@@ -16,8 +35,7 @@ export async function show(main, { session, values }) {
     button.disabled = true;
     said.replaceChildren();
     try {
-      await login(user.value, password.value);
-      location.replace(target);
+      done(await login(user.value, password.value));
     } catch (error) {
       if (!(error instanceof Problem)) throw error;
       said.replaceChildren(complaint(error));
@@ -27,6 +45,6 @@ export async function show(main, { session, values }) {
       button.disabled = false;
     }
   };
-  main.replaceChildren(h("form", { class: "login", onsubmit: enter }, h("h1", {}, "Log in"), field("User", user), field("Password", password), said, h("div", {}, button)));
-  user.focus();
+  const element = h("form", { class: "login", onsubmit: enter }, h("h1", {}, title), note && h("p", { class: "note" }, note), field("User", user), field("Password", password), said, h("div", {}, button));
+  return { element, user };
 }
