@@ -111,6 +111,12 @@ def accessible(page: Any) -> None:
     assert told == []
 
 
+def painted(page: Any) -> bool:
+    """Whether every chart has something in it."""
+    one = "c => c.width > 0 && [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data].some(Boolean)"
+    return all(page.locator("canvas").evaluate_all(f"all => all.map({one})"))
+
+
 def diagnosis_of(base: str, asset: str) -> str:
     return str(
         [one for one in asked(base, f"/diagnoses?asset={asset}")["diagnoses"] if one["grounds"] == "full"][-1]["id"]
@@ -177,8 +183,7 @@ def test_an_asset_says_what_is_wrong_how_much_and_since_when(open_page: Open) ->
     expect(page.get_by_text("samples in")).to_be_visible()
     page.wait_for_timeout(3000)
     shot(page, "asset", full_page=True)
-    painted = "c => [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data].some(Boolean)"
-    assert all(page.locator("canvas").evaluate_all(f"all => all.map({painted})"))
+    assert painted(page)
 
 
 def test_an_asset_is_live(open_page: Open) -> None:
@@ -244,6 +249,9 @@ def test_a_diagnosis_prints_in_black_on_white(open_page: Open, base: str, tmp_pa
     page.emulate_media(media="print")
     assert page.evaluate("getComputedStyle(document.body).color") == "rgb(28, 37, 48)"
     expect(page.locator("header.top")).to_be_hidden()
+    page.wait_for_timeout(500)  # sizes are watched
+    sizes = page.locator("canvas").evaluate_all("all => all.map(c => c.getBoundingClientRect().height)")
+    assert painted(page) and min(sizes) > 50.0
 
 
 def test_what_cannot_be_read_is_said(open_page: Open, tmp_path: Path) -> None:

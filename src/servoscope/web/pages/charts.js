@@ -29,7 +29,8 @@ export function plot(element, label, describe, signal) {
   const draw = () => {
     wanted ||= requestAnimationFrame(now);
   };
-  const watcher = new ResizeObserver(() => chart.resize());
+  // On paper the style sheet scales what was drawn: a plot whose height follows its picture must not shape that picture.
+  const watcher = new ResizeObserver(() => matchMedia("print").matches || chart.resize());
   watcher.observe(element);
   element.setAttribute("role", "img");
   element.setAttribute("aria-label", label);
