@@ -241,6 +241,31 @@ def test_a_recording_is_dropped_inspected_and_diagnosed(open_page: Open, eha_cas
     expect(report.value.get_by_role("heading", name="Internal leakage")).to_be_visible()
 
 
+def test_what_was_typed_in_is_there_again(open_page: Open, eha_cases: Path) -> None:
+    page = open_page("/diagnose")
+    page.get_by_label("Drop a recording here").set_input_files(eha_cases / "multisine_C_iex1.2_11.csv")
+    page.get_by_label("Output y").fill("y + 0")
+    page.get_by_label("From [s]").fill("1.5")
+    page.get_by_role("button", name="Diagnose").click()
+    page.wait_for_url("**/diagnoses/*", timeout=LONG_MS)
+    diagnosis = page.url
+    page.go_back()
+    expect(page.get_by_label("Output y")).to_have_value("y + 0")
+    expect(page.get_by_label("From [s]")).to_have_value("1.5")
+    page.goto(diagnosis)
+    page.get_by_role("link", name="Diagnose again").click()
+    expect(page.get_by_label("From [s]")).to_have_value("1.5")
+
+
+def test_a_loop_file_that_was_typed_in_survives_a_reload(open_page: Open, project: Path) -> None:
+    page = open_page("/learn")
+    text = (project / "examples" / "emps.toml").read_text()
+    page.get_by_role("combobox", name="Loop", exact=True).select_option("a loop file of your own")
+    page.get_by_label("Loop file (TOML)").last.fill(text)
+    page.reload()
+    expect(page.get_by_label("Loop file (TOML)").last).to_have_value(text)
+
+
 def test_a_diagnosis_prints_in_black_on_white(open_page: Open, base: str, tmp_path: Path) -> None:
     page = open_page(f"/diagnoses/{diagnosis_of(base, 'press-1')}", "dark")
     expect(page.get_by_role("region", name="Verdict")).to_contain_text("Internal leakage")
@@ -254,12 +279,15 @@ def test_a_diagnosis_prints_in_black_on_white(open_page: Open, base: str, tmp_pa
     assert painted(page) and min(sizes) > 50.0
 
 
-def test_what_cannot_be_read_is_said(open_page: Open, tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_said(open_page: Open, eha_cases: Path, tmp_path: Path) -> None:
     page = open_page("/diagnose", quiet=("422",))
+    page.get_by_label("Drop a recording here").set_input_files(eha_cases / "multisine_C_iex1.2_11.csv")
+    expect(page.get_by_role("heading", name="What is what")).to_be_visible()
     broken = tmp_path / "broken.csv"
     broken.write_bytes(b"\x00\xff nothing that a log would be")
     page.get_by_label("Drop a recording here").set_input_files(broken)
     expect(page.get_by_role("alert")).to_contain_text("broken.csv")
+    expect(page.get_by_role("heading", name="What is what")).to_have_count(0)  # that was of another file
 
 
 def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: Path, project: Path) -> None:

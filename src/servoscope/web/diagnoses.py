@@ -100,6 +100,7 @@ def _of_asset(context: Context, id_: str) -> Plain:
         "signals": None,
         "trace": None,
         "report": None,
+        "upload": None,
     }
 
 
@@ -115,6 +116,7 @@ def _of_upload(context: Context, id_: str) -> Plain:
         "who": about["who"],
         "baseline": about["baseline"],
         "report": f"{API}/diagnoses/{id_}/report",
+        "upload": about.get("upload"),
     }
 
 
@@ -151,7 +153,7 @@ async def diagnose(context: In, who: Operator, asked: AskedDiagnosis) -> Plain:
         hash_ = said.pop("hash")
         origin = {"id": asked.baseline, "name": baseline.row["name"], "hash": hash_}
         context.store.note(who.user, "", "diagnosis", {"diagnosis": id_, "recording": said["recording"], **origin})
-        context.folder.done("diagnoses", id_, {"who": who.user, "baseline": origin, **said})
+        context.folder.done("diagnoses", id_, {"who": who.user, "baseline": origin, "upload": asked.upload, **said})
         return {"diagnosis": f"{OF_UPLOAD}{id_}"}
 
     def abandon() -> None:

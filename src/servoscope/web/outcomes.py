@@ -80,6 +80,7 @@ class Diagnosis(DiagnosisRow):
     signals: dict[str, Any] | None
     trace: dict[str, Any] | None
     report: str | None
+    upload: str | None
 
 
 class BaselineRow(Said):

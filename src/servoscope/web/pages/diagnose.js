@@ -1,8 +1,9 @@
 // A recording from a file to its verdict: drop it, see what is in it, say which column is what, compare it with a baseline.
-import { get, job, mayChange, part } from "./api.js";
+import { get, job, mayChange, part, query } from "./api.js";
 import { list } from "./asset.js";
 import { during, field, h, section } from "./dom.js";
 import { inspected } from "./inspection.js";
+import { kept } from "./kept.js";
 import { dropzone, earlier, mapping, preview } from "./uploads.js";
 
 export async function show(main, { session, signal, values }) {
@@ -18,7 +19,7 @@ export async function show(main, { session, signal, values }) {
   const { baselines } = await get("/baselines", signal);
   const chosen = h("div", { class: "steps" });
   const open = (one) => chosen.replaceChildren(...steps(one, baselines, values.get("baseline"), signal));
-  work.append(section("Recording", null, dropzone("Drop a recording here", false, open, signal), (await earlier(open, signal)) ?? ""), chosen);
+  work.append(section("Recording", null, dropzone("Drop a recording here", false, open, signal, () => chosen.replaceChildren()), (await earlier(open, signal)) ?? ""), chosen);
   const known = values.get("upload");
   if (known) open(await get(`/uploads/${part(known)}`, signal));
 }
@@ -39,6 +40,7 @@ function steps(one, baselines, wanted, signal) {
     columns.suit(known);
     point.replaceChildren(...points.map((name) => h("option", {}, name)));
     pointed.hidden = !points.length;
+    history.replaceState(null, "", query("/diagnose", { upload: one.id, baseline: baseline.value })); // a reload, or the way back, finds it again
   };
   baseline.addEventListener("change", repoint);
   repoint();
@@ -57,16 +59,15 @@ function steps(one, baselines, wanted, signal) {
       location.assign(`/diagnoses/${encodeURIComponent(diagnosis)}`);
     }),
   );
+  const asked = section(
+    "What is what",
+    null,
+    preview(one),
+    columns.element,
+    h("div", { class: "fields" }, baselines.length ? field("Compare with the baseline", baseline) : h("p", { class: "complaint" }, "There is no baseline yet: ", h("a", { href: "/learn" }, "learn one"), "."), pointed, field("From [s]", from), field("To [s]", to)),
+    h("div", { class: "actions" }, diagnose, look, said),
+  );
+  kept(one.id, asked);
   if (columns.read().input && columns.read().output) during(look, said, inspect);
-  return [
-    section(
-      "What is what",
-      null,
-      preview(one),
-      columns.element,
-      h("div", { class: "fields" }, baselines.length ? field("Compare with the baseline", baseline) : h("p", { class: "complaint" }, "There is no baseline yet: ", h("a", { href: "/learn" }, "learn one"), "."), pointed, field("From [s]", from), field("To [s]", to)),
-      h("div", { class: "actions" }, diagnose, look, said),
-    ),
-    result,
-  ];
+  return [asked, result];
 }

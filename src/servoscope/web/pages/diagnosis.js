@@ -1,5 +1,5 @@
 // One diagnosis at its permanent address: verdict, grounds, candidates, pictures, numbers; it prints on paper.
-import { get, part } from "./api.js";
+import { get, part, query } from "./api.js";
 import { plot } from "./charts.js";
 import { coefficient, signals, tests } from "./curves.js";
 import { h, section, table } from "./dom.js";
@@ -13,6 +13,7 @@ export async function show(main, { signal, part: id, entitle }) {
   const said = found.document ?? {};
   const name = found.recording ?? found.asset ?? id;
   entitle(`${VERDICTS[found.verdict]}: ${name}`);
+  const again = found.upload && query("/diagnose", { upload: found.upload, baseline: found.baseline.id });
   const drawn = [];
   // A picture is drawn once its element has its place, and so its size.
   const picture = (label, describe, kind = "plot") => {
@@ -28,7 +29,7 @@ export async function show(main, { signal, part: id, entitle }) {
       h("h1", {}, "Diagnosis of ", where),
       h("span", { class: "note" }, [moment(found.t), found.grounds, found.who && `by ${found.who}`].filter(Boolean).join(", ")),
       h("span", { class: "gap" }),
-      h("div", { class: "actions" }, h("button", { type: "button", onclick: () => print() }, "Print"), found.report && h("a", { class: "button", href: found.report, target: "_blank", rel: "noopener" }, "Report as one file")),
+      h("div", { class: "actions" }, again && h("a", { class: "button", href: again }, "Diagnose again"), h("button", { type: "button", onclick: () => print() }, "Print"), found.report && h("a", { class: "button", href: found.report, target: "_blank", rel: "noopener" }, "Report as one file")),
     ),
     verdict(found, said),
     ...sections(found, said, picture, drawn, signal),

@@ -2,6 +2,7 @@
 import { get, job, mayChange, part, post } from "./api.js";
 import { complaint, during, field, h, section, table, tell } from "./dom.js";
 import { findings, inspected } from "./inspection.js";
+import { kept } from "./kept.js";
 import { loopChoice } from "./loops.js";
 import { mark, prose } from "./marks.js";
 import { dropzone, earlier, mapping, preview } from "./uploads.js";
@@ -9,7 +10,7 @@ import { change, count, DASH, duration, general, moment, number, plain, withStd 
 
 const KINDS = { usable: "healthy", "usable with care": "care", "not usable": "stop" };
 
-export async function show(main, { session, signal }) {
+export async function show(main, { session, signal, values }) {
   const saved = h("div", {});
   const work = h("div", { class: "steps" });
   main.replaceChildren(h("div", { class: "head" }, h("h1", {}, "Learn a baseline")), work, section("Baselines", null, saved));
@@ -34,11 +35,13 @@ export async function show(main, { session, signal }) {
     const entry = { upload: one, point: h("input", { size: "10", "aria-label": `Operating point of ${one.name}`, placeholder: "all" }), box: h("input", { type: "checkbox", checked: true, "aria-label": `Use ${one.name}` }), said: h("div", {}, h("small", {}, "not inspected")) };
     entry.box.addEventListener("change", enable);
     chosen.push(entry);
+    history.replaceState(null, "", `/learn?${new URLSearchParams(chosen.map((each) => ["upload", each.upload.id]))}`);
     listed.replaceChildren(table("Recordings to learn from", ["Recording", "Use", "*Rows", "Operating point", "Quality"], chosen.map((each) => [each.upload.name, each.box, count(each.upload.rows), each.point, each.said])));
     if (!mapped) {
       mapped = mapping(one);
       mapped.suit(loop.columns());
       columns.replaceChildren(h("h3", {}, "What is what, in all of them"), preview(one), mapped.element);
+      kept(one.id, mapped.element);
     }
     enable();
   };
@@ -76,6 +79,7 @@ export async function show(main, { session, signal }) {
     section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, h("div", { class: "actions" }, learn, look, said)),
     result,
   );
+  for (const id of values.getAll("upload")) await get(`/uploads/${part(id)}`, signal).then(add, () => {}); // those that are still there
 }
 
 function judged(each, inspection, open = null) {

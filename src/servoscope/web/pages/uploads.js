@@ -11,13 +11,14 @@ const SIGNALS = [
   ["output", "Output y"],
 ];
 
-// A place for files; `taken(upload)` is called for each that could be read.
-export function dropzone(words, several, taken, signal) {
+// A place for files; `taken(upload)` is called for each that could be read, `begun` before the first.
+export function dropzone(words, several, taken, signal, begun = () => {}) {
   const said = h("div", { role: "status", class: "working" });
   const input = h("input", { type: "file", class: "hidden", id: "files", multiple: several, "aria-label": words });
   const choose = h("button", { type: "button", class: "first", onclick: () => input.click() }, several ? "Choose files" : "Choose a file");
   const element = h("div", { class: "drop" }, h("span", {}, words), choose, input, h("small", {}, "CSV, Parquet, MAT, MDF4, TDMS, HDF5"), said);
   const take = async (files) => {
+    begun();
     for (const file of several ? files : [...files].slice(0, 1)) {
       said.replaceChildren(`Reading ${file.name}`);
       try {
