@@ -376,6 +376,26 @@ def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: 
         assert page.evaluate("document.documentElement.scrollWidth") <= width, path
 
 
+SAID = {  # by the service: as the pages say it
+    "T^2 is 1.27e+03 times its limit (p = 3e-69)": "T² is 1270 times its limit (p = 3 × 10⁻⁶⁹)",
+    "a budget of 3.16e+06 false alarms": "a budget of 3.16 × 10⁶ false alarms",
+    "set [monitor] model_error = 0.049": "set [monitor] model_error = 0.049",
+    "explains only 62% of u": "explains only 62\u00a0% of u",
+    "delay -0.00 samples (-0.00841 ms)": "delay 0.00 samples (−0.00841\u00a0ms)",
+    "press-1 on 2026-11-21": "press-1 on 2026-11-21",
+    "theta_0 fits valve_gain": "θ₀ fits valve gain",
+}
+
+
+def test_sentences_and_numbers_keep_to_one_style(open_page: Open) -> None:
+    page = open_page("/")
+    words = "(await import('/static/words.js'))"
+    for said, shown in SAID.items():
+        assert page.evaluate(f"async text => {words}.sentence(text)", said) == shown
+    assert page.evaluate(f"async () => {words}.withStd(-4e-9, 3.6e-7, 1e-6)") == ["0.0", "0.4 × 10⁻⁶", "1.0 × 10⁻⁶"]
+    assert page.evaluate(f"async () => {words}.capital('p_s is low')") == "p_s is low"
+
+
 def test_the_switch_changes_colours_and_is_remembered(open_page: Open) -> None:
     page = open_page("/")
     paper = "getComputedStyle(document.documentElement).backgroundColor"

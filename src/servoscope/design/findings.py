@@ -183,6 +183,8 @@ class Study(_Said):
     ----------
     loop, reference
         What is studied.
+    units
+        Of y and u; empty where they are not known.
     before_s, after_s
         Healthy seconds before the onset, and seconds after it that count.
     noise_u_std, noise_y_std
@@ -203,6 +205,7 @@ class Study(_Said):
 
     loop: str
     reference: str
+    units: tuple[str, str]
     before_s: float
     after_s: float
     noise_u_std: float

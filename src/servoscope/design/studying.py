@@ -85,6 +85,7 @@ def study(
     return Study(
         loop=scene.loop.name,
         reference=reference,
+        units=scene.loop.plant.units,
         before_s=scene.onset / scene.loop.sample_rate,
         after_s=scene.after_s,
         noise_u_std=scene.noise.u_std,

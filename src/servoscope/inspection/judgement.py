@@ -148,10 +148,11 @@ def _of_excitation(m: Measured, loop: Loop | None) -> Iterator[_Said]:
             f"the output rests {percent(m.rest.share)} of the time: record while the machine moves",
         )
     elif m.rest is not None and m.rest.share > 0.05:
+        unit = (loop.plant.units[0] if loop is not None else "") or "units of y"
         yield (
             "rest",
             "note",
-            f"the output rests {percent(m.rest.share)} of the time (speed below {m.rest.speed:.2g} per s)",
+            f"the output rests {percent(m.rest.share)} of the time (speed below {m.rest.speed:.2g} {unit}/s)",
         )
     if not m.coherent:
         words = f"the recording holds {m.periods:.2g} periods of the reference: too few periods to judge coherence"

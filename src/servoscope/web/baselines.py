@@ -77,7 +77,7 @@ def baseline_of(context: Context, id_: str) -> Kept:
 
 
 def _saved(context: Context, about: Plain) -> Kept:
-    row = {"name": about["id"], "origin": "saved", "assets": [], "columns": None, **about}
+    row = {"name": about["id"], "origin": "saved", "assets": [], "columns": None, "units": None, **about}
     return Kept(context.folder.path("baselines", about["id"]).absolute() / "baseline.json", row)
 
 
@@ -88,6 +88,7 @@ def _facts(baseline: Baseline) -> Plain:
         "hash": baseline.hash,
         "points": list(baseline.points),
         "columns": baseline.loop.columns.model_dump(mode="json"),
+        "units": telling.units_of(baseline.loop.plant.units),
         "recordings": len(sources),
         "duration_s": sum(source.duration_s for source in sources),
     }
@@ -131,9 +132,7 @@ def baselines(context: In, _: Viewer) -> Plain:
 def one(context: In, _: Viewer, id: str) -> Plain:
     """Tell a baseline: what was learned, and what it promises."""
     kept = baseline_of(context, id)
-    baseline = loaded(kept.path)
-    units = telling.units_of(baseline.loop.plant.units)
-    return {**kept.row, "summary": summaries.finite(summaries.baseline(baseline)), "units": units}
+    return {**kept.row, "summary": summaries.finite(summaries.baseline(loaded(kept.path)))}
 
 
 @router.get("/baselines/{id}/file", response_class=Response, responses=JSON)
@@ -168,7 +167,8 @@ def loops(context: In, _: Viewer) -> Plain:
 
 def _loop(ref: dict[str, str], loop: Loop, toml: str | None) -> Plain:
     facts = {"plant": loop.plant.kind, "sample_rate_hz": loop.sample_rate, "controller": loop.controller is not None}
-    return {"ref": ref, "name": loop.name, **facts, "columns": loop.columns.model_dump(mode="json"), "toml": toml}
+    known = {"columns": loop.columns.model_dump(mode="json"), "units": telling.units_of(loop.plant.units)}
+    return {"ref": ref, "name": loop.name, **facts, **known, "toml": toml}
 
 
 @router.post("/learnings", response_model=answers.JobSaid, status_code=HTTP_202_ACCEPTED)

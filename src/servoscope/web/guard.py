@@ -31,10 +31,13 @@ POLICY = (
 HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "same-origin",
-    "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
+
+
+# Browsers heed it over HTTPS and on loopback, and complain of it on every page elsewhere.
+OPENER = {"cross-origin-opener-policy": "same-origin"}
 
 
 class Refused(HTTPException):
@@ -67,6 +70,9 @@ class Guard:
         self._app, self._settings, self._users = app, settings, users
         self._sessions, self._metrics = sessions, metrics
         self._hosts = Hosts.of(settings.listen, settings.hosts)
+        # behind a proxy that ends TLS it listens on loopback
+        heeded = settings.secure or not self._hosts.numeric
+        self._headers = HEADERS | (OPENER if heeded else {})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request pass, or answer in its place."""
@@ -136,7 +142,7 @@ class Guard:
         return most
 
     def _dress(self, headers: MutableHeaders, path: str) -> None:
-        for name, value in HEADERS.items():
+        for name, value in self._headers.items():
             headers.setdefault(name, value)
         headers.setdefault("content-security-policy", POLICY)
         if path.startswith("/api") or path == "/metrics":

@@ -93,6 +93,7 @@ class BaselineRow(Said):
     hash: str
     points: list[str]
     columns: dict[str, Any] | None
+    units: dict[str, str] | None
     assets: list[str]
     recordings: int
     duration_s: float
@@ -110,7 +111,6 @@ class Baseline(BaselineRow):
     """A baseline with what was learned."""
 
     summary: dict[str, Any]
-    units: dict[str, str] | None
 
 
 class Loops(Said):

@@ -6,6 +6,7 @@ import { moment, multiple, number, unit } from "./words.js";
 export function tests(c, { t, statistic, level, marks = [], clock = true, range = [null, null] }) {
   const pairs = (values) => t.map((at, i) => [clock ? 1000 * at : at, values[i] > 0 ? values[i] : null]);
   const highest = Math.max(2, ...[...statistic, ...level].filter((value) => value > 0));
+  const sequential = level.some((value) => value > 0); // not every loop can be simulated, and so have one
   const lowest = Math.min(0.1, ...statistic.filter((value) => value > 0));
   const limit = {
     silent: true,
@@ -16,7 +17,7 @@ export function tests(c, { t, statistic, level, marks = [], clock = true, range 
   };
   return {
     grid: { left: 62, right: 14, top: 30, bottom: clock ? 28 : 40 },
-    legend: legend(c, ["statistic T²", "sequential test"]),
+    legend: legend(c, sequential ? ["statistic T²", "sequential test"] : ["statistic T²"]),
     tooltip: tooltip(c, {
       formatter: (points) => [clock ? moment(points[0].value[0] / 1000) : `${number(points[0].value[0], 5)} s`, ...points.map((one) => `${one.seriesName} ${multiple(one.value[1])} × limit`)].join("\n"),
     }),

@@ -5,7 +5,7 @@ import { short } from "./curves.js";
 import { complaint, field, h, section, table, tell } from "./dom.js";
 import { loopChoice } from "./loops.js";
 import { prose } from "./marks.js";
-import { capital, change, DASH, moment, number, general, plain } from "./words.js";
+import { capital, change, DASH, moment, number, general, plain, unit } from "./words.js";
 
 const REFERENCES = ["profile", "multisine", "trapezoid", "steps", "chirp"];
 
@@ -33,6 +33,10 @@ export async function show(main, { session, signal, values, entitle }) {
   const reference = h("select", {}, REFERENCES.map((name) => h("option", {}, name)));
   const after = h("input", { type: "number", min: "1", step: "any", value: "30" });
   const [u, y] = [1, 2].map(() => h("input", { type: "number", min: "0", step: "any", placeholder: "as the baseline knows" }));
+  const noise = [["u", u], ["y", y]].map(([name, control]) => [name, field("", control)]);
+  const label = () => noise.forEach(([name, element]) => tell(element.firstChild, `Noise of ${name}, standard deviation${unit(loop.units()?.[name])}`));
+  loop.changed(label);
+  label();
   const said = h("div", { role: "status", class: "working" });
   const run = h("button", { class: "first" }, "Study");
   const submit = async (event) => {
@@ -51,7 +55,7 @@ export async function show(main, { session, signal, values, entitle }) {
     section(
       "What can be told apart",
       "Under the reference that will run and the noise that is there, for a loop whose controller is known.",
-      h("form", { onsubmit: submit }, loop.element, h("div", { class: "fields" }, field("Reference", reference), field("Seconds after the onset [s]", after), field("Noise of u, standard deviation", u), field("Noise of y, standard deviation", y)), h("div", { class: "actions" }, run, said)),
+      h("form", { onsubmit: submit }, loop.element, h("div", { class: "fields" }, field("Reference", reference), field("Seconds after the onset [s]", after), noise.map(([, element]) => element)), h("div", { class: "actions" }, run, said)),
     ),
   );
 }
@@ -94,9 +98,9 @@ function studied(study, drawn, signal) {
       h("div", { class: "half" }, section("How sure a size becomes", "Cramér-Rao bound, with the healthy parameters as well known as they are.", picture("Standard deviation of the size over time", (c) => sizes(c, faults)))),
     ),
     names.length > 1 && section("How alike they look", "Cosine between what small changes do: 1 or −1 cannot be told apart, 0 is as different as can be.", table("Cosines between faults", ["Change", ...names.map((name) => `*${plain(name)}`)], names.map((one) => [plain(one), ...names.map((other) => heat(study.cosines[one][other]))]))),
-    study.mimics?.length > 0 && section("What else it could be", "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart.", table("Mimics", ["Change", "Is most like", "*Cosine", "*So much", "*Looks like", "*Told apart from"], study.mimics.map((one) => [h("span", {}, `${one.words} `, h("small", {}, prose(one.name))), one.imitates, number(one.cosines[one.imitates], 3), amount(one.amount, one.unit), change(one.looks_like), amount(one.told_apart, one.unit)]))),
+    study.mimics?.length > 0 && section("What else it could be", "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart.", table("Mimics", ["Change", "Is most like", "*Cosine", "*So much", "*Looks like", "*Told apart from"], study.mimics.map((one) => [h("span", {}, one.words, !one.words.includes(plain(one.name)) && h("small", {}, " ", prose(one.name))), one.imitates, number(one.cosines[one.imitates], 3), amount(one.amount, one.unit), change(one.looks_like), amount(one.told_apart, one.unit)]))),
     section("Frequencies to monitor", `Standard deviation of each size as one frequency shows it. The best set the faults ${number(study.frequencies.gain, 3)} times as far apart, on average.`, table("Frequencies", ["Frequency", "", ...names.map((name) => `*${plain(name)}`)], [["monitored", study.frequencies.own], ["best", study.frequencies.best]].flatMap(([what, several]) => several.map((one) => [`${general(one.frequency_hz)} Hz`, what, ...names.map((name) => percent(one.apart[name]))])))),
-    study.dither?.length > 0 && section("What a dither would buy", "Sizes from which on each fault is named, of linear sensitivities; amplitude as a share of the reference's rms.", table("Dither", ["Sine on the reference", "*Adds to u (rms)", ...names.map((name) => `*${plain(name)} from`)], study.dither.map((one) => [one.share ? `${general(100 * one.share)} % at ${general(one.frequency_hz)} Hz` : "none", number(one.extra_u_rms, 3), ...names.map((name) => change(one.radius[name]))]))),
+    study.dither?.length > 0 && section("What a dither would buy", "Sizes from which on each fault is named, of linear sensitivities; amplitude as a share of the reference's rms.", table("Dither", ["Sine on the reference", `*Adds to u (rms)${unit(study.units?.[1])}`, ...names.map((name) => `*${plain(name)} from`)], study.dither.map((one) => [one.share ? `${general(100 * one.share)} % at ${general(one.frequency_hz)} Hz` : "none", number(one.extra_u_rms, 3), ...names.map((name) => change(one.radius[name]))]))),
   ].filter(Boolean);
 }
 

@@ -48,7 +48,7 @@ function steps(one, baselines, wanted, signal) {
   const part = () => ({ upload: one.id, columns: columns.read(), ...(from.value && { from_s: Number(from.value) }), ...(to.value && { to_s: Number(to.value) }) });
   const inspect = (step) =>
     job("/inspections", { ...part(), ...(baseline.value && { loop: { baseline: baseline.value } }) }, { signal, step }).then((found) => {
-      const shown = inspected(found, null, signal);
+      const shown = inspected(found, baselines.find((each) => each.id === baseline.value)?.units, signal);
       result.replaceChildren(section("Is it usable?", null, shown.element));
       shown.draw();
     });

@@ -16,7 +16,7 @@ export function inspected(found, units, signal) {
     "div",
     {},
     h("p", { class: `badge ${VERDICTS[said.verdict]}` }, mark(VERDICTS[said.verdict]), h("b", {}, capital(said.verdict))),
-    h("p", {}, prose(said.summary)),
+    !said.summary.endsWith(`: ${said.verdict}`) && h("p", {}, prose(said.summary)), // else the same once more
     findings(said),
     said.recommendations.length > 0 && [h("h3", {}, "What to do"), h("ul", { class: "why" }, said.recommendations.map((words) => h("li", {}, prose(words))))],
     found.signals && curves,

@@ -56,9 +56,10 @@ export async function show(main, { session, signal, values }) {
     during(look, said, async () => {
       for (const each of used()) {
         tell(said, `Inspecting ${each.upload.name} …`);
+        const units = loop.units();
         const found = await job("/inspections", { upload: each.upload.id, columns: mapped.read(), loop: loop.read() }, { signal });
         judged(each, found.inspection, () => {
-          const shown = inspected(found, null, signal);
+          const shown = inspected(found, units, signal);
           result.replaceChildren(section(each.upload.name, null, shown.element));
           shown.draw();
         });
@@ -91,13 +92,16 @@ function judged(each, inspection, open = null) {
 
 function learned(found, refresh) {
   const points = found.summary.points ? Object.entries(found.summary.points) : [["", found.summary]];
-  const name = h("input", { required: true, pattern: "[\\w][\\w.:\\-]*", title: "letters, digits, . : - _" });
-  const said = h("div", { role: "status", class: "working" });
+  const name = h("input", { required: true, pattern: "[\\w][\\w.:\\-]*", title: "letters, digits, . : - _", oninput: () => (button.disabled = false) });
+  const button = h("button", { class: "first" }, "Save");
+  const [said, link] = [h("div", { role: "status", class: "working" }), h("div", {})];
   const save = async (event) => {
     event.preventDefault();
     try {
       const made = await post("/baselines", { name: name.value, learning: found.learning });
-      said.replaceChildren(`Saved as ${made.name}: `, h("a", { href: `/diagnose?baseline=${part(made.id)}` }, "diagnose a recording with it"));
+      link.replaceChildren(`Saved as ${made.name}: `, h("a", { href: `/diagnose?baseline=${part(made.id)}` }, "diagnose a recording with it"));
+      said.replaceChildren();
+      button.disabled = true; // the name is taken now, by this
       await refresh();
     } catch (error) {
       said.replaceChildren(complaint(error));
@@ -107,7 +111,7 @@ function learned(found, refresh) {
     "What was learned",
     null,
     points.map(([point, summary]) => [point && h("h3", {}, `Operating point ${point}`), told(summary)]),
-    h("form", { class: "actions", onsubmit: save }, field("Save as", name), h("button", { class: "first" }, "Save"), said),
+    h("form", { class: "actions", onsubmit: save }, field("Save as", name), button, link, said),
   );
 }
 
@@ -117,7 +121,7 @@ function told(summary) {
   return h(
     "div",
     {},
-    h("p", {}, `Explains ${number(100 * summary.explained, 4)} % of the input; threshold of T² ${number(summary.threshold, 4)}, for ${general(summary.false_alarms_per_year)} false alarms a year.`),
+    h("p", {}, prose(`Explains ${number(100 * summary.explained, 4)} % of the input; threshold of T² ${number(summary.threshold, 4)}, for ${general(summary.false_alarms_per_year)} false alarm${summary.false_alarms_per_year === 1 ? "" : "s"} a year.`)),
     h(
       "div",
       { class: "columns" },

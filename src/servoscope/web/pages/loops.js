@@ -32,7 +32,8 @@ export async function loopChoice(id, signal, wanted = null) {
   // As `suit` of a mapping takes them.
   const columns = () => (select.value === OWN ? /^\s*\[columns\]/m.test(text.value) || null : chosen().columns);
   const changed = (then) => [select, edit, text].forEach((each) => each.addEventListener(each === edit ? "click" : "change", then));
-  return { element, columns, changed, read: () => (select.value === OWN ? { toml: text.value } : chosen().ref) };
+  const units = () => chosen()?.units ?? null;
+  return { element, columns, units, changed, read: () => (select.value === OWN ? { toml: text.value } : chosen().ref) };
 }
 
 const keyOf = (one) => Object.entries(one.ref).flat().join(" ");

@@ -78,7 +78,7 @@ function described(one, c, unit, onset) {
     series: [
       path("trail", one.trail.slice(0, cut + 1), c.measured),
       path("trail since the onset", one.trail.slice(cut), tone),
-      { type: "line", name: "95 % ellipse", data: around, showSymbol: false, silent: true, lineStyle: { color: tone, width: 1.2 } },
+      { type: "line", name: "ellipse", data: around, showSymbol: false, silent: true, lineStyle: { color: tone, width: 1.2 } },
       { type: "scatter", name: "healthy", data: [healthy], z: 6, symbol: "diamond", symbolSize: 12, itemStyle: { opacity: 1, color: c.paper, borderColor: c.ink, borderWidth: 1.3 } },
       { type: "scatter", name: "now", data: now.real === null ? [] : [here], z: 7, symbolSize: 9, itemStyle: { opacity: 1, color: tone, borderColor: c.paper, borderWidth: 1 } },
     ],

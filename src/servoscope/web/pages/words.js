@@ -5,7 +5,13 @@ const GREEK = { theta: "θ", beta: "β", rho: "ρ" };
 const SUBSCRIPT = "₀₁₂₃₄₅₆₇₈₉";
 const SUPERSCRIPT = "⁰¹²³⁴⁵⁶⁷⁸⁹";
 
+const PERCENT = "\u00a0%"; // a number and its unit stay on one line
 const minus = (text) => text.replaceAll("-", "−");
+// With so many decimals; what they round to zero has no sign.
+const fixed = (value, places) => {
+  const text = value.toFixed(places);
+  return Number(text) === 0 ? text.replace("-", "") : minus(text);
+};
 const power = (exponent) => ` × 10${exponent < 0 ? "⁻" : ""}${[...String(Math.abs(exponent))].map((c) => SUPERSCRIPT[c]).join("")}`;
 
 // So many significant digits; very small and large ones as powers of ten.
@@ -20,6 +26,8 @@ export function number(value, digits = 4) {
 // How many decimals show the first digit of an uncertainty, or two where they are below 35.
 const decimals = (uncertainty) => (uncertainty > 0 ? Math.min(Math.max(-Math.floor(Math.log10(uncertainty / 3.5)), 0), 7) : 3);
 
+const scaled = (digits, exponent) => (exponent && Number(digits.replace("−", "-")) !== 0 ? digits + power(exponent) : digits);
+
 // A value and its standard deviation, both to the digits that the deviation supports.
 export function withStd(value, std, ...others) {
   const values = [value, std, ...others];
@@ -29,14 +37,14 @@ export function withStd(value, std, ...others) {
   if (exponent >= -3 && exponent < 6) exponent = 0;
   const places = decimals(std / 10 ** exponent);
   return values.map((each) =>
-    Number.isFinite(each) ? minus((each / 10 ** exponent).toFixed(places)) + (exponent ? power(exponent) : "") : DASH,
+    Number.isFinite(each) ? scaled(fixed(each / 10 ** exponent, places), exponent) : DASH,
   );
 }
 
 // With its sign, and so many decimals.
 export function signed(value, decimals) {
-  const text = value.toFixed(decimals);
-  return (Number(text) > 0 ? "+" : "") + (Number(text) === 0 ? text.replace("-", "") : minus(text));
+  const text = fixed(value, decimals);
+  return (Number(text) > 0 ? "+" : "") + text;
 }
 
 // Marks of an axis: as many decimals as its range asks for.
@@ -52,8 +60,8 @@ export function count(value) {
 
 export function probability(value) {
   if (value === null || value === undefined) return DASH;
-  if (value > 0.999) return "> 99.9 %";
-  return value < 0.001 ? "< 0.1 %" : `${(100 * value).toFixed(1)} %`;
+  if (value > 0.999) return `> 99.9${PERCENT}`;
+  return value < 0.001 ? `< 0.1${PERCENT}` : `${(100 * value).toFixed(1)}${PERCENT}`;
 }
 
 // A fault's size with its interval: +20 %, or a factor where it is large; to the digits that the interval supports.
@@ -65,7 +73,7 @@ export function size(fault) {
   return values.map((each) => {
     if (!percent) return minus(`× ${each.toFixed(places)}`);
     const change = (100 * (each - 1)).toFixed(places);
-    return minus(`${change.startsWith("-") ? "" : "+"}${change} %`);
+    return minus(`${change.startsWith("-") ? "" : "+"}${change}${PERCENT}`);
   });
 }
 
@@ -74,7 +82,7 @@ export function change(ratio) {
   if (ratio === null || ratio === undefined) return "never";
   if (ratio <= 0.5 || ratio >= 2) return `× ${number(ratio, 3)}`;
   const percent = Number((100 * (ratio - 1)).toPrecision(3));
-  return minus(`${percent > 0 ? "+" : ""}${percent} %`);
+  return minus(`${percent > 0 ? "+" : ""}${percent}${PERCENT}`);
 }
 
 // A multiple of a limit, at a width that does not jump.
@@ -93,13 +101,24 @@ export function plain(name) {
   return String(name).replaceAll("_", " ");
 }
 
+// With a capital at its beginning, unless that is a symbol: p_s is not P_s.
 export function capital(text) {
-  return text.slice(0, 1).toUpperCase() + text.slice(1);
+  return /^[a-z]{1,2}_/.test(text) ? text : text.slice(0, 1).toUpperCase() + text.slice(1);
 }
 
-// A sentence of the service, with symbols and a true sign of multiplication.
+// A sentence of the service as these pages say it: symbols, true signs, numbers as elsewhere, no unit on the next line. Names
+// become words, but for those of settings, which must be copied as they are.
 export function sentence(text) {
-  return (text ?? "").replace(/\b(theta|beta|rho)(?:_(\d+))?\b/g, (_, name, index) => GREEK[name] + [...(index ?? "")].map((c) => SUBSCRIPT[c]).join("")).replace(/\bx (?=\d)/g, "× ").replaceAll("T^2", "T²").replace(/\b[a-z]{3,}(?:_[a-z]+)+\b/g, plain);
+  return (text ?? "")
+    .replace(/\b(theta|beta|rho)(?:_(\d+))?\b/g, (_, name, index) => GREEK[name] + [...(index ?? "")].map((c) => SUBSCRIPT[c]).join(""))
+    .replace(/\bx (?=\d)/g, "× ")
+    .replaceAll("T^2", "T²")
+    .replace(/(?<![\w.])(\d(?:\.\d+)?)e[+-]\d+\b/g, (told, digits) => number(Number(told), digits.replace(".", "").length))
+    .replace(/(?<![\w.-])-(?=0(?:\.0*)?(?![\d.]))/g, "")
+    .replace(/(?<![\w.-])-(?=\d)/g, "−")
+    .replace(/(?<=\d) ?%/g, PERCENT)
+    .replace(/(?<=\d) (?=(?:m?s|min|h|d|k?Hz|m?m|m?A|m?V|k?N)(?!\w))/g, "\u00a0")
+    .replace(/\b(?!model_error\b)[a-z]{3,}(?:_[a-z]+)+\b(?! =)/g, plain);
 }
 
 const pad = (value) => String(value).padStart(2, "0");
