@@ -234,6 +234,13 @@ def test_failed_logins_are_slowed_down_and_told(folder: Path) -> None:
         assert [one["what"] for one in entries if one["who"] == "vera"][-5:] == ["login refused"] * 5
 
 
+@pytest.mark.parametrize(("listen", "heeded"), [("127.0.0.1:0", True), ("0.0.0.0:0", False)])
+def test_browsers_are_told_nothing_that_they_only_complain_of(folder: Path, listen: str, heeded: bool) -> None:
+    with Served(folder, "serve", "--store", "done.sqlite", "--users", "users.json", "--listen", listen) as served:
+        headers = httpx.get(f"{served.url}/login").headers
+        assert ("cross-origin-opener-policy" in headers) is heeded and "content-security-policy" in headers
+
+
 class TestHosts:
     def test_a_numeric_address_cannot_be_rebound(self) -> None:
         everywhere = Hosts.of("0.0.0.0:8080", ["monitor.example"])

@@ -18,7 +18,7 @@ const power = (exponent) => ` × 10${exponent < 0 ? "⁻" : ""}${[...String(Math
 export function number(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return DASH;
   if (value === 0) return "0";
-  const exponent = Math.floor(Math.log10(Math.abs(value)));
+  const exponent = Math.floor(Math.log10(Math.abs(Number(value.toPrecision(digits))))); // of what is shown: 0.9999 is 1.00
   if (exponent >= -4 && exponent < 6) return minus(value.toFixed(Math.max(digits - 1 - exponent, 0)));
   return minus((value / 10 ** exponent).toFixed(digits - 1)) + power(exponent);
 }
