@@ -31,7 +31,7 @@ format: $(STAMP)  ## put the code into shape
 	$(BIN)/python -m ruff format $(CODE)
 
 pictures: $(STAMP)  ## the pictures of the pages in docs/images/pages, from the browser's tests
-	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/test_web_pages.py
+	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/test_web_pages.py tests/test_web_files.py
 
 clean:          ## remove what the other targets made
 	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

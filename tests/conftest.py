@@ -17,6 +17,7 @@ import hypothesis
 import pytest
 from reliability.servers import Postgres, programs
 
+pytest_plugins = ("opening",)  # the browser, and what stands before it
 PROJECT = Path(__file__).resolve().parent.parent
 
 hypothesis.settings.register_profile("servoscope", derandomize=True, deadline=None, max_examples=50)
