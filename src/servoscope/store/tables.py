@@ -65,13 +65,14 @@ recent = sa.Table(  # the last minutes of samples, block by block: what a full d
 )
 # All of it is new every few minutes. Noise does not get smaller by trying; and dead rows are cleared away
 # by their number: a share of what a table holds grows with it, and what is known of it is forgotten in a crash.
-for _ddl in (
+for statement in (
     "ALTER TABLE recent ALTER COLUMN samples SET STORAGE EXTERNAL",
     "ALTER TABLE recent SET (autovacuum_vacuum_scale_factor = 0, autovacuum_vacuum_threshold = 1000,"
     " autovacuum_vacuum_cost_delay = 0, toast.autovacuum_vacuum_scale_factor = 0,"
     " toast.autovacuum_vacuum_threshold = 10000, toast.autovacuum_vacuum_cost_delay = 0)",
 ):
-    sa.event.listen(recent, "after_create", sa.DDL(_ddl).execute_if(dialect="postgresql"))
+    on_postgresql = sa.DDL(statement).execute_if(dialect="postgresql")  # type: ignore[no-untyped-call]
+    sa.event.listen(recent, "after_create", on_postgresql)
 residuals = _numbered(
     "residuals",
     sa.Column("statistic", sa.Double, nullable=False),  # the largest since the row before, over its limit
