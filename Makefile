@@ -7,18 +7,21 @@ STAMP := $(VENV)/.installed
 CODE := src tests
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format pictures clean
+.PHONY: help install demo test test-all lint format pictures clean
 .DELETE_ON_ERROR:
 
 help:           ## list the targets
-	@sed -nE 's/^([a-z]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 18
+	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 18
 
 install: $(STAMP)  ## make .venv with servoscope, editable, and what its tests need
 
 demo: $(STAMP)  ## simulate a rig, break it, diagnose it; the report goes to demo-output/
 	$(BIN)/servoscope demo -o demo-output
 
-test: lint      ## everything that must pass: format, lint, types, tests (REQUIRE_ALL=1: no test may skip)
+test: lint      ## what must pass before a commit: format, lint, types, all tests but the slow ones
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+
+test-all: lint  ## the same with the slow ones: browsers, Spark, kills and chaos (REQUIRE_ALL=1: no test may skip)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 lint: $(STAMP)  ## format, lint and types, without changing a file
