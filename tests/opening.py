@@ -1,4 +1,4 @@
-"""A browser in front of a followed hall, one of each for all tests of the pages; and what these look at in common."""
+"""A browser in front of a followed hall, one of each for a file of tests; and what these look at in common."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LONG_MS = 180_000.0  # learning and designing, on a busy machine
 Open = Callable[..., Any]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
     found = screens.browser()
@@ -34,14 +34,14 @@ def chromium() -> Iterator[Any]:
         launched.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hall")
     screens.recordings(folder)
     return screens.hall(folder)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def base(chromium: Any, config: Path) -> Iterator[str]:
     """The address of the pages, once the hall has its faults and what is wrong with them is known in full."""
     with screens.process("run", config.name, cwd=config.parent) as running, screens.serving(config) as address:
@@ -83,7 +83,7 @@ def open_page(chromium: Any, base: str) -> Iterator[Open]:
     assert complaints == []
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def users(config: Path) -> str:
     """The name of a file of users beside the service file: vera may look, otto may answer."""
     for name, role in (("vera", "viewer"), ("otto", "operator")):
