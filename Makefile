@@ -4,10 +4,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-CODE := src tests
+CODE := src tests benchmarks scripts
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format pictures clean
+.PHONY: help install demo test test-all lint format figures pictures sbom clean
 .DELETE_ON_ERROR:
 
 help:           ## list the targets
@@ -33,8 +33,14 @@ format: $(STAMP)  ## put the code into shape
 	$(BIN)/python -m ruff check --fix $(CODE)
 	$(BIN)/python -m ruff format $(CODE)
 
+figures: $(STAMP)  ## run the programs behind the figures of the documents, and print what differs (half an hour)
+	$(BIN)/python scripts/figures.py --run
+
 pictures: $(STAMP)  ## the pictures of the pages in docs/images/pages, from the browser's tests
 	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/test_web_pages.py tests/test_web_files.py
+
+sbom: $(STAMP)     ## the software bill of materials of a release, as CycloneDX: servoscope.cdx.json
+	$(BIN)/python scripts/sbom.py -o servoscope.cdx.json
 
 clean:          ## remove what the other targets made
 	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from servoscope.core import aliases
+
 __version__ = "0.1.0"
 
 __all__ = [
@@ -32,40 +34,45 @@ __all__ = [
     "simulate",
 ]
 
+aliases.install()
+
 if TYPE_CHECKING:
-    from servoscope.baseline import Baseline
     from servoscope.design import design_study
-    from servoscope.diagnosis import Diagnosis, Trace
-    from servoscope.inspection import inspect
-    from servoscope.loop import Loop
-    from servoscope.monitor import Monitor, diagnose
-    from servoscope.points import learn
-    from servoscope.readers import read, read_parts
-    from servoscope.recording import Recording
+    from servoscope.detection.baseline import Baseline
+    from servoscope.detection.result import Diagnosis, Trace
+    from servoscope.diagnosis.diagnose import diagnose
+    from servoscope.diagnosis.monitor import Monitor
+    from servoscope.diagnosis.operating_points import learn
+    from servoscope.learning.inspection import inspect
+    from servoscope.models.loop import Loop
+    from servoscope.signals.readers import read, read_parts
+    from servoscope.signals.recording import Recording
     from servoscope.simulation import simulate
 else:  # hidden from type checkers, which would otherwise accept any name
-    _ROOMS = {
-        "Baseline": "baseline",
-        "Diagnosis": "diagnosis",
-        "Loop": "loop",
-        "Monitor": "monitor",
-        "Recording": "recording",
-        "Trace": "diagnosis",
+    _HOMES = {
+        "Baseline": "detection.baseline",
+        "Diagnosis": "detection.result",
+        "Loop": "models.loop",
+        "Monitor": "diagnosis.monitor",
+        "Recording": "signals.recording",
+        "Trace": "detection.result",
         "design_study": "design",
-        "diagnose": "monitor",
-        "inspect": "inspection",
-        "learn": "points",
-        "read": "readers",
-        "read_parts": "readers",
+        "diagnose": "diagnosis.diagnose",
+        "inspect": "learning.inspection",
+        "learn": "diagnosis.operating_points",
+        "read": "signals.readers",
+        "read_parts": "signals.readers",
         "simulate": "simulation",
     }
 
     def __getattr__(name: str) -> object:
-        if name not in _ROOMS:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         import importlib
 
-        found = getattr(importlib.import_module(f"{__name__}.{_ROOMS[name]}"), name)
+        if f"{__name__}.{name}" in aliases.ALIASES:
+            return importlib.import_module(f"{__name__}.{name}")
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        found = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
         globals()[name] = found  # the next access does not come here
         return found
 

@@ -5,15 +5,15 @@ import os
 # matrices here are tiny: threads of the linear algebra would only wait for each other (a tenth of a verdict's time)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from servoscope.cli import (  # they add themselves to the application
-    alarming,
-    commands,
+from servoscope.cli import (  # their commands add themselves to the application
+    alarms,
+    export,
     fleet,
-    publishing,
+    recordings,
     service,
-    unrecorded,
+    simulate_design,
     web,
 )
 from servoscope.cli.app import app, main
 
-__all__ = ["alarming", "app", "commands", "fleet", "main", "publishing", "service", "unrecorded", "web"]
+__all__ = ["alarms", "app", "export", "fleet", "main", "recordings", "service", "simulate_design", "web"]

@@ -9,14 +9,15 @@ from typing import Annotated
 
 import typer
 
-from servoscope.cli.shell import Commands
+from servoscope.cli.exit import CommandGroup
+from servoscope.core.cache_folders import replace_library_warnings
 
 GARBAGE = 200_000  # new objects before cycles are looked for: loading code makes very many, and no garbage
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 app = typer.Typer(
-    cls=Commands,
+    cls=CommandGroup,
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -31,10 +32,11 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without a sign for squared is no reason to stop
+    replace_library_warnings()
     app(prog_name="servoscope")
 
 
-def _version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         from servoscope import __version__
 
@@ -45,7 +47,7 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def servoscope(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
     """Say from r, u and y of a servo loop whether its actuator is healthy; if not, what changed, and when."""

@@ -1,65 +1,76 @@
-"""What the words on the command line mean: operating points, row conditions, column mappings, faults."""
+"""What the options of the command line mean: times, recordings, operating points, mappings, faults."""
 
 from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from servoscope.errors import RecordingError, ServoscopeError
+from servoscope.core.errors import RecordingError, ServoscopeError
 
 if TYPE_CHECKING:
-    from servoscope.loop import Columns, Loop
-    from servoscope.readers import ChannelInfo
-    from servoscope.recording import Recording
+    from servoscope.models.loop import Columns, Loop
+    from servoscope.signals import Recording
+    from servoscope.signals.readers import ChannelInfo
     from servoscope.simulation import FaultEvent
 
-__all__ = [
-    "Engines",
-    "Rigs",
-    "Source",
-    "check_length",
-    "check_reference",
-    "columns_from",
-    "conditions",
-    "fault_events",
-    "healthy",
-    "labelled",
-    "no_mapping",
-]
+
+UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+def parse_duration(text: str, option: str) -> float:
+    """Read ``90s``, ``30min``, ``8h`` or ``7d``; return it in s; typer.BadParameter if it is none of these."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|min|h|d)", text.strip())
+    if match is None or not float(match[1]) > 0.0:
+        raise typer.BadParameter(f"{option} {text!r}: write a number and s, min, h or d, as in 8h")
+    return float(match[1]) * UNITS[match[2]]
+
+
+def parse_time(text: str | None, option: str) -> float | None:
+    """Read a date and time after ISO 8601, UTC unless it says otherwise, or how long ago; return UTC s."""
+    if text is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        try:
+            return time.time() - parse_duration(text, option)
+        except typer.BadParameter:
+            raise typer.BadParameter(
+                f"{option} {text!r}: write a date or time, as in 2026-01-31T12:00, or how long ago, as in 8h"
+            ) from None
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
 
 MOST_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
 
 
-class Engines(StrEnum):
-    """What carries the work of ``fleet``."""
+class EngineName(StrEnum):
+    """Engines of ``fleet``."""
 
     local = "local"
     spark = "spark"
 
 
-class Rigs(StrEnum):
-    """What ``simulate`` can simulate."""
+class RigModel(StrEnum):
+    """Models of the rig that ``simulate`` has."""
 
     linear = "linear"
     nonlinear = "nonlinear"
 
 
-def healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
+def parse_healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
     """Read recordings to learn from: ``warm=c.csv`` is c.csv at the operating point warm, ``c.csv`` is at none.
 
     A file whose whole name exists is taken as it is.
-
-    Raises
-    ------
-    typer.BadParameter
-        If some have an operating point and others have none.
     """
     found = []
     for text in texts:
@@ -73,14 +84,8 @@ def healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
     return found
 
 
-def labelled(texts: Sequence[str], points: Sequence[str]) -> list[tuple[str, str, Path]]:
-    """Read ``--fault`` of ``learn``: operating point, name and file; ``backlash@warm=a.csv`` is one at the point warm.
-
-    Raises
-    ------
-    typer.BadParameter
-        If a text cannot be read, or its point is none of `points`.
-    """
+def parse_labelled(texts: Sequence[str], points: Sequence[str]) -> list[tuple[str, str, Path]]:
+    """Read ``--fault`` of ``learn``: point, name and file; ``backlash@warm=a.csv`` is one at the point warm."""
     found = []
     for text in texts:
         named = re.fullmatch(r"(\w[\w-]*)(?:@(\w[\w-]*))?=(.+)", text)
@@ -94,14 +99,8 @@ def labelled(texts: Sequence[str], points: Sequence[str]) -> list[tuple[str, str
     return found
 
 
-def conditions(texts: Sequence[str]) -> dict[str, str]:
-    """Read ``--where``: ``["load=20,run=1-5"]`` is {"load": "20", "run": "1-5"}; ``run=1,3`` is one.
-
-    Raises
-    ------
-    typer.BadParameter
-        If a text does not begin with a column and ``=``.
-    """
+def parse_conditions(texts: Sequence[str]) -> dict[str, str]:
+    """Read ``--where``: ``["load=20,run=1-5"]`` is {"load": "20", "run": "1-5"}; ``run=1,3`` is one."""
     found: dict[str, str] = {}
     for text in texts:
         column = ""
@@ -117,17 +116,11 @@ def conditions(texts: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def columns_from(text: str | None, base: Columns | None = None) -> Columns | None:
-    """Read ``--columns``; keys that it does not name stay as in `base`. None stays None.
-
-    Raises
-    ------
-    typer.BadParameter
-        If it cannot be read.
-    """
+def parse_mapping(text: str | None, base: Columns | None = None) -> Columns | None:
+    """Read ``--columns``; keys that it does not name stay as in `base`. None stays None."""
     if text is None:
         return None
-    from servoscope.readers.columns import parse_columns
+    from servoscope.signals.readers.columns import parse_columns
 
     try:
         return parse_columns(text, base)
@@ -135,12 +128,12 @@ def columns_from(text: str | None, base: Columns | None = None) -> Columns | Non
         raise typer.BadParameter(f"--{error}; as in --columns 't=Time, r=Ref, u=2 * Current, y=Pos'") from None
 
 
-EVERYTHING = (-math.inf, math.inf)
+UNBOUNDED = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
-class Source:
-    """How one command reads recordings: the loop, ``--columns``, ``--where``, ``--by``, ``--from``, ``--to``."""
+class RecordingReader:
+    """How a command reads recordings: the loop, ``--columns``, ``--where``, ``--by``, ``--from``, ``--to``."""
 
     loop: Loop | None
     columns: Columns | None
@@ -149,64 +142,46 @@ class Source:
     span: tuple[float, float]
 
     @classmethod
-    def of(
+    def from_options(
         cls,
         loop: Loop | None,
         columns: str | None,
         where: Sequence[str] | None,
         by: str | None,
         span: tuple[float | None, float | None],
-    ) -> Source:
-        """Read the options.
-
-        Raises
-        ------
-        typer.BadParameter
-            If one of them cannot be read.
-        """
-        mapping = columns_from(columns, loop.columns if loop is not None else None)
-        start, end = (bound if bound is not None else limit for bound, limit in zip(span, EVERYTHING, strict=True))
+    ) -> RecordingReader:
+        """Read the options; typer.BadParameter if one of them cannot be read."""
+        mapping = parse_mapping(columns, loop.columns if loop is not None else None)
+        start, end = (bound if bound is not None else limit for bound, limit in zip(span, UNBOUNDED, strict=True))
         if not start < end:
             raise typer.BadParameter(f"--from {start:g} must be before --to {end:g}")
-        return cls(loop, mapping, conditions(where or ()), by, (start, end))
+        return cls(loop, mapping, parse_conditions(where or ()), by, (start, end))
 
     def read(self, path: Path) -> list[Recording]:
-        """Return the recordings in a file: one, or one per value of the column in ``--by``.
-
-        Raises
-        ------
-        RecordingError, LoopError
-            If the file cannot be used.
-        """
-        from servoscope import readers
+        """Return the recordings in a file: one, or one per value of the column in ``--by``."""
+        from servoscope.signals import readers
 
         parts = readers.read_parts(path, self.loop, columns=self.columns, where=self.where, by=self.by)
-        if self.span == EVERYTHING:
+        if self.span == UNBOUNDED:
             return parts
         return [part.part(*self.span) for part in parts]
 
-    def many(self, paths: Sequence[Path]) -> bool:
+    def expects_several(self, paths: Sequence[Path]) -> bool:
         """Return whether several recordings are to be expected."""
         return len(paths) > 1 or self.by is not None
 
-    def unmapped(self, path: Path) -> list[ChannelInfo]:
+    def unmapped_channels(self, path: Path) -> list[ChannelInfo]:
         """Return a file's columns if it lacks one of t, r, u, y and nobody gave a mapping; else none."""
-        from servoscope import readers
+        from servoscope.signals import readers
 
         if self.loop is not None or self.columns is not None:
             return []
-        found = readers.channels(path)
-        return found if {"t", "r", "u", "y"} - {channel.name for channel in found} else []
+        channels = readers.list_channels(path)
+        return channels if {"t", "r", "u", "y"} - {channel.name for channel in channels} else []
 
 
-def fault_events(texts: Sequence[str]) -> list[FaultEvent]:
-    """Read ``--fault``.
-
-    Raises
-    ------
-    typer.BadParameter
-        If one of them cannot be read.
-    """
+def parse_fault_events(texts: Sequence[str]) -> list[FaultEvent]:
+    """Read ``--fault``."""
     from servoscope.simulation import FaultEvent
 
     try:
@@ -218,32 +193,23 @@ def fault_events(texts: Sequence[str]) -> list[FaultEvent]:
 def check_reference(text: str) -> None:
     """Refuse a ``--reference`` that is neither a known kind nor looks like a file.
 
-    Raises
-    ------
-    typer.BadParameter
-        If so.
+    Raises typer.BadParameter if so.
     """
-    from servoscope.simulation.references import KINDS
+    from servoscope.simulation.references import REFERENCE_KINDS
 
-    if text not in KINDS and not Path(text).suffix and not Path(text).exists():
-        raise typer.BadParameter(f"--reference {text}: choose from {', '.join(KINDS)}, or name a file")
+    if text not in REFERENCE_KINDS and not Path(text).suffix and not Path(text).exists():
+        raise typer.BadParameter(f"--reference {text}: choose from {', '.join(REFERENCE_KINDS)}, or name a file")
 
 
 def check_length(duration_s: float, sample_rate: float) -> None:
-    """Refuse a ``--duration`` that has no samples, or more than a machine's memory is sure to hold.
-
-    Raises
-    ------
-    typer.BadParameter
-        If so.
-    """
+    """Refuse a ``--duration`` that has no samples, or more than a machine's memory is sure to hold."""
     samples = duration_s * sample_rate
     if not 0.5 < samples <= MOST_SAMPLES:  # not a number is refused too
         most = MOST_SAMPLES / sample_rate
         raise typer.BadParameter(f"--duration {duration_s:g}: give more than 0 s and at most {most:g} s")
 
 
-def no_mapping(path: Path) -> RecordingError:
+def missing_mapping_error(path: Path) -> RecordingError:
     """Return the error that asks for a mapping."""
     example = "--columns 't=..., r=..., u=..., y=...'"
     return RecordingError(f"{path.name}: lacks a column t, r, u or y: say which they are, {example}, or give --loop")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import shlex
 import sys
@@ -14,10 +15,7 @@ from pathlib import Path
 import typer
 from rich.text import Text
 
-from servoscope.cli.progress import on_compiling
-from servoscope.output import atomic_write, make_folder
-
-__all__ = ["Step", "prepare", "show", "steps"]
+from servoscope.core.files import atomic_write, make_folder
 
 WIDTH = 80
 COEFFICIENTS = (
@@ -27,61 +25,43 @@ COEFFICIENTS = (
 
 
 @dataclass(frozen=True)
-class Step:
-    """One command of the demonstration.
+class DemoStep:
+    """One command of the demonstration."""
 
-    Parameters
-    ----------
-    words
-        What it is for.
-    arguments
-        The command's words after ``servoscope``.
-    into
-        File that takes its standard output; None: the terminal.
-    after
-        What to know about what it said.
-    """
-
-    words: str
-    arguments: tuple[str, ...]
-    into: Path | None = None
-    after: str = ""
+    purpose: str
+    arguments: tuple[str, ...]  # after ``servoscope``
+    output: Path | None = None  # file for its standard output; None: the terminal
+    note: str = ""  # how to read what it printed
 
 
-def prepare(folder: Path) -> None:
-    """Make the folder and put the loop file of the reference rig into it.
-
-    Raises
-    ------
-    OutputError
-        If that is not possible.
-    """
+def write_loop_file(folder: Path) -> None:
+    """Make the folder and put the loop file of the reference rig into it."""
     make_folder(folder)
-    rig = files("servoscope").joinpath("examples", "reference-rig.toml").read_bytes()
+    rig = files("servoscope").joinpath("simulation", "reference-rig.toml").read_bytes()
     atomic_write(folder / "loop.toml", rig)
 
 
-def steps(folder: Path) -> tuple[Step, ...]:
+def demo_steps(folder: Path) -> tuple[DemoStep, ...]:
     """Return the commands, in order: simulate healthy and faulty, learn, diagnose."""
 
     def at(name: str) -> str:
         return str(folder / name)
 
     return (
-        Step(
+        DemoStep(
             "A healthy rig, recorded for 60 s: an electrohydraulic actuator in a closed loop.",
             ("simulate", at("loop.toml"), "-o", at("healthy.csv"), "--seed", "1"),
         ),
-        Step(
+        DemoStep(
             "The same rig on another day: at 30 s its internal leakage grows by 20 %.",
             ("simulate", at("loop.toml"), "-o", at("suspect.csv"), "--fault", "C_ie=1.2@30", "--seed", "2"),
         ),
-        Step(
+        DemoStep(
             "Learn what healthy looks like.",
             ("learn", at("loop.toml"), at("healthy.csv"), "-o", at("baseline.json")),
-            after=COEFFICIENTS,
+            note=COEFFICIENTS,
         ),
-        Step(
+        DemoStep(
             "Diagnose the other day, from r, u and y alone.",
             (
                 "diagnose",
@@ -98,49 +78,38 @@ def steps(folder: Path) -> tuple[Step, ...]:
     )
 
 
-def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
-    """Run the demonstration and print each command, what it says and what to open.
+def run_demo(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
+    """Run the demonstration and print each command, its output and what to open.
 
-    Parameters
-    ----------
-    folder
-        Where the files go.
-    run
-        Runs a command; returns its exit code, or None for 0.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be written.
+    `run` runs a command and returns its exit code, or None for 0.
     """
-    from servoscope.cli import terminal, verdicts
-    from servoscope.diagnosis import Diagnosis
+    from servoscope.cli.render import diagnosis, results
+    from servoscope.core.jit import on_compilation
+    from servoscope.detection.result import Diagnosis
 
-    prepare(folder)
-    out = terminal.console()
-    told: list[bool] = []
+    write_loop_file(folder)
+    out = results.create_console()
     stream = sys.stdout
 
-    def compiling() -> None:
-        if not told:
-            with redirect_stdout(stream):  # not among what a command prints into a file
-                out.print(Text("  compiling, once: the next time this starts at once", style="dim"))
-        told.append(True)
+    @functools.cache  # say it once
+    def announce_compilation() -> None:
+        with redirect_stdout(stream):  # not among what a command prints into a file
+            out.print(Text("  compiling, once: the next time this starts at once", style="dim"))
 
-    with on_compiling(compiling):
-        for step in steps(folder):
-            out.print(Text(step.words, style="bold"))
-            out.print(Text(_command(step), style="cyan"), soft_wrap=True)
-            if step.into is None:
-                _checked(run(step.arguments))
+    with on_compilation(announce_compilation):
+        for step in demo_steps(folder):
+            out.print(Text(step.purpose, style="bold"))
+            out.print(Text(_format_command(step), style="cyan"), soft_wrap=True)
+            if step.output is None:
+                _exit_on_failure(run(step.arguments))
             else:
-                said = io.StringIO()
-                with redirect_stdout(said):
-                    _checked(run(step.arguments))
-                atomic_write(step.into, said.getvalue().encode())
-                verdicts.diagnosis(out, Diagnosis.model_validate_json(said.getvalue()))
-            if step.after:
-                terminal.notes(out, [step.after], "blue", "-")
+                printed = io.StringIO()
+                with redirect_stdout(printed):
+                    _exit_on_failure(run(step.arguments))
+                atomic_write(step.output, printed.getvalue().encode())
+                diagnosis.print_diagnosis(out, Diagnosis.model_validate_json(printed.getvalue()))
+            if step.note:
+                results.print_notes(out, [step.note], "blue", "-")
             out.print()
     out.print(
         Text(f"Open {folder / 'report.html'} in a browser; {folder / 'loop.toml'} describes the rig."),
@@ -148,11 +117,11 @@ def show(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
     )
 
 
-def _command(step: Step) -> str:
+def _format_command(step: DemoStep) -> str:
     """Return the command as one would type it, broken where it is too long for a line."""
     words = [shlex.quote(word) for word in ("servoscope", *step.arguments)]
-    if step.into is not None:
-        words.append(f"> {shlex.quote(str(step.into))}")
+    if step.output is not None:
+        words.append(f"> {shlex.quote(str(step.output))}")
     lines = ["$"]
     for i, word in enumerate(words):
         value = i + 1 < len(words) and word.startswith("-") and not words[i + 1].startswith(("-", ">"))
@@ -164,6 +133,6 @@ def _command(step: Step) -> str:
     return "\n".join(lines)
 
 
-def _checked(code: object) -> None:
-    if code:  # the command has said why
+def _exit_on_failure(code: object) -> None:
+    if code:  # the command has printed the reason
         raise typer.Exit(int(str(code)))

@@ -9,15 +9,15 @@ import typer
 
 from servoscope.cli import arguments
 from servoscope.cli.app import app
-from servoscope.cli.arguments import Engines
-from servoscope.cli.options import AsJson, ColumnsText
-from servoscope.cli.shell import FAULT, print_json
+from servoscope.cli.arguments import EngineName
+from servoscope.cli.exit import EXIT_FAULT, print_json
+from servoscope.cli.options import ColumnsOption, JsonOption
 
 if TYPE_CHECKING:
     from servoscope.fleet import Fleet
 
 KAFKA = "kafka"  # in the place of LAKE, with --source kafka.bootstrap.servers=... --source subscribe=...
-WINDOW = 120.0  # s; as in servoscope.fleet, which is imported late
+WINDOW = 120.0  # s; as in servoscope.fleet, which is imported late: --help must not wait for it
 
 
 @app.command()
@@ -40,9 +40,11 @@ def fleet(
     partition: Annotated[
         str, typer.Option(metavar="ASSET,DAY", help="How the folders call asset and day.")
     ] = "asset,day",
-    columns: ColumnsText = None,
+    columns: ColumnsOption = None,
     window: Annotated[float, typer.Option(metavar="S", min=1.0, help="Seconds that a diagnosis sees.")] = WINDOW,
-    engine: Annotated[Engines, typer.Option(help="local: this machine's cores; spark: a cluster's.")] = Engines.local,
+    engine: Annotated[
+        EngineName, typer.Option(help="local: this machine's cores; spark: a cluster's.")
+    ] = EngineName.local,
     jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; else one per core.")] = None,
     master: Annotated[str | None, typer.Option(metavar="URL", help="Spark's master, if no session says.")] = None,
     stream: Annotated[bool, typer.Option("--stream", help="Follow what comes into LAKE, with Spark.")] = False,
@@ -64,7 +66,7 @@ def fleet(
     source: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="Stream: options of Spark's source; repeatable.")
     ] = None,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
     fail_on_fault: Annotated[bool, typer.Option("--fail-on-fault", help="Exit with 3 if an asset is ill.")] = False,
 ) -> None:
     """Learn and diagnose a whole fleet from its recordings: who is ill, what is common, what changed."""
@@ -74,25 +76,28 @@ def fleet(
     if len(keys) != 2 or not all(keys):
         raise typer.BadParameter(f"--partition {partition!r}: write two names, as in asset,day")
 
-    asked = _Asked(
+    options = _FleetOptions(
         lake, output, loop, baselines, baseline_by, healthy_days, groups, (keys[0], keys[1]), columns, window
     )
     if stream:
-        known = _streamed(asked, master, _Stream(assets, every, late, checkpoint, tuple(source or ()), store))
+        result = _run_stream(
+            options, master, _StreamOptions(assets, every, late, checkpoint, tuple(source or ()), store)
+        )
     else:
-        known = _examined(asked, engine, jobs, master)
+        result = _run_batch(options, engine, jobs, master)
     if as_json:
-        print_json(known.to_dict(), lines=False)
+        print_json(result.to_dict(), lines=False)
     else:
-        from servoscope.cli import fleets, terminal
+        from servoscope.cli.render import fleet as fleets
+        from servoscope.cli.render import results
 
-        fleets.fleet(terminal.console(), known)
-        terminal.written(terminal.console(), output / "report.html")
-    if fail_on_fault and (known.count("fault") or known.accepted):
-        raise typer.Exit(FAULT)
+        fleets.print_fleet(results.create_console(), result)
+        results.print_written_path(results.create_console(), output / "report.html")
+    if fail_on_fault and (result.count("fault") or result.accepted):
+        raise typer.Exit(EXIT_FAULT)
 
 
-class _Stream(NamedTuple):
+class _StreamOptions(NamedTuple):
     assets: int | None
     every: float | None
     late: float
@@ -101,7 +106,7 @@ class _Stream(NamedTuple):
     store: str | None
 
 
-class _Asked(NamedTuple):
+class _FleetOptions(NamedTuple):
     lake: str
     output: Path
     loop: Path | None
@@ -114,63 +119,68 @@ class _Asked(NamedTuple):
     window: float
 
 
-def _examined(asked: _Asked, engine: Engines, jobs: int | None, master: str | None) -> Fleet:
+def _run_batch(options: _FleetOptions, engine: EngineName, jobs: int | None, master: str | None) -> Fleet:
     """Run over what is in the lake."""
-    from servoscope.cli.progress import counted
+    from servoscope.cli.progress import show_count
+    from servoscope.core.workers import available_cores
     from servoscope.fleet import Lake, Plan, run
-    from servoscope.fleet.lake import groups_of
-    from servoscope.fleet.local import cores, local
-    from servoscope.loop import Loop
+    from servoscope.fleet.lake import read_groups
+    from servoscope.fleet.local_engine import local
+    from servoscope.models.loop import Loop
 
-    settings = Loop.load(asked.loop) if asked.loop is not None else None
-    groups = groups_of(asked.groups) if asked.groups is not None else None
+    settings = Loop.load(options.loop) if options.loop is not None else None
+    groups = read_groups(options.groups) if options.groups is not None else None
     plan = Plan(
-        lake=Lake.open(asked.lake, asked.partition, groups),
-        output=asked.output,
+        lake=Lake.open(options.lake, options.partition, groups),
+        output=options.output,
         loop=settings,
-        baselines=asked.baselines,
-        by=asked.by,
-        healthy=asked.healthy,
-        columns=arguments.columns_from(asked.columns, settings.columns if settings is not None else None),
-        window_s=asked.window,
+        baselines=options.baselines,
+        by=options.by,
+        healthy=options.healthy,
+        columns=arguments.parse_mapping(options.columns, settings.columns if settings is not None else None),
+        window_s=options.window,
     )
-    if engine is Engines.spark:
+    if engine is EngineName.spark:
         from servoscope.fleet.spark import session, spark
 
         carry = spark(session(master))
     else:
-        carry = local(jobs or cores())
-    with counted() as tell:
+        carry = local(jobs or available_cores())
+    with show_count() as tell:
         return run(plan, carry, tell)
 
 
-def _streamed(asked: _Asked, master: str | None, how: _Stream) -> Fleet:
+def _run_stream(options: _FleetOptions, master: str | None, stream: _StreamOptions) -> Fleet:
     """Follow what comes in: all there is, or on and on until interrupted; write the report at the end."""
-    from servoscope.cli.progress import waiting
+    from servoscope.cli.progress import show_spinner
     from servoscope.fleet import Lake, sinks
     from servoscope.fleet.baselines import Baselines
-    from servoscope.fleet.lake import groups_of
+    from servoscope.fleet.lake import read_groups
     from servoscope.fleet.spark import session
     from servoscope.fleet.streaming import follow
 
-    path = asked.baselines
+    path = options.baselines
     if path is None:
         raise typer.BadParameter("--stream goes with --baselines: learn them from the lake first")
-    assets = how.assets or (sum(1 for _ in path.glob("*.json")) if path.is_dir() else None)
+    assets = stream.assets or (sum(1 for _ in path.glob("*.json")) if path.is_dir() else None)
     if assets is None:
         raise typer.BadParameter("--assets N: say how many assets share the budget of false alarms")
-    known = Baselines.of(path, assets, asked.window).any().loop.columns
-    columns = arguments.columns_from(asked.columns, known) or known
-    options = dict(text.partition("=")[::2] for text in how.source)
-    found = session(master)
-    make = sinks.kafka if asked.lake == KAFKA else sinks.files
-    frame = make(found, asked.lake, columns, options)
-    followed = follow(frame, path, assets=assets, columns=columns, delay_s=how.late, by=asked.by, window_s=asked.window)
-    query = sinks.start(followed, asked.output, checkpoint=how.checkpoint, every_s=how.every, store=how.store)
-    with waiting("following the stream"):
-        sinks.wait(query)
-    groups = groups_of(asked.groups) if asked.groups is not None else {}
-    if asked.lake != KAFKA:
-        lake = Lake.open(asked.lake, asked.partition, groups)
+    learned = Baselines.from_source(path, assets, options.window).first().loop.columns
+    columns = arguments.parse_mapping(options.columns, learned) or learned
+    source = dict(text.partition("=")[::2] for text in stream.source)
+    spark = session(master)
+    make = sinks.kafka_stream if options.lake == KAFKA else sinks.file_stream
+    frame = make(spark, options.lake, columns, source)
+    followed = follow(
+        frame, path, assets=assets, columns=columns, delay_s=stream.late, by=options.by, window_s=options.window
+    )
+    query = sinks.start(
+        followed, options.output, checkpoint=stream.checkpoint, every_s=stream.every, store=stream.store
+    )
+    with show_spinner("following the stream"):
+        sinks.wait_for_stream(query)
+    groups = read_groups(options.groups) if options.groups is not None else {}
+    if options.lake != KAFKA:
+        lake = Lake.open(options.lake, options.partition, groups)
         groups = {item.asset: dict(item.groups) for item in lake.items}
-    return sinks.report(found, asked.output, groups, asked.lake)
+    return sinks.write_stream_report(spark, options.output, groups, options.lake)

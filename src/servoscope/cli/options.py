@@ -7,24 +7,28 @@ from typing import Annotated
 
 import typer
 
-LoopFile = Annotated[Path, typer.Argument(metavar="LOOP", help="Loop file (TOML).")]
-ColumnsText = Annotated[
+LoopArgument = Annotated[Path, typer.Argument(metavar="LOOP", help="Loop file (TOML).")]
+ColumnsOption = Annotated[
     str | None,
     typer.Option("--columns", metavar="MAP", help="Where signals stand: 't=Time, r=Ref, u=2*Amps, y=Pos'."),
 ]
-Where = Annotated[
+WhereOption = Annotated[
     list[str] | None,
     typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges."),
 ]
-By = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
-From = Annotated[float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time, in s.")]
-To = Annotated[float | None, typer.Option("--to", metavar="S", help="Leave out this time, in s, and what is after it.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
-Report = Annotated[
+ByOption = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
+FromOption = Annotated[
+    float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time, in s.")
+]
+ToOption = Annotated[
+    float | None, typer.Option("--to", metavar="S", help="Leave out this time, in s, and what is after it.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
+ReportOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE.html", help="Write a page with plots; for several, one per recording."),
 ]
-Trace = Annotated[
+TraceOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE.parquet", help="Write the course over time; for several, one each."),
 ]

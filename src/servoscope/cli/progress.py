@@ -3,39 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from contextlib import AbstractContextManager
 
-__all__ = ["Steps", "counted", "on_compiling", "progress", "waiting"]
+    from rich.console import Console
+    from rich.progress import Progress, ProgressColumn
 
 
-class Steps:
-    """A progress bar over some parts, each in so many steps, or none; made by `progress`."""
+class StepProgress:
+    """A progress bar over some parts, each in so many steps, or none; made by `show_steps`."""
 
     def __init__(self, bar: Progress | None, parts: int, each: int) -> None:
         self._bar, self._each = bar, each
         self._task = bar.add_task("", total=parts * each) if bar is not None else None
-        self._part, self._done, self._what, self._step = -1, 0, "", ""
+        self._part, self._steps_done, self._part_name, self._step = -1, 0, "", ""
 
-    def begin(self, what: str) -> None:
+    def begin(self, part: str) -> None:
         """Go on to the next part."""
-        self._part, self._done, self._what, self._step = self._part + 1, 0, what, ""
+        self._part, self._steps_done, self._part_name, self._step = self._part + 1, 0, part, ""
         self._show()
 
-    def tell(self, step: str) -> None:
+    def advance(self, step: str) -> None:
         """Go on to the next step of the part."""
-        self._done, self._step = min(self._done + 1, self._each), step
+        self._steps_done, self._step = min(self._steps_done + 1, self._each), step
         self._show()
 
-    def compiling(self) -> None:
-        """Say why this takes longer than it will the next time."""
+    def show_compilation(self) -> None:
+        """Show why this takes longer than it will the next time."""
         self._show(" (compiling, once)")
 
     @contextmanager
-    def paused(self) -> Iterator[None]:
+    def pause(self) -> Iterator[None]:
         """Take the bar away while something else is printed."""
         if self._bar is None:
             yield
@@ -48,90 +49,62 @@ class Steps:
 
     def _show(self, more: str = "") -> None:
         if self._bar is not None and self._task is not None:
-            text = ": ".join(filter(None, (self._what, self._step))) + more
-            self._bar.update(self._task, completed=self._part * self._each + self._done, description=text)
+            text = ": ".join(filter(None, (self._part_name, self._step))) + more
+            self._bar.update(self._task, completed=self._part * self._each + self._steps_done, description=text)
 
 
 @contextmanager
-def progress(parts: int, each: int) -> Iterator[Steps]:
+def show_steps(parts: int, each: int) -> Iterator[StepProgress]:
     """Show a progress bar on stderr, if that is a terminal, and take it away again at the end."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import SpinnerColumn
 
-    err = Console(stderr=True, highlight=False)
-    if not err.is_terminal:
-        yield Steps(None, parts, each)
-        return
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TimeElapsedColumn(),
-    )
-    # Results go to stdout, which may be a file: it must not be drawn into the bar's console.
-    with Progress(*columns, console=err, transient=True, redirect_stdout=False) as bar:
-        steps = Steps(bar, parts, each)
-        with on_compiling(steps.compiling):
+    with _bar(SpinnerColumn()) as bar:
+        steps = StepProgress(bar, parts, each)
+        if bar is None:
+            yield steps
+            return
+        from servoscope.core.jit import on_compilation  # loads Numba: only where a bar is shown
+
+        with on_compilation(steps.show_compilation):
             yield steps
 
 
 @contextmanager
-def counted() -> Iterator[Callable[[str, int, int], None]]:
+def show_count() -> Iterator[Callable[[str, int, int], None]]:
     """Show how many of many are done, and how long the rest will take, on stderr if that is a terminal."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
-    err = Console(stderr=True, highlight=False)
-    if not err.is_terminal:
-        yield lambda *_: None
-        return
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=err, transient=True, redirect_stdout=False) as bar:
-        task = bar.add_task("")
+    with _bar(after=(MofNCompleteColumn(), TimeRemainingColumn())) as bar:
+        task = bar.add_task("") if bar is not None else None
 
-        def tell(what: str, done: int, total: int) -> None:
-            bar.update(task, description=what, completed=done, total=total)
+        def show(what: str, done: int, total: int) -> None:
+            if bar is not None and task is not None:
+                bar.update(task, description=what, completed=done, total=total)
 
-        yield tell
+        yield show
 
 
 @contextmanager
-def waiting(what: str) -> Iterator[None]:
+def show_spinner(what: str) -> Iterator[None]:
     """Show that something goes on, on stderr if that is a terminal."""
+    console = _terminal()
+    with console.status(what) if console is not None else nullcontext():
+        yield
+
+
+def _terminal() -> Console | None:
     from rich.console import Console
 
-    err = Console(stderr=True, highlight=False)
-    if not err.is_terminal:
-        yield
-        return
-    with err.status(what):
-        yield
+    console = Console(stderr=True, highlight=False)
+    return console if console.is_terminal else None
 
 
-@contextmanager
-def on_compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Call `tell` whenever machine code is made that was not in the cache yet."""
-    from numba.core.event import Event, Listener, install_listener
+def _bar(*before: ProgressColumn, after: tuple[ProgressColumn, ...] = ()) -> AbstractContextManager[Progress | None]:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    class Told(Listener):  # type: ignore[misc]  # numba has no complete types
-        def on_start(self, event: Event) -> None:
-            tell()
-
-        def on_end(self, event: Event) -> None:
-            """Nothing to say."""
-
-    with install_listener("numba:compile", Told()):
-        yield
+    console = _terminal()
+    if console is None:
+        return nullcontext()
+    columns = (*before, TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn(), *after)
+    # Results go to stdout, which may be a file: it must not be drawn into the bar's console.
+    return Progress(*columns, console=console, transient=True, redirect_stdout=False)

@@ -1,4 +1,4 @@
-"""The commands of the service: run it, watch it, ask its history."""
+"""The commands of the service: run it, watch it, print its history, replay recordings to it."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servoscope.cli.app import app
-from servoscope.cli.moments import moment
-from servoscope.cli.options import AsJson
-from servoscope.cli.outputs import check_output
-from servoscope.cli.shell import print_json
-from servoscope.complaints import instead
-from servoscope.errors import ConfigError, StoreError
+from servoscope.cli.arguments import parse_time
+from servoscope.cli.exit import print_json
+from servoscope.cli.options import JsonOption
+from servoscope.cli.output_paths import check_output
+from servoscope.core.errors import ConfigError, StoreError
+from servoscope.core.settings_errors import suggest_name
 
 if TYPE_CHECKING:
     from rich.console import Group
 
-    from servoscope.store import Store
+    from servoscope.service.store import Store
 
-ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Service file (TOML).")]
-StoreText = Annotated[
+
+ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="Service file (TOML).")]
+StoreArgument = Annotated[
     str, typer.Argument(metavar="STORE", help="Service file, SQLite file, or URL of a PostgreSQL database.")
 ]
-OfAsset = Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only this asset; repeatable.")]
+AssetOption = Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only this asset; repeatable.")]
 
 EXPORTS = (".csv", ".parquet", ".pq", ".json")
-SHOWN = 50
+DEFAULT_ROWS = 50
 
 
-class Kinds(StrEnum):
-    """What ``history`` can tell."""
+class HistoryKind(StrEnum):
+    """Kinds of rows that ``history`` prints."""
 
     diagnoses = "diagnoses"
     alarms = "alarms"
@@ -47,17 +48,17 @@ class Kinds(StrEnum):
 
 
 COLUMNS = {
-    Kinds.diagnoses: ("t", "asset", "grounds", "summary"),
-    Kinds.alarms: ("t", "asset", "alarm", "after", "who", "cause"),
-    Kinds.audit: ("at", "who", "asset", "what", "document"),
-    Kinds.residuals: ("t", "asset", "statistic", "level"),
-    Kinds.deliveries: ("created", "sink", "told", "attempts", "due", "outcome"),
+    HistoryKind.diagnoses: ("t", "asset", "grounds", "summary"),
+    HistoryKind.alarms: ("t", "asset", "alarm", "after", "who", "cause"),
+    HistoryKind.audit: ("at", "who", "asset", "what", "document"),
+    HistoryKind.residuals: ("t", "asset", "statistic", "level"),
+    HistoryKind.deliveries: ("created", "sink", "subject", "attempts", "due", "outcome"),
 }
 
 
 @app.command()
 def run(
-    config: ConfigFile,
+    config: ConfigArgument,
     anew: Annotated[
         list[str] | None,
         typer.Option(metavar="ASSET", help="Begin with a new state behind the samples that were counted; repeatable."),
@@ -65,30 +66,30 @@ def run(
     check: Annotated[bool, typer.Option("--check", help="Read the service file and what it names, and stop.")] = False,
 ) -> None:
     """Follow assets until stopped: what their sources say goes to the store, alarms go out; logs on stderr."""
-    from servoscope.live import logs
-    from servoscope.live.assembling import assemble, rehearse
-    from servoscope.live.config import Config
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # nothing has begun yet
+    from servoscope.service import log
+    from servoscope.service.build import build_components, check_service_file
+    from servoscope.service.config import ServiceFile
 
-    settings = Config.load(config)
+    settings = ServiceFile.load(config)
     if check:
-        with naming(config):
-            rehearse(settings)
-        found = {"asset": len(settings.assets), "source": len(settings.sources)}
-        counted = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in found.items())
+        with prefix_file_name(config):
+            check_service_file(settings)
+        counts = {"asset": len(settings.assets), "source": len(settings.sources)}
+        counted = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items())
         typer.echo(f"{config}: {counted}; all can be used")
         return
-    logs.set_up(settings.service.log)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # nothing is in hand yet
-    from servoscope.live.service import Service
-    from servoscope.live.serving import serve
-    from servoscope.web.beside import Beside
+    log.set_up_logging(settings.service.log)
+    from servoscope.service.health import serve_health
+    from servoscope.service.service import Service
+    from servoscope.web.supervisor import WebSupervisor
 
-    with naming(config):
-        service = Service(settings, assemble(settings, anew or ()))
-        server = serve(service, settings.service.listen) if settings.service.listen else None
+    with prefix_file_name(config):
+        service = Service(settings, build_components(settings, anew or ()))
+        server = serve_health(service, settings.service.listen) if settings.service.listen else None
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
-    pages = Beside(config) if settings.web is not None else None
+    pages = WebSupervisor(config) if settings.web is not None else None
     try:
         if pages is not None:
             pages.start()
@@ -102,25 +103,22 @@ def run(
 
 @app.command()
 def watch(
-    store: StoreText,
-    asset: OfAsset = None,
+    store: StoreArgument,
+    asset: AssetOption = None,
     every: Annotated[float, typer.Option(metavar="S", min=0.1, help="Time between two looks, in s.")] = 1.0,
     once: Annotated[bool, typer.Option("--once", help="Look once and stop.")] = False,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Show assets as they are now: verdict, since when, residuals, alarms; read from the store."""
-    from servoscope.cli import terminal, watching
-    from servoscope.store.history import standing
+    from servoscope.cli.render import history as tables
+    from servoscope.cli.render import results
 
-    opened, out = open_store(store), terminal.console()
+    opened, out = open_store(store), results.create_console()
 
     def page() -> Group:
-        statuses = opened.statuses(asset)
-        of = {name: row["status"] for name, row in statuses.items()}
-        ill = {name: said["since"] for name, said in of.items() if said.get("verdict") == "fault"}
-        return watching.page(statuses, standing(opened, ill), out.width)
+        return tables.status_page(opened.statuses(asset), out.width)
 
-    known(opened, asset or ())
+    check_assets(opened, asset or ())
     if as_json:
         print_json(list(opened.statuses(asset).values()), lines=False)
     elif once:
@@ -136,47 +134,48 @@ def watch(
 
 @app.command()
 def history(
-    store: StoreText,
-    kind: Annotated[Kinds, typer.Option(help="What to tell.")] = Kinds.diagnoses,
-    asset: OfAsset = None,
+    store: StoreArgument,
+    kind: Annotated[HistoryKind, typer.Option(help="What to tell.")] = HistoryKind.diagnoses,
+    asset: AssetOption = None,
     since: Annotated[
         str | None, typer.Option("--from", metavar="TIME", help="From this time on: 2026-01-31T12:00 (UTC), or 8h ago.")
     ] = None,
     until: Annotated[str | None, typer.Option("--to", metavar="TIME", help="Before this time.")] = None,
     last: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help=f"Only the newest N; on a terminal {SHOWN} by default.")
+        int | None,
+        typer.Option(metavar="N", min=1, help=f"Only the newest N; on a terminal {DEFAULT_ROWS} by default."),
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="FILE", help="Write to FILE.csv, FILE.parquet or FILE.json."),
     ] = None,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Tell what happened, in the order of time, or export it."""
     check_output(output, "-o", EXPORTS, [])
-    span = moment(since, "--from"), moment(until, "--to")
+    span = parse_time(since, "--from"), parse_time(until, "--to")
 
-    from servoscope.cli import terminal, watching
-    from servoscope.store.history import history as rows_of
-    from servoscope.store.history import plain
+    from servoscope.cli.render import history as tables
+    from servoscope.cli.render import results
+    from servoscope.service.store.queries import query_history, with_time_text
 
-    shown = last if last is not None or as_json or output is not None else SHOWN
+    shown = last if last is not None or as_json or output is not None else DEFAULT_ROWS
     opened = open_store(store)
-    known(opened, asset or ())
-    rows = rows_of(opened, kind, assets=asset or (), span=span, last=shown)
+    check_assets(opened, asset or ())
+    rows = query_history(opened, kind, assets=asset or (), span=span, last=shown)
     if output is not None:
-        export(output, rows)
-        terminal.written(terminal.console(stderr=True), output)
+        export_rows(output, rows)
+        results.print_written_path(results.create_console(stderr=True), output)
     elif as_json:
         for row in rows:
-            print_json(plain(row), lines=True)
+            print_json(with_time_text(row), lines=True)
     else:
-        terminal.console().print(watching.rows(rows, COLUMNS[kind]))
+        results.create_console().print(tables.row_table(rows, COLUMNS[kind]))
 
 
 @contextmanager
-def naming(config: Path) -> Iterator[None]:
-    """Put the name of the service file before what is wrong in it."""
+def prefix_file_name(config: Path) -> Iterator[None]:
+    """Put the name of the service file before an error in it."""
     try:
         yield
     except ConfigError as error:
@@ -185,36 +184,51 @@ def naming(config: Path) -> Iterator[None]:
 
 def open_store(text: str) -> Store:
     """Open a store for reading, by a service file or by itself; a locked one is waited for."""
-    from servoscope.store import Store
+    from servoscope.service.store import Store
 
     if text.endswith(".toml"):
-        from servoscope.live.config import Config
+        from servoscope.service.config import ServiceFile
 
-        config = Config.load(text)
-        return Store.open(config.store.url, config.folder, patience=5.0)
-    return Store.open(text, patience=5.0)
+        config = ServiceFile.load(text)
+        return Store.open(config.store.url, config.folder, lock_timeout_s=5.0)
+    return Store.open(text, lock_timeout_s=5.0)
 
 
-def known(store: Store, assets: Sequence[str]) -> None:
-    """Refuse assets that the store knows nothing of: an empty answer would look like peace."""
-    there = store.statuses() if assets else {}
+def check_assets(store: Store, assets: Sequence[str]) -> None:
+    """Refuse assets that are not in the store: an empty answer would look as if all were well."""
+    known = store.statuses() if assets else {}
     for name in assets:
-        if name not in there:
-            raise StoreError(f"{name}: no such asset in {store.name}, {instead(name, there)}")
+        if name not in known:
+            raise StoreError(f"{name}: no such asset in {store.name}, {suggest_name(name, known)}")
 
 
-def export(path: Path, rows: list[Any]) -> None:
+def export_rows(path: Path, rows: list[Any]) -> None:
     """Write rows to a file."""
     import json
 
     import numpy as np
 
-    from servoscope.output import atomic_write
-    from servoscope.store.history import plain, spread
-    from servoscope.writers import write_table
+    from servoscope.core.files import atomic_write
+    from servoscope.service.store.queries import rows_to_columns, with_time_text
+    from servoscope.signals.writers import write_table
 
     if path.suffix.lower() == ".json":
-        lines = [json.dumps(plain(row), allow_nan=False) for row in rows]
+        lines = [json.dumps(with_time_text(row), allow_nan=False) for row in rows]
         atomic_write(path, ("[\n" + ",\n".join(lines) + "\n]\n").encode())
     else:
-        write_table(path, {name: np.array(column, dtype=object) for name, column in spread(rows).items()})
+        write_table(path, {name: np.array(column, dtype=object) for name, column in rows_to_columns(rows).items()})
+
+
+@app.command()
+def publish(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="What is sent, and where to (TOML).")],
+) -> None:
+    """Send recordings to an MQTT broker, as if measured now, until the service has all of them; logs on stderr."""
+    from servoscope.service import log
+    from servoscope.service.mqtt.replay_client import ReplayClient, ReplayClientSettings
+
+    log.set_up_logging("info")
+    publisher = ReplayClient(ReplayClientSettings.load(config))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: publisher.stop())
+    publisher.run()

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servoscope.access import ROLES, Role
 from servoscope.cli.app import app
-from servoscope.cli.shell import print_json
+from servoscope.cli.exit import print_json
+from servoscope.service.access import ROLES, Role
 
 if TYPE_CHECKING:
-    from servoscope.access import WebSettings
-    from servoscope.live.config import Config
+    from servoscope.service.access import WebSettings
+    from servoscope.service.config import ServiceFile
 
-users = typer.Typer(no_args_is_help=True, help="Who may log in to the pages: names, roles and passwords in a file.")
-app.add_typer(users, name="users")
+users_app = typer.Typer(no_args_is_help=True, help="Who may log in to the pages: names, roles and passwords in a file.")
+app.add_typer(users_app, name="users")
 
-UsersFile = Annotated[Path, typer.Option("--users", metavar="FILE", help="File of users.")]
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the user.")]
-DEFAULT = Path("users.json")
+UsersOption = Annotated[Path, typer.Option("--users", metavar="FILE", help="File of users.")]
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the user.")]
+DEFAULT_USERS_FILE = Path("users.json")
 
 
 @app.command()
@@ -51,63 +51,56 @@ def serve(
         import fastapi  # noqa: F401  # the first of what the extra brings
         import uvicorn  # noqa: F401
     except ModuleNotFoundError as error:
-        from servoscope.errors import ConfigError
+        from servoscope.core.errors import ConfigError
 
         raise ConfigError(f"{error.name} is missing, pip install 'servoscope[web]'") from None
-    from servoscope.live.config import Config
-    from servoscope.store import Store
-    from servoscope.web.serving import STORE_PATIENCE
-    from servoscope.web.serving import serve as run
+    from servoscope.service.config import ServiceFile
+    from servoscope.service.store import Store
+    from servoscope.web.server import STORE_PATIENCE, run_server
 
-    found = Config.load(config) if config is not None else None
-    # what is said here is relative to where it is said, and what the service file says to that file
+    service = ServiceFile.load(config) if config is not None else None
+    # paths on the command line are relative to the current folder, those in the service file to its own
     paths = {"users": users, "folder": folder, "certificate": certificate, "key": key}
     given = {name: None if path is None else str(Path(path).absolute()) for name, path in paths.items()}
-    settings = settings_of(found, {**given, "listen": listen, "hosts": host or None})
-    here = found.folder if found is not None else Path.cwd()
-    url = found.store.url if found is not None else str(store)
-    # a store that is there is never changed; one that is not is made, so that files can be diagnosed at once
+    settings = merge_web_settings(service, {**given, "listen": listen, "hosts": host or None})
+    here = service.folder if service is not None else Path.cwd()
+    url = service.store.url if service is not None else str(store)
+    # a store that exists is only read; one that does not is made, so that files can be diagnosed at once
     missing = "://" not in url and not (here / url).exists()
-    opened = Store.open(url, here, write=missing, patience=STORE_PATIENCE)
+    opened = Store.open(url, here, write=missing, lock_timeout_s=STORE_PATIENCE)
     if missing:
         typer.echo(f"servoscope: {opened.name} is new, and empty until servoscope run follows assets", err=True)
-    run(settings, opened, found, here, with_parent=with_parent)
+    run_server(settings, opened, service, here, with_parent=with_parent)
 
 
-def settings_of(config: Config | None, given: dict[str, object]) -> WebSettings:
-    """Return the section ``[web]`` with what the command line says laid over it.
-
-    Raises
-    ------
-    ConfigError
-        If they do not go together.
-    """
+def merge_web_settings(config: ServiceFile | None, given: dict[str, object]) -> WebSettings:
+    """Return the section ``[web]`` with the options of the command line in place of its own."""
     from pydantic import ValidationError
 
-    from servoscope.access import WebSettings
-    from servoscope.complaints import describe
-    from servoscope.errors import ConfigError
+    from servoscope.core.errors import ConfigError
+    from servoscope.core.settings_errors import describe_error
+    from servoscope.service.access import WebSettings
 
     base = config.web.model_dump() if config is not None and config.web is not None else {}
     try:
         return WebSettings.model_validate({**base, **{key: value for key, value in given.items() if value is not None}})
     except ValidationError as error:
-        raise ConfigError(describe(error, WebSettings, "web")) from None
+        raise ConfigError(describe_error(error, WebSettings, "web")) from None
 
 
-@users.command()
+@users_app.command()
 def add(
-    name: Name,
+    name: NameArgument,
     role: Annotated[
         str, typer.Option(metavar="ROLE", help=f"{', '.join(ROLES)}: each may do what those before it may.")
     ] = "viewer",
-    file: UsersFile = DEFAULT,
+    file: UsersOption = DEFAULT_USERS_FILE,
     password_stdin: Annotated[
         bool, typer.Option("--password-stdin", help="Read the password from stdin instead of asking.")
     ] = False,
 ) -> None:
     """Add a user, or give one a new role and password."""
-    from servoscope.access import Users
+    from servoscope.service.access import Users
 
     chosen: Role | None = next((one for one in ROLES if one == role), None)
     if chosen is None:
@@ -122,23 +115,25 @@ def add(
     typer.echo(f"{file}: {name} is {chosen}")
 
 
-@users.command("list")
-def list_(file: UsersFile = DEFAULT, as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False) -> None:
+@users_app.command("list")
+def print_users(
+    file: UsersOption = DEFAULT_USERS_FILE, as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False
+) -> None:
     """List users and roles."""
-    from servoscope.access import Users
+    from servoscope.service.access import Users
 
-    found = Users(file).all()
+    users = Users(file).all()
     if as_json:
-        print_json(found, lines=False)
+        print_json(users, lines=False)
     else:
-        for name, role in sorted(found.items()):
+        for name, role in sorted(users.items()):
             typer.echo(f"{name}  {role}")
 
 
-@users.command()
-def remove(name: Name, file: UsersFile = DEFAULT) -> None:
+@users_app.command()
+def remove(name: NameArgument, file: UsersOption = DEFAULT_USERS_FILE) -> None:
     """Remove a user; its sessions end."""
-    from servoscope.access import Users
+    from servoscope.service.access import Users
 
     Users(file).remove(name)
     typer.echo(f"{file}: {name} is removed")

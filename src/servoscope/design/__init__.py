@@ -1,9 +1,8 @@
 """Before deployment: which faults can be detected and told apart, at which size, after how long."""
 
-from servoscope.design.designing import design_study
-from servoscope.design.findings import FaultStudy, Side, Study
-from servoscope.design.pairs import explanations
-from servoscope.design.scene import Scene
-from servoscope.design.studying import study
+from servoscope.design.isolability_pairs import explanation_distances
+from servoscope.design.result import DesignStudy, DirectionStudy, FaultStudy
+from servoscope.design.scenario import Scenario
+from servoscope.design.study import design_study, study
 
-__all__ = ["FaultStudy", "Scene", "Side", "Study", "design_study", "explanations", "study"]
+__all__ = ["DesignStudy", "DirectionStudy", "FaultStudy", "Scenario", "design_study", "explanation_distances", "study"]

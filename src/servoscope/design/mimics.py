@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoscope.design.information import MISNAMED, cosines, equivalent
-from servoscope.design.scene import Scene
-from servoscope.plants import FloatArray
-from servoscope.refinement.predictor import Predictor
-from servoscope.refinement.window import TINY
+from servoscope.core.arrays import FloatArray
+from servoscope.core.messages import Message, message, text_message
+from servoscope.design.fisher_information import MISNAMED, cosines, equivalent_distance
+from servoscope.design.scenario import Scenario
+from servoscope.isolation.ml.predictor import Predictor
+from servoscope.isolation.ml.window import TINY
 
 PARALLEL = 1e-6  # 1 - cosine^2 below which two changes are one and the same
 LOUDER = 1e-4  # gain by which one is taken
@@ -18,82 +19,68 @@ LATER = 0.01  # samples of delay by which the derivative is taken
 
 
 @dataclass(frozen=True, eq=False)
-class Cause:
-    """A change that is no fault of the list.
+class MimicCause:
+    """A change that is no fault of the list."""
 
-    Parameters
-    ----------
-    name, words
-        Short and long.
-    unit
-        What `column` is the derivative by: a relative change, or samples of delay.
-    column
-        Innovations by the change, shape (N + m,).
-    """
-
-    name: str
-    words: str
-    unit: str
-    column: FloatArray
+    name: str  # name, words: short and long
+    words: Message
+    unit: str  # what `column` is the derivative by: a relative change, or samples of delay
+    column: FloatArray  # innovations by the change, shape (N + m,)
 
 
-def causes(scene: Scene) -> list[Cause]:
+def mimic_causes(scene: Scenario) -> list[MimicCause]:
     """Return what else may change: further parts of the plant, gains of both sensors, the delay."""
-    window, plant, m = scene.healthy, scene.baseline.plant, scene.healthy.nuisances
+    window, plant, m = scene.healthy, scene.baseline.plant, scene.healthy.nuisance_count
     names = tuple(plant.causes)
-    J = window.jacobian(np.zeros(m + len(names)), names, scene.growth, slice(m, None))
-    found = [Cause(name, plant.causes[name], "relative", J[:, i]) for i, name in enumerate(names)]
-    healthy, bench = window.healthy, window.bench
-    louder, softer = (bench.predictor(plant, output_gain=1.0 + step) for step in (LOUDER, -LOUDER))
-    stronger = bench.predictor(plant.model_copy(update={"input_gain": plant.input_gain * (1.0 + 1j * TINY)}))
-    later = bench.predictor(plant, later_s=LATER / scene.loop.sample_rate)
-    gain_of_y = (_column(scene, louder) - _column(scene, softer)).real / (2.0 * LOUDER)
+    J = window.jacobian(np.zeros(m + len(names)), names, scene.profile, slice(m, None))
+    found = [MimicCause(name, text_message(plant.causes[name]), "relative", J[:, i]) for i, name in enumerate(names)]
+    healthy, factory = window.healthy, window.factory
+    louder, softer = (factory.predictor(plant, output_gain=1.0 + step) for step in (LOUDER, -LOUDER))
+    stronger = factory.predictor(plant.model_copy(update={"input_gain": plant.input_gain * (1.0 + 1j * TINY)}))
+    later = factory.predictor(plant, later_s=LATER / scene.loop.sample_rate)
+    gain_of_y = (_innovation_column(scene, louder) - _innovation_column(scene, softer)).real / (2.0 * LOUDER)
     return [
         *found,
-        Cause("gain of y", "another gain of the sensor of y", "relative", gain_of_y),
-        Cause("gain of u", "another gain of the input", "relative", _column(scene, stronger).imag / TINY),
-        Cause("delay", "a further delay", "samples", (_column(scene, later) - _column(scene, healthy)).real / LATER),
+        MimicCause("gain of y", message("design.gain_of_y"), "relative", gain_of_y),
+        MimicCause(
+            "gain of u", message("design.gain_of_u"), "relative", _innovation_column(scene, stronger).imag / TINY
+        ),
+        MimicCause(
+            "delay",
+            message("design.delay"),
+            "samples",
+            (_innovation_column(scene, later) - _innovation_column(scene, healthy)).real / LATER,
+        ),
     ]
 
 
 @dataclass(frozen=True)
-class Imitation:
-    """Which fault a cause looks like.
+class MimicMatch:
+    """Which fault a cause looks like."""
 
-    Parameters
-    ----------
-    cosine
-        Between both, for each fault, what the healthy parameters can take up left out.
-    fault
-        Number of the fault with the largest.
-    size
-        Logarithm of its ratio that a unit of the cause looks like.
-    told_apart
-        Units of the cause from which on it is told from that fault with 99.5 % probability; infinite: never.
-    """
-
-    cosine: FloatArray
-    fault: int
-    size: float
-    told_apart: float
+    cosine: FloatArray  # between both, for each fault, what the healthy parameters can take up left out
+    fault: int  # number of the fault with the largest
+    size: float  # logarithm of its ratio that a unit of the cause looks like
+    # units of the cause from which on it is told from that fault with 99.5 % probability; infinite: never
+    distinguishable_from: float
 
 
-def imitation(scene: Scene, cause: Cause) -> Imitation:
+def match_mimic(scene: Scenario, cause: MimicCause) -> MimicMatch:
     """Return which fault a small change of a cause looks like."""
-    column = scene.projected(cause.column[:, None])
-    faults = scene.projected(scene.sensitivity)
+    column = scene.project_out_nuisances(cause.column[:, None])
+    faults = scene.project_out_nuisances(scene.sensitivity)
     cosine = cosines(column, faults)[0]
     i = int(np.argmax(np.abs(cosine)))
     size = float(faults[:, i] @ column[:, 0]) / max(float(faults[:, i] @ faults[:, i]), 1e-300)
     own = max(1.0 - float(cosine[i]) ** 2, 0.0)
     length = float(np.linalg.norm(column))
-    told = equivalent(MISNAMED) / (length * np.sqrt(own)) if own > PARALLEL and length > 0.0 else np.inf
-    return Imitation(cosine, i, size, float(told))
+    told = equivalent_distance(MISNAMED) / (length * np.sqrt(own)) if own > PARALLEL and length > 0.0 else np.inf
+    return MimicMatch(cosine, i, size, float(told))
 
 
-def _column(scene: Scene, changed: Predictor) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
+def _innovation_column(scene: Scenario, changed: Predictor) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
     """Return innovations (N,) with a changed predictor from the onset on, and nothing for the prior, (N + m,)."""
-    window, growth = scene.healthy, scene.growth
+    window, profile = scene.healthy, scene.profile
     both = [Predictor(*(part.astype(np.complex128) for part in each)) for each in (window.healthy, changed)]
-    e = window.innovations(Predictor.of(both), growth)
-    return np.concatenate([e, np.zeros(window.nuisances)])
+    e = window.innovations(Predictor.concatenate(both), profile)
+    return np.concatenate([e, np.zeros(window.nuisance_count)])

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
-from servoscope.fleet.common import Cause, Prior, causes
-from servoscope.fleet.evidence import Evidence
-from servoscope.fleet.knowledge import Fleet
+from servoscope.fleet import sinks as sinks
+from servoscope.fleet import spark as spark
+from servoscope.fleet.common_cause import Cause, Evidence, Prior, causes
 from servoscope.fleet.lake import Lake
-from servoscope.fleet.local import local
-from servoscope.fleet.running import Plan, run
+from servoscope.fleet.local_engine import local
+from servoscope.fleet.run import Plan, run
 from servoscope.fleet.spark import diagnose
 from servoscope.fleet.streaming import follow
+from servoscope.fleet.summary import Fleet
 
-__all__ = ["Cause", "Evidence", "Fleet", "Lake", "Plan", "Prior", "causes", "diagnose", "follow", "local", "run"]
+__all__ = [
+    "Cause",
+    "Evidence",
+    "Fleet",
+    "Lake",
+    "Plan",
+    "Prior",
+    "causes",
+    "diagnose",
+    "follow",
+    "local",
+    "run",
+    "sinks",
+    "spark",
+]

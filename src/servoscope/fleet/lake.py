@@ -1,4 +1,4 @@
-"""What a lake holds: one item per asset and day, found by the names of folders or in a table of files."""
+"""The items of a lake, one per asset and day, from the names of folders or from a table of files."""
 
 from __future__ import annotations
 
@@ -6,43 +6,29 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
-from servoscope.errors import RecordingError
-
-__all__ = ["Item", "Lake", "filesystem", "groups_of"]
+from servoscope.core.errors import RecordingError
 
 TABLES = (".csv", ".txt", ".tsv")
 ASSET, DAY = "asset", "day"
-WHOLE = "all"  # the day of files that name none
+UNDATED_DAY = "all"  # the day of files that name none
 
 
 @dataclass(frozen=True)
-class Item:
-    """One asset's day.
-
-    Parameters
-    ----------
-    asset, day
-        Their names.
-    files
-        Where the rows are, as paths or URLs.
-    stamp
-        Changes when a file does: a hash of names, sizes and times.
-    groups
-        What else is known of the asset: (key, value) pairs, such as its hydraulic supply.
-    """
+class AssetDay:
+    """One asset's day."""
 
     asset: str
     day: str
-    files: tuple[str, ...]
-    stamp: str
-    groups: tuple[tuple[str, str], ...] = ()
+    files: tuple[str, ...]  # where the rows are, as paths or URLs
+    stamp: str  # hash of the files' names, sizes and times
+    groups: tuple[tuple[str, str], ...] = ()  # what the asset belongs to: (key, value), such as its hydraulic supply
 
     @property
     def key(self) -> tuple[str, str]:
-        """What makes it this item."""
+        """What identifies it."""
         return self.asset, self.day
 
 
@@ -50,8 +36,8 @@ class Item:
 class Lake:
     """All items of a lake, by asset and day in order."""
 
-    where: str
-    items: tuple[Item, ...]
+    location: str
+    items: tuple[AssetDay, ...]
 
     @property
     def assets(self) -> tuple[str, ...]:
@@ -74,38 +60,37 @@ class Lake:
             with other keys are groups. Or a table of files, CSV, with the columns ``asset``, ``file`` and, if wanted,
             ``day`` and groups.
         partition
-            How the keys of asset and day are called.
+            The keys of asset and day.
         groups
             More groups by asset.
 
         Raises
         ------
         RecordingError
-            If there is nothing, or no key for the asset.
+            If there is no file, or no key for the asset.
         """
-        found = _listed(where, partition) if where.lower().endswith(TABLES) else _walked(where, partition)
-        known: dict[tuple[str, str], tuple[list[tuple[str, str]], dict[str, str]]] = {}
-        for asset, day, file, stamp, more in found:
-            files, own = known.setdefault((asset, day), ([], {}))
-            files.append((file, stamp))
-            own.update(more)
-        if not known:
+        is_table = where.lower().endswith(TABLES)
+        files: dict[tuple[str, str], list[tuple[str, str]]] = {}
+        keys: dict[tuple[str, str], dict[str, str]] = {}
+        for file in (_read_file_table if is_table else _walk_folders)(where, partition):
+            files.setdefault((file.asset, file.day), []).append((file.path, file.stamp))
+            keys.setdefault((file.asset, file.day), {}).update(file.groups)
+        if not files:
             raise RecordingError(f"{where}: holds no Parquet file, give a folder with asset=.../day=... in it")
         items = []
-        for (asset, day), (files, own) in sorted(known.items()):
-            own.update((groups or {}).get(asset, {}))
-            digest = hashlib.sha256(repr(sorted(files)).encode()).hexdigest()[:16]
-            items.append(Item(asset, day, tuple(name for name, _ in sorted(files)), digest, tuple(sorted(own.items()))))
+        for (asset, day), stamped in sorted(files.items()):
+            digest = hashlib.sha256(repr(sorted(stamped)).encode()).hexdigest()[:16]
+            own = {**keys[asset, day], **(groups or {}).get(asset, {})}
+            items.append(
+                AssetDay(asset, day, tuple(path for path, _ in sorted(stamped)), digest, tuple(sorted(own.items())))
+            )
         return cls(where, tuple(items))
 
 
 def filesystem(where: str) -> tuple[Any, str]:
     """Return the file system of a path or URL, and the path in it.
 
-    Raises
-    ------
-    RecordingError
-        If the URL is of an unknown kind.
+    Raises RecordingError if the URL is of an unknown kind.
     """
     import pyarrow as pa
     from pyarrow import fs
@@ -113,30 +98,34 @@ def filesystem(where: str) -> tuple[Any, str]:
     if "://" not in where:
         return fs.LocalFileSystem(), str(Path(where).absolute())
     try:
-        found: tuple[Any, str] = fs.FileSystem.from_uri(where)
+        system, path = fs.FileSystem.from_uri(where)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise RecordingError(f"{where}: cannot be opened ({' '.join(str(error).split())[:100]})") from None
-    return found
+    return system, path
 
 
-def groups_of(path: Path) -> dict[str, dict[str, str]]:
+def read_groups(path: Path) -> dict[str, dict[str, str]]:
     """Read groups by asset from a table with the column ``asset``; each other column is a key.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such column.
+    Raises RecordingError if there is no such column.
     """
-    rows = _table(str(path))
+    rows = _read_csv(str(path))
     if rows and ASSET not in rows[0]:
         raise RecordingError(f"{path}: no column {ASSET!r}, the table of groups has one row per asset")
     return {row[ASSET]: {key: value for key, value in row.items() if key != ASSET and value} for row in rows}
 
 
-Found = tuple[str, str, str, str, dict[str, str]]  # asset, day, file, stamp, groups
+class LakeFile(NamedTuple):
+    """A file of a lake, with the groups that its folders or its row name."""
+
+    asset: str
+    day: str
+    path: str
+    stamp: str
+    groups: dict[str, str]
 
 
-def _walked(where: str, partition: tuple[str, str]) -> Iterator[Found]:
+def _walk_folders(where: str, partition: tuple[str, str]) -> Iterator[LakeFile]:
     from pyarrow import fs
 
     system, root = filesystem(where)
@@ -154,13 +143,13 @@ def _walked(where: str, partition: tuple[str, str]) -> Iterator[Found]:
         keys = {k: unquote(v) for k, equals, v in (part.partition("=") for part in parts[:-1]) if equals}
         if partition[0] not in keys:
             raise RecordingError(f"{info.path}: no folder {partition[0]}=... above it: say with --partition which keys")
-        asset, day = keys.pop(partition[0]), keys.pop(partition[1], WHOLE)
-        yield asset, day, prefix + info.path, f"{info.size} {info.mtime_ns}", keys
+        asset, day = keys.pop(partition[0]), keys.pop(partition[1], UNDATED_DAY)
+        yield LakeFile(asset, day, prefix + info.path, f"{info.size} {info.mtime_ns}", keys)
 
 
-def _listed(where: str, partition: tuple[str, str]) -> Iterator[Found]:
+def _read_file_table(where: str, partition: tuple[str, str]) -> Iterator[LakeFile]:
     folder = Path(where).parent
-    for i, row in enumerate(_table(where), start=2):
+    for i, row in enumerate(_read_csv(where), start=2):
         asset, file = row.pop(partition[0], ""), row.pop("file", "")
         if not asset or not file:
             raise RecordingError(f"{where}: row {i}: needs a value in the columns {partition[0]!r} and 'file'")
@@ -170,11 +159,11 @@ def _listed(where: str, partition: tuple[str, str]) -> Iterator[Found]:
             state = Path(path).stat()
             stamp = f"{state.st_size} {state.st_mtime_ns}"
         except OSError:
-            stamp = "missing"  # the item says so when it is read
-        yield asset, day, path, stamp, {key: value for key, value in row.items() if value}
+            stamp = "missing"  # reading the item will fail with the reason
+        yield LakeFile(asset, day, path, stamp, {key: value for key, value in row.items() if value})
 
 
-def _table(where: str) -> list[dict[str, str]]:
+def _read_csv(where: str) -> list[dict[str, str]]:
     import csv
 
     try:

@@ -1,4 +1,4 @@
-"""Rows of r, u, y on a clock of whole microseconds: from any table, in one order, on whatever machine they are read."""
+"""Rows of a lake on a clock of whole microseconds: the same from any table, in one order, on whatever machine."""
 
 from __future__ import annotations
 
@@ -9,31 +9,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.errors import RecordingError
-from servoscope.loop import Columns
-from servoscope.plants import FloatArray
-from servoscope.readers.columns import find_channel, parse_combination
-from servoscope.readers.tables import UNITS, Table, number_column
-
-__all__ = ["Rows", "clock_of", "names_of", "rows_of", "signals_of"]
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.core.errors import RecordingError
+from servoscope.models.loop import Columns, Loop
+from servoscope.signals import Recording, clean
+from servoscope.signals.readers.columns import LinearCombination, find_channel, parse_combination, parse_output
+from servoscope.signals.readers.table import TIME_UNITS, Table, number_column
 
 MICRO = 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Samples as logged.
+    """Rows as logged, in any order; time is in whole numbers, so that it can be compared and saved without rounding."""
 
-    Parameters
-    ----------
-    t_us
-        Time [us], whole numbers since the clock's own origin, shape (N,).
-    r, u, y
-        Reference, control input, measured output, shape (N,); NaN where a cell was empty.
-    """
-
-    t_us: npt.NDArray[np.int64]
-    r: FloatArray
+    t_us: IntArray  # [us] since the clock's own origin, shape (N,)
+    r: FloatArray  # r, u, y: reference, control input, measured output, shape (N,); NaN where a cell was empty
     u: FloatArray
     y: FloatArray
 
@@ -49,29 +40,37 @@ class Rows:
         """Return the rows with after_us < t <= to_us."""
         return self[(self.t_us > after_us) & (self.t_us <= to_us)]
 
-    def sorted(self) -> Rows:
+    def sort_by_time(self) -> Rows:
         """Return them in the order of time; rows of one time in an order that depends on nothing but themselves."""
         if len(self) < 2 or bool((np.diff(self.t_us) > 0).all()):
             return self
         return self[np.lexsort((self.y, self.u, self.r, self.t_us))]
 
+    def to_recording(self, origin_us: int, loop: Loop, name: str) -> Recording:
+        """Return rows in the order of time as a recording whose time is 0 at `origin_us`.
+
+        Raises RecordingError if they cannot be used as one.
+        """
+        t = (self.t_us - origin_us) / MICRO
+        return clean(t, self.r, self.u, self.y, name=name, sample_rate=loop.sample_rate, limits=loop.input_limits)
+
     @classmethod
-    def none(cls) -> Rows:
+    def empty(cls) -> Rows:
         """Return no rows."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0))
 
     @classmethod
-    def joined(cls, parts: Sequence[Rows]) -> Rows:
+    def concatenate(cls, parts: Sequence[Rows]) -> Rows:
         """Return several blocks as one."""
         if len(parts) == 1:
             return parts[0]
         if not parts:
-            return cls.none()
+            return cls.empty()
         t_us, r, u, y = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t_us", "r", "u", "y"))
         return cls(t_us, r, u, y)
 
     def pack(self) -> bytes:
-        """Return them as bytes, 32 a row."""
+        """Return them as bytes, 32 per row."""
         return b"".join(np.ascontiguousarray(x).tobytes() for x in (self.t_us, self.r, self.u, self.y))
 
     @classmethod
@@ -82,71 +81,66 @@ class Rows:
         return cls(np.frombuffer(content, dtype=np.int64, count=n), floats[:n], floats[n : 2 * n], floats[2 * n :])
 
 
-def names_of(columns: Columns, known: Sequence[str], where: str) -> list[str]:
-    """Return the columns that a mapping takes out of those that there are.
+def required_columns(columns: Columns, known: Sequence[str], where: str) -> list[str]:
+    """Return those of the columns `known` that a mapping uses, time first.
 
-    Raises
-    ------
-    RecordingError, LoopError
-        If one does not exist, or the mapping has no time: rows that are spread over files have no order without.
+    Raises RecordingError, LoopError if one does not exist, or the mapping has no time: rows that are spread over
+    files have no order without.
     """
     if columns.time is None:
         raise RecordingError(f"{where}: rows of a fleet need a time column: say which it is, --columns 't=...'")
     named = [find_channel(columns.time, known, f"{where}: [columns] time")]
-    for key in ("reference", "input", "output"):
+    for key in ("reference", "input"):
         named += parse_combination(getattr(columns, key), known, f"{where}: [columns] {key}").factors
+    for sensor in parse_output(columns, known, f"{where}: [columns] output"):
+        named += sensor.factors
     return list(dict.fromkeys(named))
 
 
-def rows_of(table: Table, columns: Columns) -> Rows:
-    """Return the rows of a table; those without a time are left out.
+def rows_from_table(table: Table, columns: Columns) -> Rows:
+    """Return the rows of a table that have a time.
 
-    Raises
-    ------
-    RecordingError, LoopError
-        If the columns cannot be used.
+    Raises RecordingError, LoopError if the columns cannot be used.
     """
-    t_us, known = clock_of(table, columns)
-    rows = Rows(t_us, *signals_of(table, columns))
+    t_us, known = time_from_table(table, columns)
+    rows = Rows(t_us, *signals_from_table(table, columns))
     return rows if known.all() else rows[known]
 
 
-def signals_of(table: Table, columns: Columns) -> tuple[FloatArray, FloatArray, FloatArray]:
+def signals_from_table(table: Table, columns: Columns) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return r, u and y of a table, shape (N,) each.
 
-    Raises
-    ------
-    RecordingError, LoopError
-        If the columns cannot be used.
+    Raises RecordingError, LoopError if the columns cannot be used.
     """
-    known, signals = list(table.columns), []
-    for key in ("reference", "input", "output"):
-        mix = parse_combination(getattr(columns, key), known, f"{table.name}: [columns] {key}")
-        total = np.full(table.rows, mix.constant)
-        for name, factor in mix.factors.items():
-            total += factor * number_column(table, name, f"[columns] {key}")
-        signals.append(total)
-    r, u, y = signals
-    return r, u, y
+    known, where = list(table.columns), f"{table.name}: [columns]"
+    r, u = (
+        _mix(table, parse_combination(getattr(columns, key), known, f"{where} {key}"), key)
+        for key in ("reference", "input")
+    )
+    sensors = [_mix(table, one, "output") for one in parse_output(columns, known, f"{where} output")]
+    return r, u, sensors[0] if len(sensors) == 1 else np.asarray(np.mean(sensors, axis=0))
 
 
-def clock_of(table: Table, columns: Columns) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Return the time of each row [us] and whether there is one; times are rounded to microseconds.
+def _mix(table: Table, mix: LinearCombination, key: str) -> FloatArray:
+    total = np.full(table.rows, mix.constant)
+    for name, factor in mix.factors.items():
+        total += factor * number_column(table, name, f"[columns] {key}")
+    return total
 
-    Raises
-    ------
-    RecordingError
-        If the column holds neither numbers nor times.
+
+def time_from_table(table: Table, columns: Columns) -> tuple[IntArray, BoolArray]:
+    """Return the time of each row, rounded to whole microseconds, and whether it has one.
+
+    Raises RecordingError if the column holds neither numbers nor times.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    where = f"{table.name}: [columns] time"
-    column = table.columns[find_channel(columns.time or "", list(table.columns), where)]
+    column = table.columns[find_channel(columns.time or "", list(table.columns), f"{table.name}: [columns] time")]
     if not pa.types.is_timestamp(column.type):
-        seconds = number_column(table, columns.time or "", "time") * UNITS[columns.time_unit]
-        there = np.isfinite(seconds) & (np.abs(seconds) < 9e12)
-        return np.round(np.where(there, seconds, 0.0) * MICRO).astype(np.int64), there
+        seconds = number_column(table, columns.time or "", "time") * TIME_UNITS[columns.time_unit]
+        known = np.isfinite(seconds) & (np.abs(seconds) < 9e12)
+        return np.round(np.where(known, seconds, 0.0) * MICRO).astype(np.int64), known
     missing = np.asarray(column.is_null().to_numpy(zero_copy_only=False), dtype=bool)
     whole = pc.cast(column, pa.timestamp("us", column.type.tz), safe=False).cast(pa.int64()).fill_null(0)
     return np.concatenate([np.zeros(0, np.int64), *(np.asarray(chunk) for chunk in whole.chunks)]), ~missing

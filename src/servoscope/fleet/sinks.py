@@ -1,4 +1,4 @@
-"""Where a stream comes from and where its results go: sources by configuration, batches written once, the report."""
+"""The two ends of a stream: sources by configuration; results, each micro-batch written once, and their report."""
 
 from __future__ import annotations
 
@@ -9,36 +9,33 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from servoscope.errors import RecordingError, ServoscopeError
-from servoscope.fleet.common import PRIOR, Prior
-from servoscope.fleet.knowledge import Fleet, known
-from servoscope.fleet.pages import write_knowledge
-from servoscope.fleet.passing import DAY_US
-from servoscope.fleet.rows import MICRO, names_of
+from servoscope.core.errors import RecordingError, ServoscopeError
+from servoscope.fleet.common_cause import PRIOR, Prior
+from servoscope.fleet.partition import DAY_US
+from servoscope.fleet.report import write_fleet_report
+from servoscope.fleet.rows import MICRO, required_columns
 from servoscope.fleet.streaming import SCHEMA
-from servoscope.loop import Columns
+from servoscope.fleet.summary import Fleet, summarise_fleet
+from servoscope.models.loop import Columns
 
 if TYPE_CHECKING:
     from pyspark.sql import DataFrame, SparkSession
     from pyspark.sql.streaming import StreamingQuery
 
-    from servoscope.store import Row
-
-__all__ = ["files", "kafka", "report", "results", "start", "wait"]
+    from servoscope.service.store import Row
 
 
 OWNER = "fleet stream"  # in the store: whose transactions these are
 
 
-def files(session: SparkSession, folder: str, columns: Columns, options: Mapping[str, str] | None = None) -> DataFrame:
-    """Return a stream of the Parquet files that come into a folder, as they come.
+def file_stream(
+    session: SparkSession, folder: str, columns: Columns, options: Mapping[str, str] | None = None
+) -> DataFrame:
+    """Return a stream of the Parquet files that come into a folder.
 
-    The first file says which columns there are; ``asset=...`` in the names of folders is a column too.
+    The first file decides which columns there are; ``asset=...`` in the names of folders is a column too.
 
-    Raises
-    ------
-    RecordingError
-        If there is no file yet, or it lacks a column.
+    Raises RecordingError if there is no file yet, or it lacks a column.
     """
     from pyspark.errors import AnalysisException
 
@@ -48,25 +45,19 @@ def files(session: SparkSession, folder: str, columns: Columns, options: Mapping
         schema = session.read.parquet(folder).schema
     except AnalysisException as error:
         raise RecordingError(f"{folder}: holds no Parquet file yet ({str(error).splitlines()[0][:100]})") from None
-    names_of(columns, schema.names, folder)
+    required_columns(columns, schema.names, folder)
     return session.readStream.schema(schema).options(**(options or {})).parquet(folder)
 
 
-def kafka(session: SparkSession, _: str, columns: Columns, options: Mapping[str, str]) -> DataFrame:
+def kafka_stream(session: SparkSession, _: str, columns: Columns, options: Mapping[str, str]) -> DataFrame:
     """Return a stream of JSON objects from Kafka, with ``asset``, a time in seconds since 1970, and the signals.
 
-    Parameters
-    ----------
-    session
-        With Spark's package for Kafka.
-    columns
-        Where the signals stand; each is one column of its own, not a sum.
-    options
-        Of Spark's source, such as ``kafka.bootstrap.servers`` and ``subscribe``.
+    `session`: with Spark's package for Kafka; `columns`: each signal is one column, not a sum; `options`: of Spark's
+    source, such as ``kafka.bootstrap.servers`` and ``subscribe``.
     """
     from pyspark.sql import functions as F
 
-    names = [columns.time or "t", columns.reference, columns.input, columns.output]
+    names = [columns.time or "t", columns.reference, columns.input, *columns.outputs]
     schema = ", ".join(["asset string", *(f"`{name.strip('`')}` double" for name in names)])
     raw = session.readStream.format("kafka").options(**options).load()
     return raw.select(F.from_json(raw["value"].cast("string"), schema).alias("row")).select("row.*")
@@ -80,9 +71,9 @@ def start(
     every_s: float | None = 60.0,
     store: str | None = None,
 ) -> StreamingQuery:
-    """Start a stream whose results are Parquet, each micro-batch in a folder of its own, `results` / batch=N.
+    """Start a stream whose results are Parquet, each micro-batch in a folder of its own, `read_results` / batch=N.
 
-    A batch that is done again after a crash replaces its folder with the same content: nothing is lost or doubled.
+    A batch that is repeated after a crash replaces its folder with the same content: nothing is lost or doubled.
 
     Parameters
     ----------
@@ -93,10 +84,10 @@ def start(
     checkpoint
         Folder or URL for checkpoints; None: beside the results.
     every_s
-        Seconds between micro-batches; None: what there is is done, and the stream ends.
+        Seconds between micro-batches; None: the stream ends when all present rows are processed.
     store
-        A SQLite file or URL of PostgreSQL that diagnoses go to as well, one per asset and day, each micro-batch in one
-        transaction; a batch that is done again is not written again.
+        A SQLite file or URL of PostgreSQL that diagnoses are also written to, one per asset and day, each micro-batch
+        once and in one transaction.
 
     Raises
     ------
@@ -104,7 +95,7 @@ def start(
         If the store cannot be used.
     """
     if store is not None:
-        from servoscope.store import Batch, Store  # late: it needs an extra of its own
+        from servoscope.service.store import Batch, Store  # late: it needs an extra of its own
 
         history = Store.open(store, write=True)
 
@@ -113,7 +104,7 @@ def start(
         batch.write.mode("overwrite").partitionBy("kind").parquet(folder)
         if store is not None and history.last_commit(OWNER) <= number:
             items = batch.sparkSession.read.schema(SCHEMA).parquet(folder).where("kind = 'item'").select("result")
-            rows: list[Row] = [_stored(json.loads(row.result)) for row in items.collect()]
+            rows: list[Row] = [_diagnosis_row(json.loads(row.result)) for row in items.collect()]
             history.write(Batch(rows={"diagnoses": rows}), OWNER, number + 1)
 
     writer = followed.writeStream.foreachBatch(write).outputMode("append")
@@ -122,10 +113,10 @@ def start(
     return writer.trigger(**trigger).start()
 
 
-def _stored(entry: Mapping[str, Any]) -> dict[str, Any]:
+def _diagnosis_row(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return an item as a row of the store's diagnoses, numbered by its day."""
-    said = entry.get("diagnosis", {})
-    onset = said.get("onset_s")
+    diagnosis = entry.get("diagnosis", {})
+    onset = diagnosis.get("onset_s")
     begin = (entry.get("first_us") or 0) / MICRO
     day = int(np.datetime64(entry["day"], "D").astype(int))
     return {
@@ -133,14 +124,14 @@ def _stored(entry: Mapping[str, Any]) -> dict[str, Any]:
         "number": day,
         "t": (entry.get("last_us") or day * DAY_US) / MICRO,
         "grounds": "full",
-        "verdict": said.get("verdict", "undetermined"),
-        "summary": said.get("summary") or str(entry["error"]),
+        "verdict": diagnosis.get("verdict", "undetermined"),
+        "summary": diagnosis.get("summary") or str(entry["error"]),
         "onset": begin + onset[1] if onset else None,
         "document": dict(entry),
     }
 
 
-def results(session: SparkSession, output: str | Path) -> DataFrame:
+def read_results(session: SparkSession, output: str | Path) -> DataFrame:
     """Return all results that a stream has written."""
     return (
         session.read.schema(f"{SCHEMA}, batch long")
@@ -149,13 +140,10 @@ def results(session: SparkSession, output: str | Path) -> DataFrame:
     )
 
 
-def wait(query: StreamingQuery) -> None:
-    """Wait for the end of a stream; interrupting it is one.
+def wait_for_stream(query: StreamingQuery) -> None:
+    """Wait for the end of a stream, or an interrupt.
 
-    Raises
-    ------
-    ServoscopeError
-        If it failed.
+    Raises ServoscopeError if it failed.
     """
     from pyspark.errors import StreamingQueryException
 
@@ -167,24 +155,21 @@ def wait(query: StreamingQuery) -> None:
         raise ServoscopeError(f"the stream stopped: {' '.join(str(error).split())[:300]}") from None
 
 
-def report(
+def write_stream_report(
     session: SparkSession,
     output: Path,
     groups: Mapping[str, Mapping[str, str]],
     lake: str,
     prior: Prior = PRIOR,
 ) -> Fleet:
-    """Write fleet.json and report.html from what a stream has found, and return it.
+    """Write fleet.json and report.html from the results of a stream, and return the fleet.
 
-    Raises
-    ------
-    OutputError
-        If they cannot be written.
+    Raises OutputError if they cannot be written.
     """
-    found = results(session, output)
-    entries = [json.loads(row.result) for row in found.where("kind = 'item'").select("result").collect()]
-    counted = found.where("kind = 'late'").groupBy("asset").sum("late").collect()
-    late = {asset: int(count) for asset, count in counted}
-    fleet = known(sorted(entries, key=lambda entry: (entry["asset"], entry["day"])), groups, {}, prior, late)
-    write_knowledge(output, fleet, lake)
+    results = read_results(session, output)
+    entries = [json.loads(row.result) for row in results.where("kind = 'item'").select("result").collect()]
+    counts = results.where("kind = 'late'").groupBy("asset").sum("late").collect()
+    late = {asset: int(count) for asset, count in counts}
+    fleet = summarise_fleet(sorted(entries, key=lambda entry: (entry["asset"], entry["day"])), groups, {}, prior, late)
+    write_fleet_report(output, fleet, lake)
     return fleet

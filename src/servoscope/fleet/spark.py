@@ -1,4 +1,4 @@
-"""Spark carries the work: tasks on executors that read the lake themselves, and DataFrames of rows, keyed by asset."""
+"""The fleet on Spark: tasks on executors that read the lake themselves, and DataFrames of rows, keyed by asset."""
 
 from __future__ import annotations
 
@@ -9,33 +9,32 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from servoscope.baseline import Baseline
-from servoscope.errors import ServoscopeError
+from servoscope.core.errors import ServoscopeError
+from servoscope.detection.baseline import Baseline
 from servoscope.fleet.baselines import Baselines
-from servoscope.fleet.following import WINDOW
-from servoscope.fleet.local import Engine, Result, Task, died
-from servoscope.fleet.passing import examined_days
-from servoscope.fleet.rows import names_of
-from servoscope.fleet.tables import KINDS, row
-from servoscope.loop import Columns
+from servoscope.fleet.day_monitor import WINDOW
+from servoscope.fleet.local_engine import Engine, Task, TaskResult, crash_result
+from servoscope.fleet.partition import examine_days
+from servoscope.fleet.rows import required_columns
+from servoscope.fleet.tasks import RESULT_COLUMNS, result_table
+from servoscope.models.loop import Columns
 
 if TYPE_CHECKING:
     from pyspark.sql import DataFrame, SparkSession
 
-__all__ = ["diagnose", "session", "spark"]
 
 WAVE = 8  # tasks per core that are handed out at once; their results are on disk before the next ones begin
 
 
 def session(master: str | None = None, **settings: str) -> SparkSession:
-    """Return the session that there is, or start one.
+    """Return the running session, or start one.
 
     Parameters
     ----------
     master
-        Such as ``local[2]`` or ``spark://host:7077``; None: what the environment says.
+        Such as ``local[2]`` or ``spark://host:7077``; None: that of the environment.
     settings
-        Of Spark, with ``__`` for dots.
+        Spark's own, with ``__`` for dots.
 
     Raises
     ------
@@ -69,22 +68,22 @@ def spark(found: SparkSession) -> Engine:
     The lake and the output folder must be where all executors see them; rows do not pass through Spark.
     """
 
-    def run(tasks: Sequence[Task]) -> Iterator[Result]:
+    def run(tasks: Sequence[Task]) -> Iterator[TaskResult]:
         step = max(1, WAVE * found.sparkContext.defaultParallelism)
         for i in range(0, len(tasks), step):
             wave = tasks[i : i + step]
             try:
-                yield from zip(wave, _results(found, wave), strict=True)
+                yield from zip(wave, _run_tasks(found, wave), strict=True)
             except Exception as error:
-                if not _lost(error):
+                if not _is_stage_failure(error):
                     raise
                 for task in wave:  # one of them kills its executor: alone, it takes no other with it
-                    yield task, _alone(found, task)
+                    yield task, _run_isolated(found, task)
 
     return run
 
 
-def _results(found: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]]:
+def _run_tasks(found: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]]:
     import pyarrow as pa
 
     def work(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
@@ -96,16 +95,16 @@ def _results(found: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]]:
     return [json.loads(each.result) for each in sorted(done, key=lambda each: each.i)]
 
 
-def _alone(found: SparkSession, task: Task) -> dict[str, Any]:
+def _run_isolated(found: SparkSession, task: Task) -> dict[str, Any]:
     try:
-        return _results(found, [task])[0]
+        return _run_tasks(found, [task])[0]
     except Exception as error:
-        if not _lost(error):
+        if not _is_stage_failure(error):
             raise
-        return died(task)
+        return crash_result(task)
 
 
-def _lost(error: Exception) -> bool:
+def _is_stage_failure(error: Exception) -> bool:
     """Return whether a task of Spark failed as often as it may, and not Spark itself."""
     return "stage failure" in str(error)
 
@@ -119,7 +118,7 @@ def diagnose(
     assets: int | None = None,
     window_s: float = WINDOW,
 ) -> DataFrame:
-    """Follow and diagnose every asset's day in a DataFrame of rows; bit for bit what the local engine finds.
+    """Follow and diagnose every asset's day in a DataFrame of rows, bit for bit as the local engine.
 
     Rows are shuffled by asset, sorted by time, and pass through the workers in Arrow batches of any size, with a window
     of them in memory.
@@ -131,13 +130,13 @@ def diagnose(
     baselines
         One for all, one by asset, or a folder with NAME.json that all workers see.
     columns
-        Where the signals stand; None: where the baseline's loop says.
+        Where the signals are; None: where the baseline's loop says.
     by
         Column whose value names the baseline.
     assets
         How many assets share the budget of false alarms; None: as many as there are in the frame.
     window_s
-        Seconds of raw rows that a diagnosis sees.
+        Seconds of raw rows that a diagnosis covers.
 
     Returns
     -------
@@ -154,19 +153,17 @@ def diagnose(
     import pyarrow as pa
 
     count = assets if assets is not None else frame.select("asset").distinct().count()
-    known = Baselines.of(baselines, max(count, 1), window_s)
-    mapping = columns if columns is not None else known.any().loop.columns
-    signals = names_of(mapping, frame.columns, "the DataFrame")
+    known = Baselines.from_source(baselines, max(count, 1), window_s)
+    mapping = columns if columns is not None else known.first().loop.columns
+    signals = required_columns(mapping, frame.columns, "the DataFrame")
     keys = list(dict.fromkeys(["asset", by, *(["day"] if "day" in frame.columns else [])]))
     rows = frame.select(*(frame[key].cast("string") for key in keys), *(name for name in signals if name not in keys))
     rows = rows.where(rows[signals[0]].isNotNull())
     order = [*keys, signals[0]]
 
     def work(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
-        kinds = {"string": pa.string(), "double": pa.float64(), "long": pa.int64()}
-        schema = pa.schema([(name, kinds[kind]) for name, kind in KINDS.items()])
-        for entry in examined_days(batches, keys, by, mapping, known.follower):
-            yield pa.RecordBatch.from_pylist([row(entry)], schema)
+        for entry in examine_days(batches, keys, by, mapping, known.day_monitor):
+            yield result_table([entry])
 
     sorted_rows = rows.repartition("asset").sortWithinPartitions(*order)
-    return sorted_rows.mapInArrow(work, ", ".join(f"{name} {kind}" for name, kind in KINDS.items()))
+    return sorted_rows.mapInArrow(work, ", ".join(f"{name} {kind}" for name, kind in RESULT_COLUMNS.items()))

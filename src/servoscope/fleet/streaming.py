@@ -1,13 +1,14 @@
-"""Structured Streaming carries the same step: rows wait in state for the watermark, then are sorted and followed.
+"""The fleet as a stream of Spark: rows wait in the state for the watermark, then are sorted and followed.
 
-Rows of an asset may come in several Arrow batches, in any order, from any partition. They are put away as they come,
-and nothing else happens until the watermark has passed them: then they are followed in the order of time. So results
-depend on the rows alone where all of them are on time; a row behind what has been followed already is late and counted.
+Rows of an asset may come in several Arrow batches, in any order, from any partition. They are only stored until the
+watermark has passed them, and then followed in the order of time: where all rows are on time, results depend on them
+alone. A row from before what has been followed already is late, and counted.
 """
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,21 +16,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from servoscope.baseline import Baseline
-from servoscope.errors import LoopError, RecordingError, ServoscopeError
+from servoscope.core.errors import LoopError, RecordingError, ServoscopeError
+from servoscope.detection.baseline import Baseline
 from servoscope.fleet.baselines import Baselines
-from servoscope.fleet.following import WINDOW, Evaluated, State
-from servoscope.fleet.passing import DAY_US, day_name
-from servoscope.fleet.rows import Rows, names_of, signals_of
-from servoscope.fleet.tasks import examined
-from servoscope.loop import Columns
-from servoscope.readers.tables import UNITS, Table
+from servoscope.fleet.day_monitor import WINDOW, DayState, EvaluationBlock
+from servoscope.fleet.partition import DAY_US, day_name
+from servoscope.fleet.rows import Rows, required_columns, signals_from_table
+from servoscope.fleet.tasks import day_result, error_text, failed_result
+from servoscope.models.loop import Columns
+from servoscope.signals.readers.table import TIME_UNITS, Table
 
 if TYPE_CHECKING:
     from pyspark.sql import DataFrame
     from pyspark.sql.streaming import StatefulProcessorHandle
 
-__all__ = ["SCHEMA", "follow"]
 
 SCHEMA = (
     "kind string, asset string, day string, time_us long, theta array<double>, statistic double, threshold double, "
@@ -50,7 +50,7 @@ def follow(
     by: str = "asset",
     window_s: float = WINDOW,
 ) -> DataFrame:
-    """Follow and diagnose a stream of rows; on rows that are on time, bit for bit what the local engine finds.
+    """Follow and diagnose a stream of rows; for rows that are on time, bit for bit as the local engine.
 
     Parameters
     ----------
@@ -62,13 +62,13 @@ def follow(
     assets
         How many assets share the budget of false alarms.
     columns
-        Where the signals stand; None: where the baseline's loop says.
+        Where the signals are; None: where the baseline's loop says.
     delay_s
-        How long rows may be late [s].
+        How late rows may be [s].
     by
         Column whose value names the baseline.
     window_s
-        Seconds of raw rows that a diagnosis sees.
+        Seconds of raw rows that a diagnosis covers.
 
     Returns
     -------
@@ -87,15 +87,15 @@ def follow(
     if session.conf.get("spark.sql.session.timeZone") not in ("UTC", "Etc/UTC", "GMT", "Z"):
         raise LoopError("a stream's days are those of UTC: set spark.sql.session.timeZone to UTC")
     session.conf.set("spark.sql.streaming.stateStore.providerClass", ROCKSDB)
-    known = Baselines.of(baselines, assets, window_s)
-    mapping = columns if columns is not None else known.any().loop.columns
-    time, *signals = names_of(mapping, frame.columns, "the stream")
+    known = Baselines.from_source(baselines, assets, window_s)
+    mapping = columns if columns is not None else known.first().loop.columns
+    time, *signals = required_columns(mapping, frame.columns, "the stream")
     if time in signals:
         raise RecordingError(f"the stream: column {time!r} cannot be time and signal")
     kind = frame.schema[time].dataType.typeName()
     stamp = frame[time].cast("timestamp")
     if not kind.startswith("timestamp"):
-        micros = F.rint(frame[time] * UNITS[mapping.time_unit] * 1e6).cast("long")
+        micros = F.rint(frame[time] * TIME_UNITS[mapping.time_unit] * 1e6).cast("long")
         stamp = F.timestamp_micros(micros)
     named = [frame[name] for name in signals]
     keyed = frame.select(
@@ -104,60 +104,53 @@ def follow(
     marked = keyed.where("_at is not null").withWatermark("_at", f"{round(delay_s * 1e3)} milliseconds")
     # without the column that bears the watermark Spark drops no late row unseen: they are counted here, by asset
     rows = marked.select("asset", "baseline_of", F.unix_micros("_at").alias("at_us"), *signals)
-    processor = _processor(known, mapping)
+    processor = _create_processor(known, mapping)
     return rows.groupBy("asset").transformWithStateInPandas(processor, SCHEMA, "append", "eventtime")
 
 
 @dataclass
-class Head:
-    """What is kept of an asset beside its raw rows: a line of numbers and the state of the day that is open.
+class StreamState:
+    """What is kept of an asset beside its raw rows: a line of numbers and the state of the day that is open."""
 
-    Parameters
-    ----------
-    by
-        Name of its baseline.
-    until_us
-        All rows up to here have been followed [us].
-    number
-        Of the next block of raw rows.
-    blocks
-        Number -> smallest and largest time [us] of the blocks that are kept.
-    day
-        The day that is open; None: none is.
-    error
-        Why the open day cannot be followed; empty: it can.
-    """
-
-    by: str = ""
-    until_us: int = FAR_PAST
-    number: int = 0
-    blocks: dict[int, tuple[int, int]] = field(default_factory=dict)
-    day: int | None = None
-    error: str = ""
-    state: State | None = None
+    baseline: str = ""  # its name
+    processed_until_us: int = FAR_PAST  # all rows up to here have been followed [us]
+    next_block: int = 0  # number of the next block of raw rows
+    blocks: dict[int, tuple[int, int]] = field(default_factory=dict)  # number -> first and last time [us] of its rows
+    day: int | None = None  # the day that is open
+    error: str = ""  # why the open day cannot be followed
+    state: DayState | None = None
 
     def pack(self) -> bytes:
         """Return it as bytes."""
-        numbers = {key: value for key, value in vars(self).items() if key != "state"}
+        numbers = {
+            "by": self.baseline,
+            "until_us": self.processed_until_us,
+            "number": self.next_block,
+            "blocks": self.blocks,
+            "day": self.day,
+            "error": self.error,
+        }
         return json.dumps(numbers).encode() + b"\n" + (self.state.pack() if self.state is not None else b"")
 
     @classmethod
-    def unpack(cls, content: bytes) -> Head:
+    def unpack(cls, content: bytes) -> StreamState:
         """Return what `pack` packed."""
-        line, _, state = content.partition(b"\n")
+        line, _, packed = content.partition(b"\n")
         numbers = json.loads(line)
-        numbers["blocks"] = {int(number): tuple(span) for number, span in numbers["blocks"].items()}
-        return cls(**numbers, state=State.unpack(state) if state else None)
+        blocks = {int(number): (low, high) for number, (low, high) in numbers["blocks"].items()}
+        state = DayState.unpack(packed) if packed else None
+        return cls(
+            numbers["by"], numbers["until_us"], numbers["number"], blocks, numbers["day"], numbers["error"], state
+        )
 
     @property
     def pending_us(self) -> int | None:
         """The first row that waits for the watermark, or a time before it [us]; None: none does."""
-        return min(
-            (max(low, self.until_us + 1) for low, high in self.blocks.values() if high > self.until_us), default=None
-        )
+        done = self.processed_until_us
+        return min((max(low, done + 1) for low, high in self.blocks.values() if high > done), default=None)
 
 
-def _processor(known: Baselines, columns: Columns) -> Any:
+def _create_processor(baselines: Baselines, columns: Columns) -> Any:
     """Return the stateful processor; its class needs PySpark, which is imported late."""
     from pyspark.sql.streaming import StatefulProcessor
 
@@ -168,19 +161,18 @@ def _processor(known: Baselines, columns: Columns) -> Any:
             self.blocks = handle.getMapState("blocks", "number long", "content binary")
 
         def handleInputRows(self, key: Any, rows: Iterator[Any], timerValues: Any) -> Iterator[Any]:
-            asset = _Asset(key[0], self, known, columns)
-            late: dict[int, int] = {}
+            asset = _StreamAsset(key[0], self, baselines, columns)
+            late: Counter[int] = Counter()
             for frame in _chunks(rows):
-                for day, count in asset.put_away(frame):
-                    late[day] = late.get(day, 0) + count
-            asset.wait()
+                late += asset.store_rows(frame)
+            asset.save()
             for day, count in sorted(late.items()):
                 yield _output(asset.name, kind=["late"], day=[day_name(day)], late=[count])
 
         def handleExpiredTimer(self, key: Any, timerValues: Any, expiredTimerInfo: Any) -> Iterator[Any]:
-            asset = _Asset(key[0], self, known, columns)
-            yield from asset.follow(timerValues.getCurrentWatermarkInMs() * 1000)
-            asset.wait()
+            asset = _StreamAsset(key[0], self, baselines, columns)
+            yield from asset.process_until(timerValues.getCurrentWatermarkInMs() * 1000)
+            asset.save()
 
         def close(self) -> None:
             pass
@@ -188,102 +180,100 @@ def _processor(known: Baselines, columns: Columns) -> Any:
     return Processor()
 
 
-class _Asset:
-    """One asset in the hands of a worker."""
+class _StreamAsset:
+    """One asset of a stream, for as long as a worker processes it."""
 
-    def __init__(self, name: str, store: Any, known: Baselines, columns: Columns) -> None:
-        self.name, self.store, self.known, self.columns = name, store, known, columns
-        found = store.head.get()
-        self.head = Head.unpack(bytes(found[0])) if found is not None else Head()
-        self._read: dict[int, Rows] = {}
+    def __init__(self, name: str, store: Any, baselines: Baselines, columns: Columns) -> None:
+        self.name, self.store, self.baselines, self.columns = name, store, baselines, columns
+        packed = store.head.get()
+        self.head = StreamState.unpack(bytes(packed[0])) if packed is not None else StreamState()
+        self._cache: dict[int, Rows] = {}
 
-    def put_away(self, frame: Any) -> Iterator[tuple[int, int]]:
-        """Keep rows that are on time; yield how many are late, by day."""
+    def store_rows(self, frame: Any) -> Counter[int]:
+        """Store the rows that are on time; return how many are late, by day."""
         import pyarrow as pa
 
-        t_us = frame["at_us"].to_numpy().astype(np.int64)
-        self.head.by = str(frame["baseline_of"].iloc[-1])
+        head, t_us = self.head, frame["at_us"].to_numpy().astype(np.int64)
+        head.baseline = str(frame["baseline_of"].iloc[-1])
         names = [name for name in frame.columns if name not in ("asset", "baseline_of", "at_us")]
         table = Table(self.name, {name: pa.chunked_array([pa.Array.from_pandas(frame[name])]) for name in names})
-        rows = Rows(t_us, *signals_of(table, self.columns))
-        late = t_us <= self.head.until_us
-        for day, count in zip(*np.unique(t_us[late] // DAY_US, return_counts=True), strict=True):
-            yield int(day), int(count)
+        rows = Rows(t_us, *signals_from_table(table, self.columns))
+        late = t_us <= head.processed_until_us
         rows = rows[~late]
         if len(rows):
-            self.store.blocks.updateValue((self.head.number,), (rows.pack(),))
-            self.head.blocks[self.head.number] = (int(rows.t_us.min()), int(rows.t_us.max()))
-            self.head.number += 1
+            self.store.blocks.updateValue((head.next_block,), (rows.pack(),))
+            head.blocks[head.next_block] = (int(rows.t_us.min()), int(rows.t_us.max()))
+            head.next_block += 1
+        return Counter((t_us[late] // DAY_US).tolist())
 
-    def wait(self) -> None:
-        """Set the timer: for the first row that waits, or the end of the day that is open; put the head away."""
+    def save(self) -> None:
+        """Save the state, and set the timer: for the first row that waits, or the end of the day that is open."""
         times = [] if self.head.pending_us is None else [self.head.pending_us]
         times += [] if self.head.day is None else [(self.head.day + 1) * DAY_US]
         if times:
             self.store.handle.registerTimer(min(times) // 1000 + 1)
         self.store.head.update((self.head.pack(),))
 
-    def follow(self, until_us: int) -> Iterator[Any]:
-        """Follow all rows up to a time, close the days that are over by then; yield what is found."""
+    def process_until(self, until_us: int) -> Iterator[Any]:
+        """Follow all rows up to a time, and close the days that are over by then; yield the results."""
         head = self.head
-        if until_us <= head.until_us:
+        if until_us <= head.processed_until_us:
             return
-        pending = self._rows(head.until_us, until_us)
-        head.until_us = until_us
+        pending = self._rows(head.processed_until_us, until_us)
+        head.processed_until_us = until_us
         for day in np.unique(pending.t_us // DAY_US):
             if head.day is not None and head.day != int(day):
-                yield self._closed()
+                yield self._close_day()
             head.day = int(day)
-            part = pending[pending.t_us // DAY_US == day]
-            found = self._advance(part)
-            if found is not None and len(found.t_us):
-                yield _traced(self.name, day_name(int(day)), found)
+            evaluations = self._advance(pending[pending.t_us // DAY_US == day])
+            if evaluations is not None and len(evaluations.t_us):
+                yield _trace_frame(self.name, day_name(int(day)), evaluations)
         if head.day is not None and until_us >= (head.day + 1) * DAY_US:
-            yield self._closed()
+            yield self._close_day()
         keep = until_us
         if head.state is not None and head.day is not None and not head.error:
-            keep = min(keep, self.known.follower(head.by).needed(head.state))
+            keep = min(keep, self.baselines.day_monitor(head.baseline).needed_since(head.state))
         for number in [number for number, (_, high) in head.blocks.items() if high <= keep]:
             self.store.blocks.removeKey((number,))
             del head.blocks[number]
 
-    def _advance(self, rows: Rows) -> Evaluated | None:
+    def _advance(self, rows: Rows) -> EvaluationBlock | None:
         head = self.head
         if head.error:
             return None
         try:
-            follower = self.known.follower(head.by)
-            state = head.state if head.state is not None else follower.start()
-            head.state, found = follower.advance(state, rows, self._rows)
+            monitor = self.baselines.day_monitor(head.baseline)
+            state = head.state if head.state is not None else monitor.start()
+            head.state, evaluations = monitor.advance(state, rows, self._rows)
         except Exception as error:  # garbage of one asset must not end the stream
-            head.error = _told(error)
+            head.error = error_text(error)
             return None
-        return found
+        return evaluations
 
-    def _closed(self) -> Any:
+    def _close_day(self) -> Any:
         head = self.head
-        assert head.day is not None
+        assert head.day is not None, "a day is open"
         try:
             if head.error or head.state is None:
                 raise ServoscopeError(head.error)
-            follower = self.known.follower(head.by)
-            found = examined(follower, follower.finish(head.state, self._rows))
+            monitor = self.baselines.day_monitor(head.baseline)
+            result = day_result(monitor, monitor.finish(head.state, self._rows))
         except Exception as error:
-            found = {"status": "failed", "error": _told(error)}
+            result = failed_result(error)
         day = day_name(head.day)
         head.day, head.state, head.error = None, None, ""
-        text = json.dumps({"asset": self.name, "day": day, **found}, allow_nan=False)
+        text = json.dumps({"asset": self.name, "day": day, **result}, allow_nan=False)
         return _output(self.name, kind=["item"], day=[day], result=[text])
 
     def _rows(self, after_us: int, to_us: int) -> Rows:
-        """Return the kept rows with after_us < t <= to_us, in order."""
+        """Return the stored rows with after_us < t <= to_us, in the order of time."""
         parts = []
         for number, (low, high) in sorted(self.head.blocks.items()):
             if high > after_us and low <= to_us:
-                if number not in self._read:
-                    self._read[number] = Rows.unpack(bytes(self.store.blocks.getValue((number,))[0]))
-                parts.append(self._read[number].between(after_us, to_us))
-        return Rows.joined(parts).sorted()
+                if number not in self._cache:
+                    self._cache[number] = Rows.unpack(bytes(self.store.blocks.getValue((number,))[0]))
+                parts.append(self._cache[number].between(after_us, to_us))
+        return Rows.concatenate(parts).sort_by_time()
 
 
 def _chunks(frames: Iterator[Any]) -> Iterator[Any]:
@@ -302,21 +292,16 @@ def _chunks(frames: Iterator[Any]) -> Iterator[Any]:
         yield pd.concat(parts, ignore_index=True)
 
 
-def _traced(asset: str, day: str, found: Evaluated) -> Any:
-    n = len(found.t_us)
-    columns = {name: getattr(found, name) for name in ("statistic", "threshold", "level")}
-    return _output(asset, kind=["trace"] * n, day=[day] * n, time_us=found.t_us, theta=list(found.theta), **columns)
+def _trace_frame(asset: str, day: str, block: EvaluationBlock) -> Any:
+    n = len(block.t_us)
+    columns = {name: getattr(block, name) for name in ("statistic", "threshold", "level")}
+    return _output(asset, kind=["trace"] * n, day=[day] * n, time_us=block.t_us, theta=list(block.theta), **columns)
 
 
 def _output(asset: str, *, kind: list[str], **columns: Any) -> Any:
     """Return rows of `SCHEMA`; columns that are not named are empty."""
     import pandas as pd
 
+    known = {"kind": kind, "asset": [asset] * len(kind), **columns}
     names = [column.split()[0] for column in SCHEMA.split(", ")]
-    told = {"kind": kind, "asset": [asset] * len(kind), **columns}
-    return pd.DataFrame({name: told.get(name, [None] * len(kind)) for name in names})
-
-
-def _told(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, ServoscopeError) else f"{type(error).__name__}: {text[:200]}"
+    return pd.DataFrame({name: known.get(name, [None] * len(kind)) for name in names})

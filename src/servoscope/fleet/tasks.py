@@ -1,65 +1,72 @@
-"""The two pieces of work that an engine hands out: learn one baseline, examine one item. They never raise.
-
-Both are plain data that travels to other processes and machines; a task that fails says so in its result, by name.
-"""
+"""The tasks of a fleet, which any engine can run, and their results as rows with the same columns everywhere."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from servoscope.baseline import Baseline
-from servoscope.errors import NotEnoughError, ServoscopeError
-from servoscope.fleet.baselines import follower_of_file
-from servoscope.fleet.following import Evaluated, Follower, Memory, State
-from servoscope.fleet.lake import Item
-from servoscope.fleet.reading import blocks
+from servoscope.core.errors import NotEnoughError, ServoscopeError
+from servoscope.core.files import atomic_write, make_folder
+from servoscope.fleet.baselines import load_day_monitor
+from servoscope.fleet.day_monitor import DayMonitor, DayState, EvaluationBlock, RowHistory
+from servoscope.fleet.lake import AssetDay
+from servoscope.fleet.read import read_blocks
 from servoscope.fleet.rows import MICRO, Rows
-from servoscope.loop import Columns, Loop
-from servoscope.output import atomic_write, make_folder
-from servoscope.recording import Recording, clean
+from servoscope.models.loop import Columns, Loop
+from servoscope.signals import Recording
 
-__all__ = ["Examine", "Learn", "columns_of", "examined", "traces"]
+RESULT_COLUMNS = {
+    **dict.fromkeys(("asset", "day", "status", "error", "verdict", "fault", "parameter"), "string"),
+    **dict.fromkeys(("ratio", "low", "high", "probability", "peak"), "double"),
+    **dict.fromkeys(("first_us", "last_us", "alarm_us", "samples", "gaps", "missing", "repeats"), "long"),
+    **dict.fromkeys(("summary", "result"), "string"),
+}
+
+
+def result_row(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a result as one row of `RESULT_COLUMNS`; ``result`` is all of it, as JSON."""
+    diagnosis = entry.get("diagnosis", {})
+    fault: Mapping[str, Any] = next(iter(diagnosis.get("faults") or ()), {})
+    low, high = fault.get("interval", (None, None))
+    known = {"low": low, "high": high, "fault": fault.get("name"), "result": json.dumps(entry)}
+    known |= {name: fault.get(name) for name in ("parameter", "ratio")}
+    known |= {name: diagnosis.get(name) for name in ("verdict", "probability", "summary")}
+    return {name: known[name] if name in known else entry.get(name) for name in RESULT_COLUMNS}
+
+
+def result_table(entries: Sequence[Mapping[str, Any]]) -> Any:
+    """Return results as one Arrow record batch."""
+    import pyarrow as pa
+
+    types = {"string": pa.string(), "double": pa.float64(), "long": pa.int64()}
+    schema = pa.schema([(name, types[kind]) for name, kind in RESULT_COLUMNS.items()])
+    return pa.RecordBatch.from_pylist([result_row(entry) for entry in entries], schema)
 
 
 @dataclass(frozen=True)
-class Learn:
-    """Learn what healthy looks like from some items, and write it to a file.
+class LearnTask:
+    """Learn a baseline from some items, and write it to a file."""
 
-    Parameters
-    ----------
-    name
-        Of the asset, or of the group of assets.
-    items
-        Healthy ones.
-    loop
-        Settings, with the columns.
-    output
-        The baseline's file.
-    most_s
-        Seconds of each item that are learned from.
-    """
-
-    name: str
-    items: tuple[Item, ...]
-    loop: Loop
-    output: str
-    most_s: float
+    name: str  # of the asset, or of the group of assets
+    items: tuple[AssetDay, ...]
+    loop: Loop  # settings, with the columns
+    output: str  # the baseline's file
+    max_s: float  # seconds of each item that are used
 
     @property
     def key(self) -> str:
-        """What a result calls it."""
+        """What identifies its result."""
         return self.name
 
     def run(self) -> dict[str, Any]:
-        """Learn; items that cannot be used are named and left out."""
-        from servoscope.points import learn
+        """Learn; items that cannot be used are left out and named."""
+        from servoscope.diagnosis.operating_points import learn
 
         unused: dict[str, str] = {}
         recordings: list[Recording] = []
@@ -67,133 +74,106 @@ class Learn:
             try:
                 recordings.append(self._read(item))
             except Exception as error:  # whatever is wrong with one item must not cost the others
-                unused[f"{item.asset} {item.day}"] = _told(error)
+                unused[f"{item.asset} {item.day}"] = error_text(error)
         try:
             if not recordings:
-                raise NotEnoughError("; ".join(f"{name}: {why}" for name, why in unused.items()))
+                raise NotEnoughError("; ".join(f"{name}: {reason}" for name, reason in unused.items()))
             learn(self.loop, recordings).save(self.output)
         except Exception as error:
-            return {"name": self.name, "error": _told(error), "unused": unused}
+            return {"name": self.name, "error": error_text(error), "unused": unused}
         return {"name": self.name, "error": None, "unused": unused}
 
-    def _read(self, item: Item) -> Recording:
+    def _read(self, item: AssetDay) -> Recording:
         parts: list[Rows] = []
-        for rows in blocks(item.files, self.loop.columns):
+        for rows in read_blocks(item.files, self.loop.columns):
             parts.append(rows)
-            if rows.t_us[-1] - parts[0].t_us[0] > self.most_s * MICRO:
+            if rows.t_us[-1] - parts[0].t_us[0] > self.max_s * MICRO:
                 break
-        rows = Rows.joined(parts)
+        rows = Rows.concatenate(parts)
         if not len(rows):
             raise NotEnoughError("holds no rows")
-        rows = rows.between(int(rows.t_us[0]) - 1, int(rows.t_us[0] + self.most_s * MICRO))
-        return clean(
-            (rows.t_us - rows.t_us[0]) / MICRO,
-            rows.r,
-            rows.u,
-            rows.y,
-            name=f"{item.asset} {item.day}",
-            sample_rate=self.loop.sample_rate,
-            limits=self.loop.input_limits,
-        )
+        first_us = int(rows.t_us[0])
+        rows = rows.between(first_us - 1, int(first_us + self.max_s * MICRO))
+        return rows.to_recording(first_us, self.loop, f"{item.asset} {item.day}")
 
 
 @dataclass(frozen=True)
-class Examine:
-    """Follow one item and diagnose it; write its trace.
+class ExamineTask:
+    """Follow one item and diagnose it; write its trace."""
 
-    Parameters
-    ----------
-    item
-        The asset's day.
-    baseline
-        File of the baseline; None: there is none, because of `why`.
-    why
-        Why there is none.
-    assets
-        How many assets share the budget of false alarms.
-    columns
-        Where the signals stand; None: where the baseline's loop says.
-    window_s
-        Seconds of raw rows that a diagnosis sees.
-    trace
-        Parquet file of the trace; None: it is not written.
-    """
-
-    item: Item
-    baseline: str | None
-    why: str
-    assets: int
-    columns: Columns | None
-    window_s: float
-    trace: str | None
+    item: AssetDay
+    baseline: str | None  # file of the baseline; None: there is none
+    baseline_error: str  # why there is none
+    assets: int  # how many assets share the budget of false alarms
+    columns: Columns | None  # where the signals are; None: where the baseline's loop says
+    window_s: float  # seconds of raw rows that a diagnosis covers
+    trace: str | None  # Parquet file of the trace; None: it is not written
 
     @property
     def key(self) -> tuple[str, str]:
-        """What a result calls it."""
+        """What identifies its result."""
         return self.item.key
 
     def run(self) -> dict[str, Any]:
-        """Return what was found, as plain values."""
+        """Return the result as plain values."""
         try:
             if self.baseline is None:
-                raise ServoscopeError(f"no baseline: {self.why}")
-            one = follower_of_file(self.baseline, self.assets, self.window_s)
-            state, parts = _followed(one, blocks(self.item.files, columns_of(one.baseline, self.columns)))
-            if self.trace is not None and parts:
+                raise ServoscopeError(f"no baseline: {self.baseline_error}")
+            monitor = load_day_monitor(self.baseline, self.assets, self.window_s)
+            columns = self.columns if self.columns is not None else monitor.baseline.loop.columns
+            result, trace = examine_day(monitor, read_blocks(self.item.files, columns))
+            if self.trace is not None and trace:
                 make_folder(Path(self.trace).parent)
-                atomic_write(self.trace, _parquet(parts))
-            found = json.loads(json.dumps(examined(one, state), allow_nan=False))
+                atomic_write(self.trace, _encode_trace(trace))
+            result = json.loads(json.dumps(result, allow_nan=False))
         except Exception as error:  # garbage in one item must not cost another
-            found = {"status": "failed", "error": _told(error)}
-        return {"asset": self.item.asset, "day": self.item.day, "stamp": self.item.stamp, **found}
+            result = failed_result(error)
+        return {"asset": self.item.asset, "day": self.item.day, "stamp": self.item.stamp, **result}
 
 
-def columns_of(baseline: Baseline, columns: Columns | None) -> Columns:
-    """Return where the signals stand."""
-    return columns if columns is not None else baseline.loop.columns
-
-
-def _followed(one: Follower, source: Iterable[Rows]) -> tuple[State, list[Evaluated]]:
-    state, history, parts = one.start(), Memory(), []
-    for rows in source:
+def examine_day(monitor: DayMonitor, blocks: Iterable[Rows]) -> tuple[dict[str, Any], list[EvaluationBlock]]:
+    """Return the result of a day, whose rows come in the order of time, and its trace."""
+    state, history, trace = monitor.start(), RowHistory(), []
+    for rows in blocks:
         history.add(rows)
-        state, evaluated = one.advance(state, rows, history)
-        history.forget(one.needed(state))
-        parts.append(evaluated)
-    return one.finish(state, history), parts
+        state, evaluations = monitor.advance(state, rows, history)
+        history.drop_until(monitor.needed_since(state))
+        trace.append(evaluations)
+    return day_result(monitor, monitor.finish(state, history)), trace
 
 
-def examined(one: Follower, state: State) -> dict[str, Any]:
+def day_result(monitor: DayMonitor, state: DayState) -> dict[str, Any]:
     """Return what is known of a day that is over, as plain values."""
-    if state.said is None:
-        return {"status": "failed", "error": "holds no rows"}
-    if (error := state.said.get("error")) is not None:
+    error = "holds no rows" if state.result is None else state.result.get("error")
+    if error is not None:
         return {"status": "failed", "error": error}
     counts = {name: getattr(state, name) for name in ("samples", "repeats", "missing", "gaps", "evaluations", "peak")}
     times = {"first_us": state.first_us, "last_us": state.last_us, "alarm_us": state.alarm_us}
-    return {"status": "examined", "error": None, "baseline": one.baseline.hash, **counts, **times, **state.said}
+    baseline = monitor.baseline.hash
+    return {"status": "examined", "error": None, "baseline": baseline, **counts, **times, **(state.result or {})}
 
 
-def traces(parts: Iterable[Evaluated]) -> dict[str, Any]:
-    """Return the columns of a trace: time_us, theta_0 ..., statistic, threshold, level."""
-    parts = list(parts)
-    theta = np.concatenate([part.theta for part in parts])
-    columns = {"time_us": np.concatenate([part.t_us for part in parts])}
-    columns |= {f"theta_{i}": theta[:, i] for i in range(theta.shape[1])}
-    return columns | {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in ("statistic", "threshold", "level")
-    }
+def failed_result(error: Exception) -> dict[str, Any]:
+    """Return the result of a day that could not be examined."""
+    return {"status": "failed", "error": error_text(error)}
 
 
-def _parquet(parts: list[Evaluated]) -> bytes:
+def error_text(error: Exception) -> str:
+    """Return an error in one line; with its type where it is none of servoscope's own."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ServoscopeError) else f"{type(error).__name__}: {text[:200]}"
+
+
+def _encode_trace(trace: Sequence[EvaluationBlock]) -> bytes:
+    """Return a trace as a Parquet file with the columns time_us, theta_0 ..., statistic, threshold, level."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    theta = np.concatenate([block.theta for block in trace])
+    columns = {"time_us": np.concatenate([block.t_us for block in trace])}
+    columns |= {f"theta_{i}": theta[:, i] for i in range(theta.shape[1])}
+    for name in ("statistic", "threshold", "level"):
+        columns[name] = np.concatenate([getattr(block, name) for block in trace])
     sink = io.BytesIO()
-    pq.write_table(pa.table(traces(parts)), sink)
+    pq.write_table(pa.table(columns), sink)
     return sink.getvalue()
-
-
-def _told(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, ServoscopeError) else f"{type(error).__name__}: {text[:200]}"

@@ -1,5 +1,5 @@
 """A diagnosis as one self-contained HTML page with plots."""
 
-from servoscope.report.document import page, write
+from servoscope.report.diagnosis_page import render_diagnosis_page, write_diagnosis_page
 
-__all__ = ["page", "write"]
+__all__ = ["render_diagnosis_page", "write_diagnosis_page"]

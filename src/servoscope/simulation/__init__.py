@@ -1,9 +1,10 @@
 """Closed loops with known faults: recordings beside their truth, and fast noise-free responses."""
 
-from servoscope.simulation.closed_loop import Truth, response, simulate
+from servoscope.simulation.closed_loop import simulate, simulate_response
 from servoscope.simulation.faults import FaultEvent
+from servoscope.simulation.measurement import Truth
+from servoscope.simulation.nonlinear_eha import Rig, RigTruth, simulate_rig
 from servoscope.simulation.references import reference
-from servoscope.simulation.rig import Rig, RigTruth, simulate_rig
 from servoscope.simulation.stability import check_stable, closed_loop_poles
 
 __all__ = [
@@ -14,7 +15,7 @@ __all__ = [
     "check_stable",
     "closed_loop_poles",
     "reference",
-    "response",
     "simulate",
+    "simulate_response",
     "simulate_rig",
 ]

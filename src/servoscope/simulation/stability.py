@@ -7,21 +7,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.errors import SimulationError
-from servoscope.simulation.discretise import Discrete, discretise
+from servoscope.core.errors import SimulationError
+from servoscope.models.discretise import DiscretePlant, discretise
 
 if TYPE_CHECKING:
-    from servoscope.loop import Loop
-    from servoscope.plants import Plant
+    from servoscope.models.loop import Loop
+    from servoscope.models.plants import Plant
 
 
-def gains(loop: Loop) -> tuple[float, float]:
+def controller_gains(loop: Loop) -> tuple[float, float]:
     """Return k_p and k_i T of the controller.
 
-    Raises
-    ------
-    SimulationError
-        If the loop has no controller.
+    Raises SimulationError if the loop has no controller.
     """
     if loop.controller is None:
         raise SimulationError(f"loop {loop.name!r} has no [controller]: a simulation needs one, kind, k_p and k_i")
@@ -33,27 +30,24 @@ def closed_loop_poles(loop: Loop, plant: Plant | None = None) -> npt.NDArray[np.
 
     Friction and offset of a plant are left out, and so are limits and dead zone. A delay adds poles near 0.
 
-    Raises
-    ------
-    SimulationError
-        If the loop has no controller.
-    LoopError
-        If the plant has no nominal values.
+    Raises SimulationError if the loop has no controller; raises LoopError if the plant has no nominal values.
     """
-    gains(loop)
+    controller_gains(loop)
     plant = loop.plant if plant is None else plant
-    return poles_of(loop, discretise(plant.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay))
+    return discrete_closed_loop_poles(
+        loop, discretise(plant.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay)
+    )
 
 
-def poles_of(loop: Loop, discrete: Discrete) -> npt.NDArray[np.complex128]:
+def discrete_closed_loop_poles(loop: Loop, discrete: DiscretePlant) -> npt.NDArray[np.complex128]:
     """Return the closed-loop poles of a plant that is discretised already.
 
     The state is [w, s, u(k-1) ... u(k-m-1)], w the plant's state without the present u, s = k_i T sum e up
     to k-1.
     """
-    k_p, integrating = gains(loop)
+    k_p, integrating = controller_gains(loop)
     gain = k_p + integrating
-    n, m, c = discrete.c.size, discrete.m, discrete.c
+    n, m, c = discrete.c.size, discrete.delay_samples, discrete.c
     size = n + 1 + m + 1
     share = float(c @ discrete.b_next) if m == 0 else 0.0
     # u as a row of the state: from u = gain e + s, e = -c w - share u.
@@ -76,11 +70,7 @@ def poles_of(loop: Loop, discrete: Discrete) -> npt.NDArray[np.complex128]:
     loop_matrix[n] = np.eye(size)[n] + integrating * e
     loop_matrix[n + 1] = u
     loop_matrix[n + 2 :] = past[:-1]
-    if integrating == 0.0:
-        # A sum that nobody integrates stands still: no pole of the loop.
-        keep = np.arange(size) != n
-        loop_matrix = loop_matrix[np.ix_(keep, keep)]
-    if not integrating:  # s stays 0 then, and its pole at 1 is nobody's
+    if integrating == 0.0:  # the sum stays 0: its pole at 1 is none of the loop
         loop_matrix = np.delete(np.delete(loop_matrix, n, axis=0), n, axis=1)
     # States in SI differ by ten decades, which eigvals evens out itself only in part.
     from scipy.linalg import matrix_balance
@@ -88,15 +78,9 @@ def poles_of(loop: Loop, discrete: Discrete) -> npt.NDArray[np.complex128]:
     return np.asarray(np.linalg.eigvals(matrix_balance(loop_matrix)[0]), dtype=np.complex128)
 
 
-def check_stable(loop: Loop, discrete: Discrete, what: str) -> None:
-    """Refuse a loop that is unstable with a plant.
-
-    Raises
-    ------
-    SimulationError
-        If a pole lies on or outside the unit circle; the message says how far.
-    """
-    largest = float(np.max(np.abs(poles_of(loop, discrete))))
+def check_stable(loop: Loop, discrete: DiscretePlant, what: str) -> None:
+    """Raise a SimulationError if a closed-loop pole with this plant lies on or outside the unit circle."""
+    largest = float(np.max(np.abs(discrete_closed_loop_poles(loop, discrete))))
     if largest >= 1.0:
         raise SimulationError(
             f"loop {loop.name!r} is unstable with {what}: closed-loop pole of magnitude {largest:.4f}"

@@ -1,4 +1,4 @@
-"""The application: routes of the interface, pages, metrics and health behind one guard."""
+"""The application: routes of the interface, pages, metrics and health behind one middleware."""
 
 from __future__ import annotations
 
@@ -13,30 +13,29 @@ from fastapi import APIRouter, FastAPI
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import FileResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from servoscope import __version__
-from servoscope.web import alarms, assets, baselines, description, designs, diagnoses, live, problems, session, uploads
-from servoscope.web.context import Context
-from servoscope.web.guard import API, Guard
-from servoscope.web.metrics import Metrics
+from servoscope.service.health import HEALTH_PATHS, HealthReport
+from servoscope.web import errors
+from servoscope.web.dependencies import Context
+from servoscope.web.metrics import WebMetrics
+from servoscope.web.middleware import API, SecurityMiddleware
+from servoscope.web.routes import alarms, assets, baselines, designs, diagnoses, events, session, uploads
 
-__all__ = ["application"]
-
-SWEEP_S = 3600.0
-TEXT = "text/plain; version=0.0.4; charset=utf-8"
-PARTS = (session, assets, alarms, live, diagnoses, uploads, baselines, designs)
+CLEANUP_S = 3600.0  # between two removals of expired uploads
+ROUTE_MODULES = (session, assets, alarms, events, diagnoses, uploads, baselines, designs)
 
 
-def application(context: Context) -> ASGIApp:
-    """Return what uvicorn serves."""
-    metrics = Metrics(context.hub)
+def create_app(context: Context) -> ASGIApp:
+    """Return the application that uvicorn serves."""
+    metrics = WebMetrics(context.event_hub)
 
     @contextlib.asynccontextmanager
-    async def running(_: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(context.hub.follow()), asyncio.create_task(_sweep(context))]
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        tasks = [asyncio.create_task(context.event_hub.run()), asyncio.create_task(_remove_expired(context))]
         try:
             yield
         finally:
@@ -51,75 +50,74 @@ def application(context: Context) -> ASGIApp:
         openapi_url=f"{API}/openapi.json",
         docs_url=None,  # they would load scripts from elsewhere
         redoc_url=None,
-        lifespan=running,
+        lifespan=lifespan,
     )
     app.state.context, app.state.metrics = context, metrics
-    problems.install(app)
-    description.install(app)
+    errors.install_openapi(app)
+    errors.install_error_handlers(app)
     router = APIRouter(prefix=API)
-    for part in PARTS:
-        router.include_router(part.router)
+    if context.single_sign_on is not None:
+        from servoscope.web.routes import oidc  # late: it needs an extra
+
+        router.include_router(oidc.router)
+    for module in ROUTE_MODULES:
+        router.include_router(module.router)
     app.include_router(router)
-    _own(app, context, metrics)
-    _pages(app)
-    return Guard(app, context.settings, context.users, context.sessions, metrics)
+    _add_health_routes(app, context, metrics)
+    _add_pages(app)
+    return SecurityMiddleware(app, context.settings, context.users, context.sessions, metrics)
 
 
-async def _sweep(context: Context) -> None:
+async def _remove_expired(context: Context) -> None:
     while True:
         try:
-            await asyncio.to_thread(context.folder.sweep, context.settings.keep_days * 86400.0)
+            await asyncio.to_thread(context.storage.remove_expired, context.settings.keep_days * 86400.0)
         except OSError as error:
             logging.getLogger("servoscope.web").warning("old uploads cannot be removed: %s", error)
-        await asyncio.sleep(SWEEP_S)
+        await asyncio.sleep(CLEANUP_S)
 
 
-def _own(app: FastAPI, context: Context, metrics: Metrics) -> None:
-    """Add metrics and health."""
+def _add_health_routes(app: FastAPI, context: Context, metrics: WebMetrics) -> None:
+    report = HealthReport(metrics.render, lambda: context.event_hub.error)
 
-    @app.get("/metrics", include_in_schema=False)
-    async def told() -> Response:
-        return Response(metrics.text(), media_type=TEXT)
+    async def get_health(request: Request) -> Response:
+        answer = report.answer(request.url.path)
+        assert answer is not None, "one of the paths"
+        return Response(answer.body, answer.status, media_type=answer.media_type)
 
-    @app.get("/health/live", include_in_schema=False)
-    async def alive() -> Response:
-        return JSONResponse({"ok": True})
-
-    @app.get("/health/ready", include_in_schema=False)
-    async def ready() -> Response:
-        why = context.hub.unavailable
-        return JSONResponse({"ok": not why, "why": why}, 503 if why else 200)
+    for path in HEALTH_PATHS:
+        app.add_api_route(path, get_health, include_in_schema=False)
 
 
-def _pages(app: FastAPI) -> None:
-    """Add the pages: files under ``/static``, and the shell at every other address."""
+def _add_pages(app: FastAPI) -> None:
+    """Add the files of the pages under ``/static``, and the shell, which loads them, at every other address."""
     folder = Path(str(contextlib.ExitStack().enter_context(as_file(files("servoscope.web")))), "pages")
     palette, shell = folder.parents[1] / "report" / "palette.css", folder / "index.html"
 
     @app.get("/static/palette.css", include_in_schema=False)
-    async def colours() -> Response:
-        return _file(palette)
+    async def get_palette() -> Response:
+        return _file_response(palette)
 
-    app.mount("/static", GZipMiddleware(_Fresh(directory=folder, check_dir=False), minimum_size=1000))
+    app.mount("/static", GZipMiddleware(_NoCacheFiles(directory=folder, check_dir=False), minimum_size=1000))
 
     @app.api_route("/{path:path}", methods=["GET", "HEAD"], include_in_schema=False)
-    async def page(request: Request, path: str) -> Response:
+    async def get_page(request: Request, path: str) -> Response:
         if path.split("/")[0] in ("api", "static", "metrics", "health"):
             raise HTTPException(404, f"there is nothing at {request.url.path}")
-        return _file(shell)
+        return _file_response(shell)
 
 
-def _file(path: Path) -> Response:
+def _file_response(path: Path) -> Response:
     if not path.is_file():
         raise HTTPException(404, f"this installation has no {path.name}")
     return FileResponse(path, headers={"Cache-Control": "no-cache"})
 
 
-class _Fresh(StaticFiles):
-    """Files that a browser asks for each time whether they have changed: an update shows at once."""
+class _NoCacheFiles(StaticFiles):
+    """Files that a browser checks for changes each time: an update shows at once."""
 
     def file_response(self, *args: object, **more: object) -> Response:
-        """Return a file, or that it has not changed."""
-        found = super().file_response(*args, **more)  # type: ignore[arg-type]  # handed on as they come
-        found.headers["Cache-Control"] = "no-cache"
-        return found
+        """Return a file, or the answer that it has not changed."""
+        response = super().file_response(*args, **more)  # type: ignore[arg-type]  # handed on as they come
+        response.headers["Cache-Control"] = "no-cache"
+        return response

@@ -1,31 +1,47 @@
 // Asks who is there, and goes on to where they wanted to be.
-import { login, Problem } from "./api.js";
+import { login, Problem, query, session as ask } from "./api.js";
 import { complaint, field, h } from "./dom.js";
+
+const REFUSED = {
+  state: "The login took too long, or began in another browser: try again.",
+  provider: "The provider did not confirm the login: try again, or ask who runs this server to look into its log.",
+  role: "You are known to the provider, but have no role here: ask who runs this server.",
+};
 
 export async function show(main, { session, values }) {
   // Only to our own pages: an address of elsewhere could imitate them.
   const next = new URL(values.get("next") ?? "/", location.origin);
   const target = next.origin === location.origin ? next.pathname + next.search : "/";
   if (!session.login_required || session.user) return location.replace(target);
-  const { element, user } = form("Log in", () => location.replace(target));
+  const { element, user } = form("Log in", () => location.replace(target), { session, target, note: REFUSED[values.get("refused")] });
   main.replaceChildren(element);
-  user.focus();
+  user?.focus();
 }
 
 // Asks in a dialog over a page whose session is over; returns the new session, null if nobody logs in.
-export function again() {
+export async function again() {
+  const session = await ask();
   return new Promise((resolve) => {
     let begun = null;
-    const { element, user } = form("Log in again", (session) => ((begun = session), dialog.close()), "The session is over. What is on the page stays as it is.");
+    const { element, user } = form("Log in again", (session) => ((begun = session), dialog.close()), {
+      session,
+      note: "The session is over. What is on the page stays as it is.",
+    });
     const dialog = h("dialog", { "aria-label": "Log in again" }, element);
     dialog.addEventListener("close", () => (dialog.remove(), resolve(begun)));
     document.body.append(dialog);
     dialog.showModal();
-    user.focus();
+    user?.focus();
   });
 }
 
-function form(title, done, note = null) {
+// With `target`, the page that a provider leads back to; without, its login is in another tab, and the page stays.
+function form(title, done, { session, target = null, note = null }) {
+  const way = query("/api/v1/session/oidc", { next: target ?? "/" });
+  const provider = session.single_sign_on && h("a", { class: "button", href: way, target: target ? null : "_blank" }, session.single_sign_on);
+  if (!session.password_login) {
+    return { element: h("div", { class: "login" }, h("h1", {}, title), note && h("p", { class: "note" }, note), h("div", {}, provider, !target && renew(done))), user: null };
+  }
   const user = h("input", { name: "user", autocomplete: "username", required: true, autofocus: true });
   const password = h("input", { name: "password", type: "password", autocomplete: "current-password", required: true });
   const said = h("div", {});
@@ -45,6 +61,15 @@ function form(title, done, note = null) {
       button.disabled = false;
     }
   };
-  const element = h("form", { class: "login", onsubmit: enter }, h("h1", {}, title), note && h("p", { class: "note" }, note), field("User", user), field("Password", password), said, h("div", {}, button));
+  const element = h("form", { class: "login", onsubmit: enter }, h("h1", {}, title), note && h("p", { class: "note" }, note), field("User", user), field("Password", password), said, h("div", {}, button, provider, provider && !target && renew(done)));
   return { element, user };
+}
+
+// Goes on where another tab has logged in.
+function renew(done) {
+  const enter = async () => {
+    const session = await ask();
+    if (session.user) done(session);
+  };
+  return h("button", { type: "button", onclick: enter }, "I have logged in there");
 }

@@ -1,0 +1,72 @@
+"""How a command ends and what it leaves on the standard streams: one-line errors, exit codes, JSON."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+import typer.core
+
+from servoscope.core.errors import ServoscopeError
+
+EXIT_INPUT, EXIT_FAULT, EXIT_INTERRUPTED = 1, 3, 130  # exit codes; 2 is the command line's
+
+
+class CommandGroup(typer.core.TyperGroup):
+    """Commands whose users' errors are one line and an exit code; other errors keep their traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        try:
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+        except ServoscopeError as error:
+            print_error(error)
+            raise typer.Exit(EXIT_INPUT) from None
+        except KeyboardInterrupt:
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            print_error(f"cannot be written ({error.strerror})")
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the exit would try once more
+            raise typer.Exit(EXIT_INPUT) from None
+        return result
+
+
+class FailureCounter:
+    """Counts the inputs that could not be used, so that the others go on."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    @contextmanager
+    def catch(self) -> Iterator[None]:
+        """Print the error of one input and go on behind the block."""
+        try:
+            yield
+        except ServoscopeError as error:
+            self.count += 1
+            print_error(error)
+
+    def exit_if_any(self) -> None:
+        """End the command with exit code 1 if there was any failure."""
+        if self.count:
+            raise typer.Exit(EXIT_INPUT)
+
+
+def print_error(what: object) -> None:
+    """Print one line on stderr, whatever characters a file's name may have."""
+    line = " ".join(f"servoscope: {what}".split())
+    typer.echo("".join(c if c.isprintable() else "?" for c in line), err=True)
+
+
+def print_json(value: object, *, lines: bool) -> None:
+    """Print one object on stdout: one line of several, or an indented document."""
+    typer.echo(json.dumps(value, indent=None if lines else 2, allow_nan=False))

@@ -1,0 +1,291 @@
+"""The commands about recordings, thin: parse, call, print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from servoscope.cli import arguments
+from servoscope.cli.app import app
+from servoscope.cli.arguments import RecordingReader
+from servoscope.cli.exit import EXIT_FAULT, EXIT_INPUT, FailureCounter, print_json
+from servoscope.cli.options import (
+    ByOption,
+    ColumnsOption,
+    FromOption,
+    JsonOption,
+    LoopArgument,
+    ReportOption,
+    ToOption,
+    TraceOption,
+    WhereOption,
+)
+from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output, recording_stem
+
+if TYPE_CHECKING:
+    from servoscope.signals import Recording
+
+
+@app.command()
+def inspect(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Recordings.")],
+    loop: Annotated[Path | None, typer.Option(metavar="LOOP", help="Loop file: columns, sample rate, plant.")] = None,
+    columns: ColumnsOption = None,
+    where: WhereOption = None,
+    by: ByOption = None,
+    from_s: FromOption = None,
+    to_s: ToOption = None,
+    as_json: JsonOption = False,
+    report: ReportOption = None,
+) -> None:
+    """Say whether a log is usable, and if not, why; without a mapping, say which columns it has."""
+    check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
+
+    from servoscope.cli.progress import show_steps
+    from servoscope.cli.render import results
+    from servoscope.learning import inspection
+    from servoscope.models.loop import Loop
+    from servoscope.report import inspection_page, plain_values
+
+    settings = Loop.load(loop) if loop is not None else None
+    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s))
+    several = reader.expects_several(logs)
+    pages = OutputPaths.from_option(report, ".html", several, logs)
+    out, failures = results.create_console(), FailureCounter()
+    with show_steps(len(logs), 2) as steps:
+        for path in logs:
+            steps.begin(path.name)
+            with failures.catch():
+                if channels := reader.unmapped_channels(path):
+                    with steps.pause():
+                        if as_json:
+                            print_json(plain_values.channels_summary(path.name, channels), lines=several)
+                        else:
+                            results.print_channels(out, path.name, channels)
+                    raise arguments.missing_mapping_error(path)
+                for recording in reader.read(path):
+                    steps.advance("inspecting")
+                    result = inspection.inspect(recording, settings)
+                    with steps.pause():
+                        if as_json:
+                            print_json(result.model_dump(mode="json"), lines=several)
+                        else:
+                            results.print_inspection(out, result)
+                    if pages is not None:
+                        with failures.catch():
+                            target = pages.path(recording_stem(path, recording.name))
+                            inspection_page.write_inspection_page(target, result, recording)
+                            results.print_written_path(results.create_console(stderr=as_json), target)
+    failures.exit_if_any()
+
+
+@app.command()
+def learn(
+    loop: LoopArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="BASELINE", help="Baseline to write (JSON).")],
+    healthy: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[POINT=]HEALTHY", help="Healthy recordings, at operating points.", show_default=False),
+    ] = None,
+    nominal: Annotated[bool, typer.Option("--nominal", help="From the plant's nominal parameters instead.")] = False,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="BASELINE", help="Refuse recordings that are a fault to this earlier baseline."),
+    ] = None,
+    accept_change: Annotated[
+        bool, typer.Option("--accept-change", help="Learn them all the same, and note the change.")
+    ] = False,
+    accept_delay: Annotated[
+        bool, typer.Option("--accept-delay", help="Learn although u and y are out of step, and note it.")
+    ] = False,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=FILE", help="Recording of a known fault to learn too, NAME@POINT=FILE; repeatable."),
+    ] = None,
+    columns: ColumnsOption = None,
+    where: WhereOption = None,
+    by: ByOption = None,
+    from_s: FromOption = None,
+    to_s: ToOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Learn from healthy recordings what healthy looks like, and from labelled ones what faults look like."""
+    named = arguments.parse_healthy(healthy or [])
+    if nominal == bool(named):
+        raise typer.BadParameter("give healthy recordings or --nominal, and not both")
+    if (accept_change and compare is None) or (nominal and compare is not None):
+        raise typer.BadParameter("--accept-change goes with --compare, and that with recordings")
+    if nominal and accept_delay:
+        raise typer.BadParameter("--accept-delay goes with healthy recordings, not with --nominal")
+    if nominal and fault:
+        raise typer.BadParameter("--fault goes with healthy recordings, not with --nominal")
+    faults = arguments.parse_labelled(fault or [], list(dict.fromkeys(point for point, _ in named)))
+    files = [path for _, path in named] + [path for *_, path in faults]
+    check_output(output, "-o", (), [loop, *files, *filter(None, [compare])])
+
+    from servoscope.cli.progress import show_steps
+    from servoscope.cli.render import results
+    from servoscope.detection.baseline import Baseline
+    from servoscope.diagnosis import operating_points
+    from servoscope.learning.learn import nominal_baseline
+    from servoscope.models.loop import Loop
+    from servoscope.report import plain_values
+
+    settings = Loop.load(loop)
+    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s))
+    if reader.columns is not None:  # they become part of the baseline, so that diagnose need not be told again
+        settings = settings.model_copy(update={"columns": reader.columns})
+    earlier = Baseline.load(compare) if compare is not None else None
+    failures = FailureCounter()
+    recordings: dict[str, list[Recording]] = {point: [] for point, _ in named}
+    labels: dict[str, dict[str, list[Recording]]] = {point: {} for point in recordings}
+    with show_steps(len(files) + 1, 6 * max(1, len(recordings))) as steps:
+        for point, path in named:
+            steps.begin(path.name)
+            with failures.catch():
+                recordings[point] += reader.read(path)
+        if failures.count and not any(recordings.values()):
+            failures.exit_if_any()
+        for point, name, path in faults:
+            steps.begin(path.name)
+            with failures.catch():
+                labels[point][name] = labels[point].get(name, []) + reader.read(path)
+        steps.begin("learning")
+        if nominal:
+            baseline = nominal_baseline(settings, steps.advance)
+        else:
+            chosen, known = recordings.get("", recordings), labels.get("", labels)
+            baseline = operating_points.learn(
+                settings,
+                chosen,
+                steps.advance,
+                compare=earlier,
+                accept_change=accept_change,
+                faults=known,
+                accept_delay=accept_delay,
+            )
+        baseline.save(output)
+    if as_json:
+        print_json({"baseline": str(output), **plain_values.baseline_summary(baseline)}, lines=False)
+    else:
+        results.print_baseline(results.create_console(), baseline)
+        results.print_written_path(results.create_console(), output)
+    failures.exit_if_any()
+
+
+@app.command()
+def diagnose(
+    baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="What learn wrote.")],
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING", help="Recordings to judge.")],
+    point: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Operating point that they were taken at; else any.")
+    ] = None,
+    columns: ColumnsOption = None,
+    where: WhereOption = None,
+    by: ByOption = None,
+    from_s: FromOption = None,
+    to_s: ToOption = None,
+    as_json: JsonOption = False,
+    report: ReportOption = None,
+    trace: TraceOption = None,
+    fail_on_fault: Annotated[bool, typer.Option("--fail-on-fault", help="Exit with 3 if there is a fault.")] = False,
+) -> None:
+    """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure."""
+    inputs = [baseline, *recordings]
+    check_output(report, "--report", REPORTS, inputs, folder=True)
+    check_output(trace, "--trace", TRACES, inputs, folder=True)
+
+    from servoscope.cli.progress import show_steps
+    from servoscope.cli.render import diagnosis, results
+    from servoscope.detection.baseline import Baseline
+    from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
+    from servoscope.diagnosis.diagnose import diagnose_with_trace
+    from servoscope.diagnosis.verify import provenance
+    from servoscope.report import plain_values, write_diagnosis_page
+    from servoscope.signals.writers import write_table
+
+    whole = learned = Baseline.load(baseline)
+    if point is not None:
+        learned = whole.at(point)
+    reader = RecordingReader.from_options(learned.loop, columns, where, by, (from_s, to_s))
+    several = reader.expects_several(recordings)
+    pages = OutputPaths.from_option(report, ".html", several, inputs)
+    traces = OutputPaths.from_option(trace, ".parquet", several, inputs)
+    out, failures, faulty = results.create_console(), FailureCounter(), False
+    with show_steps(len(recordings), 3 + len(learned.loop.plant.all_faults) + len(learned.learned)) as steps:
+        for path in recordings:
+            steps.begin(path.name)
+            with failures.catch():
+                for recording in reader.read(path):
+                    with failures.catch():
+                        steps.advance("recursion")
+                        if traces is None and pages is None:
+                            result, course = diagnose_recording(learned, recording, steps.advance), None
+                        else:
+                            result, course = diagnose_with_trace(learned, recording, steps.advance)
+                        faulty |= result.verdict == "fault"
+                        if as_json:
+                            result = result.model_copy(update={"provenance": provenance(whole, recording)})
+                        with steps.pause():
+                            if as_json:
+                                print_json(plain_values.to_plain_values(result), lines=several)
+                            else:
+                                diagnosis.print_diagnosis(out, result)
+                        stem = recording_stem(path, recording.name)
+                        if traces is not None and course is not None:
+                            target = traces.path(stem)
+                            write_table(target, course.table())
+                            results.print_written_path(results.create_console(stderr=as_json), target)
+                        if pages is not None and course is not None:
+                            target = pages.path(stem)
+                            at = learned.at(result.point) if result.point else learned
+                            origin = plain_values.provenance(at, baseline, path)
+                            write_diagnosis_page(target, result, course, recording, at.loop, origin)
+                            results.print_written_path(results.create_console(stderr=as_json), target)
+    if fail_on_fault and faulty:
+        raise typer.Exit(EXIT_FAULT)
+    failures.exit_if_any()
+
+
+@app.command()
+def verify(
+    diagnosis: Annotated[Path, typer.Argument(metavar="DIAGNOSIS", help="What diagnose --json printed.")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="The recording that it judged.")],
+    baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="The baseline that it was judged with.")],
+    columns: ColumnsOption = None,
+    where: WhereOption = None,
+    from_s: FromOption = None,
+    to_s: ToOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Repeat a diagnosis from its file and say whether the verdict is the same; if not, exit with 1."""
+    from servoscope.cli.render import results
+    from servoscope.core.errors import RecordingError
+    from servoscope.detection.baseline import Baseline
+    from servoscope.diagnosis import verify as verification
+    from servoscope.report import plain_values
+    from servoscope.report.page import say
+
+    told = verification.load_diagnosis(diagnosis)
+    learned = Baseline.load(baseline)
+    reader = RecordingReader.from_options(learned.loop, columns, where, None, (from_s, to_s))
+    read = reader.read(recording)
+    if len(read) != 1:
+        raise RecordingError(f"{recording}: holds {len(read)} recordings, choose one with --where")
+    found = verification.verify(told, learned, read[0])
+    if as_json:
+        plain = plain_values.to_plain_values(found)
+        texts = {
+            "differences": [str(each) for each in found.differences],
+            "remarks": [str(each) for each in found.remarks],
+        }
+        print_json({**plain, **texts} if isinstance(plain, dict) else plain, lines=False)
+    else:
+        out = results.create_console()
+        verdict = say("verify.same", verdict=told.verdict)
+        out.print(verdict if found.same else say("verify.changed", differences=found.differences))
+        results.print_notes(out, [str(remark) for remark in found.remarks])
+    if not found.same:
+        raise typer.Exit(EXIT_INPUT)

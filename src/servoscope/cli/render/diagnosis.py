@@ -1,0 +1,85 @@
+"""How a diagnosis looks in a terminal: the verdict first, then when, what else, and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from rich.console import Console
+from rich.padding import Padding
+from rich.text import Text
+
+from servoscope.cli.render.results import COLOURS, INDENT, print_facts, print_notes, print_table, print_title
+from servoscope.core.number_format import format_ratios, format_short
+from servoscope.detection.result import Candidate, Diagnosis, DiagnosisWarning, RefitSummary
+from servoscope.report.format_values import format_duration, format_probability
+from servoscope.report.page import say
+
+MOST_WARNINGS = 12
+LEAST_SHOWN = 0.01  # probability below which a candidate has no line; the explanation says why it was rejected
+
+
+def print_diagnosis(out: Console, d: Diagnosis) -> None:
+    """Print a verdict, what it rests on, and the warnings."""
+    print_title(out, d.recording, f": {format_duration(d.duration_s)}, {d.samples} samples")
+    out.print(Padding(Text(str(d.summary), style=f"bold {COLOURS[d.verdict]}"), INDENT, expand=False))
+    times = []
+    if d.detected_at_s is not None:
+        times.append(("detected", f"{d.detected_at_s:.4g} s"))
+    if d.onset_s is not None:
+        low, likely, high = d.onset_s
+        times.append(("onset", f"{likely:.4g} s ({low:.4g} to {high:.4g} s, 95 %)"))
+    if times:
+        print_facts(out, times)
+    _print_candidates(out, d.candidates)
+    if d.explanation:
+        out.print("  Why:")
+        print_notes(out, d.explanation, "blue", "-")
+    if d.refit is not None:
+        print_facts(out, _refit_facts(d.refit))
+    _print_warnings(out, d.warnings)
+
+
+def _refit_facts(refit: RefitSummary) -> Iterator[tuple[str, str]]:
+    """Yield the lines on the data of the refit, and on what the recursion says beside it."""
+    misfit, limit = format_short(refit.misfit), format_short(refit.limit)
+    known = {"low": refit.from_s, "high": refit.to_s, "noise": refit.noise, "misfit": misfit, "limit": limit}
+    yield "refit", say("cli.refit", **known)
+    first = refit.recursive[0]
+    sizes = ["{} {} ({} to {})".format(f.parameter, *format_ratios(f.ratio, *f.interval)) for f in first.faults]
+    yield "recursion", ", ".join((first.name, format_probability(first.probability), *sizes))
+
+
+def _print_candidates(out: Console, candidates: Sequence[Candidate]) -> None:
+    """Print the explanations that are worth a line; of a pair, one line per fault."""
+    shown = [c for i, c in enumerate(candidates) if c.probability >= LEAST_SHOWN or not i]
+    if not shown:
+        return
+    faults = [fault for c in shown for fault in c.faults]
+    columns = {
+        "candidate": ["\n+ ".join(fault.name for fault in c.faults) or c.name for c in shown],
+        "probability": [format_probability(c.probability) for c in shown],
+    }
+    if any(fault.name != fault.parameter for fault in faults):
+        columns["parameter"] = ["\n".join(fault.parameter for fault in c.faults) for c in shown]
+    if faults:
+        sizes = [[format_ratios(fault.ratio, *fault.interval) for fault in c.faults] for c in shown]
+        columns["ratio"] = ["\n".join(ratio for ratio, _, _ in each) for each in sizes]
+        columns["95 % interval"] = ["\n".join(f"{low} to {high}" for _, low, high in each) for each in sizes]
+    if len(shown) > 1 and any(c.misfit for c in shown):
+        columns["worse by"] = [f"{math.sqrt(c.misfit):.3g} σ" if c.misfit else "" for c in shown]
+    if any(c.cosine is not None for c in shown):
+        columns["cosine"] = [f"{c.cosine:.3f}" if c.cosine is not None else "" for c in shown]
+    print_table(out, list(columns), list(zip(*columns.values(), strict=True)))
+
+
+def _print_warnings(out: Console, warnings: Sequence[DiagnosisWarning]) -> None:
+    texts = []
+    for w in warnings:
+        when = f"at {w.from_s:.6g} s" if w.from_s == w.to_s else f"{w.from_s:.6g} to {w.to_s:.6g} s"
+        # What the recording can show at all is no matter of time.
+        texts.append(str(w.message) if w.kind == "power" else f"{when}: {w.message}")
+    more = len(texts) - MOST_WARNINGS
+    if more > 1:
+        texts[MOST_WARNINGS:] = [say("cli.more_warnings", count=more)]
+    print_notes(out, texts)

@@ -1,0 +1,47 @@
+"""How a fleet looks in a terminal: what is common, who is ill, what could not be examined."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.text import Text
+
+from servoscope.cli.render.results import COLOURS, print_facts, print_notes, print_table
+from servoscope.core.number_format import format_ratios
+from servoscope.report.format_values import DASH, format_probability
+
+if TYPE_CHECKING:
+    from servoscope.fleet import Fleet
+
+MOST_SHOWN = 20
+LEAST_SHOWN = 0.05  # probability of a common cause that is worth its line
+
+
+def print_fleet(out: Console, f: Fleet) -> None:
+    """Print what a fleet's results say."""
+    from servoscope.fleet.report import headline
+
+    colour = COLOURS["fault" if f.count("fault") or f.accepted else "healthy"]
+    out.print(Text.assemble((f"{len(f.assets)} assets", "bold"), ": ", (headline(f), f"bold {colour}")))
+    states = ("healthy", "fault", "common cause", "undetermined", "failed")
+    print_facts(out, [(state, str(f.count(state))) for state in states if f.count(state)])
+    shared = [(cause, since) for cause, since in zip(f.causes, f.since, strict=True) if cause.probability > LEAST_SHOWN]
+    if shared:
+        rows = []
+        for cause, since in shared:
+            size, low, high = format_ratios(cause.ratio, *cause.interval)
+            what = (f"{cause.key} {cause.group}", f"{len(cause.members)}", f"{cause.parameter} x {size}")
+            rows.append((*what, f"{low} to {high}", since or DASH, format_probability(cause.probability)))
+        print_table(out, ("common cause", "assets", "change", "95 %", "since", "probability"), rows)
+    ill = [one for one in f.assets if one.state not in ("healthy", "failed")]
+    if ill:
+        own = [
+            (one.asset, one.day, one.state, format_probability(one.probability), one.said) for one in ill[:MOST_SHOWN]
+        ]
+        print_table(out, ("asset", "day", "state", "own", ""), own, words=5)
+    if len(ill) > MOST_SHOWN:
+        print_notes(out, [f"{len(ill) - MOST_SHOWN} more are ill, see the report"])
+    lost = [f"{asset} {day}: {why}" for asset, day, why in f.failed]
+    lost += [f"{name}, not learned: {why}" for name, why in f.unlearned.items()]
+    print_notes(out, lost[:MOST_SHOWN])

@@ -1,0 +1,164 @@
+"""How a store looks in a terminal: assets as they are now, and rows of history."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from servoscope.cli.render.results import COLOURS
+from servoscope.report.format_values import DASH, format_duration, plain_name
+from servoscope.report.page import say
+from servoscope.service.store.queries import format_time
+
+OLD_S = 60.0
+TIME_COLUMNS = ("t", "at", "created", "onset", "since", "due", "asked", "from", "until", "time")
+OUTCOME = 80  # characters that are shown of a receiver's answer
+WIDE = 110  # columns of a terminal, and 9 for each frequency
+
+NE107 = {
+    "good": "green",
+    "maintenance_required": "blue",
+    "out_of_specification": "yellow",
+    "function_check": "yellow",
+    "failure": "red",
+}
+
+
+def format_timestamp(t: float | None) -> str:
+    """Return a time, UTC, to the second."""
+    return DASH if t is None else format_time(t)
+
+
+def asset_table(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
+    """Return a table of assets: verdict, since when, residuals, alarms; on a wide terminal more of each."""
+    followed = {name: row for name, row in statuses.items() if not row["status"].get("service")}
+    frequencies = sorted({f for row in followed.values() for f, *_ in row["status"].get("residual", ())})
+    wide = width >= WIDE + 9 * len(frequencies)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("asset", "verdict", "since (UTC)", *(("T²/limit", "test") if wide else ())):
+        table.add_column(name, justify="right" if name in ("T²/limit", "test") else "left", no_wrap=True)
+    for f in frequencies:
+        table.add_column(f"γ {f:g} Hz", justify="right", no_wrap=True)
+    table.add_column("alarms", overflow="fold")
+    for name in ("NE 107", "last sample", "stored") if wide else ():
+        table.add_column(name, no_wrap=True)
+    now = time.time()
+    for name, row in followed.items():
+        status = row["status"]
+        residual = {f: (real, imaginary, healthy) for f, real, imaginary, healthy in status.get("residual", ())}
+        tests = _format_number(status.get("statistic")), _format_number(status.get("level"))
+        ne107 = Text(plain_name(status["ne107"]), NE107.get(status["ne107"], ""))
+        more = (
+            ne107,
+            format_timestamp(status["counted"]["t"]),
+            f"{format_duration(round(max(0.0, now - row['at']), 1))} ago",
+        )
+        table.add_row(
+            name,
+            Text(status["verdict"], COLOURS.get(status["verdict"], "")),
+            format_timestamp(status["since"]),
+            *(tests if wide else ()),
+            *(format_relative_residual(residual.get(f)) for f in frequencies),
+            format_alarms(status["alarms"]),
+            *(more if wide else ()),
+        )
+    return table
+
+
+def service_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line for each service that has alarms or a flood of them."""
+    lines = []
+    for name, row in statuses.items():
+        if row["status"].get("service"):
+            flood, alarms = row["status"]["flood"], format_alarms(row["status"]["alarms"])
+            parts = [alarms] if alarms != DASH else []
+            if flood["since"] is not None:
+                parts.append(f"flood since {format_timestamp(flood['since'])}, {flood['held']} held")
+            lines += [f"{name}: {', '.join(parts)}"] if parts else []
+    return lines
+
+
+def fault_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line for each asset with a fault."""
+    each = {name: row["status"] for name, row in statuses.items()}
+    return [f"{name}: {status['summary']}" for name, status in each.items() if status.get("verdict") == "fault"]
+
+
+def stale_store_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line if the store is no longer written: a table that does not change looks like healthy machines."""
+    age = time.time() - max((row["at"] for row in statuses.values()), default=time.time())
+    return [say("cli.stale_store", age=format_duration(round(age)))] if age > OLD_S else []
+
+
+def status_page(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Group:
+    """Return the assets with what there is to say about them."""
+    return Group(
+        asset_table(statuses, width), *fault_lines(statuses), *service_lines(statuses), *stale_store_lines(statuses)
+    )
+
+
+def format_alarms(alarms: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the alarms that are not normal."""
+    active = [f"{name} {plain_name(one['state'])}" for name, one in alarms.items() if one["state"] != "normal"]
+    return ", ".join(active) or DASH
+
+
+def format_relative_residual(residual: Sequence[float | None] | None) -> str:
+    """Return a residual as a share of the healthy response."""
+    if residual is None or None in residual or not residual[2]:
+        return DASH
+    real, imaginary, healthy = (float(part or 0.0) for part in residual)
+    return f"{100.0 * math.hypot(real, imaginary) / healthy:.2g} %"
+
+
+def active_alarms(statuses: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the alarms that are not normal, one each."""
+    return [
+        {"asset": name, "alarm": alarm, **one}
+        for name, row in statuses.items()
+        for alarm, one in row["status"]["alarms"].items()
+        if one["state"] != "normal"
+    ]
+
+
+def row_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
+    """Return a table of some columns of rows; times as dates."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in columns:
+        table.add_column(plain_name(name), overflow="fold", no_wrap=name in ("t", "at", "created", "due", "asset"))
+    for row in rows:
+        table.add_row(
+            *(_format_cell(name, _delivery_subject(row) if name == "subject" else row.get(name)) for name in columns)
+        )
+    return table
+
+
+def _delivery_subject(row: Mapping[str, Any]) -> str:
+    """Return the asset, the alarm and the event of a delivery, as far as it has them."""
+    event = row["event"]
+    words = (event.get("asset"), event.get("alarm"), plain_name(str(event.get("event", ""))))
+    return " ".join(word for word in words if word)
+
+
+def _format_number(value: float | None) -> str:
+    return DASH if value is None else f"{value:.3g}"
+
+
+def _format_cell(name: str, value: Any) -> str:
+    if value is None:
+        return DASH
+    if name in TIME_COLUMNS and isinstance(value, int | float):  # "from" is the address in the audit of a login
+        return format_timestamp(value)
+    if name == "outcome":
+        return str(value) if len(value) <= OUTCOME else f"{value[: OUTCOME - 3]}..."
+    if isinstance(value, Mapping):
+        return ", ".join(f"{plain_name(key)}: {_format_cell(key, one)}" for key, one in value.items() if one != "")
+    if name in ("state", "after", "what"):
+        return plain_name(str(value))
+    return _format_number(value) if isinstance(value, float) else str(value)

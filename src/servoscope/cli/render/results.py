@@ -1,0 +1,229 @@
+"""How results look in a terminal: simulations, inspections, baselines; tables, facts and notes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from servoscope.report.format_values import DASH, format_duration, format_percent
+from servoscope.report.page import say
+
+if TYPE_CHECKING:
+    from servoscope.detection.baseline import Baseline
+    from servoscope.learning.inspection import Inspection
+    from servoscope.models.loop import Columns
+    from servoscope.report.page import ResultTable
+    from servoscope.research.bench import BenchmarkResult
+    from servoscope.signals import Recording
+    from servoscope.signals.readers import ChannelInfo
+    from servoscope.simulation import Truth
+
+COLOURS = {
+    "healthy": "green",
+    "usable": "green",
+    "fault": "red",
+    "not usable": "red",
+    "stop": "red",
+    "undetermined": "yellow",
+    "usable with care": "yellow",
+    "care": "yellow",
+    "note": "blue",
+    "holds": "green",
+    "holds partly": "yellow",
+    "does not hold": "red",
+}
+INDENT = (0, 0, 0, 2)
+
+
+def create_console(*, stderr: bool = False) -> Console:
+    """Return a console on stdout or stderr: without colour when that is no terminal or NO_COLOR is set."""
+    return Console(stderr=stderr, highlight=False, markup=False, emoji=False)
+
+
+def print_title(out: Console, name: str, text: str) -> None:
+    """Print the first line of a result: a name in bold, and what follows it."""
+    out.print(Text.assemble((name, "bold"), text))
+
+
+def print_table(out: Console, header: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> None:
+    """Print a table whose first `words` columns are text and whose others are numbers."""
+    grid = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_edge=False)
+    for i, name in enumerate(header):
+        grid.add_column(name, justify="left" if i < words else "right", overflow="fold")
+    for row in rows:
+        grid.add_row(*(Text(cell) for cell in row))
+    out.print(Padding(grid, INDENT, expand=False))
+
+
+def print_result_table(out: Console, table: ResultTable) -> None:
+    """Print a table that pages show too, with the headings of a terminal, which are lower case."""
+    header = [name if name[1:2].isupper() else name[:1].lower() + name[1:] for name in table.head]
+    print_table(out, header, table.rows, table.words)
+
+
+def print_facts(out: Console, pairs: Iterable[tuple[str, str]]) -> None:
+    """Print names and values in two columns; long values wrap inside theirs."""
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(style="dim", no_wrap=True)
+    grid.add_column(overflow="fold")
+    for name, value in pairs:
+        grid.add_row(name, Text(value))
+    out.print(Padding(grid, INDENT, expand=False))
+
+
+def print_notes(out: Console, texts: Iterable[object], colour: str = "yellow", mark: str = "!") -> None:
+    """Print sentences as a list, wrapped under their own beginning."""
+    for text in texts:
+        grid = Table.grid(padding=(0, 1, 0, 0))
+        grid.add_column()
+        grid.add_column(overflow="fold")
+        grid.add_row(Text(mark, style=colour), Text(str(text)))
+        out.print(Padding(grid, INDENT, expand=False))
+
+
+def print_written_path(out: Console, path: object) -> None:
+    """Print that a file was written, on one line that can be copied."""
+    out.print(Text(f"  wrote {path}"), soft_wrap=True)
+
+
+def print_baseline(out: Console, baseline: Baseline) -> None:
+    """Print what was learned, operating point by operating point."""
+    for point in baseline.per_point:
+        _print_operating_point(out, point)
+
+
+def _print_operating_point(out: Console, b: Baseline) -> None:
+    at = f" at {b.point}" if b.point else ""
+    if b.loop.name == type(b.loop).model_fields["name"].default:
+        print_title(out, "Baseline", f"{at} from {_format_sources(b)}")
+    else:
+        print_title(out, b.loop.name, f": baseline{at} from {_format_sources(b)}")
+    std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
+    rows = [
+        (name, f"{value:.5g}", f"{s:.2g}", f"{100.0 * abs(s / value):.2g} %" if value else DASH)
+        for name, value, s in zip(b.names, b.theta, std, strict=True)
+    ]
+    print_table(out, ("coefficient", "value", "std. dev.", "relative"), rows)
+    out.print()
+    if b.ratios:
+        print_table(out, ("parameter", "healthy / nominal"), [(name, f"{x:.4g}") for name, x in b.ratios.items()])
+        out.print()
+    if b.promises:
+        header = ("fault",) if all(p.name == p.parameter for p in b.promises) else ("fault", "parameter")
+        promised = [
+            (*(p.name, p.parameter)[: len(header)], format_percent(p.change) if p.change is not None else "never")
+            for p in b.promises
+        ]
+        print_table(out, (*header, "detected from a change of"), promised, words=len(header))
+        out.print()
+    if b.learned:
+        severity = [(f.name, f"{len(f.shares)}", f"{min(f.shares):.2f} to {max(f.shares):.2f}") for f in b.learned]
+        print_table(out, ("labelled fault", "recordings", "severity"), severity)
+        out.print()
+    print_facts(out, _baseline_facts(b))
+    print_notes(out, b.notes)
+
+
+def _baseline_facts(b: Baseline) -> Iterator[tuple[str, str]]:
+    yield "explained", say("cli.baseline.explained", share=format_percent(b.explained), R=b.R)
+    if b.noise is not None:
+        yield "noise", say("cli.baseline.noise", u=b.noise.u_std, y=b.noise.y_std)
+    delay = say("cli.baseline.delay", ms=1e3 * b.delay_s) if b.delay_s is not None else say("cli.baseline.no_delay")
+    yield "delay", delay
+    cusums = say("cli.baseline.cusums", count=len(b.members)) if b.members else None
+    budget, supported = b.loop.monitor.false_alarms_per_year, b.supported_false_alarms_per_year
+    yield "false alarms", say("cli.baseline.false_alarms", limit=b.limit, cusums=cusums, budget=budget)
+    yield "data support", say("cli.baseline.data_support", budget=supported)
+    error = {"set": b.loop.monitor.model_error, "suggested": b.suggested_model_error}
+    yield "model_error", say("cli.baseline.model_error", **error)
+
+
+def _format_sources(b: Baseline) -> str:
+    length = format_duration(sum(source.duration_s for source in b.sources))
+    if len(b.sources) > 3:
+        return f"{len(b.sources)} recordings, {length}"
+    return f"{', '.join(source.name for source in b.sources)}, {length}"
+
+
+def print_channels(out: Console, name: str, channels: Sequence[ChannelInfo]) -> None:
+    """Print the columns of a file, and which of them might be t, r, u and y."""
+    from servoscope.signals.readers.guess_columns import guess_columns
+
+    print_title(out, name, f": {len(channels)} columns")
+    limits = [[f"{x:.6g}" if math.isfinite(x) else DASH for x in (c.min, c.max)] for c in channels]
+    rows = [(c.name, c.dtype, *limit) for c, limit in zip(channels, limits, strict=True)]
+    print_table(out, ("column", "type", "smallest", "largest"), rows, words=2)
+    if proposed := guess_columns([c.name for c in channels]):
+        mapping = ", ".join(f"{letter}={column}" for letter, column in proposed.items())
+        print_notes(out, [say("cli.proposed_mapping", mapping=mapping)])
+
+
+def print_column_mapping(out: Console, columns: Columns) -> None:
+    """Print the mapping that a simulated recording needs, where the loop's columns are no plain names."""
+    pairs = [*zip("tru", (columns.time or "t", columns.reference, columns.input), strict=True)]
+    mapping = ", ".join(f"{letter}={name}" for letter, name in [*pairs, *(("y", name) for name in columns.outputs)])
+    print_notes(out, [say("cli.needed_mapping", mapping=mapping)])
+
+
+def print_simulation(out: Console, path: str, reference: str, recording: Recording, truth: Truth) -> None:
+    """Print what was simulated, with its truth."""
+    print_title(out, recording.name, f": {format_duration(recording.duration_s)}, {recording.samples} samples")
+    named = {fault.parameter: fault.name for fault in truth.plant.all_faults}
+    facts = [("reference", reference)]
+    for event in truth.faults:
+        over = say("cli.truth_over", duration=format_duration(event.ramp_s)) if event.ramp_s else None
+        known = {"parameter": event.parameter, "ratio": event.ratio, "at": event.at_s, "over": over}
+        what = say("cli.truth", **known)
+        facts.append(("truth", f"{named[event.parameter]}: {what}" if event.parameter in named else what))
+    print_facts(out, facts if truth.faults else [*facts, ("truth", "healthy")])
+    print_written_path(out, path)
+
+
+def print_inspection(out: Console, i: Inspection) -> None:
+    """Print whether a recording is usable, why, what it holds, and what to do."""
+    from servoscope.report.inspection_page import excitation_table, inspection_size, stretches
+
+    print_title(out, i.recording, f": {inspection_size(i)}")
+    headline = str(i.headline)
+    out.print(
+        Padding(Text(headline[:1].upper() + headline[1:], style=f"bold {COLOURS[i.verdict]}"), INDENT, expand=False)
+    )
+    facts = [("sampling", stretches(i))] if i.sampling.runs > 1 or i.sampling.stretches > 1 else []
+    if i.suggested_cutoff_hz is not None:
+        facts.append(("cutoff", say("report.cutoff", frequency=i.suggested_cutoff_hz)))
+    print_facts(out, facts)
+    if i.frequencies:
+        print_result_table(out, excitation_table(i))
+    for finding in i.findings:
+        print_notes(out, [finding.message], COLOURS[finding.severity], "-" if finding.severity == "note" else "!")
+    if i.recommendations:
+        out.print("  What to do:")
+        print_notes(out, i.recommendations, "green", "-")
+
+
+def print_claims(out: Console, claims: Iterable[tuple[str, str, str]]) -> None:
+    """Print claims of the paper, each with what was measured and a verdict."""
+    for claim, measured, verdict in claims:
+        out.print(Text.assemble((verdict, COLOURS[verdict]), f": {claim}"))
+        out.print(Padding(Text(measured, style="dim"), INDENT))
+
+
+def print_benchmark(out: Console, result: BenchmarkResult) -> None:
+    """Print what was measured of speed: per sample, beside what it is compared with, and single numbers."""
+    rows = []
+    for figure in result.figures:
+        median, low, high = (f"{x:.1f}" if x < 1000.0 else f"{x:.0f}" for x in figure.ns)
+        ratio = "" if figure.ratio is None else f"{figure.ratio:.3g}"
+        error = "" if figure.error is None else f"{figure.error:.0e}"
+        rows.append((figure.name, median, f"{low}-{high}", ratio, error))
+    print_table(out, ("ns per sample", "median", "quartiles", "times", "error"), rows)
+    print_notes(out, [say("cli.bench")], "dim", " ")
+    out.print()
+    for name, number in result.facts.items():
+        out.print(f"{name}: {number:.4g}")

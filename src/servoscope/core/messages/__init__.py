@@ -1,0 +1,216 @@
+"""The catalogue of messages: records carry keys and values, and the text that people read is rendered here.
+
+The catalogue of a language is one TOML file of templates, ``<language>.toml``. A template is a format string whose
+format specifications are Python's or one of `FORMATS` and `JOINS`::
+
+    [diagnosis]
+    candidate = "{names:plus} ({probability:probability})"
+
+    render(message("diagnosis.candidate", names=("pump", "leakage"), probability=0.86))
+
+A value that is None leaves nothing, so an optional part of a sentence is a message of its own, or None.
+"""
+
+from __future__ import annotations
+
+import functools
+import string
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime
+from importlib.resources import files
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, field_validator
+
+from servoscope.core.number_format import format_share, format_short
+
+__all__ = [
+    "FORMATS",
+    "JOINS",
+    "Message",
+    "MessageField",
+    "MessageText",
+    "catalogue",
+    "message",
+    "read_messages",
+    "render",
+    "text_message",
+]
+
+LANGUAGE = "en"  # of what is rendered without another one being named
+FOLDER = files("servoscope.core.messages")
+PLAIN_TEXT = "text"  # the key of a message that is its text: from outside, or of a file of an earlier version
+
+
+class Message(BaseModel):
+    """A sentence, or a part of one: a key of the catalogue with the values that its template names."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    key: str  # section and name in the catalogue: ``diagnosis.healthy``
+    values: dict[str, Any] = {}  # numbers, words, messages, sequences of these; None for a part that is left out
+
+    @field_validator("values", mode="before")
+    @classmethod
+    def _read_nested(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Turn messages that come from JSON back into messages."""
+        return {name: _read_value(value) for name, value in values.items()}
+
+    def __str__(self) -> str:
+        return render(self)
+
+    def __eq__(self, other: object) -> bool:
+        # by text: of a record that was written and read back only the text is left
+        return isinstance(other, Message) and str(self) == str(other)
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
+
+def message(key: str, **values: Any) -> Message:
+    """Return the message of a key of the catalogue with values."""
+    return Message(key=key, values=values)
+
+
+def _read_value(value: Any) -> Any:
+    if isinstance(value, Mapping) and "key" in value:
+        return Message(key=value["key"], values=value.get("values", {}))
+    if isinstance(value, (list, tuple)):
+        return tuple(_read_value(each) for each in value)
+    return value
+
+
+def text_message(text: str) -> Message:
+    """Return a message that is its text: of an error, or of a file written before messages had keys."""
+    return message(PLAIN_TEXT, text=text)
+
+
+# Of a record's field: plain text is accepted too.
+MessageField = Annotated[
+    Message, BeforeValidator(lambda given: text_message(given) if isinstance(given, str) else given)
+]
+
+# The same, written to JSON and files as its text, and read back as that text.
+MessageText = Annotated[MessageField, PlainSerializer(str, return_type=str)]
+
+
+def read_messages(written: Any, **texts: str) -> Any:
+    """Return the written fields of a record with its messages, or sequences of them, restored.
+
+    `texts` gives, by field, the key under which the rendered text stands beside it. The text replaces the message where
+    there is none (files of earlier versions) and where this version cannot render it (files of later ones).
+    """
+    if not isinstance(written, Mapping):
+        return written
+    fields = dict(written)
+    for field, key in texts.items():
+        text = fields.pop(key, None)
+        if text is not None:
+            fields[field] = _restore(fields.get(field), text)
+    return fields
+
+
+def _restore(given: Any, text: Any) -> Any:
+    if isinstance(text, (list, tuple)):
+        each = given if isinstance(given, (list, tuple)) and len(given) == len(text) else [None] * len(text)
+        return tuple(_restore(one, words) for one, words in zip(each, text, strict=True))
+    try:
+        found = Message.model_validate(given)
+        render(found)
+    except (ValueError, LookupError, TypeError, AttributeError):
+        return text
+    return found
+
+
+def _format_percent(value: float) -> str:
+    return f"{100.0 * value:.3g} %"
+
+
+def _format_probability(value: float) -> str:
+    return "> 99.9 %" if value > 0.999 else f"{100.0 * value:.3g} %"
+
+
+def _format_utc(value: float) -> str:
+    try:
+        return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    except (OverflowError, OSError, ValueError):  # a clock that was set to what is in no calendar
+        return f"{value:.0f} s"
+
+
+FORMATS: Mapping[str, Callable[[Any], str]] = {
+    "short": format_short,
+    "percent": _format_percent,
+    "share": format_share,
+    "probability": _format_probability,
+    "utc": _format_utc,
+    "capitalised": lambda value: str(value)[:1].upper() + str(value)[1:],
+}
+JOINS: Mapping[str, str] = {
+    "list": ", ",
+    "semicolon": "; ",
+    "plus": " + ",
+    "sentences": " ",
+    "and": "join.and",
+    "or": "join.or",
+}
+
+
+class _Renderer(string.Formatter):
+    def __init__(self, language: str) -> None:
+        self._language = language
+
+    def convert_field(self, value: Any, conversion: str | None) -> Any:
+        return None if value is None else super().convert_field(value, conversion)
+
+    def format_field(self, value: Any, spec: str) -> str:
+        if value is None:
+            return ""
+        if isinstance(value, Message):
+            value = render(value, self._language)
+        if isinstance(value, (list, tuple)):
+            return self._join([self.format_field(each, "") for each in value], spec or "list")
+        if spec in FORMATS:
+            return FORMATS[spec](value)
+        return str(super().format_field(value, spec))
+
+    def _join(self, texts: list[str], spec: str) -> str:
+        if spec not in ("and", "or"):
+            return JOINS[spec].join(texts)
+        if len(texts) < 2:
+            return "".join(texts)
+        return template(JOINS[spec], self._language).format(first=", ".join(texts[:-1]), last=texts[-1])
+
+
+def render(given: Message, language: str | None = None) -> str:
+    """Return a message as text.
+
+    Raises
+    ------
+    KeyError
+        If the catalogue has no such key, or the template names a value that the message has not.
+    """
+    if given.key == PLAIN_TEXT:
+        return str(given.values["text"])
+    language = language or LANGUAGE
+    return _Renderer(language).vformat(template(given.key, language), (), given.values)
+
+
+def template(key: str, language: str) -> str:
+    """Return the template of a key; in English where the language has none."""
+    found = catalogue(language).get(key)
+    return found if found is not None else catalogue("en")[key]
+
+
+@functools.cache
+def catalogue(language: str = "en") -> Mapping[str, str]:
+    """Return the templates of a language by key."""
+    return dict(_flatten(tomllib.loads(FOLDER.joinpath(f"{language}.toml").read_text(encoding="utf-8"))))
+
+
+def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
+    for name, value in table.items():
+        if isinstance(value, str):
+            yield prefix + name, value
+        else:
+            yield from _flatten(value, f"{prefix}{name}.")

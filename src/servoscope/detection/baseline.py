@@ -1,0 +1,330 @@
+"""What healthy looks like: learned from recordings or computed from nominal parameters; one JSON file, versioned."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import BaselineError, LoopError
+from servoscope.core.files import atomic_write
+from servoscope.core.messages import MessageText
+from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, worst_case_hypotheses
+from servoscope.detection.expectation import Expectation
+from servoscope.detection.learned_fault import LearnedFault
+from servoscope.detection.sensors import SensorModel
+from servoscope.detection.threshold_calibration import SEQUENTIAL, CalibrationFactors, t2_threshold
+from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.estimation.instrument import InstrumentTuning
+from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
+from servoscope.estimation.pipeline import Pipeline, Tuning
+from servoscope.estimation.two_stage import StageOneTuning
+from servoscope.models.loop import Loop
+from servoscope.models.plants import Plant
+
+if TYPE_CHECKING:
+    from servoscope.estimation.kernel.cusum import CusumConstants
+
+FORMAT = "servoscope-baseline"
+VERSION = 2
+
+Vector = tuple[float, ...]
+Matrix = tuple[Vector, ...]
+
+
+class _BaselineModel(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class BaselineSource(_BaselineModel):
+    """A recording that the baseline was learned from."""
+
+    name: str
+    samples: int
+    duration_s: float
+
+
+class DetectableChange(_BaselineModel):
+    """The smallest change that the baseline promises to see, relative: 0.05 is 5 %; None: none at all."""
+
+    name: str
+    parameter: str
+    change: float | None
+
+
+class ExactPredictorFit(_BaselineModel):
+    """What the exact predictor, of which the refit makes use, says of the healthy recordings."""
+
+    noise: WhiteNoise  # n_u and n_y that make their innovations likeliest
+    # what it leaves unexplained in the worst of them, over what noise leaves in all but one of a thousand: the refit
+    # is made where this is at most 1
+    misfit: float
+
+
+class Baseline(_BaselineModel):
+    """What a healthy loop looks like to the monitor; everything that `diagnose` needs.
+
+    Parameters
+    ----------
+    loop, sources, hash
+        The loop, as in its file, and what it was learned from.
+    names, theta, covariance
+        The n coefficients: names, healthy values (n,), and the covariance (n, n) of a further healthy recording's mean
+        around them: noise of the baseline, scatter between recordings and model error.
+    scale, P_d, R, noise_a, noise_b, noise_gamma, noise_variance, stage_one
+        The recursion's tuning (see `servoscope.estimation.pipeline.Tuning`), and that of stage 1 of two stages.
+    noise, ratios, ratios_std, ratios_covariance, model_theta
+        n_u and n_y; the healthy parameters relative to the loop file's nominal values, the standard deviations and the
+        covariance (m, m) of their logarithms; the coefficients that they lead to under the references of the baseline.
+        Without a controller or physics None or empty.
+    dof, limit, explained
+        Effective number of independent residuals; threshold of T^2; share of eta's variance that the model explains.
+    still_speed
+        Speed below which the axis stands still [output per s]; 0 where rest is part of what is expected.
+    delay_s
+        Delay that the recordings show [s]; None where they do not show it.
+    loudest
+        The largest noise that the recordings allow; None where white noises on u and y do not explain the residual.
+    rehearsed, members
+        Counted false alarms over those of theory; the hypotheses of the sequential test, empty where there is none.
+    promises
+        Smallest changes that are detected with 90 % probability within the baseline's own excitation.
+    exact
+        What the exact predictor says of the healthy recordings; None where there is none.
+    notes
+        Warnings of `learn`.
+    learned
+        Faults known from labelled recordings.
+    sensors
+        How the sensors of the output disagree; None where it has one.
+    instrument
+        The model behind the instrument of a loop without a controller; None where none was needed or learned.
+    point, others
+        Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
+        others is itself that of the first point.
+    """
+
+    loop_settings: dict[str, Any] = Field(alias="loop")
+    sources: tuple[BaselineSource, ...]
+    hash: str
+    names: tuple[str, ...]
+    theta: Vector
+    covariance: Matrix
+    scale: Vector
+    P_d: Matrix
+    R: float
+    noise_a: Vector
+    noise_b: Vector
+    noise_gamma: Vector
+    noise_variance: float
+    stage_one: StageOneTuning | None = None
+    noise: WhiteNoise | None
+    ratios: dict[str, float]
+    ratios_std: dict[str, float]
+    ratios_covariance: Matrix
+    model_theta: Vector
+    dof: float
+    limit: float
+    explained: float
+    still_speed: float
+    delay_s: float | None
+    suggested_model_error: float
+    supported_false_alarms_per_year: float
+    loudest: WhiteNoise | None
+    rehearsed: CalibrationFactors
+    members: tuple[CusumHypothesis, ...]
+    promises: tuple[DetectableChange, ...]
+    notes: tuple[MessageText, ...]
+    exact: ExactPredictorFit | None = None
+    learned: tuple[LearnedFault, ...] = ()
+    sensors: SensorModel | None = None
+    instrument: InstrumentTuning | None = None
+    point: str = ""
+    others: tuple[Baseline, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> Self:
+        n, p = len(self.names), len(self.noise_a)
+        for name in ("theta", "scale"):
+            if len(getattr(self, name)) != n:
+                raise ValueError(f"{name} must have {n} values, one per coefficient")
+        for name in ("covariance", "P_d"):
+            rows = getattr(self, name)
+            if len(rows) != n or any(len(row) != n for row in rows):
+                raise ValueError(f"{name} must be {n} by {n}")
+        if len(self.noise_gamma) != p or not p or not (self.noise_gamma[0] > 0.0 and self.noise_variance > 0.0):
+            raise ValueError("noise_a and noise_gamma must have the same length, and a positive variance")
+        if len(self.model_theta) not in (0, n):
+            raise ValueError(f"model_theta must be empty or have {n} values")
+        if not (n and self.R > 0.0 and self.limit > 0.0 and min(self.scale) > 0.0):
+            raise ValueError("names, R, limit and scale must be positive")
+        C, size = np.array(self.covariance), np.sqrt(np.abs(np.diag(self.covariance)))
+        scaled = C / np.outer(size, size) if size.all() else C
+        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
+            raise ValueError("covariance must be symmetric and positive")
+        if any(len(fault.deviation) != n for fault in self.learned):
+            raise ValueError(f"learned must have deviations of {n} values, one per coefficient")
+        if len({fault.name for fault in self.learned}) < len(self.learned):
+            raise ValueError("learned must have names of their own")
+        if self.others and (not all(self.points) or len(set(self.points)) < len(self.points)):
+            raise ValueError("point must be a name of its own at every operating point")
+        if any(other.others for other in self.others):
+            raise ValueError("others must have no others")
+        return self
+
+    @cached_property
+    def loop(self) -> Loop:
+        """The loop."""
+        return Loop.from_dict(self.loop_settings)
+
+    @property
+    def points(self) -> tuple[str, ...]:
+        """Names of the operating points; none where none was declared."""
+        return (self.point, *(other.point for other in self.others)) if self.point or self.others else ()
+
+    @property
+    def per_point(self) -> tuple[Baseline, ...]:
+        """One baseline per operating point; itself where none was declared."""
+        return (self.model_copy(update={"others": ()}), *self.others)
+
+    def at(self, point: str) -> Baseline:
+        """Return the baseline of one operating point.
+
+        Raises
+        ------
+        BaselineError
+            If there is no such point.
+        """
+        for one in self.per_point:
+            if point and one.point == point:
+                return one
+        known = f"choose from {', '.join(self.points)}" if self.points else "the baseline has none"
+        raise BaselineError(f"there is no operating point {point!r}: {known}")
+
+    @property
+    def plant(self) -> Plant:
+        """The plant with its healthy parameters as learned."""
+        return self.loop.plant.scaled(self.ratios) if self.ratios else self.loop.plant
+
+    @property
+    def tuning(self) -> Tuning:
+        """What the recursion takes."""
+        arrays = (self.theta, self.scale, self.P_d)
+        theta, scale, P_d = (np.array(value) for value in arrays)
+        a, b, gamma = (np.array(value) for value in (self.noise_a, self.noise_b, self.noise_gamma))
+        return Tuning(theta, scale, P_d, self.R, ArmaNoise(a, b, gamma, self.noise_variance))
+
+    def pipeline(self) -> Pipeline:
+        """Return the loop's chain of constant matrices."""
+        return Pipeline.of(self.loop, self.stage_one, self.still_speed, self.instrument)
+
+    def cusum_constants(
+        self, pipeline: Pipeline, under: Expectation | None = None, growth: float = 1.0
+    ) -> CusumConstants | None:
+        """Return the sequential test beside a pipeline's recursion.
+
+        `under` is the expectation of a recording, to whose reference the limits are then fitted, instead of that of
+        the baseline; `growth` is that of the noise's variance.
+        """
+        if self.loudest is None or not self.members:
+            return None
+        noise = self.loudest.times(np.sqrt(growth))
+        budget = SEQUENTIAL * self.loop.monitor.false_alarms_per_year / self.rehearsed.cusum
+        heard = self.members
+        if under is not None:
+            heard = worst_case_hypotheses(under, self.plant, self.loudest, np.array(self.ratios_covariance), heard)
+        return build_cusum_constants(pipeline, self.plant, noise, np.array(self.scale), heard, budget)
+
+    @cached_property
+    def bias(self) -> FloatArray:
+        """What the biases of the regression add to the healthy coefficients, shape (n,)."""
+        if not self.model_theta or self.loop.monitor.structure != "svf":
+            return np.zeros(len(self.theta))
+        return np.array(self.model_theta) - nominal_theta(self.loop, self.plant)
+
+    def shared(self, assets: int) -> Self:
+        """Return the baseline of one among many assets that share its budget of false alarms.
+
+        Each asset gets an equal part: whatever they have in common, all together raise at most the budget's alarms
+        (Bonferroni).
+
+        Raises BaselineError if there is not at least one asset.
+        """
+        if assets < 1:
+            raise BaselineError(f"a budget cannot be shared by {assets} assets, give at least 1")
+        monitor = self.loop.monitor
+        budget = monitor.false_alarms_per_year / assets
+        loop = self.loop.model_copy(update={"monitor": monitor.model_copy(update={"false_alarms_per_year": budget})})
+        limit = t2_threshold(loop, len(self.names), self.dof, self.rehearsed, bool(self.members))
+        others = tuple(other.shared(assets) for other in self.others)
+        changed = self.model_copy(update={"loop_settings": loop.to_dict(), "limit": limit, "others": others})
+        vars(changed).pop("loop", None)  # a copy takes along what was computed from the old settings
+        return changed
+
+    def covariance_array(self) -> FloatArray:
+        """Return `covariance` as an array (n, n)."""
+        return np.array(self.covariance)
+
+    def save(self, path: str | Path) -> None:
+        """Write the baseline as JSON; nothing half-written stays behind.
+
+        Raises
+        ------
+        OutputError
+            If the file cannot be written.
+        """
+        content = {"format": FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
+        atomic_write(Path(path), (json.dumps(content, indent=1) + "\n").encode())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a baseline.
+
+        Raises
+        ------
+        BaselineError
+            If the file is missing, is no baseline, or is one of another version.
+        """
+        path = Path(path)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise BaselineError(f"{path}: no such file; make a baseline with servoscope learn") from None
+        except OSError as error:
+            raise BaselineError(f"{path}: cannot be read ({error.strerror or error})") from None
+        except (ValueError, RecursionError):
+            raise BaselineError(
+                f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
+            ) from None
+        if not isinstance(content, Mapping) or content.get("format") != FORMAT:
+            raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
+        if content.get("version") != VERSION:
+            raise BaselineError(
+                f"{path}: baseline of version {content.get('version')!r}, this program reads {VERSION}: learn it again"
+            )
+        fields = {key: value for key, value in content.items() if key not in ("format", "version")}
+        try:
+            baseline = cls.model_validate(fields)
+            _ = [one.loop for one in baseline.per_point]
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise BaselineError(f"{path}: damaged baseline, {where}: {first['msg'].lower()}; learn it again") from None
+        except LoopError as error:
+            raise BaselineError(f"{path}: damaged baseline, {error}; learn it again") from None
+        return baseline
+
+
+def digest(loop: Loop, arrays: list[FloatArray]) -> str:
+    """Return a hash of a loop and of all samples that were learned from: 16 hexadecimal digits."""
+    h = hashlib.sha256(loop.hash().encode())
+    for array in arrays:
+        h.update(np.ascontiguousarray(array).tobytes())
+    return h.hexdigest()[:16]

@@ -1,0 +1,233 @@
+"""From estimates to "since when": the statistic T^2, its threshold from a false-alarm budget, its power, the onset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.estimation.pipeline import Estimates, Pipeline, Tuning
+from servoscope.signals import Recording
+
+SECONDS_PER_YEAR = 365.25 * 86400.0
+POWER = 0.9  # probability with which a promised change is seen
+REACH = 40.0  # memories before an alarm in which its onset is looked for first
+NEGLIGIBLE = 1e-9  # probability that it came earlier
+
+
+def threshold(
+    n: int, evaluation_rate: float, memory: float, false_alarms_per_year: float, dof: float, counted: float = 1.0
+) -> float:
+    """Return the limit of T^2 that a healthy loop crosses as often as the budget allows.
+
+    theta_hat forgets within `memory`, so looks close together are one look; how close depends on the level: an
+    Ornstein-Uhlenbeck process stays above a high level only for a time of the order of memory / level (Aldous, 1989,
+    section D). Simulated healthy loops show level / (2 memory) looks per second. The noise's variance is itself
+    estimated, so T^2 follows Hotelling's distribution rather than a chi-square.
+
+    `evaluation_rate`: evaluations per second [Hz]; `memory`: of the estimator [s]; `dof`: effective number of
+    independent values behind the noise's variance; `counted`: alarms that a rehearsal counted (see
+    `threshold_calibration`), divided by those that this rule expects.
+    """
+    from scipy import special  # not scipy.stats: half a second to import
+
+    dof = min(max(dof, n + 2.0), 1e9)
+    rest = dof - n + 1.0
+    limit = 10.0
+    for _ in range(20):
+        looks = counted * SECONDS_PER_YEAR * min(evaluation_rate, max(limit / (2.0 * memory), 1.0 / memory))
+        tail = min(false_alarms_per_year / looks, 0.5)
+        share = float(special.betaincinv(rest / 2.0, n / 2.0, tail))  # upper quantile of F(n, rest) through the beta's
+        limit = dof * (1.0 - share) / share
+    return limit
+
+
+def apply_alarm_delays(exceeded: BoolArray, on: int, off: int) -> BoolArray:
+    """Return an alarm with delays: raised when it has lasted for `on` evaluations, kept for `off` after it has gone."""
+    if not exceeded.any():
+        return exceeded
+    k, raised = np.arange(len(exceeded)), consecutive_exceedances(exceeded) > on
+    last = np.maximum.accumulate(np.where(raised, k, -off - 1))
+    return np.asarray(k - last <= off)
+
+
+def consecutive_exceedances(exceeded: BoolArray, before: int = 0) -> IntArray:
+    """Return for how many evaluations the limit has been exceeded without interruption, shape (K,).
+
+    `before`: the same for the evaluation before the first one.
+    """
+    k = np.arange(len(exceeded))
+    below = np.maximum.accumulate(np.where(exceeded, -1 - before, k))  # last evaluation below the limit
+    return np.asarray(k - below)
+
+
+def required_noncentrality(n: int, limit: float) -> float:
+    """Return the noncentrality at which a chi-square with n degrees of freedom exceeds `limit` with `POWER`."""
+    from scipy import special
+
+    return float(special.chndtrinc(limit, n, 1.0 - POWER))
+
+
+def whiten(covariance: FloatArray, deviation: FloatArray) -> FloatArray:
+    """Return L^-1 d with L L' the covariance, row by row; units of very different sizes are evened out first.
+
+    `covariance`: shape (K, n, n); `deviation`: shape (K, n) or (K, n, m).
+    """
+    n = covariance.shape[-1]
+    # columns of many evaluations at a time: LAPACK takes longer to begin than a matrix of this size takes
+    C = np.ascontiguousarray(np.moveaxis(covariance, 0, -1))
+    columns = np.moveaxis(deviation if deviation.ndim == 3 else deviation[..., None], 0, -1)
+    size = np.sqrt(np.maximum(np.array([C[i, i] for i in range(n)]), np.finfo(float).tiny))
+    L: dict[tuple[int, int], FloatArray] = {}
+    white = np.empty(columns.shape)
+    for i in range(n):
+        for j in range(i + 1):
+            left = C[i, j] / (size[i] * size[j]) + (1e-12 if i == j else 0.0)
+            for k in range(j):
+                left -= L[i, k] * L[j, k]
+            if i == j and not (left > 0.0).all():
+                raise np.linalg.LinAlgError("a covariance is not positive definite")
+            L[i, j] = np.sqrt(left) if i == j else left / L[j, j]
+        rest = columns[i] / size[i]
+        for k in range(i):
+            rest -= L[i, k] * white[k]
+        white[i] = rest / L[i, i]
+    white = np.moveaxis(white, -1, 0)
+    return np.asarray(white[..., 0] if deviation.ndim == 2 else white)
+
+
+def t2_statistic(theta: FloatArray, expected: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return ``T^2 = (theta - mu)' Cov^-1 (theta - mu)``, shape (K,)."""
+    return np.asarray((whiten(covariance, theta - expected) ** 2).sum(axis=-1))
+
+
+def noncentrality(covariance: FloatArray, Psi: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return what a unit change along each direction would have added to T^2 by now.
+
+    After a change Delta the mean of theta_hat has moved by (I - Psi) Delta, so the recording's own excitation, and
+    not a promise made elsewhere, says what would have been seen.
+
+    `covariance, Psi`: shape (K, n, n); `directions`: one change per row, shape (m, n); returns numpy.ndarray: shape
+    (K, m).
+    """
+    moved = (np.eye(Psi.shape[-1]) - Psi) @ directions.T
+    return np.asarray((whiten(covariance, moved) ** 2).sum(axis=-2))
+
+
+@dataclass(frozen=True)
+class Onset:
+    """Since when: the 95 % interval and the most likely time [s], and the sample of the latter."""
+
+    low_s: float
+    likely_s: float
+    high_s: float
+    sample: int
+
+
+def estimate_onset(
+    pipeline: Pipeline,
+    tuning: Tuning,
+    recording: Recording,
+    estimates: Estimates,
+    healthy: FloatArray,
+    faulty: FloatArray,
+    until: int,
+    last: int,
+) -> Onset:
+    """Find when the regression stopped following `healthy` and began to follow `faulty`.
+
+    Change point by maximum likelihood on the residual whitened by an autoregression of the noise, with a flat prior
+    over the samples before the alarm (Basseville and Nikiforov, 1993, section 2.6). While the filters settle, the
+    share of the change that they have let through counts.
+
+    `healthy, faulty`: coefficients before and after, shape (n,); `until`: sample of the alarm: the onset is not
+    later; `last`: last sample that `faulty` speaks for.
+    """
+    reach = round(REACH * pipeline.memory * pipeline.stride)
+    while True:
+        begin = max(until - reach, 0) // pipeline.stride * pipeline.stride
+        near = recording.rows(slice(begin, min(last, until + reach) + 1))
+        likelihood = _likelihood(pipeline, tuning, near, float(estimates.power[-1]), healthy, faulty, until - begin)
+        weight = np.exp(likelihood - likelihood.max())
+        share = np.cumsum(weight) / weight.sum()
+        likely = int(np.argmax(likelihood))
+        if not begin or share[(until - begin) // 2] < NEGLIGIBLE:
+            break
+        reach *= 2  # the change may have come earlier
+    low, high = (begin + int(k) for k in np.searchsorted(share, [0.025, 0.975]))
+    likely += begin
+    # what the filters leave of a step is known only about, so neither end is surer than half their settling time
+    blur = pipeline.bank.wait / (2.0 * recording.sample_rate)
+    t = recording.t
+    return Onset(
+        max(float(t[min(low, until)]) - blur, float(t[0])),
+        float(t[likely]),
+        min(float(t[min(high, until)]) + blur, float(t[until])),
+        likely,
+    )
+
+
+def _likelihood(
+    pipeline: Pipeline,
+    tuning: Tuning,
+    recording: Recording,
+    power: float,
+    healthy: FloatArray,
+    faulty: FloatArray,
+    until: int,
+) -> FloatArray:
+    """Return the logarithm of the likelihood of a change at each of the samples up to `until`, but for a constant."""
+    # u itself changes at once, where u_a of stage 1 has to learn the change first
+    single = replace(pipeline, stage_one=None)
+    g = single.regression(recording.r, recording.u, recording.y, recording.restart)
+    used = np.flatnonzero(g.ok)
+    phi = g.phi[used]
+    changed = phi @ (faulty - healthy)
+    noise = tuning.noise.autoregression()  # a short memory: what surrounds each candidate is computed anew
+    costs = _change_costs(g.eta[used] - phi @ healthy, changed, noise.a, _onset_of_filters(pipeline))
+    scale = 2.0 * noise.variance * max(1.0, power)
+    # a change between two updates shows at the later one
+    at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
+    return np.asarray(-costs[at_update] / scale)
+
+
+def _onset_of_filters(pipeline: Pipeline) -> FloatArray:
+    """Return how much of a sudden change the filters have let through, update by update: 0 to 1, shape (W,)."""
+    bank = pipeline.bank
+    w = np.zeros((bank.wait + 1, bank.system.B.shape[1]))
+    w[1:, 1] = 1.0  # u steps
+    response = bank.system.simulate(w)[1:, 0] / bank.gain
+    share = response[pipeline.stride - 1 :: pipeline.stride] / max(float(response[-1]), 1e-12)
+    return np.asarray(np.clip(share, 0.0, 1.0))
+
+
+def _change_costs(v: FloatArray, changed: FloatArray, a: FloatArray, ramp: FloatArray) -> FloatArray:
+    """Return the sum of squared innovations for a change at each update, shape (N,).
+
+    The residual under a change at i is v(k) - ramp(k - i) changed(k): v before, v - changed once the filters have
+    settled, and in between the share of the change that they have let through.
+    """
+    N, p, W = len(v), len(a), len(ramp)
+    before, after = (_whiten_ar(each, a) ** 2 for each in (v, v - changed))
+    sum_before = np.concatenate([[0.0], np.cumsum(before)])
+    sum_after = np.concatenate([[0.0], np.cumsum(after)])
+    span = W + p  # updates whose innovation mixes the two
+    padded_v = np.concatenate([np.zeros(p), v, np.zeros(span)])
+    padded_changed = np.concatenate([np.zeros(p), changed, np.zeros(span)])
+    share = np.concatenate([np.zeros(p), ramp, np.ones(p)])
+    windows = np.lib.stride_tricks.sliding_window_view
+    residual = windows(padded_v, p + span)[:N] - share * windows(padded_changed, p + span)[:N]
+    white = residual[:, p:].copy()
+    for lag, weight in enumerate(a, start=1):
+        white -= weight * residual[:, p - lag : p - lag + span]
+    inside = np.arange(N)[:, None] + np.arange(span) < N
+    end = np.minimum(np.arange(N) + span, N)
+    return np.asarray(sum_before[:N] + (white**2 * inside).sum(axis=1) + sum_after[N] - sum_after[end])
+
+
+def _whiten_ar(v: FloatArray, a: FloatArray) -> FloatArray:
+    white = v.copy()
+    for lag, weight in enumerate(a, start=1):
+        white[lag:] -= weight * v[:-lag]
+    return white

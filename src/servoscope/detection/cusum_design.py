@@ -1,0 +1,198 @@
+"""The sequential test's design: which changes it listens for, from which size on, and where each of them alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import LoopError, SimulationError
+from servoscope.detection.chi2_test import SECONDS_PER_YEAR
+from servoscope.detection.expectation import Expectation, residual_noise_model
+from servoscope.estimation.filter_bank import closed_loop_system, nominal_theta
+from servoscope.estimation.kernel.cusum import LAGS, CusumConstants, lagged_columns, whitening_filter
+from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.models.plants import Plant
+
+FACTOR = 4.0  # in information from one size to the next: in between, a CUSUM is at most a fifth slower than the best
+FASTEST = 2000.0  # 1/s; a change with more information shows within a few samples anyway
+OVERSHOOT = 1.166  # twice Siegmund's 0.583: by how much a random walk passes its limit, in its own steps
+SLOWEST = 0.05  # 1/s; with less, a change would take a quarter of an hour
+TRIED = 8  # sizes per direction at which the information is computed
+STEP = 1e-3  # of the logarithm of a parameter, for derivatives
+FEWEST = 500  # updates with less of which a reference says nothing
+LONGEST = 60.0  # s of a healthy recording by which the test is designed
+HARDEST = 1.3  # a limit raised by more than this for the baseline's own uncertainty is not worth having
+
+
+@dataclass(frozen=True)
+class CusumHypothesis:
+    """One expected change, and what its CUSUM would do to a healthy loop."""
+
+    parameter: str  # parameter, ratio: what changes, and to how many times its healthy value
+    ratio: float
+    # weights of the shadow's columns (see `servoscope.estimation.kernel.cusum.columns`) that it looks like
+    change: tuple[float, ...]
+    rate: float  # false alarms per year at a limit of zero, to be divided by exp(limit)
+    drift: float  # variance of the drift that an error of the baseline causes, in units of the drift under the change
+
+    def limit(self, false_alarms_per_year: float) -> float:
+        """Return where the CUSUM alarms; infinity where the baseline is too uncertain for so small a change.
+
+        The limit solves rate exp(-h + 2 h^2 drift) = budget: averaged over the baseline's error, which is Gaussian,
+        false alarms grow by the second term.
+        """
+        level = float(np.log(max(self.rate / false_alarms_per_year, np.e)))
+        if 8.0 * self.drift * level >= 1.0:
+            return np.inf
+        h = 2.0 * level / (1.0 + float(np.sqrt(1.0 - 8.0 * self.drift * level)))
+        return h if h <= HARDEST * level else np.inf
+
+
+def choose_cusum_hypotheses(
+    expectation: Expectation, plant: Plant, noise: WhiteNoise, covariance: FloatArray
+) -> tuple[CusumHypothesis, ...]:
+    """Choose the changes to listen for.
+
+    A CUSUM whose steps shift by m(k) standard deviations under its change raises m^2/2 exp(-h - 1.166 m) false alarms
+    per step at a limit h (Siegmund, 1985, chapter 10).
+
+    `covariance`: of the logarithms of the plant's parameters, shape (m, m).
+    """
+    whitened = _WhitenedResidual(_design_expectation(expectation), plant, noise)
+    if len(whitened.phi) < FEWEST:
+        return ()
+    size = np.sqrt((whitened.phi**2).mean(axis=0))
+    found = []
+    for fault in plant.faults:
+        for bound in np.log(fault.ratio_range):
+            for x in _hypothesis_sizes(partial(whitened.shift, fault.parameter), float(bound), whitened.rate):
+                try:
+                    d = whitened.shift(fault.parameter, x)
+                except SimulationError:
+                    continue
+                change = np.linalg.lstsq(whitened.phi / size, d, rcond=None)[0] / size
+                found.append(CusumHypothesis(fault.parameter, float(np.exp(x)), tuple(change.tolist()), 0.0, 0.0))
+    return whitened.worst_case(found, covariance)
+
+
+def worst_case_hypotheses(
+    expectation: Expectation, plant: Plant, noise: WhiteNoise, covariance: FloatArray, chosen: Sequence[CusumHypothesis]
+) -> tuple[CusumHypothesis, ...]:
+    """Return the same changes with rate and drift under another reference where those are worse."""
+    return _WhitenedResidual(_design_expectation(expectation), plant, noise).worst_case(chosen, covariance)
+
+
+def _design_expectation(expectation: Expectation) -> Expectation:
+    return expectation.truncate(design_duration_s(expectation.pipeline))
+
+
+def design_duration_s(pipeline: Pipeline) -> float:
+    """Return how much of a reference the design needs [s]."""
+    return max(LONGEST, 10.0 * FEWEST * pipeline.stride / pipeline.loop.sample_rate)
+
+
+class _WhitenedResidual:
+    """The whitened residual of the simulated loop under one reference, and how changes of the plant shift it."""
+
+    def __init__(self, expectation: Expectation, plant: Plant, noise: WhiteNoise) -> None:
+        pipeline = expectation.pipeline
+        self.expectation, self.plant = expectation, plant
+        self.rate = pipeline.loop.sample_rate / pipeline.stride
+        self.noise_model = residual_noise_model(pipeline, plant, noise)
+        self.theta, self.warm_up = nominal_theta(pipeline.loop, plant), whitening_filter(self.noise_model)[3]
+        g = expectation.regression(plant)
+        self.phi = lagged_columns(self.noise_model.whiten(g.phi[g.ok]))[self.warm_up :]
+        self.healthy = self.noise_model.whiten((g.eta - g.phi @ self.theta)[g.ok])
+
+    def shift(self, parameter: str, x: float) -> FloatArray:
+        """Return what moving the logarithm of a parameter by x adds to the residual, update by update."""
+        faulty = self.plant.scaled({parameter: float(np.exp(x))})
+        return (self.noise_model.whiten(self.expectation.mean_residual(faulty, self.theta)) - self.healthy)[
+            self.warm_up :
+        ]
+
+    def worst_case(self, chosen: Sequence[CusumHypothesis], covariance: FloatArray) -> tuple[CusumHypothesis, ...]:
+        """Return the members with rate and drift under this reference where they are worse than those that stand."""
+        if len(self.phi) < FEWEST:
+            return tuple(chosen)
+        names = self.plant.physical_parameters[: len(covariance)]
+        drift = np.array([self.shift(parameter, STEP) / STEP for parameter in names])
+        found = []
+        for member in chosen:
+            d = self.phi @ np.array(member.change)
+            m = np.abs(d)
+            false = self.rate * float((0.5 * m**2 * np.exp(-OVERSHOOT * m)).mean()) * SECONDS_PER_YEAR
+            q = drift @ d / max(float(d @ d), 1e-300)
+            worst = max(member.rate, false), max(member.drift, float(q @ covariance @ q))
+            found.append(replace(member, rate=worst[0], drift=worst[1]))
+        return tuple(found)
+
+
+def _hypothesis_sizes(shift: Callable[[float], FloatArray], bound: float, rate: float) -> list[float]:
+    """Return sizes between nothing and a bound, `FACTOR` apart in information per second, largest first.
+
+    The information is computed at a few sizes and read off in between on logarithmic scales.
+    """
+    tried, information = [], []
+    for x in np.geomspace(abs(bound), 1e-3, TRIED) * np.sign(bound):
+        try:
+            d = shift(float(x))
+        except SimulationError:  # nobody could have recorded it
+            continue
+        tried.append(float(np.log(abs(x))))
+        information.append(float(np.log(max(rate * float(d @ d) / len(d), 1e-300))))
+    if not tried:
+        return []
+    logs = np.minimum.accumulate(np.array(information))[::-1]  # a larger change may tell less: the smaller one counts
+    target, sizes = min(np.log(FASTEST), logs[-1]), []
+    while target >= max(np.log(SLOWEST), logs[0]):
+        sizes.append(float(np.sign(bound) * np.exp(np.interp(target, logs, np.array(tried)[::-1]))))
+        target -= np.log(FACTOR)
+    return sizes
+
+
+def build_cusum_constants(
+    pipeline: Pipeline,
+    plant: Plant,
+    noise: WhiteNoise,
+    scale: FloatArray,
+    chosen: Sequence[CusumHypothesis],
+    false_alarms_per_year: float,
+) -> CusumConstants | None:
+    """Turn the design into what the compiled test takes; None where there is nothing to listen for.
+
+    The plant is the healthy one, which the test simulates beside the recursion; the budget is that of all CUSUMs.
+    """
+    share = false_alarms_per_year / max(len(chosen), 1)
+    hypotheses = [member for member in chosen if np.isfinite(member.limit(share))]
+    if not hypotheses:
+        return None
+    limits = np.array([member.limit(false_alarms_per_year / len(hypotheses)) for member in hypotheses])
+    try:
+        quiet = closed_loop_system(pipeline.loop, plant).input(np.eye(3, 1))
+    except LoopError as error:
+        raise SimulationError(str(error)) from None
+    shadow = quiet.then(pipeline.bank.linear)
+    numerator, denominator, gain, warm = whitening_filter(residual_noise_model(pipeline, plant, noise))
+    rows = np.concatenate([[1.0], 1.0 / scale])[:, None]
+    return CusumConstants(
+        A=shadow.A,
+        B=shadow.B,
+        C=np.ascontiguousarray(rows * shadow.C),
+        D=np.ascontiguousarray(rows * shadow.D),
+        X0=shadow.steady,
+        theta=nominal_theta(pipeline.loop, plant) * scale,
+        numerator=numerator,
+        denominator=denominator,
+        gain=gain,
+        warm=warm,
+        changes=np.ascontiguousarray(
+            np.array([member.change for member in hypotheses]) * np.pad(scale, (0, LAGS), mode="edge")
+        ),
+        limits=limits,
+    )

@@ -1,0 +1,118 @@
+"""Whether healthy recordings show one and the same plant, and what their scatter adds to the covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.messages import Message, message
+from servoscope.detection.chi2_test import t2_statistic
+
+BY_CHANCE = 1e-3  # probability with which recordings of one plant may be called different
+SCATTER_BY_CHANCE = 0.01  # probability of such scatter by noise alone, below which few recordings are believed
+ENOUGH = 4  # recordings whose scatter is believed in any case
+
+
+@dataclass(frozen=True)
+class RecordingOutlier:
+    """A recording that differs from the others."""
+
+    recording: int
+    # statistic, limit: T^2 of its distance to the mean of the others, and what chance reaches in one of a thousand
+    # baselines
+    statistic: float
+    limit: float
+    # coefficient, deviations: number of the coefficient that differs most, and by how many standard deviations
+    coefficient: int
+    deviations: float
+
+
+def find_outliers(apart: FloatArray, covariances: FloatArray) -> list[RecordingOutlier]:
+    """Return the recordings that differ from the others, the most different first.
+
+    Each is compared with the mean of the others, weighted by what each of them knows: T^2 is then chi-square with n
+    degrees of freedom. The most different one is put aside and the rest compared again, or it would speak for them.
+
+    The coefficients (m, n) are those of each recording less what its reference explains, with covariances (m, n, n).
+    """
+    from scipy import special
+
+    m, n = apart.shape
+    limit = float(special.chdtri(n, BY_CHANCE / m))
+    x, C, W = _standardise(apart, covariances)
+    remaining, outliers_found = list(range(m)), []
+    while len(remaining) > 1:
+        compared = [_compare(k, [j for j in remaining if j != k], x, C, W, limit) for k in remaining]
+        worst = max(compared, key=lambda outliers: outliers.statistic)
+        if worst.statistic <= limit:
+            break
+        outliers_found.append(worst)
+        remaining.remove(worst.recording)
+    return outliers_found
+
+
+def _standardise(apart: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return coefficients and covariances in standard deviations, and the inverses of the latter."""
+    size = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
+    C = covariances / np.outer(size, size)
+    return apart / size, C, np.asarray(np.linalg.inv(C), dtype=np.float64)
+
+
+def _compare(k: int, others: list[int], x: FloatArray, C: FloatArray, W: FloatArray, limit: float) -> RecordingOutlier:
+    known = np.linalg.inv(W[others].sum(axis=0))
+    mean = known @ np.einsum("jab,jb->a", W[others], x[others])
+    covariance = C[k] + known
+    T2 = float(t2_statistic(x[k][None], mean[None], covariance[None])[0])
+    deviations = (x[k] - mean) / np.sqrt(np.diag(covariance))
+    most = int(np.argmax(np.abs(deviations)))
+    return RecordingOutlier(k, T2, limit, most, float(deviations[most]))
+
+
+def describe_outliers(
+    outliers: Sequence[RecordingOutlier], recordings: Sequence[str], coefficients: Sequence[str]
+) -> list[Message]:
+    """Return one message, or none: which recordings differ, and what to do about it."""
+    if not outliers:
+        return []
+    first, name = outliers[0], recordings[outliers[0].recording]
+    t2 = {"statistic": first.statistic, "limit": first.limit}
+    if len(recordings) == 2:
+        outlier = message("learning.outlier_pair", first=recordings[0], second=recordings[1], **t2)
+        remedy = message("learning.learn_two_points")
+    elif len(outliers) == 1:
+        outlier = message("learning.outlier_one", recording=name, **t2)
+        remedy = message("learning.learn_one_point")
+    else:
+        counts = {"count": len(outliers), "recordings": len(recordings)}
+        outlier = message("learning.outlier_several", recording=name, **counts, **t2)
+        remedy = message("learning.learn_several_points")
+    most = {"coefficient": coefficients[first.coefficient], "deviations": abs(first.deviations)}
+    return [message("learning.outlier", outlier=outlier, remedy=remedy, **most)]
+
+
+def scatter(apart: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return the covariance between recordings beyond their noise; it is diagonal, few recordings give no more.
+
+    A further recording scatters like Student's t around the mean of m, with the variance (m - 1)/(m - 3); fewer than
+    four recordings get the factor of four. A variance of two or three values is mostly chance, opens directions that
+    noise leaves narrow, and would let two recordings of one plant promise less than one of them. It counts only where
+    noise does not explain it: Cochran's (1954) Q, the weighted squares of the distances to the weighted mean, is
+    chi-square with (m - 1) n degrees of freedom then. Four and more always count: real machines scatter.
+
+    The arguments are those of `find_outliers`.
+    """
+    from scipy import special
+
+    m, n = apart.shape
+    x, C, W = _standardise(apart, covariances)
+    mean = np.linalg.solve(W.sum(axis=0), np.einsum("jab,jb->a", W, x))
+    Q = float(t2_statistic(x, np.broadcast_to(mean, x.shape), C).sum())
+    if m < 2 or (m < ENOUGH and special.chdtrc((m - 1) * n, Q) > SCATTER_BY_CHANCE):
+        return np.zeros((n, n))
+    own = np.mean([np.diag(c) for c in covariances], axis=0)
+    beyond = np.maximum(apart.var(axis=0, ddof=1) - own, 0.0)
+    students = (m - 1.0) / (m - 3.0) if m >= ENOUGH else 3.0
+    return np.diag(beyond * students * (1.0 + 1.0 / m))

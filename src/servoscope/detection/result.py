@@ -1,0 +1,382 @@
+"""The result of a diagnosis as data: verdict, intervals with faults and candidates, warnings; and a monitor's trace."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, computed_field, model_validator
+
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.messages import Message, MessageField, message, read_messages, render, text_message
+from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.signals import Defect
+
+Verdict = Literal["healthy", "fault", "undetermined"]
+UNKNOWN = "unknown"
+SEVERITY = "severity"  # the parameter of a fault that was learned from labelled recordings
+
+
+class _ResultModel(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class FaultEstimate(_ResultModel):
+    """A fault with its size: `ratio` of `parameter` to its healthy value, and the 95 % interval of it.
+
+    The parameter of a fault learned from labelled recordings is ``severity``: there `ratio` is to the labelled one.
+    """
+
+    name: str
+    parameter: str
+    ratio: float
+    interval: tuple[float, float]
+
+    @property
+    def learned(self) -> bool:
+        """Whether it is known from labelled recordings, so that `ratio` is a share of their severity."""
+        return self.parameter == SEVERITY
+
+    @property
+    def change(self) -> float:
+        """How far from healthy it is: of the parameter's healthy value, or of the labelled severity."""
+        return self.ratio if self.learned else abs(self.ratio - 1.0)
+
+
+class Candidate(_ResultModel):
+    """One explanation of a detected change; ``unknown`` carries no faults."""
+
+    name: str
+    probability: float
+    faults: tuple[FaultEstimate, ...] = ()
+    misfit: float | None = None  # squared standard deviations by which it fits worse than the best; None for unknown
+    covariance: tuple[tuple[float, ...], ...] | None = None  # of a pair: of the logarithms of its ratios, shape (k, k)
+    # Of a fault learned from labelled recordings: of the angle between the deviation and its direction, in units of
+    # the misfit's covariance; 1 is the same way, 0 elsewhere, -1 the opposite way.
+    cosine: float | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of its faults, of which `name` is made; ``unknown`` where there are none."""
+        return tuple(fault.name for fault in self.faults) or (self.name,)
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether it is a fault learned from labelled recordings."""
+        return any(fault.learned for fault in self.faults)
+
+
+class Mimic(_ResultModel):
+    """A cause outside the list of faults that explains the recording as well, or better where the answer is unknown."""
+
+    name: str
+    description: MessageField
+    value: float  # a ratio to the healthy value, or a size in `unit`
+    unit: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, written: Any) -> Any:
+        return read_messages(written, description="words")
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def words(self) -> str:
+        """The description as text."""
+        return render(self.description)
+
+    @property
+    def size(self) -> Message:
+        """Its value with its unit, a ratio as a factor."""
+        if self.unit == "ratio":
+            return message("diagnosis.mimic_ratio", value=self.value)
+        unit = {"in units of y": message("diagnosis.units_of_y"), "in units of u": message("diagnosis.units_of_u")}
+        return message("diagnosis.mimic_size", value=self.value, unit=unit.get(self.unit, self.unit))
+
+
+class RefitSummary(_ResultModel):
+    """The refit of the seconds around the onset, from which onset and candidates of a diagnosis come."""
+
+    from_s: float  # from_s, to_s: the seconds that were fitted
+    to_s: float
+    over_s: float  # how long the change grew; 0 where it may have been a step, growing for less than the onset interval
+    noise: float  # standard deviation of the innovations, as a multiple of the baseline's
+    misfit: float  # what the best candidate leaves unexplained
+    limit: float  # of the misfit; a true candidate exceeds it in one of a thousand cases
+    recursive: tuple[Candidate, ...]  # what the recursion alone, with its memory, finds at its last evaluation
+    mimics: tuple[Mimic, ...]
+
+    @property
+    def drifting(self) -> bool:
+        """Whether the change grew, by an explanation that fits."""
+        return self.over_s > 0.0 and self.misfit <= self.limit
+
+
+class FinalCoefficient(_ResultModel):
+    """A coefficient at the end of the recording: value, standard deviation, and what a healthy loop would show."""
+
+    value: float
+    std: float
+    nominal: float
+
+
+class ResponsePoint(_ResultModel):
+    """The iFRF at one monitored frequency at the end of the recording."""
+
+    frequency_hz: float
+    real: float
+    imag: float
+    real_std: float
+    imag_std: float
+    nominal_real: float
+    nominal_imag: float
+
+
+class DiagnosisWarning(_ResultModel):
+    """Something about the recording that the reader should know."""
+
+    kind: str
+    from_s: float
+    to_s: float
+    count: int
+    description: MessageField
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, written: Any) -> Any:
+        return read_messages(written, description="message")
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def message(self) -> str:
+        """The description as text."""
+        return render(self.description)
+
+    @classmethod
+    def of(cls, defect: Defect) -> DiagnosisWarning:
+        """Turn a recording's defect into a warning."""
+        return cls(
+            kind=defect.kind,
+            from_s=defect.from_s,
+            to_s=defect.to_s,
+            count=defect.count,
+            description=text_message(defect.message),
+        )
+
+
+class FaultInterval(_ResultModel):
+    """A time during which the actuator differed from healthy, and what explains that."""
+
+    detected_at_s: float | None = None  # first evaluation above a threshold
+    onset_s: tuple[float, float, float] | None = None  # lower end, most likely, upper end of the 95 % interval
+    end_s: float | None = None  # when the alarm went; None while it lasts
+    from_start: bool = False  # the change may be older than the recording
+    probability: float | None = None  # of the first candidate
+    faults: tuple[FaultEstimate, ...] = ()  # those that are named; none where no candidate reaches probability 0.95
+    candidates: tuple[Candidate, ...] = ()  # most probable first
+    refit: RefitSummary | None = None  # what the candidates rest on; None where the recursion alone found them
+
+
+class Provenance(_ResultModel):
+    """What a diagnosis was made with: versions, and hashes of the baseline and of the recording's samples."""
+
+    servoscope: str
+    python: str
+    numpy: str
+    baseline: str
+    recording: str
+
+
+WRITTEN_INTERVAL = frozenset(FaultInterval.model_fields) - {"end_s", "from_start"}  # fields that a Diagnosis repeats
+
+
+class Diagnosis(_ResultModel):
+    """The verdict on one recording.
+
+    Parameters
+    ----------
+    recording, samples, duration_s
+        What was examined.
+    verdict
+        ``undetermined`` when the recording excites too little or is too short to show a change of the size that the
+        baseline promises.
+    headline
+        The verdict in one sentence; as text: `summary`.
+    reasons
+        Why, sentence by sentence: what moved, what was rejected; as text: `explanation`.
+    intervals
+        When the actuator differed from healthy, in order; `onset_s`, `detected_at_s`, `probability`, `faults`,
+        `candidates` and `refit` are those of the last one, None or empty where there is none.
+    parameters, ifrf
+        At the end of the recording.
+    warnings
+        Defects of the recording, and doubts about the result.
+    point
+        Operating point whose baseline was used; None where the baseline has none.
+    provenance
+        Versions and hashes by which `servoscope verify` repeats it; None where nobody asked for them.
+    """
+
+    recording: str
+    samples: int
+    duration_s: float
+    verdict: Verdict
+    headline: MessageField
+    reasons: tuple[MessageField, ...] = ()
+    intervals: tuple[FaultInterval, ...] = ()
+    parameters: dict[str, FinalCoefficient]
+    ifrf: tuple[ResponsePoint, ...]
+    warnings: tuple[DiagnosisWarning, ...] = ()
+    point: str | None = None
+    provenance: Provenance | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, written: Any) -> Any:
+        """Read what was written, by version 0.1.0 too: it had text for messages, and no list of intervals."""
+        if not isinstance(written, Mapping):
+            return written
+        fields = read_messages(written, headline="summary", reasons="explanation")
+        last = {name: fields.pop(name) for name in WRITTEN_INTERVAL if name in fields}
+        if "intervals" not in fields and any(value not in (None, (), []) for value in last.values()):
+            fields["intervals"] = (last,)
+        return fields
+
+    @property
+    def current(self) -> FaultInterval:
+        """The last interval; an empty one where there is none."""
+        return self.intervals[-1] if self.intervals else FaultInterval()
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def summary(self) -> str:
+        """The verdict in one sentence."""
+        return render(self.headline)
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def explanation(self) -> tuple[str, ...]:
+        """Why, sentence by sentence."""
+        return tuple(render(reason) for reason in self.reasons)
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def detected_at_s(self) -> float | None:
+        """First evaluation above a threshold."""
+        return self.current.detected_at_s
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def onset_s(self) -> tuple[float, float, float] | None:
+        """Lower end, most likely, upper end of the 95 % interval of the onset."""
+        return self.current.onset_s
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def probability(self) -> float | None:
+        """Of the first candidate; None when nothing was detected."""
+        return self.current.probability
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def faults(self) -> tuple[FaultEstimate, ...]:
+        """Named faults; empty when healthy and when no candidate reaches probability 0.95."""
+        return self.current.faults
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Explanations, the most probable first."""
+        return self.current.candidates
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def refit(self) -> RefitSummary | None:
+        """What the candidates rest on; None where the recursion alone found them."""
+        return self.current.refit
+
+    def dated_headline(self, began: float, onset: float | None = None) -> Message:
+        """Return the headline with a date instead of seconds since the recording began, at `began` [UTC s].
+
+        `onset`: of a change that is older than the recording, where it is known [UTC s].
+        """
+        since = self.headline.values.get("since")
+        if self.current.onset_s is None or not isinstance(since, Message):
+            return self.headline
+        if self.current.from_start and onset is None:
+            since = message("diagnosis.since_start_date", t=began)
+        else:
+            at = began + self.current.onset_s[1] if onset is None else onset
+            since = message("diagnosis.since_date", t=at, growth=since.values.get("growth"))
+        return self.headline.model_copy(update={"values": {**self.headline.values, "since": since}})
+
+
+@dataclass(frozen=True, eq=False)
+class Statistic:
+    """One of the statistics that raise the alarm, over K evaluations."""
+
+    name: str  # ``t2``; ``cusum``, the sequential test
+    value: FloatArray  # shape (K,)
+    limit: float | FloatArray
+    exceeded: BoolArray  # shape (K,)
+
+
+def detection_statistics(
+    t2: FloatArray, limit: float | FloatArray, cusum: FloatArray, ready: BoolArray
+) -> tuple[Statistic, ...]:
+    """Return the statistics that raise the alarm, each with where it is above its limit."""
+    return (Statistic("t2", t2, limit, ready & (t2 > limit)), Statistic("cusum", cusum, 1.0, ready & (cusum >= 1.0)))
+
+
+def any_exceeded(statistics: tuple[Statistic, ...]) -> BoolArray:
+    """Return where one of the statistics is above its limit, shape (K,)."""
+    return np.logical_or.reduce([statistic.exceeded for statistic in statistics])  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """The output of a monitor over time, K evaluations; for a fleet all shapes begin with the assets."""
+
+    t: FloatArray  # in s, shape (K,)
+    names: tuple[str, ...]  # of the n coefficients
+    # theta, covariance: the estimate, shapes (K, n) and (K, n, n); where the loop can be simulated, without the biases
+    # of the regression by intersample behaviour and by noise in the regressors
+    theta: FloatArray
+    covariance: FloatArray
+    expected: FloatArray  # what a healthy loop would show under the same reference, shape (K, n)
+    statistic: FloatArray  # T^2, shape (K,)
+    threshold: float | FloatArray  # of the statistic; for a fleet one per asset, shape (assets, 1)
+    level: FloatArray  # largest CUSUM since the evaluation before, as a multiple of its limit, shape (K,); 0: no CUSUM
+    crossed: FloatArray  # when a CUSUM passed its limit [s], NaN where none is above it, shape (K,)
+    ifrf: FrequencyResponse  # at the monitored frequencies, of `theta`
+    ifrf_expected: FrequencyResponse  # and of `expected`
+    ready: BoolArray  # whether the estimator had learned anything by then, shape (K,)
+
+    @cached_property
+    def statistics(self) -> tuple[Statistic, ...]:
+        """The statistics that raise the alarm: T^2 and the sequential test."""
+        return detection_statistics(self.statistic, self.threshold, self.level, self.ready)
+
+    @cached_property
+    def exceeded(self) -> BoolArray:
+        """Whether any of the statistics is above its limit, without on-delay and off-delay, shape (K,)."""
+        return any_exceeded(self.statistics)
+
+    def table(self) -> dict[str, FloatArray]:
+        """Return the columns of ``diagnose --trace``: t, theta_0 ..., ifrf_1Hz_real ..., statistic, threshold, level.
+
+        The last is the sequential test's, which alarms at 1.
+        """
+        columns = {"t": self.t}
+        for i in range(self.theta.shape[1]):
+            columns[f"theta_{i}"] = self.theta[:, i]
+        for i, f in enumerate(self.ifrf.frequencies):
+            columns[f"ifrf_{f:g}Hz_real"] = self.ifrf.H[:, i].real
+            columns[f"ifrf_{f:g}Hz_imag"] = self.ifrf.H[:, i].imag
+        columns["statistic"] = self.statistic
+        columns["threshold"] = np.full(len(self.t), self.threshold)
+        columns["level"] = self.level
+        return columns

@@ -1,0 +1,204 @@
+"""Signals that are not what the loop file says: stuck, wrapped, exchanged, of the other sign or in another unit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core import outofcore
+from servoscope.core.arrays import FloatArray
+from servoscope.core.messages import Message, message
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.signals import Recording
+from servoscope.signals.quality import QualityFinding, QualitySettings, check_block, init_state
+
+SIGNALS = ("r", "u", "y")
+# units that are confused: powers of ten; inches and mm; degrees and radians; turns and radians; per minute and second
+FACTORS = (*(10.0**k for k in range(1, 7)), 25.4, 180.0 / np.pi, 2.0 * np.pi, 60.0)
+CLEARER = 5.0  # times smaller is the residual of the healthy plant where the signals are put right
+FROZEN_S = 1.0  # how long y or u stays exactly the same while the motion demands a change [s]
+TRAVEL = 0.1  # of the range of y, that r moves by then
+JUMP = 0.4  # of the range of y, in one sample: a counter that wraps or is reset
+MOST_JUMPS = 0.1  # share of the samples
+SMOOTHER = 2.0  # times smaller are all other steps of y, and those of r at that time
+AHEAD = 3  # samples that r may step before y does
+MOST_ROWS = 50_000  # that the residual is computed from
+UNEXPLAINED, EXPLAINED = 0.1, 0.05  # share of eta^2 that a plant known roughly leaves of signals: wrong, right
+UNIT_ERROR = 0.25  # relative, up to which the spreads of r and y tell the factor between their units
+
+
+@dataclass(frozen=True)
+class SignalDefect:
+    """What is wrong with a signal, and from which sample on."""
+
+    begin: int  # sample
+    description: Message
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Which columns are taken as r, u and y, and what each is multiplied by."""
+
+    order: tuple[int, int, int] = (0, 1, 2)
+    factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def apply(self, recording: Recording) -> Recording:
+        """Return the recording with its signals put right."""
+        columns = (recording.r, recording.u, recording.y)
+        r, u, y = (columns[i] * factor for i, factor in zip(self.order, self.factors, strict=True))
+        return replace(recording, r=r, u=u, y=y)
+
+    @property
+    def description(self) -> Message:
+        """What it says of the signals."""
+        moved = tuple(name for i, name in enumerate(SIGNALS) if self.order[i] != i)
+        if moved:
+            return message("signals.exchanged", names=moved)
+        scaled = tuple(name for name, factor in zip(SIGNALS, self.factors, strict=True) if factor != 1.0)
+        factor = next(factor for factor in self.factors if factor != 1.0)
+        if factor == -1.0:
+            return message("signals.sign" if len(scaled) == 1 else "signals.signs", names=scaled)
+        return message("signals.unit" if len(scaled) == 1 else "signals.units", names=scaled, factor=factor)
+
+
+def find_signal_defect(recording: Recording) -> SignalDefect | None:
+    """Return the first place where y or u is stuck while the motion demands a change, or where y jumps."""
+    span = float(np.ptp(recording.y))
+    settings = QualitySettings(frozen_s=FROZEN_S, frozen_travel=TRAVEL * span or None)
+    limits, state = settings.limits(recording.sample_rate), init_state()
+    for chunk in outofcore.iter_chunks(0, recording.samples):
+        rows = recording.rows(chunk)
+        state, findings = check_block(limits, state, rows.t, rows.r, rows.u, rows.y)
+        found = [_frozen_defect(recording, finding) for finding in findings] + [_find_jump(rows, chunk.start)]
+        outofcore.release(*recording.columns)
+        if defects := [defect for defect in found if defect is not None]:
+            return min(defects, key=lambda defect: defect.begin)
+    return None
+
+
+def find_corrections(
+    pipeline: Pipeline, theta: FloatArray, residual_power: float | None, recording: Recording
+) -> Iterator[Correction]:
+    """Yield corrections of the signals under which the plant with theta explains the recording, the likeliest first.
+
+    `residual_power`: what the plant leaves of eta^2 when healthy; it tells u in another unit from y in another unit,
+    which are alike to a linear plant. None yields both.
+    """
+    rows = recording.rows(slice(0, MOST_ROWS))
+
+    def residual(correction: Correction) -> tuple[float, float]:
+        return _residual_share(pipeline, theta, correction.apply(rows))
+
+    share, _ = residual(Correction())
+    tried = {correction: residual(correction) for correction in _single_corrections()}
+    best = min((each for each, _ in tried.values()), default=np.inf)
+    if not best * CLEARER < share:
+        yield from _reference_corrections(rows)
+        return
+    near = [correction for correction, (each, _) in tried.items() if each < 2.5 * best]
+    if residual_power:
+        near.sort(key=lambda one: abs(np.log(max(tried[one][1], 1e-300) / residual_power)))
+    spreads = _spread(rows.r), _spread(rows.y)
+    opposed = min(spreads) > 0.0 and float(np.corrcoef(rows.r, rows.y)[0, 1]) < 0.0
+    for correction in near:
+        factor = correction.factors[2]
+        together = replace(correction, factors=(factor, *correction.factors[1:]))
+        if factor == -1.0:  # to a linear plant, u of the opposite sign is r and y of it
+            yield from (correction,) if opposed else (replace(correction, factors=(1.0, -1.0, 1.0)), together)
+        elif factor != 1.0 and min(spreads) > 0.0:
+            both = abs(np.log(spreads[0] / spreads[1])) < np.log(2.0)
+            yield from (together, correction) if both else (correction, together)
+        else:
+            yield correction
+
+
+def describe_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording) -> Message | None:
+    """Return what is wrong with signals that the plant with theta explains only when they are put right.
+
+    For plants that are known roughly, as before learning.
+    """
+    rows = recording.rows(slice(0, MOST_ROWS))
+    if not _residual_share(pipeline, theta, rows)[0] > UNEXPLAINED:
+        return None
+    found = [
+        correction
+        for correction in find_corrections(pipeline, theta, None, rows)
+        if _residual_share(pipeline, theta, correction.apply(rows))[0] < EXPLAINED
+    ]
+    of_u = [correction for correction in found if abs(correction.factors[1]) != 1.0]
+    of_y = [correction for correction in found if abs(correction.factors[2]) != 1.0]
+    if of_u and of_y and of_y[0].factors[0] != 1.0:  # r agrees with y, so that both or u may be wrong
+        return message("signals.unit_of_either", u=of_u[0].factors[1], y=of_y[0].factors[2])
+    return (of_y or found)[0].description if found else None
+
+
+def _single_corrections() -> Iterator[Correction]:
+    for order in ((2, 1, 0), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1)):
+        yield Correction(order=order)
+    yield Correction(factors=(1.0, 1.0, -1.0))
+    for factor in (*FACTORS, *(1.0 / each for each in FACTORS)):
+        yield Correction(factors=(1.0, 1.0, factor))
+        yield Correction(factors=(1.0, factor, 1.0))
+
+
+def _reference_corrections(rows: Recording) -> Iterator[Correction]:
+    """Yield r in another unit, which the plant does not notice, where r is much larger or smaller than y."""
+    spreads = _spread(rows.r), _spread(rows.y)
+    if min(spreads) > 0.0:
+        ratio = spreads[1] / spreads[0]
+        for factor in (*FACTORS, *(1.0 / each for each in FACTORS)):
+            if abs(ratio / factor - 1.0) < UNIT_ERROR:
+                yield Correction(factors=(factor, 1.0, 1.0))
+
+
+def _residual_share(pipeline: Pipeline, theta: FloatArray, rows: Recording) -> tuple[float, float]:
+    """Return the mean square of what the plant with theta leaves of eta: relative, and in units of eta."""
+    g = pipeline.regression(rows.r, rows.u, rows.y, rows.restart)
+    if not g.ok.any():
+        return np.inf, np.inf
+    left = float(np.mean((g.eta[g.ok] - g.phi[g.ok] @ theta) ** 2))
+    whole = float(np.mean(g.eta[g.ok] ** 2))
+    return (left / whole if whole > 0.0 else np.inf), left
+
+
+def _spread(x: FloatArray) -> float:
+    return float(np.std(x))
+
+
+def _frozen_defect(recording: Recording, finding: QualityFinding) -> SignalDefect | None:
+    name = finding.kind.removeprefix("frozen_")
+    if not finding.begins or name not in SIGNALS or not finding.value > 0.0:  # at rest nothing is demanded
+        return None
+    x: FloatArray = getattr(recording, name)
+    at = int(np.searchsorted(recording.t, finding.time))
+    begin = at
+    while begin and x[begin - 1] == x[at]:
+        begin -= 1
+    if name == "u" and not x.min() < x[at] < x.max():
+        return None  # it is limited
+    other = "r" if name == "y" else "r - y"
+    text = message("signals.frozen", name=name, t=float(recording.t[begin]), other=other, by=finding.value)
+    return SignalDefect(begin, text)
+
+
+def _largest_near(steps: FloatArray, at: npt.NDArray[np.intp]) -> float:
+    near = np.clip(at[:, None] + np.arange(-AHEAD, 2), 0, len(steps) - 1)
+    return float(steps[near].max())
+
+
+def _find_jump(rows: Recording, first: int) -> SignalDefect | None:
+    steps = np.where(rows.restart[1:], 0.0, np.abs(np.diff(rows.y)))
+    span = float(np.ptp(rows.y))
+    jumps = np.flatnonzero(steps > JUMP * span) if span > 0.0 else np.zeros(0, dtype=np.intp)
+    if not len(jumps) or len(jumps) > MOST_JUMPS * len(steps):
+        return None
+    size, other = float(np.median(steps[jumps])), float(np.delete(steps, jumps).max(initial=0.0))
+    demanded = _largest_near(np.abs(np.diff(rows.r)), jumps)
+    if SMOOTHER * max(other, demanded) > size or np.ptp(steps[jumps]) > 2.0 * other:
+        return None  # a motion, or jumps of several sizes
+    begin = int(jumps[0]) + 1
+    text = message("signals.jump", t=float(rows.t[begin]), size=size)
+    return SignalDefect(first + begin, text)

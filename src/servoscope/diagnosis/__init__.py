@@ -1,0 +1,1 @@
+"""One recording, or a running loop, against a baseline."""

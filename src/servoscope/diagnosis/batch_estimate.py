@@ -1,0 +1,91 @@
+"""How far theta is from healthy over a whole stretch of a recording: least squares instead of the recursion."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import NotEnoughError, RecordingError
+from servoscope.detection.chi2_test import Onset
+from servoscope.detection.expectation import Expectation, reference_path
+from servoscope.detection.signature import Signature
+from servoscope.diagnosis.examine import Examination
+from servoscope.estimation.instrumental_fit import InstrumentalFit, fit_with_instrument
+from servoscope.estimation.tuning import fit_tuning
+from servoscope.isolation.signatures import fault_signatures
+
+LONGEST = 500_000  # samples of a stretch; more of them add nothing
+ENOUGH = 0.05  # stated relative deviation, up to which half a stretch is enough
+
+
+def estimate_batch_deviation(exam: Examination, from_s: float, to_s: float = np.inf) -> tuple[FloatArray, FloatArray]:
+    """Return theta minus its healthy expectation over from_s <= t < to_s, (n,), and the covariance of its noise (n, n).
+
+    Raises NotEnoughError if the stretch is too short or does not excite all coefficients.
+    """
+    baseline, name = exam.baseline, exam.recording.name
+    if baseline.instrument is not None:
+        return _deviation_by_instrument(exam, from_s, to_s)
+    try:
+        rec = exam.recording.part(from_s, to_s)
+        found = fit_tuning(exam.pipeline, [exam.pipeline.regression(rec.r, rec.u, rec.y, rec.restart)])
+    except RecordingError as error:
+        raise NotEnoughError(f"{name}, from {from_s:.4g} s on: {error}") from None
+    expected = np.array(baseline.theta)
+    if exam.noise is not None:  # the bias that this reference has under any plant
+        bias = Expectation(exam.pipeline, exam.tuning, exam.noise, reference_path(rec)).batch_estimate(baseline.plant)
+        expected = expected + bias - np.array(baseline.model_theta)
+    return found.each[0] - expected, found.each_covariance[0]
+
+
+def _deviation_by_instrument(exam: Examination, from_s: float, to_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return what `estimate_batch_deviation` does, with an instrument of the changed plant itself.
+
+    The second half of the stretch speaks where it knows enough: a gradual change is over by then, as a rule.
+    """
+    found, end_s = _fit_stretch(exam, from_s, to_s), min(to_s, float(exam.recording.t[-1]))
+    with contextlib.suppress(NotEnoughError):
+        half = _fit_stretch(exam, 0.5 * (from_s + end_s), to_s)
+        found = half if half.deviation <= ENOUGH else found
+    return found.fit.tuning.theta - np.array(exam.baseline.theta), found.fit.covariance
+
+
+def _fit_stretch(exam: Examination, from_s: float, to_s: float) -> InstrumentalFit:
+    """Return the fit of a stretch by an instrument; NotEnoughError where it cannot be trusted."""
+    baseline, name = exam.baseline, exam.recording.name
+    assert baseline.instrument is not None
+    try:
+        rec = exam.recording.part(from_s, to_s)
+        found = fit_with_instrument(exam.pipeline, [rec], baseline.instrument.source, np.array(baseline.theta))
+    except (RecordingError, np.linalg.LinAlgError) as error:
+        raise NotEnoughError(f"{name}, from {from_s:.4g} s on: {error}") from None
+    if found is None or not found.trusted:
+        raise NotEnoughError(f"{name}, from {from_s:.4g} s on: noise in y hides the coefficients, record longer")
+    return found
+
+
+def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Signature], FloatArray, FloatArray]:
+    """Return what isolation compares after an alarm: signatures, the deviation (n,) and its covariance (n, n).
+
+    Learned faults whose directions are close are separated better by the whole stretch since the onset than by the last
+    memory of it, so a baseline that has some uses it; not where signatures are simulated, which are the recursion's.
+    With a learned instrument it is used too: the recursion's is of the healthy plant, which large changes leave behind.
+    """
+    recording, e, last = exam.recording, exam.estimates, int(exam.estimates.index[at])
+    first, whole = exam.memory_start(at), None
+    if (exam.baseline.learned or exam.baseline.instrument is not None) and exam.noise is None:
+        # nothing from before the change may be in a fit by an instrument, whose deviation is small
+        change_s = onset.likely_s if exam.baseline.instrument is None else onset.high_s
+        begin = max(change_s, float(recording.t[max(last - LONGEST, 0)]))
+        # where it is not enough, the recursion, which starts from healthy, needs no more than the alarm did
+        with contextlib.suppress(NotEnoughError):
+            whole = estimate_batch_deviation(exam, begin, float(recording.t[last]) + 0.5 / recording.sample_rate)
+    recursive = e.theta[at] - exam.expected[at], e.S[at] * max(1.0, float(e.power[at]))
+    deviation, covariance = whole or recursive
+    expectation = exam.expectation(first, last + 1) if exam.noise is not None else None
+    recalled = recording.rows(slice(first, last + 1))
+    settled = whole is not None
+    signatures = fault_signatures(exam.baseline, recalled, expectation, max(onset.sample - first, 0), settled)
+    return signatures, deviation, covariance + exam.baseline.covariance_array()

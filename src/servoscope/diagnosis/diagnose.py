@@ -1,0 +1,295 @@
+"""The diagnosis of a recording: operating point, verdict, onset, fault and size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from servoscope.core.blas import with_one_blas_thread
+from servoscope.core.messages import message
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.chi2_test import Onset, estimate_onset
+from servoscope.detection.result import (
+    UNKNOWN,
+    Candidate,
+    Diagnosis,
+    DiagnosisWarning,
+    FaultInterval,
+    FinalCoefficient,
+    ResponsePoint,
+    Trace,
+    Verdict,
+)
+from servoscope.detection.signal_defects import find_signal_defect
+from servoscope.diagnosis.batch_estimate import isolation_inputs
+from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
+from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.explanation import build_headline, build_reasons
+from servoscope.diagnosis.ml_refit import (
+    disagreement_warnings,
+    refit_candidates,
+    refit_onset,
+    refit_recording,
+    summarise_refit,
+)
+from servoscope.diagnosis.output_onset import refine_onset
+from servoscope.diagnosis.sensor_check import check_sensors
+from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
+from servoscope.diagnosis.warnings import detectable_sizes, estimate_warnings, power_warnings, warning_throughout
+from servoscope.estimation.frequency_response import ResponseRow, response_rows
+from servoscope.isolation.isolate import isolate
+from servoscope.signals import MIN_SAMPLES, Recording
+
+if TYPE_CHECKING:
+    from servoscope.isolation.ml import RefitResult
+
+SURE = 0.95  # probability from which a fault is named
+DOUBTFUL = 0.05  # probability of an unknown change from which an operating point does not explain a recording
+
+
+@with_one_blas_thread
+def diagnose(
+    baseline: Baseline,
+    recording: Recording,
+    progress: Callable[[str], None] = lambda _: None,
+    *,
+    point: str | None = None,
+) -> Diagnosis:
+    """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure that is.
+
+    Parameters
+    ----------
+    baseline
+        What healthy looks like.
+    recording
+        The recording to judge.
+    progress
+        Called with the name of each step.
+    point
+        Operating point of the recording. Without it, a recording is healthy if it is so at one point of the baseline.
+        A change is explained at the point where the recording stays healthy for longest; among points within one
+        memory of that, where a known fault explains it, and then where it is smallest. A warning names other points
+        that explain it too.
+
+    Raises
+    ------
+    RecordingError
+        If the recording's sample rate is not the loop's.
+    BaselineError
+        If the baseline has no such point.
+    """
+    return _diagnose_at_point(baseline, recording, progress, point)[0]
+
+
+@with_one_blas_thread
+def diagnose_with_trace(
+    baseline: Baseline,
+    recording: Recording,
+    progress: Callable[[str], None] = lambda _: None,
+    *,
+    point: str | None = None,
+) -> tuple[Diagnosis, Trace]:
+    """Return the diagnosis of a recording together with its trace; arguments and errors as for `diagnose`."""
+    diagnosis, exam, correction = _diagnose_at_point(baseline, recording, progress, point)
+    return diagnosis, corrected_trace(exam, correction)
+
+
+def _diagnose_at_point(
+    baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
+) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
+    """Return the diagnosis at the operating point that explains the recording, and what its trace is made of."""
+    defect = find_signal_defect(recording)
+    if defect is not None:
+        sound = recording.part(float(recording.t[0]), float(recording.t[max(defect.begin, MIN_SAMPLES)]))
+        diagnosis, exam, correction = _judge_signals(baseline, sound, progress, point)
+        return limit_to_sound_part(diagnosis, recording, defect), exam, correction
+    return _judge_signals(baseline, recording, progress, point)
+
+
+def _judge_signals(
+    baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
+) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
+    points = baseline.per_point if point is None else (baseline.at(point),)
+    recording, sensors = check_sensors(points[0], recording)
+    exams = [Examination.from_recording(one, recording) for one in points]
+    last = max(_first_alarm_time(exam) for exam in exams)
+    near = last - baseline.loop.monitor.memory if np.isfinite(last) else last
+    rivals = sorted((exam for exam in exams if _first_alarm_time(exam) >= near), key=_largest_statistic_ratio)
+    if np.isinf(last):
+        diagnosis, correction = diagnose_examination(rivals[0], progress)
+        return _with_warnings(diagnosis, sensors), rivals[0], correction
+    progress("signals")
+    if (reason := describe_correction(points, recording)) is not None:
+        return leave_undetermined(rivals[0], reason), rivals[0], None
+    found = sorted(
+        ((*diagnose_examination(exam, progress), exam) for exam in rivals), key=lambda one: _change_size(one[0])
+    )
+    diagnosis, correction, exam = found[0]
+    others = [message("warning.point", other=other.headline) for other, *_ in found[1:] if _is_explained(other)]
+    doubts = [warning_throughout(exam, "point", other) for other in others]
+    return _with_warnings(diagnosis, [*sensors, *doubts]), exam, correction
+
+
+def _with_warnings(diagnosis: Diagnosis, more: Sequence[DiagnosisWarning]) -> Diagnosis:
+    return diagnosis.model_copy(update={"warnings": (*diagnosis.warnings, *more)}) if more else diagnosis
+
+
+def _first_alarm_time(exam: Examination) -> float:
+    alarms = np.flatnonzero(exam.alarm)
+    return float(exam.t(alarms[0])) if alarms.size else np.inf
+
+
+def _largest_statistic_ratio(exam: Examination) -> float:
+    """Return the largest value of all statistics, as a multiple of its limit."""
+    ratios = [statistic.value / statistic.limit for statistic in exam.statistics]
+    return float(np.maximum.reduce(ratios)[exam.ready].max(initial=0.0))
+
+
+def _change_size(diagnosis: Diagnosis) -> float:
+    """Return how large the change is, relative; infinite where no known fault explains it."""
+    return max(fault.change for fault in diagnosis.candidates[0].faults) if _is_explained(diagnosis) else np.inf
+
+
+def _is_explained(diagnosis: Diagnosis) -> bool:
+    """Return whether known faults explain the change."""
+    return all(c.probability < DOUBTFUL for c in diagnosis.candidates if c.name == UNKNOWN)
+
+
+def diagnose_examination(
+    exam: Examination, progress: Callable[[str], None] = lambda _: None
+) -> tuple[Diagnosis, BiasCorrection | None]:
+    """Return the diagnosis of an examination, and how its estimates become those of the actuator itself."""
+    recording, baseline, last = exam.recording, exam.baseline, exam.evaluations - 1
+    warnings = [DiagnosisWarning.of(defect) for defect in recording.defects] + estimate_warnings(exam)
+    alarm = first_alarm(exam, progress)
+    verdict: Verdict = "fault"
+    interval: FaultInterval | None = None
+    onset: Onset | None = None
+    detectable: dict[str, tuple[float, float]] = {}
+    at = last
+    if alarm is not None:
+        at = alarm.evaluation
+        interval, onset, doubts = _explain_alarm(exam, alarm, progress)
+    else:
+        detectable = detectable_sizes(exam)
+        doubts = power_warnings(exam, detectable)
+        verdict = "undetermined" if doubts else "healthy"
+    warnings += doubts
+    correction = estimate_bias_correction(exam, interval.candidates if interval else (), onset, at)
+    end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
+    explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
+    diagnosis = Diagnosis(
+        recording=recording.name,
+        samples=recording.samples,
+        duration_s=recording.duration_s,
+        verdict=verdict,
+        headline=build_headline(verdict, interval, detectable, warnings, baseline.point),
+        reasons=build_reasons(exam, explained, interval) if interval is not None else (),
+        intervals=(interval,) if interval is not None else (),
+        parameters=_final_coefficients(end),
+        ifrf=_final_response(end),
+        warnings=tuple(sorted(warnings, key=lambda warning: warning.from_s)),
+        point=baseline.point or None,
+    )
+    return diagnosis, correction
+
+
+def _explain_alarm(
+    exam: Examination, alarm: RecordingAlarm, progress: Callable[[str], None]
+) -> tuple[FaultInterval, Onset, list[DiagnosisWarning]]:
+    """Return the interval that begins with an alarm, its onset, and doubts about the explanation."""
+    onset, refit, doubts = alarm.onset, None, list[DiagnosisWarning]()
+    recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
+    progress("refit")
+    last = int(exam.estimates.index[alarm.evaluation])
+    refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit"))
+    if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
+        candidates, refit = refit_candidates(refined), summarise_refit(refined, exam, recursive)
+        onset = onset if refined.is_unknown else refit_onset(refined, exam)
+        doubts = disagreement_warnings(exam, candidates, refit, SURE)
+    best, t = candidates[0], exam.recording.t
+    wait_s = exam.pipeline.bank.wait / exam.recording.sample_rate
+    interval = FaultInterval(
+        detected_at_s=float(t[alarm.sample]),
+        onset_s=(onset.low_s, onset.likely_s, onset.high_s),
+        end_s=None if exam.alarm[-1] else float(exam.t(int(np.flatnonzero(exam.alarm)[-1]) + 1)),
+        from_start=onset.likely_s - float(t[0]) <= 3.0 * wait_s,
+        probability=best.probability,
+        faults=best.faults if best.probability >= SURE and best.name != UNKNOWN else (),
+        candidates=candidates,
+        refit=refit,
+    )
+    return interval, onset, doubts
+
+
+@dataclass(frozen=True)
+class RecordingAlarm:
+    """The alarm of a recording: its sample, the evaluation that is explained, and the onset by the recursion."""
+
+    sample: int
+    evaluation: int
+    onset: Onset
+
+
+def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: None) -> RecordingAlarm | None:
+    """Return the first alarm of an examination; None if there was none."""
+    alarms = np.flatnonzero(exam.alarm)
+    if not alarms.size:
+        return None
+    first = int(alarms[0])
+    # the sequential test alarms at any sample, T^2 at its evaluations
+    crossed = int(exam.estimates.crossed[first]) - 1
+    at_once = crossed >= 0 and not exam.baseline.loop.monitor.on_delay
+    sample = crossed if at_once else int(exam.estimates.index[first])
+    # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
+    at = exam.evaluations - 1 if exam.alarm[-1] else first + int(np.argmax(exam.statistic[first:]))
+    progress("onset")
+    onset = estimate_onset(
+        exam.pipeline,
+        exam.tuning,
+        exam.recording,
+        exam.estimates,
+        exam.expected[at],
+        exam.estimates.theta[at],
+        sample,
+        max(int(exam.estimates.index[at]), sample),
+    )
+    return RecordingAlarm(sample, at, refine_onset(exam, onset, sample, int(exam.estimates.index[at])))
+
+
+def _prefers_learned_fault(refined: RefitResult, recursive: Candidate) -> bool:
+    """Return whether a fault learned from labelled recordings explains more than the refit, which knows none."""
+    sure = recursive.is_learned and recursive.probability >= SURE
+    return sure and (refined.is_unknown or len(refined.best.fitted.faults) > 1)
+
+
+def _final_coefficients(trace: Trace) -> dict[str, FinalCoefficient]:
+    if not len(trace.t):
+        return {}
+    std = np.sqrt(np.diag(trace.covariance[-1]))
+    return {
+        name: FinalCoefficient(value=float(value), std=float(s), nominal=float(nominal))
+        for name, value, s, nominal in zip(trace.names, trace.theta[-1], std, trace.expected[-1], strict=True)
+    }
+
+
+def _final_response(trace: Trace) -> tuple[ResponsePoint, ...]:
+    if not len(trace.t):
+        return ()
+    rows = response_rows(trace.ifrf, trace.ifrf_expected, -1)
+    std = np.sqrt([rows[:, 5], rows[:, 7]])
+    return tuple(
+        ResponsePoint(
+            frequency_hz=row.frequency_hz,
+            real=row.real,
+            imag=row.imag,
+            real_std=real_std,
+            imag_std=imag_std,
+            nominal_real=row.nominal_real,
+            nominal_imag=row.nominal_imag,
+        )
+        for row, real_std, imag_std in zip(map(ResponseRow._make, rows.tolist()), *std.tolist(), strict=True)
+    )

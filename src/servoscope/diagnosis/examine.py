@@ -1,0 +1,265 @@
+"""One recording against one baseline: the estimates, what a healthy loop would have shown, and the statistics.
+
+A recording of any length is read once, chunk by chunk; later questions about single evaluations are answered from the
+samples that they have not forgotten.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core import outofcore
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import RecordingError
+from servoscope.detection import cusum_design
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
+from servoscope.detection.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
+from servoscope.detection.result import Statistic, any_exceeded, detection_statistics
+from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, RegressionRunner, Tuning
+from servoscope.models.plants import Plant
+from servoscope.signals import Recording
+from servoscope.simulation import closed_loop_poles
+
+MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip before the AKF takes over
+WEAKEST_INSTRUMENT = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
+FALL_BACK = {"estimator": "akf"}
+MIN_NOISE_GROWTH = 1.5  # of the variance; below it counts as none
+FORGOTTEN = 1e-9  # share of the past below which it counts as forgotten
+MEMORIES = 22.0  # after which it usually is
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """Everything about one recording that its diagnosis is made from; see `from_recording`."""
+
+    baseline: Baseline
+    recording: Recording
+    pipeline: Pipeline
+    tuning: Tuning
+    estimates: Estimates
+    noise: WhiteNoise | None  # of the loop, at the level of this recording; None where the loop cannot be simulated
+    expected: FloatArray  # theta_hat of a healthy loop, biases included, shape (K, n)
+    statistic: FloatArray  # T^2, shape (K,)
+    skipped_share: float  # share of the updates that the estimator's guard skipped
+    noise_growth: float  # of the noise's variance against the baseline's
+    replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
+
+    @classmethod
+    def from_recording(cls, baseline: Baseline, recording: Recording) -> Examination:
+        """Run the recursion over the recording and compare it with what a healthy loop would show.
+
+        Raises RecordingError if the recording's sample rate is not the loop's.
+        """
+        loop = baseline.loop
+        if abs(recording.sample_rate / loop.sample_rate - 1.0) > 0.01:
+            raise RecordingError(
+                f"{recording.name}: sampled at {recording.sample_rate:g} Hz, the baseline's loop at "
+                f"{loop.sample_rate:g} Hz: learn a baseline at this rate"
+            )
+        exam = _run_recursion(baseline, recording, baseline.pipeline())
+        skipped = _skipped_share(exam.estimates)
+        replaced = _has_failed_instrument(exam)
+        if replaced or skipped > MAX_SKIPPED_SHARE:
+            other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
+            exam = _run_recursion(baseline, recording, Pipeline.of(other, baseline.stage_one, baseline.still_speed))
+        growth = 1.0 if exam.noise is None else _noise_growth(exam.pipeline, exam.estimates)
+        if growth > 1.0:  # it shifts the expectation, and the sequential test would take it for steps of a change
+            exam = _run_recursion(baseline, recording, exam.pipeline, growth)
+        return replace(exam, skipped_share=skipped, replaced=replaced)
+
+    @property
+    def evaluations(self) -> int:
+        """Their number K."""
+        return len(self.statistic)
+
+    def t(self, at: Any) -> Any:
+        """Return the times of some evaluations [s]."""
+        return self.recording.t[self.estimates.index[at]]
+
+    def covariance(self, at: Any) -> FloatArray:
+        """Return the covariance of theta_hat minus its expectation at some evaluations, shape (..., n, n)."""
+        return np.asarray(self.noise_growth * self.estimates.S[at] + self.baseline.covariance_array())
+
+    @property
+    def ready(self) -> npt.NDArray[np.bool_]:
+        """Whether the estimator had learned anything by then, shape (K,)."""
+        return self.estimates.updates > 0
+
+    @cached_property
+    def statistics(self) -> tuple[Statistic, ...]:
+        """The statistics that raise the alarm: T^2 and the sequential test."""
+        return detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready)
+
+    @cached_property
+    def alarm(self) -> npt.NDArray[np.bool_]:
+        """Whether there was an alarm: any of the statistics above its limit, after the delays, shape (K,)."""
+        return apply_alarm_delays(any_exceeded(self.statistics), *self.pipeline.delays)
+
+    def memory_start(self, at: int) -> int:
+        """Return the sample before which loop, filters and estimator have forgotten everything in an evaluation.
+
+        A recursion that starts there gives the same evaluation as one from the beginning, up to `FORGOTTEN`.
+        """
+        pipeline, tuning = self.pipeline, self.tuning
+        end, period = (at + 1) * pipeline.every, int(np.lcm(pipeline.every, pipeline.stride))
+        settling = pipeline.bank.wait + (_settling(pipeline, self.baseline.plant) if self.noise is not None else 0)
+        memories = MEMORIES
+        while True:
+            learning = end - round(memories * pipeline.memory * pipeline.stride)
+            first = (learning - settling) // period * period
+            if first <= 0:
+                return 0
+            estimating, Psi = EstimationRunner(pipeline, tuning), np.eye(len(tuning.theta))[None]
+            for rows in outofcore.iter_chunks(learning, end):
+                found = estimating.advance(self.recording.rows(rows)).Psi
+                Psi = found if len(found) else Psi
+            if np.abs(Psi[-1] * tuning.scale[:, None] / tuning.scale).max() <= FORGOTTEN:
+                return first
+            memories *= 2.0
+
+    def expectation(self, first: int, end: int) -> Expectation:
+        """Return the expectation under the reference of samples `first` to `end`, of a loop that can be simulated."""
+        if self.noise is None:
+            raise ValueError("a loop that cannot be simulated expects nothing")
+        return Expectation(
+            self.pipeline, self.tuning, self.noise, reference_path(self.recording.rows(slice(first, end)))
+        )
+
+    def expected_path(self, at: slice, plant: Plant, onset: int) -> FloatArray:
+        """Return the expected theta_hat at some evaluations, shape (K, n), under a change of plant at a sample."""
+        first, start = self.memory_start(at.start), np.array(self.baseline.model_theta)
+        walk = self.expectation(first, first + 1).propagator(start, self.baseline.plant, plant, max(onset - first, 0))
+        return self._collect(at, first, lambda rows: walk.advance(_reference_piece(self.recording, rows, first)))
+
+    def covariance_under(self, at: slice, plant: Plant) -> FloatArray:
+        """Return the covariance of theta_hat at some evaluations, shape (K, n, n), under the noise of another plant.
+
+        A changed actuator passes the sensor's noise on differently, and its estimates scatter accordingly.
+        """
+        coloured = replace(self.tuning, noise=residual_noise_model(self.pipeline, plant, self.expectation(0, 1).noise))
+        estimating = EstimationRunner(self.pipeline, coloured)
+        return self._collect(
+            at, self.memory_start(at.start), lambda rows: estimating.advance(self.recording.rows(rows)).S
+        )
+
+    def _collect(self, at: slice, first: int, advance: Callable[[slice], FloatArray]) -> FloatArray:
+        """Return the output of a recursion at some evaluations; it starts at sample `first`."""
+        every, n = self.pipeline.every, len(self.tuning.theta)
+        found = np.empty((0, n))
+        k = first // every - at.start
+        for rows in outofcore.iter_chunks(first, at.stop * every):
+            piece = advance(rows)
+            if not len(found):
+                found = outofcore.empty((at.stop - at.start, *piece.shape[1:]))
+            found[max(k, 0) : max(k + len(piece), 0)] = piece[max(-k, 0) :]
+            k += len(piece)
+            outofcore.release(found, *self.recording.columns)
+        return found
+
+
+def _settling(pipeline: Pipeline, plant: Plant) -> int:
+    """Return how many samples a loop takes to forget its initial state."""
+    slowest = float(np.abs(closed_loop_poles(pipeline.loop, plant)).max())
+    return int(np.ceil(np.log(FORGOTTEN) / np.log(slowest))) if 0.0 < slowest < 1.0 else 0
+
+
+def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
+    """Return the reference of a chunk; the run began at sample `first`."""
+    before = rows.start - 1
+    ahead = (float(recording.t[before]), float(recording.r[before])) if rows.start > first else None
+    return reference_path(recording.rows(rows), ahead)
+
+
+def _run_recursion(baseline: Baseline, recording: Recording, pipeline: Pipeline, growth: float = 1.0) -> Examination:
+    """Read a recording once: the estimates, and in a second thread what a healthy loop would show."""
+    tuning, C, noise, walk = baseline.tuning, baseline.covariance_array(), None, None
+    if baseline.noise is None:
+        watch = baseline.cusum_constants(pipeline)
+    else:
+        noise = baseline.noise.times(np.sqrt(growth))
+        beginning = recording.rows(slice(0, round(cusum_design.design_duration_s(pipeline) * recording.sample_rate)))
+        expectation = Expectation(pipeline, tuning, noise, reference_path(beginning))
+        watch = baseline.cusum_constants(pipeline, expectation, growth)
+        walk = expectation.propagator(np.array(baseline.model_theta), baseline.plant)
+
+    def healthy(rows: slice) -> FloatArray:
+        if walk is None:
+            return tuning.theta
+        return np.asarray(
+            walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.model_theta))
+        )
+
+    estimating = EstimationRunner(pipeline, tuning, watch)
+    columns = defaultdict[str, outofcore.GrowableArray](outofcore.GrowableArray)
+
+    def keep(e: Estimates, path: Future[FloatArray]) -> None:
+        expected = np.broadcast_to(path.result(), e.theta.shape)
+        T2 = np.where(e.updates > 0, t2_statistic(e.theta, expected, growth * e.S + C), 0.0)
+        for name, piece in {**vars(e), "expected": expected, "statistic": T2}.items():
+            columns[name].append(piece)
+
+    with ThreadPoolExecutor(1) as second:  # one thread, so that its tasks run in order
+        kept: Future[None] | None = None
+        for rows in outofcore.iter_chunks(0, recording.samples):
+            path = second.submit(healthy, rows)
+            e = estimating.advance(recording.rows(rows))
+            if kept is not None:
+                kept.result()
+            kept = second.submit(keep, e, path)
+            outofcore.release(*recording.columns)
+        if kept is not None:
+            kept.result()
+    found = {name: column.to_array() for name, column in columns.items()}
+    expected, T2 = found.pop("expected"), found.pop("statistic")
+    estimates = Estimates(**found)
+    return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
+
+
+def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
+    """Return the growth of the noise's variance against the baseline's, 1 where it has not grown.
+
+    Noise shifts the expected estimate (errors in variables), so a failing sensor would look like a faulty plant. A low
+    quantile over time tells it from a fault, whose residual is large only until the estimate has followed.
+    """
+    settled = estimates.power[estimates.updates > 3.0 * pipeline.memory]
+    if not len(settled):
+        return 1.0
+    growth = float(np.quantile(settled, 0.1))
+    return growth if growth > MIN_NOISE_GROWTH else 1.0
+
+
+def _has_failed_instrument(exam: Examination) -> bool:
+    """Return whether the instrument of the nominal loop tells nothing of this recording's motion, or the contrary.
+
+    The mean of theta moves by -E[z z']^-1 E[z phi'] theta/N: its eigenvalues tell where it goes. Coefficients that an
+    instrument has been learned for are not those of the AKF, which therefore cannot take over there.
+    """
+    if exam.baseline.instrument is not None or not exam.pipeline.bank.has_instrument:
+        return False
+    recording, runner, scale = exam.recording, RegressionRunner(exam.pipeline), exam.tuning.scale
+    own = shared = np.zeros((len(scale), len(scale)))
+    for rows in outofcore.iter_chunks(0, recording.samples):
+        part = recording.rows(rows)
+        g = runner.advance(part.r, part.u, part.y, part.restart)
+        z, phi = g.z[g.ok] / scale, g.phi[g.ok] / scale
+        own, shared = own + z.T @ z, shared + z.T @ phi
+    if not own.any():
+        return False
+    return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < WEAKEST_INSTRUMENT)
+
+
+def _skipped_share(estimates: Estimates) -> float:
+    if not len(estimates.updates):
+        return 0.0
+    skipped, updated = float(estimates.skipped[-1]), float(estimates.updates[-1])
+    return skipped / max(skipped + updated, 1.0)

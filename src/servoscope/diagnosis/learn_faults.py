@@ -1,0 +1,108 @@
+"""Faults learned from labelled recordings: which of these show the fault, and in which direction it moves theta."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import BaselineError, NotEnoughError
+from servoscope.core.messages import Message, message
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.learned_fault import LearnedFault
+from servoscope.detection.result import UNKNOWN
+from servoscope.diagnosis.batch_estimate import estimate_batch_deviation
+from servoscope.diagnosis.diagnose import diagnose_examination
+from servoscope.diagnosis.examine import Examination
+from servoscope.isolation.isolate import misfit_limit
+from servoscope.signals import Recording
+
+DISTINCT = 2.0  # times the limit of a misfit: less means that the direction is known to worse than 35 degrees
+LIKELY = 0.05  # probability from which another explanation of a labelled recording is noted
+
+LabelledRecordings = Mapping[str, Sequence[Recording]]
+
+
+def add_learned_faults(
+    baseline: Baseline, faults: LabelledRecordings, progress: Callable[[str], None] = lambda _: None
+) -> Baseline:
+    """Return the baseline with faults learned from labelled recordings; its notes say what they may be mistaken for.
+
+    A fault has to last to the end of its recordings; the time before its onset is left out. Raises BaselineError if a
+    name is one of the plant's own faults, NotEnoughError if no recording of a fault differs from healthy, one is too
+    short, or those of one name do not agree.
+    """
+    own = {UNKNOWN, *(fault.name for fault in baseline.loop.plant.all_faults)}
+    learned, examined, notes = [], {}, list(baseline.notes)
+    digest = hashlib.sha256(baseline.hash.encode())
+    for name, recordings in faults.items():
+        if name in own:
+            raise BaselineError(
+                f"fault {name}: the name is taken ({', '.join(sorted(own))} are): give the labelled recordings another"
+            )
+        progress(f"fault {name}")
+        exams = [Examination.from_recording(baseline, recording) for recording in recordings]
+        examined[name] = faulty = [exam for exam in exams if exam.alarm.any()]
+        if not faulty:
+            raise NotEnoughError(_undetected_message(name, exams))
+        silent = [exam.recording.name for exam in exams if not exam.alarm.any()]
+        notes += [message("learning.left_out", recording=rec, fault=name) for rec in silent]
+        learned.append(_learn_fault(name, faulty, baseline.covariance_array()))
+        for rec in (exam.recording for exam in faulty):
+            for array in (rec.t, rec.r, rec.u, rec.y):
+                digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(name.encode())
+    found = baseline.model_copy(update={"learned": tuple(learned), "hash": digest.hexdigest()[:16]})
+    progress("faults compared")
+    notes += [note for name, faulty in examined.items() if (note := _confusion_note(found, name, faulty)) is not None]
+    return found.model_copy(update={"notes": tuple(notes)})
+
+
+def _fault_deviation(exam: Examination) -> tuple[FloatArray, FloatArray]:
+    onset = diagnose_examination(exam)[0].onset_s
+    return estimate_batch_deviation(exam, onset[1] if onset is not None else float(exam.recording.t[0]))
+
+
+def _learn_fault(name: str, faulty: Sequence[Examination], healthy: FloatArray) -> LearnedFault:
+    deviations, covariances = map(np.array, zip(*map(_fault_deviation, faulty), strict=True))
+    found = LearnedFault.from_recordings(
+        name, [exam.recording.name for exam in faulty], deviations, covariances, healthy
+    )
+    if min(found.shares) <= 0.0:
+        odd = found.recordings[int(np.argmin(found.shares))]
+        raise NotEnoughError(f"{odd} moves theta the other way than the other recordings of {name}: two labels?")
+    if found.distinctness < DISTINCT * misfit_limit(len(healthy)):
+        raise NotEnoughError(
+            f"the {len(faulty)} recordings of {name} differ from each other as much as from healthy, so nearly any "
+            "change would look like it: give them different labels, or record more"
+        )
+    return found
+
+
+def _undetected_message(name: str, exams: Sequence[Examination]) -> str:
+    if not exams:
+        return f"{name}: no recording to learn from, give at least one"
+    share = max(float(exam.statistic.max(initial=0.0)) / exam.baseline.limit for exam in exams)
+    one = len(exams) == 1
+    subject = f"{exams[0].recording.name} does not differ" if one else f"none of {len(exams)} recordings of it differs"
+    return (
+        f"{name}: {subject} from healthy (T² reaches {share:.0%} of its limit), and a fault that does not show cannot "
+        "be learned: record it more severe, under livelier motion or at another load"
+    )
+
+
+def _confusion_note(baseline: Baseline, name: str, faulty: Sequence[Examination]) -> Message | None:
+    """Return a note on what else explains the labelled recordings of a fault; None if nothing does."""
+    diagnoses = [diagnose_examination(replace(exam, baseline=baseline))[0] for exam in faulty]
+    likely = Counter(
+        c.name for each in diagnoses for c in each.candidates if c.name != name and c.probability >= LIKELY
+    )
+    others = tuple(
+        message("learning.mistaken_for", name=other, count=count, recordings=len(faulty))
+        for other, count in likely.items()
+    )
+    return message("learning.mistaken", fault=name, others=others) if others else None

@@ -1,0 +1,138 @@
+"""The refit of the seconds around an onset as part of a diagnosis, and where it contradicts the recursion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from servoscope.core.messages import message
+from servoscope.core.number_format import ratio_digits
+from servoscope.detection.chi2_test import Onset
+from servoscope.detection.result import UNKNOWN, Candidate, DiagnosisWarning, FaultEstimate, Mimic, RefitSummary
+from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.warnings import warning_throughout
+
+if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
+    from servoscope.isolation.ml import Hypothesis, RefitResult
+
+WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
+MAX_SIZE_DISTANCE = 3.0  # standard deviations between two sizes that are called different
+
+
+def refit_recording(
+    exam: Examination, onset: Onset, alarm: int, last: int, progress: Callable[[], None]
+) -> RefitResult | None:
+    """Refit the seconds around an onset; None where the exact predictor does not even explain healthy recordings."""
+    exact = exam.baseline.exact
+    if exact is None or exact.misfit > 1.0:
+        return None
+    from servoscope.isolation.ml import MAX_WINDOW_SAMPLES, fit_hypotheses
+
+    begin = max(onset.sample - MAX_WINDOW_SAMPLES, 0)
+    near = exam.recording.rows(slice(begin, onset.sample + MAX_WINDOW_SAMPLES))
+    found = fit_hypotheses(exam.baseline, near, onset.sample - begin, alarm - begin, last - begin, progress)
+    return replace(found, window=replace(found.window, first_sample=found.window.first_sample + begin))
+
+
+def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:
+    """Return all single faults, the pairs worth listing and ``unknown``, the most probable first."""
+    least = min(each.fitted.cost for each in refined.hypotheses)
+    candidates = [
+        _candidate(each, least, refined.noise_variance)
+        for each in refined.hypotheses
+        if len(each.fitted.faults) == 1 or each.probability >= WORTH_LISTING
+    ]
+    candidates.append(Candidate(name=UNKNOWN, probability=refined.unknown_probability))
+    # where probabilities vanish, the closest comes first
+    return tuple(sorted(candidates, key=lambda candidate: (-candidate.probability, candidate.misfit or 0.0)))
+
+
+def refit_onset(refined: RefitResult, exam: Examination) -> Onset:
+    """Return the onset in the recording's time."""
+    t, first, onset = exam.recording.t, refined.window.first_sample, refined.onset
+    last = len(t) - 1
+    low, likely, high = (min(first + k, last) for k in (onset.low, onset.profile.onset, onset.high))
+    # the first changed sample ends the interval in which the change came
+    return Onset(float(t[max(low - 1, 0)]), float(t[likely]), float(t[high]), likely)
+
+
+def summarise_refit(refined: RefitResult, exam: Examination, recursive: tuple[Candidate, ...]) -> RefitSummary:
+    """Return the part of a refit that a diagnosis keeps."""
+    from servoscope.isolation.ml import find_other_causes
+
+    t, window = exam.recording.t, refined.window
+    over = refined.onset.profile.duration
+    of_y, of_u = exam.baseline.plant.units
+    units = {"of y": of_y or "in units of y", "of u": of_u or "in units of u"}
+    return RefitSummary(
+        from_s=float(t[window.first_sample]),
+        to_s=float(t[window.first_sample + window.samples - 1]),
+        over_s=over / exam.recording.sample_rate if over > refined.onset.high - refined.onset.low else 0.0,
+        noise=float(np.sqrt(refined.noise_variance)),
+        misfit=refined.goodness.statistic,
+        limit=refined.goodness.limit,
+        recursive=recursive,
+        mimics=tuple(
+            Mimic(name=cause.name, description=cause.cause, value=cause.value, unit=units.get(cause.unit, cause.unit))
+            for cause in find_other_causes(refined)
+        ),
+    )
+
+
+def disagreement_warnings(
+    exam: Examination, candidates: tuple[Candidate, ...], refit: RefitSummary, sure: float
+) -> list[DiagnosisWarning]:
+    """Return a warning where the refit and the recursion contradict each other, both with probability `sure`."""
+    one, other = candidates[0], refit.recursive[0]
+    if min(one.probability, other.probability) < sure or (len(one.faults) > 1 and other.name == UNKNOWN):
+        return []  # the recursion knows no pairs
+    reason = message("warning.disagreement_recency")
+    if len(one.faults) > 1:
+        reason = message("warning.disagreement_pairs")
+    elif refit.over_s > 0.0:
+        reason = message("warning.disagreement_growth", over_s=refit.over_s)
+    if one.name != other.name:
+        found = [message("warning.disagreement_faults", refit=one.names, recursion=other.names, reason=reason)]
+    else:
+        found = [
+            message(
+                "warning.disagreement_size",
+                parameter=a.parameter,
+                refit=a.ratio,
+                refit_digits=ratio_digits(a.ratio, *a.interval),
+                recursion=b.ratio,
+                recursion_digits=ratio_digits(b.ratio, *b.interval),
+                reason=reason,
+            )
+            for a, b in zip(one.faults, other.faults, strict=True)
+            if size_distance_std(a, b) > MAX_SIZE_DISTANCE
+        ]
+    return [warning_throughout(exam, "disagreement", each) for each in found[-1:]]
+
+
+def size_distance_std(a: FaultEstimate, b: FaultEstimate) -> float:
+    """Return how many standard deviations the logarithms of two sizes are apart, as if they shared no data."""
+    spread = float(np.hypot(*(np.log(fault.interval[1] / fault.interval[0]) / 3.92 for fault in (a, b))))
+    return abs(float(np.log(a.ratio / b.ratio))) / max(spread, 1e-12)
+
+
+def _candidate(each: Hypothesis, least: float, noise_variance: float) -> Candidate:
+    fitted = each.fitted
+    ratios, intervals = np.exp(fitted.x), np.exp(np.array(each.evidence.intervals))
+    faults = tuple(
+        FaultEstimate(
+            name=fault.name, parameter=fault.parameter, ratio=float(ratio), interval=(float(low), float(high))
+        )
+        for fault, ratio, (low, high) in zip(fitted.faults, ratios, intervals, strict=True)
+    )
+    covariance = tuple(tuple(row) for row in (noise_variance * fitted.covariance).tolist()) if len(faults) > 1 else None
+    return Candidate(
+        name=each.name,
+        probability=each.probability,
+        faults=faults,
+        misfit=max(fitted.cost - least, 0.0) / noise_variance,
+        covariance=covariance,
+    )

@@ -1,0 +1,304 @@
+"""The monitor of running loops: init / run / step, for one asset or a fleet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import BaselineError, RecordingError
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import Trace
+from servoscope.estimation import frequency_response
+from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.two_stage import StageOneRunner
+
+if TYPE_CHECKING:
+    from servoscope.estimation.recursion import Recursion, RecursionConstants
+
+
+class Monitor:
+    """Follows one asset, or a fleet of assets, block by block or sample by sample.
+
+    Its state is one plain array, shape (size,) for one asset and (assets, size) for a fleet: it is saved by copying it,
+    resuming is bit-identical, and splitting the samples into blocks anywhere changes nothing. The states of a valve law
+    and of stage 1 precede that of stage 2.
+
+    Parameters
+    ----------
+    baseline
+        One baseline, or one per asset. The assets of a fleet may differ in everything but sample rate, evaluation rate,
+        coefficients and monitored frequencies; those of one structure are followed together.
+    share_budget
+        Whether the budget of false alarms is divided among the assets of a fleet; otherwise each asset has all of it.
+    precision
+        ``"single"`` follows a fleet about twice as fast; the documentation's page on speed says what that costs.
+
+    Raises
+    ------
+    BaselineError
+        If the baselines cannot be followed together, or one of them has several operating points.
+    """
+
+    def __init__(
+        self,
+        baseline: Baseline | Sequence[Baseline],
+        *,
+        share_budget: bool = False,
+        precision: Literal["double", "single"] = "double",
+    ) -> None:
+        self.baselines = (baseline,) if isinstance(baseline, Baseline) else tuple(baseline)
+        self.fleet = not isinstance(baseline, Baseline)
+        if not self.baselines:
+            raise BaselineError("a monitor needs at least one baseline")
+        distinct = {id(each): each for each in self.baselines}
+        for each in distinct.values():
+            if each.others:
+                raise BaselineError(
+                    f"a monitor follows one operating point, this baseline has {', '.join(each.points)}: give "
+                    f"baseline.at({each.points[0]!r})"
+                )
+        if share_budget:
+            shared = {key: each.shared(len(self.baselines)) for key, each in distinct.items()}
+            self.baselines = tuple(shared[id(each)] for each in self.baselines)
+            distinct = {id(each): each for each in self.baselines}
+        if len({compatibility_key(each) for each in distinct.values()}) > 1:
+            raise BaselineError(
+                "the baselines of one monitor must share sample rate, evaluation rate, coefficients and frequencies: "
+                "make one monitor for each kind of loop"
+            )
+        self.loop = self.baselines[0].loop
+        constants = {key: MonitorConstants.from_baseline(each) for key, each in distinct.items()}
+        self._constants_of = tuple(constants[id(each)] for each in self.baselines)
+        self.pipeline = self._constants_of[0].pipeline
+        self._single_precision = precision == "single"
+        self._groups = self._group_assets()
+        self._shared_columns = {
+            "expected": _deduplicate([each.expected_theta for each in self._constants_of]),
+            "H": _deduplicate([each.healthy.H for each in self._constants_of]),
+            "covariance of H": _deduplicate([each.healthy.covariance for each in self._constants_of]),
+        }
+        self._limits = np.array([each.limit for each in self.baselines])[:, None]
+        self._prefix_size = max(each.prefix_size for each in self._constants_of)  # where the state of stage 2 begins
+        self._size = self._prefix_size + max(recursion.size for _, recursion in self._groups)
+        self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
+        self._step_constants = np.zeros(0)
+
+    def _group_assets(self) -> list[tuple[npt.NDArray[np.intp], Recursion]]:
+        """Return the assets of each structure, which go through one recursion together."""
+        from servoscope.estimation.recursion import Recursion, structure_key
+
+        keys = {id(each): structure_key(each.constants) for each in self._constants_of}
+        members: dict[Hashable, list[int]] = {}
+        for i, each in enumerate(self._constants_of):
+            members.setdefault(keys[id(each)], []).append(i)
+        constants = [each.constants for each in self._constants_of]
+        return [
+            (np.array(assets), Recursion([constants[i] for i in assets], single=self._single_precision))
+            for assets in members.values()
+        ]
+
+    def init(self) -> FloatArray:
+        """Return the state before the first sample."""
+        states = np.zeros((len(self.baselines), self._size))
+        for assets, recursion in self._groups:
+            states[assets, self._prefix_size : self._prefix_size + recursion.size] = recursion.start()
+        if self._prefix_size:
+            for row, each in zip(states, self._constants_of, strict=True):
+                row[: each.prefix_size] = np.concatenate([each.pipeline.valve.start(), each.stage.start()])
+        return states if self.fleet else states[0]
+
+    def run(
+        self,
+        state: FloatArray,
+        r: npt.ArrayLike,
+        u: npt.ArrayLike,
+        y: npt.ArrayLike,
+        restart: npt.ArrayLike | None = None,
+    ) -> tuple[FloatArray, Trace]:
+        """Feed a block of samples of any length.
+
+        Parameters
+        ----------
+        state
+            As returned by `init` or an earlier `run`; it stays valid.
+        r, u, y
+            Shape (N,), or (assets, N) for a fleet. A NaN anywhere in a sample is a gap: the estimate is held.
+        restart
+            True where a sample does not follow its predecessor by one sample time; same shape.
+
+        Returns
+        -------
+        numpy.ndarray, Trace
+            The new state, and the evaluations that fell into the block, shape (K, ...) or (assets, K, ...).
+
+        Raises
+        ------
+        RecordingError
+            If the shapes do not fit together.
+        """
+        number = np.float32 if self._single_precision else np.float64
+        signals = [np.atleast_2d(np.ascontiguousarray(signal, dtype=number)) for signal in (r, u, y)]
+        shape = (len(self.baselines), signals[0].shape[1])
+        if any(signal.shape != shape for signal in signals) or state.shape != self._shape:
+            raise RecordingError(
+                f"r, u, y must have the same shape ({'assets, N' if self.fleet else 'N,'}) for {shape[0]} asset(s), "
+                "and the state must come from this monitor's init or run"
+            )
+        flags = None
+        if restart is not None:
+            flags = np.atleast_2d(np.ascontiguousarray(restart, dtype=np.bool_))
+            if flags.shape != shape:
+                raise RecordingError("restart must have the shape of r")
+        rows = np.ascontiguousarray(np.atleast_2d(state), dtype=np.float64)
+        if self._prefix_size:
+            rows = rows.copy()
+            gaps = np.zeros(shape, dtype=np.bool_) if flags is None else flags
+            signals[1] = self._apply_input_stages(rows, signals[0], signals[1], signals[2], gaps)
+        if len(self._groups) == 1 and not self._prefix_size:
+            ((_, recursion),) = self._groups
+            index = recursion.rows(rows, shape[1])
+            new, out = recursion.run(rows, signals[0], signals[1], signals[2], flags)
+        else:
+            new, out, index = self._run_groups(rows, signals, flags)
+        return new if self.fleet else new[0], self._trace(out, index)
+
+    def _run_groups(
+        self, rows: FloatArray, signals: list[npt.NDArray[Any]], flags: npt.NDArray[np.bool_] | None
+    ) -> tuple[FloatArray, npt.NDArray[Any], npt.NDArray[np.int64]]:
+        """Run each group on its own."""
+        new, outs = rows.copy(), []
+        for assets, recursion in self._groups:
+            part = slice(self._prefix_size, self._prefix_size + recursion.size)
+            own = np.ascontiguousarray(rows[assets, part])
+            index = recursion.rows(own, signals[0].shape[1])
+            r, u, y = (signal[assets] for signal in signals)
+            new[assets, part], out = recursion.run(own, r, u, y, None if flags is None else flags[assets])
+            outs.append(out)
+        together = np.empty((len(rows), *outs[0].shape[1:]), dtype=outs[0].dtype)
+        for (assets, _), out in zip(self._groups, outs, strict=True):
+            together[assets] = out
+        return new, together, index
+
+    def step(self, state: FloatArray, r: float, u: float, y: float) -> bool:
+        """Feed one sample of one asset and change the state in place; return whether it holds a new evaluation.
+
+        Read it with `latest`. NaN in any of the three is a gap.
+        """
+        if self._step is None or len(state) != self._size or state.ndim != 1:
+            if state.shape != self._shape or self.fleet or self._single_precision:
+                raise RecordingError(
+                    "step follows one asset: give the state of a monitor with one baseline, or use run"
+                )
+            self._step, self._step_constants = self._groups[0][1].stepper
+        if self._prefix_size:
+            one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
+            u = float(self._apply_input_stages(state[None, :], one[0], one[1], one[2], gap)[0, 0])
+            state = state[self._prefix_size :]
+        return self._step(self._step_constants, state, r, u, y)
+
+    def _apply_input_stages(
+        self, rows: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, flags: npt.NDArray[np.bool_]
+    ) -> FloatArray:
+        """Return u behind valve law and stage 1, whose states are changed in place."""
+        flow = np.empty_like(u)
+        for i, each in enumerate(self._constants_of):
+            valve = each.pipeline.valve
+            behind_valve = valve.run(rows[i, : valve.size], u[i], y[i], flags[i])
+            flow[i] = each.stage.run(rows[i, valve.size : each.prefix_size], r[i], behind_valve, flags[i])
+        return flow
+
+    def latest(self, state: FloatArray) -> Trace:
+        """Return the trace of the latest evaluation in a state."""
+        from servoscope.estimation.kernel.sample_steps import SAMPLE
+
+        rows = np.atleast_2d(state)[:, self._prefix_size :]
+        out = np.empty((len(rows), self._groups[0][1].sizes.row))
+        for assets, recursion in self._groups:
+            out[assets] = recursion.evaluate(rows[assets, : recursion.size])
+        return self._trace(out[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]))
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        return (len(self.baselines), self._size) if self.fleet else (self._size,)
+
+    def _trace(self, out: npt.NDArray[Any], index: npt.NDArray[np.int64]) -> Trace:
+        """Return complete evaluations, shape (assets, K, row), as a trace."""
+        n, f = len(self._constants_of[0].expected_theta), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)
+        shape = out.shape[:2]
+        H = out[..., 4 + n + n * n :].reshape(*shape, len(f), 6)
+        response = H[..., :2].view(np.result_type(out, np.complex64))[..., 0], H[..., 2:].reshape(*shape, len(f), 2, 2)
+        columns: dict[str, Any] = {
+            "theta": out[..., 4 : 4 + n],
+            "covariance": out[..., 4 + n : 4 + n + n * n].reshape(*shape, n, n),
+            "statistic": out[..., 1],
+            "level": out[..., 2],
+            "crossed": out[..., 3],
+            "ready": _ready_mask(out[..., 0]),
+        }
+        for name, values in self._shared_columns.items():
+            columns[name] = np.broadcast_to(values[:, None], (*shape, *values.shape[1:]))
+        threshold: Any = self._limits
+        if not self.fleet:
+            columns = {name: values[0] for name, values in columns.items()}
+            response, threshold = (response[0][0], response[1][0]), self.baselines[0].limit
+        expected = FrequencyResponse(f, columns.pop("H"), columns.pop("covariance of H"))
+        return Trace(
+            t=index / self.loop.sample_rate,
+            names=self.pipeline.bank.names,
+            threshold=threshold,
+            ifrf=FrequencyResponse(f, *response),
+            ifrf_expected=expected,
+            **columns,
+        )
+
+
+def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Return where there is an estimate; updates never become fewer, so the first column mostly decides."""
+    if updates.size and (updates[:, 0] > 0.0).all():
+        return np.broadcast_to(np.True_, updates.shape)
+    return updates > 0.0
+
+
+def _deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Stack arrays; where all are the same object, it stands once, with a first axis of length one."""
+    return np.array(values if len({id(value) for value in values}) > 1 else values[:1])
+
+
+def compatibility_key(baseline: Baseline) -> Hashable:
+    """Return the properties that all assets of one monitor must share."""
+    loop = baseline.loop
+    return loop.sample_rate, loop.monitor.evaluation_rate, baseline.names, loop.monitor.frequencies
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorConstants:
+    """The part of a monitor that comes from one baseline and never changes."""
+
+    pipeline: Pipeline
+    stage: StageOneRunner
+    prefix_size: int  # of the states of valve law and stage 1
+    constants: RecursionConstants
+    expected_theta: FloatArray
+    healthy: FrequencyResponse
+
+    @classmethod
+    def from_baseline(cls, baseline: Baseline) -> MonitorConstants:
+        """Derive the constants; the bias under the baseline's references is taken out of estimate and expectation."""
+        from servoscope.estimation.recursion import EvaluationConstants
+
+        pipeline, stage = baseline.pipeline(), StageOneRunner(baseline.loop, baseline.stage_one)
+        frequencies, expected = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
+        E = pipeline.bank.E(frequencies)
+        response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
+        evaluation = EvaluationConstants(baseline.covariance_array(), expected, response, baseline.loop.sample_rate)
+        constants = pipeline.constants(baseline.tuning, baseline.cusum_constants(pipeline), evaluation)
+        healthy = frequency_response.frequency_response(
+            pipeline.bank, frequencies, expected, baseline.covariance_array()
+        )
+        return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, expected, healthy)

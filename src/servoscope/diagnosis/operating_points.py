@@ -1,0 +1,146 @@
+"""Learning at one or several operating points, and the comparison with an earlier baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from servoscope.core.errors import BaselineError, NotEnoughError
+from servoscope.core.messages import Message, message
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis import learn_faults
+from servoscope.diagnosis.diagnose import diagnose
+from servoscope.diagnosis.learn_faults import LabelledRecordings
+from servoscope.learning import learn as learning
+from servoscope.learning.learn import Progress
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
+
+LIKELY = 0.05  # probability from which a fault is noted that looks like another operating point
+
+
+def learn(
+    loop: Loop,
+    recordings: Sequence[Recording] | Mapping[str, Sequence[Recording]],
+    progress: Progress = lambda _: None,
+    *,
+    compare: Baseline | None = None,
+    accept_change: bool = False,
+    faults: LabelledRecordings | Mapping[str, LabelledRecordings] | None = None,
+    accept_delay: bool = False,
+) -> Baseline:
+    """Learn a baseline from healthy recordings, at one operating point or at several.
+
+    With `compare`, no change of the machine is learned as healthy unnoticed.
+
+    Parameters
+    ----------
+    loop
+        The loop.
+    recordings
+        Healthy recordings, one or more; by the name of their operating point (a load, a temperature, a tool, a season)
+        where there are several, ``{"cold": [...], "warm": [...]}``.
+    progress
+        Called with the name of each step.
+    compare
+        An earlier baseline of the same machine; each recording is diagnosed with it first, at its own operating point
+        if that baseline has it.
+    accept_change
+        Learn although a recording is a fault to the earlier baseline; the notes then say so.
+    faults
+        Recordings of known faults by name, ``{"backlash": [...]}``; `diagnose` then knows these faults too. Where
+        operating points are named, by point first, ``{"cold": {"backlash": [...]}}``.
+    accept_delay
+        Learn although u and y are out of step by more than the loop file says; the notes then say so.
+
+    Returns
+    -------
+    Baseline
+        With `points` and `at(name)` where operating points were named.
+
+    Raises
+    ------
+    NotEnoughError
+        If the recordings are too short or excite too little, if a point has none, or if those of a fault do not
+        differ from healthy.
+    RecordingError
+        If u and y are certainly out of step by more than the loop file says, and that is not accepted.
+    LoopError
+        If settings contradict each other.
+    BaselineError
+        If a recording is a fault to the earlier baseline and the change is not accepted, if a point has no name, or if
+        a fault has the name of one that the plant knows, or a point that has no healthy recordings.
+    """
+    named = recordings if isinstance(recordings, Mapping) else {"": recordings}
+    for name, some in named.items():
+        if not name and isinstance(recordings, Mapping):
+            raise BaselineError("an operating point needs a name, as in {'cold': [...], 'warm': [...]}")
+        if name and not some:
+            raise NotEnoughError(f"operating point {name}: no recording to learn from, give at least one")
+    if not named:
+        raise NotEnoughError("no recording to learn from: give at least one healthy recording")
+    labels = _group_by_point(faults or {}, recordings)
+    notes = {name: _compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
+    learned: list[Baseline] = []
+    for name, some in named.items():
+        one = learning.learn_baseline(loop, some, progress, accept_delay)
+        longest = max(some, key=lambda rec: rec.samples)
+        progress("operating points")
+        alike = [note for other in learned if (note := _resemblance_note(other, name, longest)) is not None]
+        one = one.model_copy(update={"point": name, "notes": (*one.notes, *notes[name], *alike)})
+        learned.append(learn_faults.add_learned_faults(one, labels[name], progress) if name in labels else one)
+    return learned[0].model_copy(update={"others": tuple(learned[1:])})
+
+
+def _group_by_point(
+    faults: LabelledRecordings | Mapping[str, LabelledRecordings],
+    recordings: Sequence[Recording] | Mapping[str, Sequence[Recording]],
+) -> dict[str, LabelledRecordings]:
+    """Return the labelled recordings of each operating point; the point of a baseline without points is ""."""
+    found: dict[str, dict[str, Sequence[Recording]]] = {}
+    for key, value in faults.items():
+        if isinstance(recordings, Mapping) != isinstance(value, Mapping):
+            form = "{'cold': {'backlash': [...]}}" if isinstance(recordings, Mapping) else "{'backlash': [...]}"
+            raise BaselineError(f"faults, {key}: give them by operating point where healthy ones are, as in {form}")
+        if isinstance(value, Mapping):
+            found[key] = dict(value)
+        else:
+            found.setdefault("", {})[key] = value
+    for point in found:
+        if point and point not in recordings:
+            raise BaselineError(f"faults at {point}: there are no healthy recordings at that operating point")
+    return {point: labels for point, labels in found.items() if labels}
+
+
+def _compare_with_earlier(
+    earlier: Baseline | None, point: str, recordings: Sequence[Recording], progress: Progress, accept: bool
+) -> list[Message]:
+    """Return notes on what changed since an earlier baseline; raises BaselineError if the change is not accepted."""
+    if earlier is None:
+        return []
+    progress("comparison")
+    notes = []
+    for rec in recordings:
+        diagnosis = diagnose(earlier, rec, point=point if point in earlier.points else None)
+        if diagnosis.verdict == "fault" and not accept:
+            raise BaselineError(
+                f"{rec.name} is not healthy by the earlier baseline. {diagnosis.summary} Nothing was learned; find the "
+                "cause, or accept the change (--accept-change)"
+            )
+        known = {"recording": rec.name, "hash": earlier.hash}
+        if diagnosis.verdict == "fault":
+            notes.append(message("learning.accepted", **known, headline=diagnosis.headline))
+        elif diagnosis.verdict == "undetermined":
+            notes.append(message("learning.not_comparable", **known))
+    return notes
+
+
+def _resemblance_note(other: Baseline, point: str, recording: Recording) -> Message | None:
+    """Return a note on which fault at another operating point looks like this point, or that both may be one."""
+    diagnosis = diagnose(other, recording)
+    if diagnosis.verdict == "healthy":
+        return message("learning.one_point", recording=recording.name, other=other.point, point=point)
+    likely = [fault for c in diagnosis.candidates if c.probability >= LIKELY for fault in c.faults]
+    if not likely:
+        return None
+    faults = tuple(message("learning.size", name=f.name, parameter=f.parameter, ratio=f.ratio) for f in likely)
+    return message("learning.hidden_fault", faults=faults, other=other.point, point=point)

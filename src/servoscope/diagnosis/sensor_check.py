@@ -1,0 +1,66 @@
+"""Sensors of one output that disagree: which one is wrong, and the recording without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import DiagnosisWarning
+from servoscope.detection.sensors import find_sensor_deviation, without_sensor
+from servoscope.signals import Recording
+
+WORSE = 2.0  # times the residual power of the other sensor, from which the plant says that a sensor is wrong
+LONGEST = 20.0  # memories after the onset that are asked
+FEWEST = 20  # usable samples
+
+
+def check_sensors(baseline: Baseline, recording: Recording) -> tuple[Recording, list[DiagnosisWarning]]:
+    """Return a recording without the sensor that departs from the others, and a warning that names it.
+
+    Where it cannot be told which of two it is, or only its noise has grown, the recording stays as it is.
+    """
+    model = baseline.sensors
+    if model is None:
+        return recording, []
+    found = find_sensor_deviation(model, recording, lambda onset: wrong_sensor(baseline, recording, onset))
+    if found is None:
+        return recording, []
+    from_s, to_s = float(recording.t[found.onset]), float(recording.t[-1])
+    count = recording.samples - found.onset
+    warning = DiagnosisWarning(kind="sensor", from_s=from_s, to_s=to_s, count=count, description=found.text)
+    if len(found.names) == 1 and found.kind != "noise":
+        y = without_sensor(recording, model.names, found.names[0], found.onset)
+        recording = replace(recording, y=y)
+    return recording, [warning]
+
+
+def wrong_sensor(baseline: Baseline, recording: Recording, onset: int) -> int | None:
+    """Return which of two sensors contradicts the healthy plant from a sample on; None where neither does more.
+
+    An offset shows only where the plant has a stiffness, and a fault of the actuator contradicts both alike.
+    """
+    loop = baseline.loop
+    rows = recording.rows(slice(onset, onset + round(LONGEST * loop.monitor.memory * loop.sample_rate)))
+    powers = [_residual_power(baseline, rows, rows.channels[name]) for name in loop.columns.outputs]
+    return _larger(powers)
+
+
+def _larger(powers: Sequence[float]) -> int | None:
+    first, second = powers
+    if max(first, second) > WORSE * min(first, second):
+        return int(second > first)
+    return None
+
+
+def _residual_power(baseline: Baseline, rows: Recording, y: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    """Return the mean square of what the healthy plant leaves of u, by one sensor."""
+    restart = rows.restart.copy()
+    restart[:1] = True
+    found = baseline.pipeline().regression(rows.r, rows.u, y, restart)
+    if found.ok.sum() < FEWEST:
+        return 0.0
+    residual = found.eta - found.phi @ np.array(baseline.theta)
+    return float(np.mean(residual[found.ok] ** 2))

@@ -1,0 +1,80 @@
+"""Warnings about an examination: changes too small for this recording to show, and doubts about the estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servoscope.core import outofcore
+from servoscope.core.messages import Message, message
+from servoscope.detection.chi2_test import noncentrality, required_noncentrality
+from servoscope.detection.plant_fit import MOST_SATURATED, fault_directions, saturated_share
+from servoscope.detection.result import DiagnosisWarning
+from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
+
+AT_ONCE = 4096  # evaluations
+MIN_SKIPPED_SHARE = 0.01  # share of updates without an instrument from which a warning is given
+NO_PROMISE = 10.0  # relative change; a baseline that detects nothing smaller promises nothing
+WEAKER = 3.0  # a recording that shows only changes this much larger than promised is called undetermined
+
+
+def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
+    """Return, by parameter, the smallest change that would have shown here, and what the baseline promises."""
+    baseline, e = exam.baseline, exam.estimates
+    promised = {p.parameter: p.change for p in baseline.promises if p.change is not None and p.change < NO_PROMISE}
+    directions = fault_directions(baseline.loop, baseline.plant, exam.tuning.theta)
+    rows = np.array([directions[parameter] for parameter in promised])
+    best = np.zeros(len(rows))
+    for at in outofcore.iter_chunks(0, exam.evaluations, e.S, e.Psi, at_once=AT_ONCE) if len(rows) else ():
+        ok = e.updates[at] > 0
+        if ok.any():
+            best = np.maximum(best, noncentrality(exam.covariance(at)[ok], e.Psi[at][ok], rows).max(axis=0))
+    needed = required_noncentrality(exam.pipeline.bank.n, baseline.limit)
+    smallest = (float(np.sqrt(needed / one)) if one > 0.0 else np.inf for one in best)
+    return dict(zip(promised, zip(smallest, promised.values(), strict=True), strict=True))
+
+
+def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]) -> list[DiagnosisWarning]:
+    """Return warnings about what this recording could not have shown although the baseline promises it."""
+    if (share := saturated_share(exam.baseline.loop, exam.recording)) > MOST_SATURATED:
+        reasons = [message("warning.saturated", share=share)]
+    elif not detectable:
+        reasons = [message("warning.no_promise")]
+    elif all(np.isinf(smallest) for smallest, _ in detectable.values()):
+        reasons = [message("warning.no_motion")]
+    else:
+        reasons = [
+            message("warning.weak_never", parameter=parameter, promised=promised)
+            if np.isinf(smallest)
+            else message("warning.weak", parameter=parameter, smallest=smallest, promised=promised)
+            for parameter, (smallest, promised) in detectable.items()
+            if smallest > WEAKER * promised
+        ]
+    return [warning_throughout(exam, "power", reason) for reason in reasons]
+
+
+def estimate_warnings(exam: Examination) -> list[DiagnosisWarning]:
+    """Return warnings about the estimate itself."""
+    warnings = []
+    e, t = exam.estimates, exam.recording.t
+    if exam.replaced:
+        warnings.append(warning_throughout(exam, "instrument", message("warning.instrument_failed")))
+    if exam.skipped_share > MIN_SKIPPED_SHARE:
+        replaced = exam.skipped_share > MAX_SKIPPED_SHARE
+        key = "warning.instrument_replaced" if replaced else "warning.instrument"
+        warnings.append(warning_throughout(exam, "instrument", message(key, share=exam.skipped_share)))
+    if exam.noise_growth > 1.0:
+        louder = message("warning.noise", factor=float(np.sqrt(exam.noise_growth)))
+        warnings.append(warning_throughout(exam, "noise", louder))
+    if len(e.updates) and e.updates[-1] > 0:
+        last = int(e.index[int(np.searchsorted(e.updates, e.updates[-1]))])
+        if t[-1] - t[last] > exam.baseline.loop.monitor.memory:
+            from_s, to_s, count = float(t[last]), float(t[-1]), len(t) - last
+            rest = message("warning.rest")
+            warnings.append(DiagnosisWarning(kind="rest", from_s=from_s, to_s=to_s, count=count, description=rest))
+    return warnings
+
+
+def warning_throughout(exam: Examination, kind: str, description: Message) -> DiagnosisWarning:
+    """Return a warning about the whole recording."""
+    from_s, to_s = float(exam.recording.t[0]), float(exam.recording.t[-1])
+    return DiagnosisWarning(kind=kind, from_s=from_s, to_s=to_s, count=1, description=description)

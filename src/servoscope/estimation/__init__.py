@@ -1,0 +1,1 @@
+"""Recursive estimation of the inverse transfer function: filter bank, estimators, noise model, frequency response."""

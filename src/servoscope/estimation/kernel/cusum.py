@@ -1,0 +1,85 @@
+"""The sequential test: the residual of a simulated healthy loop is subtracted, the rest whitened and tested by CUSUMs.
+
+Beside the measured loop runs a shadow: the healthy loop without noise, driven by the same reference, through the same
+filters. The measured residual minus the shadow's is noise, white after a filter of its own; a change of the
+actuator adds Delta' phi to it. One CUSUM (Page, 1954) per expected change adds up the logarithm of the likelihood
+ratio of "changed by Delta" against "healthy", and starts anew whenever that falls below zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.jit import dot, fma, maximum, minimum
+from servoscope.estimation.noise_model import ArmaNoise
+
+CLIP = 4.0  # standard deviations that one sample may contribute: a spike alone raises no alarm
+CAP = 2.0  # largest CUSUM, in limits: it falls soon after an actuator is repaired
+WARMUP_REMAINDER = 0.05  # share of the whitening filter's transient below which its output counts
+MAX_WARMUP = 1000  # updates
+LAGS = 2  # delayed copies of the last column, for changes that come between samples
+
+
+class CusumConstants(NamedTuple):
+    """Constants of the sequential test; without members there is none.
+
+    ``A, B, C, D, X0`` are the shadow, r -> [eta, phi]; `theta` the coefficients that the residual is formed with;
+    `numerator` and `denominator` the whitening filter, both of one length, first element 1, and `gain` its factor;
+    `warm` the updates that it needs; `changes` (members, n + `LAGS`) the weights of the columns and `limits`
+    (members,) where a CUSUM alarms. Scaled as `estimation.recursion.RecursionConstants`.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    X0: FloatArray
+    theta: FloatArray
+    numerator: FloatArray
+    denominator: FloatArray
+    gain: float
+    warm: int
+    changes: FloatArray
+    limits: FloatArray
+
+
+def whitening_filter(noise: ArmaNoise) -> tuple[FloatArray, FloatArray, float, int]:
+    """Return numerator, denominator, gain and warm-up of the filter that whitens a noise."""
+    length = max(len(noise.a), len(noise.b)) + 1
+    numerator, denominator = (np.pad(each, (0, length - len(each))) for each in noise.polynomials)
+    slowest = float(np.abs(np.roots(denominator)).max(initial=0.0)) if len(noise.b) else 0.0
+    warm = MAX_WARMUP
+    if slowest < 1.0:
+        warm = min(int(np.log(WARMUP_REMAINDER) / np.log(max(slowest, 0.1))), MAX_WARMUP) + length
+    return numerator, denominator, 1.0 / float(np.sqrt(noise.variance)), warm
+
+
+def lagged_columns(phi: FloatArray) -> FloatArray:
+    """Return whitened columns (N, n) with `LAGS` delayed copies of the last beside them, shape (N, n + LAGS)."""
+    late = [np.concatenate([np.zeros(lag), phi[:, -1]])[: len(phi)] for lag in range(1, LAGS + 1)]
+    return np.column_stack([phi, *late])
+
+
+def whiten_sample(c: Any, model: int, s: Any, at: int, memory: int, x: Any) -> Any:
+    """Whiten one sample; s[at:] holds the filter's memory (transposed direct form II).
+
+    c[model:] is the gain, then `memory` coefficients of the numerator and as many of the denominator, from lag 1 on.
+    """
+    y = x + s[at]
+    for i in range(memory):
+        new = fma(c[model + 1 + i], x, -(c[model + 1 + memory + i] * y))
+        s[at + i] = new + s[at + i + 1] if i < memory - 1 else new
+    return y * c[model]
+
+
+def update_cusum(weights: Sequence[Any], psi: Sequence[Any], e: Any, g: Any, half: Any) -> Any:
+    """Return a CUSUM g, in units of its limit h, after one more whitened residual e.
+
+    A change would shift e by m = h weights' psi, and the likelihood ratio grows by m e - m^2/2; `half` is -h/2.
+    """
+    shift = dot(weights, psi)
+    return minimum(maximum(fma(shift, fma(shift, half, e), g), 0.0), CAP)

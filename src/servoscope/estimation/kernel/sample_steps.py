@@ -1,0 +1,301 @@
+"""One sample of one asset through the whole chain: filters, estimator, covariance, sequential test.
+
+Traced arithmetic (see `core.jit`) that becomes straight-line code for the sizes of one loop; a lane is an asset. With
+one lane it is the recursion of one series, kept in registers; with many, the same lines become vectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+from servoscope.core.jit import Bool, dot, fma, maximum, minimum, where
+from servoscope.estimation.kernel import sparse_lti
+from servoscope.estimation.kernel.cusum import CLIP, LAGS, update_cusum, whiten_sample
+from servoscope.estimation.kernel.sparse_lti import SparsityPattern
+from servoscope.estimation.moments import propagate_covariance, propagate_initial_share
+
+# counters at the head of a state row
+ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, STILL, WHITENED, CROSSED = range(8)
+HEADER_SIZE = 8
+CUSUM_BATCH = 8  # the number of CUSUMs is rounded up to this, so that few kernels serve many baselines
+# status of a sample: missing, held back, may update the estimator, between two updates
+MISSING, HELD, USED, BETWEEN = -1.0, 0.0, 1.0, 2.0
+# Of the speed of a reference, as shares of the parts that cancel in it: what rounding leaves, and where it counts as
+# standing still. The differentiator's tail falls to no less than a fifth from sample to sample: it cannot jump the gap.
+ROUNDING, STANDING = 1e-14, 1e-12
+LEAST_SPEED = 1e-30  # below, a reference that rests at 0 stands still
+MAX_PHYSICAL = 1e100  # larger is no physical signal; its square would overflow and stay in the state for ever
+TILE = 16  # largest number of samples that are fetched together
+
+
+class KernelSizes(NamedTuple):
+    """The sizes that code is compiled for."""
+
+    n: int
+    rows: int
+    inputs: int
+    states: int
+    speed: int
+    gated: bool
+    codes: tuple[int, ...]
+    lags: int
+    shadow: int
+    memory: int
+    watched: int
+    steady: bool
+    extra: int
+    frequencies: int
+    start: bool
+    row: int
+    floats: int
+
+
+class KernelSpec(NamedTuple):
+    """Sizes of a recursion and its offsets in state (`to`) and constants (`at`); equal ones share machine code."""
+
+    estimator: str
+    sizes: KernelSizes
+    to: tuple[tuple[str, int], ...]
+    at: tuple[tuple[str, int], ...]
+    bank: SparsityPattern
+    shadow: SparsityPattern
+
+
+class SampleSteps:
+    """The steps of one sample for the sizes of a specification.
+
+    c are constants, s is the state, h its counters, v the regressors [eta, phi, z], `shadow` those of the healthy loop,
+    e the whitened residual. The sequential test takes w and the sample numbers `when` of a tile; g are its CUSUMs. With
+    `single_lane`, neighbouring CUSUMs of one asset are the lanes of `update_cusums`.
+    """
+
+    def __init__(self, spec: KernelSpec, steady: Any, single_lane: bool = False) -> None:
+        self.size, self.to, self.at = spec.sizes, SimpleNamespace(**dict(spec.to)), SimpleNamespace(**dict(spec.at))
+        self._bank, self._shadow, self._steady, self.single_lane = spec.bank, spec.shadow, steady, single_lane
+
+    def begin_evaluation(self, s: Any, h: Any) -> None:
+        """Forget the largest CUSUM of the evaluation before."""
+        if self.size.shadow:
+            level = s[self.to.level]
+            h[CROSSED] = where(level < 1.0, 0.0, h[CROSSED])
+            s[self.to.peak] = level
+
+    def accumulate_size(self, e: Any, tile: Any, i: Any) -> None:
+        """Sum up the magnitudes of samples, and count restarts."""
+        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
+        e[0] = e[0] + ((abs(r) + abs(u)) + abs(y))
+        e[1] = e[1] + tile[i + 3 * TILE]
+
+    def is_undisturbed(self, h: Any, e: Any) -> Bool:
+        """Return whether all samples that were summed up update the estimator: none is missing, restarts or waits."""
+        undisturbed: Bool = (
+            (e[0] < MAX_PHYSICAL) & (e[1] <= 0.0) & (h[ARMED] > 0.0) & (h[WAIT] <= 0.0)
+        )  # NaN is below nothing
+        return undisturbed
+
+    def update_undisturbed(self, c: Any, s: Any, h: Any, w: Any, when: Any, tile: Any, i: Any) -> None:
+        """Process an undisturbed sample: `advance_filters` and `update_estimate` without their special cases."""
+        h[SAMPLE] = h[SAMPLE] + 1.0
+        x = self._inputs(c, tile[i], tile[i + TILE], tile[i + 2 * TILE], None)
+        v = sparse_lti.advance_system(self._bank, c, self.at.bank, s, self.to.x, x)
+        shadow = sparse_lti.advance_system(self._shadow, c, self.at.shadow, s, self.to.shadow, x)
+        e: dict[int, Any] = {}
+        self.update_estimate(c, s, h, v, shadow, e)
+        if self.size.shadow:
+            self._store_whitened(s, e, h[WHITENED] > c[self.at.warm], w, i)
+            when[i] = h[SAMPLE]
+
+    def count_sample(self, h: Any, tile: Any, i: Any) -> Bool:
+        """Count a sample; return whether it is complete and continues the one before."""
+        h[SAMPLE] = h[SAMPLE] + 1.0
+        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
+        complete = (abs(r) < MAX_PHYSICAL) & (abs(u) < MAX_PHYSICAL) & (abs(y) < MAX_PHYSICAL)
+        continues: Bool = complete & (tile[i + 3 * TILE] <= 0.0) & (h[ARMED] > 0.0)
+        return continues
+
+    def begin_filters(self, c: Any, s: Any, h: Any, tile: Any, i: Any) -> None:
+        """Put the filters into their steady state at one sample, after a gap."""
+        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
+        h[ARMED] = 1.0
+        h[WAIT] = c[self.at.wait]
+        speed = None
+        if self.size.speed:
+            source = r if self.size.speed == 2 else y
+            for j in range(2):
+                s[self.to.velocity + j] = c[self.at.velocity + 9 + j] * source
+            speed, parts = self._speed(c, s, source)
+            if self.size.speed == 2:
+                speed = where(abs(speed) <= ROUNDING * parts, 0.0, speed)
+        w = self._inputs(c, r, u, y, speed)
+        for k in range(self.size.states):
+            s[self.to.x + k] = dot([c[self.at.steady + k * len(w) + j] for j in range(len(w))], w)
+        for k in range(self.size.shadow):
+            s[self.to.shadow + k] = c[self.at.shadow_steady + k] * r
+
+    def advance_filters(
+        self, c: Any, s: Any, h: Any, status: Any, v: Any, shadow: Any, tile: Any, i: Any, due: Any
+    ) -> Bool:
+        """Pass one complete sample through the filters; return whether its status is `USED`.
+
+        It is `HELD` while the filters settle, the axis rests or u is in the dead zone, and `BETWEEN` where no update is
+        due.
+        """
+        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
+        speed: Any = None
+        hold: Any = None
+        if self.size.speed:
+            source = r if self.size.speed == 2 else y
+            speed, parts = self._speed(c, s, source)
+            k, x = self.at.velocity, [s[self.to.velocity], s[self.to.velocity + 1]]
+            ahead = [c[k + 2 * j] * x[0] + c[k + 2 * j + 1] * x[1] + c[k + 4 + j] * source for j in range(2)]
+            if self.size.speed == 2:
+                # a reference stands still exactly: the filter is stopped before the sign of its tail, that of the last
+                # motion, is lost in rounding, which differs from machine to machine; without a motion it is 0
+                stands = abs(speed) <= STANDING * parts + LEAST_SPEED
+                ahead = [where(stands, old, new) for old, new in zip(x, ahead, strict=True)]
+                speed = where(abs(speed) <= ROUNDING * parts, 0.0, speed)
+            for j in range(2):
+                s[self.to.velocity + j] = ahead[j]
+        w = self._inputs(c, r, u, y, speed)
+        if self.size.speed:
+            # a reversal is short; an axis that has stood longer than the filters remember is at rest
+            drift = fma(speed - s[self.to.drift], c[self.at.forget], s[self.to.drift])  # the speed without its noise
+            s[self.to.drift] = drift
+            h[STILL] = where(abs(drift) < c[self.at.still_speed], h[STILL] + 1.0, 0.0)
+            hold = h[STILL] > c[self.at.wait]
+            if self.size.gated:
+                dead = (w[1] >= c[self.at.dead_low]) & (w[1] <= c[self.at.dead_high])
+                hold = hold | (abs(speed) <= c[self.at.rest_speed]) | dead
+        for k, number in enumerate(sparse_lti.advance_system(self._bank, c, self.at.bank, s, self.to.x, w)):
+            v[k] = number
+        for k, number in enumerate(sparse_lti.advance_system(self._shadow, c, self.at.shadow, s, self.to.shadow, w)):
+            shadow[k] = number
+        waiting = h[WAIT]
+        settling = waiting > 0.0
+        # what enters the filters while it rests has nothing to do with the motion: wait until they have forgotten it
+        h[WAIT] = (
+            maximum(waiting - 1.0, 0.0) if hold is None else where(hold, c[self.at.wait], maximum(waiting - 1.0, 0.0))
+        )
+        held = settling if hold is None else hold | settling
+        status[0] = where(held, HELD, where(due, USED, BETWEEN))
+        return self.is_update(status)
+
+    def is_update(self, status: Any) -> Bool:
+        """Return whether the sample updates the estimator."""
+        used: Bool = (status[0] >= USED) & (status[0] <= USED)
+        return used
+
+    def update_estimate(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any) -> None:
+        """Update theta with an estimator whose P stays at P_d, then all that follows from the update."""
+        phi = [v[1 + i] for i in range(self.size.n)]
+        theta = [s[self.to.theta + i] for i in range(self.size.n)]
+        residual = v[0] - dot(phi, theta)
+        K = self._steady(c[self.at.R], phi)
+        for i, gain in enumerate(K):
+            s[self.to.theta + i] = fma(gain, residual, theta[i])
+        h[UPDATES] = h[UPDATES] + 1.0
+        s[self.to.power] = self._mean_square(c, s, residual)
+        self._propagate(c, s, h, v, shadow, e, phi, K)
+
+    def record_update(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, k: Any) -> None:
+        """Do what follows from an update of theta and P by any estimator; k holds its gain, residual and status."""
+        n = self.size.n
+        refused = k[n + 1]
+        h[UPDATES] = h[UPDATES] + (1.0 - refused)
+        h[SKIPPED] = h[SKIPPED] + refused
+        s[self.to.power] = where(refused > 0.0, s[self.to.power], self._mean_square(c, s, k[n]))
+        self._propagate(c, s, h, v, shadow, e, [v[1 + i] for i in range(n)], [k[i] for i in range(n)])
+
+    def reset_noise(self, s: Any, h: Any) -> None:
+        """Forget the noise before a gap or a rest."""
+        size, to = self.size, self.to
+        spans = [(to.M, size.lags * size.n)]
+        if size.shadow:
+            h[WHITENED] = 0.0
+            spans += [(to.white, (size.n + 1) * size.memory), (to.psi, size.n + LAGS)]
+        for begin, count in spans:
+            for i in range(count):
+                s[begin + i] = 0.0
+
+    def store_residual(self, c: Any, s: Any, h: Any, status: Any, e: Any, w: Any, when: Any, i: Any) -> None:
+        """Store a sample for the sequential test; it counts once the whitening filter has forgotten its start."""
+        used = self.is_update(status)
+        self._store_whitened(s, e, used & (h[WHITENED] > c[self.at.warm]), w, i)
+        when[i] = where(used, h[SAMPLE], 0.0)
+
+    def update_cusums(self, c: Any, g: Any, w: Any, top: Any, i: Any) -> None:
+        """Update the CUSUMs g with the whitened residual of sample i; c begins with their weights."""
+        columns, each = self.size.n + LAGS, self.size.watched // CUSUM_BATCH if self.single_lane else CUSUM_BATCH
+        count = each if self.single_lane else self.size.watched
+        psi, white, best = [w[i * (columns + 1) + k] for k in range(columns)], w[i * (columns + 1) + columns], top[i]
+        for j in range(each):
+            g[j] = update_cusum([c[j + count * k] for k in range(columns)], psi, white, g[j], c[j + count * columns])
+            best = maximum(best, g[j])
+        top[i] = best
+
+    def reduce_cusums(self, top: Any, i: Any) -> None:
+        """Write the largest of neighbouring CUSUMs of one asset to the first of them."""
+        levels = [top[i * CUSUM_BATCH + j] for j in range(CUSUM_BATCH)]
+        while len(levels) > 1:
+            levels = [maximum(a, b) for a, b in zip(levels[::2], levels[1::2], strict=True)]
+        top[i * CUSUM_BATCH] = levels[0]
+
+    def update_alarm(self, s: Any, h: Any, top: Any, when: Any, i: Any) -> None:
+        """Store the level of the largest CUSUM, and the first sample at which one passes its limit."""
+        level, number = top[i], when[i]
+        used = number > 0.0
+        s[self.to.peak] = where(used, maximum(s[self.to.peak], level), s[self.to.peak])
+        s[self.to.level] = where(used, level, s[self.to.level])
+        h[CROSSED] = where(used & (level >= 1.0) & (h[CROSSED] <= 0.0), number, h[CROSSED])
+
+    def _speed(self, c: Any, s: Any, source: Any) -> tuple[Any, Any]:
+        """Return the speed, and the sum of the magnitudes that cancel in it."""
+        k = self.at.velocity  # A (2, 2), B, C, D, steady state
+        # not fused: at rest what is left of it is rounding, whose sign must not hang on how the sum is rounded
+        parts = c[k + 8] * source, c[k + 6] * s[self.to.velocity], c[k + 7] * s[self.to.velocity + 1]
+        speed = parts[0] + parts[1] + parts[2]
+        return speed, abs(parts[0]) + abs(parts[1]) + abs(parts[2])
+
+    def _inputs(self, c: Any, r: Any, u: Any, y: Any, speed: Any) -> list[Any]:
+        """Return the bank's inputs: r, u within its limits, y, and the columns of friction and offset."""
+        w = [r, minimum(maximum(u, c[self.at.low]), c[self.at.high]), y]
+        for kind in self.size.codes:
+            if kind == 0:
+                w.append(where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0)))
+            elif kind < 3:
+                w.append(maximum(speed, 0.0) if kind == 1 else minimum(speed, 0.0))
+            else:
+                w.append(1.0)
+        return w
+
+    def _mean_square(self, c: Any, s: Any, residual: Any) -> Any:
+        return fma(fma(residual, residual, -s[self.to.power]), c[self.at.share], s[self.to.power])
+
+    def _propagate(
+        self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, phi: Sequence[Any], K: Sequence[Any]
+    ) -> None:
+        propagate_covariance(c, self.at.noise, s, self.to.S, self.size.lags, phi, K)
+        if self.size.start:
+            propagate_initial_share(s, self.to.Psi, phi, K)
+        if self.size.shadow:
+            self._whiten(c, s, h, v, shadow, e, phi)
+
+    def _whiten(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, phi: Sequence[Any]) -> None:
+        """Whiten the residual minus the shadow's, and the shadow's columns; delay copies of the last column."""
+        n, memory, to = self.size.n, self.size.memory, self.to
+        for lag in range(LAGS, 0, -1):
+            s[to.psi + n - 1 + lag] = s[to.psi + n - 2 + lag]
+        for i in range(n):
+            s[to.psi + i] = whiten_sample(c, self.at.white, s, to.white + (1 + i) * memory, memory, shadow[1 + i])
+        residual = v[0] - shadow[0] - dot([c[self.at.apart + i] for i in range(n)], phi)
+        e[0] = minimum(maximum(whiten_sample(c, self.at.white, s, to.white, memory, residual), -CLIP), CLIP)
+        h[WHITENED] = h[WHITENED] + 1.0
+
+    def _store_whitened(self, s: Any, e: Any, counts: Bool, w: Any, i: Any) -> None:
+        """Write columns and residual of sample i to w; no CUSUM moves where all of them are zero."""
+        columns = self.size.n + LAGS
+        for k in range(columns):
+            w[i * (columns + 1) + k] = where(counts, s[self.to.psi + k], 0.0)
+        w[i * (columns + 1) + columns] = where(counts, e[0], 0.0)

@@ -1,0 +1,313 @@
+"""One loop's filter bank and recursion: from a recording to regressors and estimates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.core.errors import LoopError
+from servoscope.estimation import filter_bank
+from servoscope.estimation.filter_bank import FilterBank
+from servoscope.estimation.instrument import InstrumentTuning, instrument_model
+from servoscope.estimation.noise_model import ArmaNoise
+from servoscope.estimation.two_stage import StageOneRunner, StageOneTuning
+from servoscope.estimation.valve import ValveLaw, integer_delay
+from servoscope.models.lti import LinearSystem
+from servoscope.models.plants import EXTRA_COLUMNS
+from servoscope.signals import Recording
+
+if TYPE_CHECKING:
+    from servoscope.estimation.kernel.cusum import CusumConstants
+    from servoscope.estimation.recursion import EvaluationConstants, Recursion, RecursionConstants
+    from servoscope.models.loop import Loop
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """The tuning of one loop's recursion, from a baseline, in physical units."""
+
+    theta: FloatArray  # healthy coefficients, where the recursion starts, shape (n,)
+    scale: FloatArray  # typical size (rms) of each column of phi on healthy data, shape (n,)
+    P_d: FloatArray  # desired covariance of the AKF, shape (n, n)
+    R: float  # variance of the residual v
+    noise: ArmaNoise  # model of v
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """eta, phi and z of every sample."""
+
+    eta: FloatArray  # shape (N,)
+    phi: FloatArray  # phi, z: shape (N, n); z is phi where there is no instrument
+    z: FloatArray
+    ok: BoolArray  # whether the sample may update an estimator, shape (N,)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Estimates of the recursion, one row per evaluation."""
+
+    index: IntArray  # sample of the evaluation, shape (K,)
+    updates: FloatArray  # updates, skipped: updates so far, and those that a guard refused, shape (K,)
+    skipped: FloatArray
+    power: FloatArray  # recent mean square of the residual relative to the baseline's, shape (K,)
+    level: FloatArray  # largest CUSUM since the evaluation before, as a multiple of its limit, shape (K,)
+    crossed: FloatArray  # sample at which one first passed its limit, counted from 1; 0 where none has, shape (K,)
+    theta: FloatArray  # estimate, shape (K, n)
+    S: FloatArray  # its covariance under the recording's own excitation, shape (K, n, n)
+    Psi: FloatArray  # share of the starting value that is left in it, shape (K, n, n)
+
+
+@dataclass(frozen=True, eq=False)
+class Pipeline:
+    """A loop, its filter bank, stage 1 if it has one, and the speed below which it rests; build it with `of`."""
+
+    loop: Loop
+    bank: FilterBank
+    stage_one: StageOneTuning | None = None
+    still_speed: float = 0.0
+    instrument: InstrumentTuning | None = None
+
+    @classmethod
+    def of(
+        cls,
+        loop: Loop,
+        stage_one: StageOneTuning | None = None,
+        still_speed: float = 0.0,
+        instrument: InstrumentTuning | None = None,
+    ) -> Pipeline:
+        """Turn a loop's settings into constant matrices.
+
+        A loop with ``two_stage = "adaptive"`` needs a tuning of stage 1. The estimator is held once the axis has been
+        slower than `still_speed` for longer than the filters remember. An estimator that needs an instrument takes the
+        learned one, or that of the nominal closed loop. Raises LoopError if the structure does not suit the plant, the
+        instrument cannot be made, stage 1 is missing, or it meets a valve law.
+        """
+        from servoscope.estimation import estimators
+
+        if loop.monitor.two_stage != "none" and stage_one is None:
+            raise LoopError(f"{loop.name}: [monitor] two_stage = 'adaptive' needs a tuned stage 1: learn a baseline")
+        if loop.monitor.two_stage != "none" and ValveLaw(loop).size:
+            raise LoopError(
+                f"{loop.name}: [monitor] two_stage = 'adaptive' simulates u from r as if the valve were linear: "
+                "set [plant] valve_law = 'linear' or two_stage = 'none'"
+            )
+        needs = estimators.load_estimator(loop.monitor.estimator).NEEDS_INSTRUMENT
+        bank = filter_bank.build_filter_bank(loop, instrument_model(loop, instrument) if needs else None)
+        stage = stage_one if loop.monitor.two_stage != "none" else None
+        return cls(loop, bank, stage, still_speed, instrument if needs else None)
+
+    @property
+    def every(self) -> int:
+        """Samples between evaluations."""
+        return max(1, round(self.loop.sample_rate / self.loop.monitor.evaluation_rate))
+
+    @property
+    def delays(self) -> tuple[int, int]:
+        """On-delay and off-delay of the alarm, in evaluations."""
+        monitor = self.loop.monitor
+        off = monitor.memory if monitor.off_delay is None else monitor.off_delay
+        rate = self.loop.sample_rate / self.every
+        return round(monitor.on_delay * rate), round(off * rate)
+
+    @property
+    def stride(self) -> int:
+        """Samples between updates: 1 up to 20 times the cutoff.
+
+        Beyond, the noise is so nearly a polynomial in time that no autoregression of it can be solved for.
+        """
+        if self.bank.structure != "svf":
+            return 1
+        return max(1, int(self.loop.sample_rate / (10.0 * filter_bank.filter_cutoff(self.loop))))
+
+    @property
+    def memory(self) -> float:
+        """Memory N of the estimator in updates."""
+        return self.loop.monitor.memory * self.loop.sample_rate / self.stride
+
+    def constants(
+        self,
+        tuning: Tuning,
+        watch: CusumConstants | None = None,
+        view: EvaluationConstants | None = None,
+        *,
+        steady: bool = True,
+    ) -> RecursionConstants:
+        """Turn loop and tuning into the constants of the recursion.
+
+        `watch` is the sequential test, if there is one. Without `view` there are only the evaluations that a diagnosis
+        takes. `steady` says that P begins at P_d, so that an estimator that leaves it there needs none.
+        """
+        from servoscope.estimation import estimators
+        from servoscope.estimation.recursion import RecursionConstants
+
+        loop, bank, name = self.loop, self.bank, self.loop.monitor.estimator
+        steady = steady and hasattr(estimators.load_estimator(name), "steady_gain")
+        # phi times this has P_d = I; the scale keeps Cholesky's factor from mixing units
+        pairs = np.outer(tuning.scale, tuning.scale)
+        basis = np.diag(1.0 / tuning.scale)
+        if steady:
+            basis = basis @ np.linalg.cholesky(tuning.P_d * pairs)
+        back = np.linalg.inv(basis)
+        theta = np.asarray(back @ tuning.theta, dtype=np.float64)
+        rows = np.eye(len(self._behind_valve.C))
+        rows[1 : 1 + bank.n, 1 : 1 + bank.n] = basis.T
+        if bank.has_instrument:
+            rows[1 + bank.n :, 1 + bank.n :] = basis.T
+        rows[0] -= theta @ rows[1 : 1 + bank.n]
+        dead = loop.input_deadzone or (np.inf, -np.inf)
+        unlimited = loop.input_logged == "after_limiter" or self.valve.size  # a valve law limits u itself
+        lags, heads = tuning.noise.chain()
+        return RecursionConstants(
+            estimator=name,
+            steady=steady,
+            bank=self._behind_valve.output(rows),
+            velocity=bank.velocity,
+            v_of_r=bank.velocity_of_reference,
+            codes=tuple(EXTRA_COLUMNS.index(extra) for extra in bank.extras),
+            limits=(-np.inf, np.inf) if unlimited else (loop.input_limits or (-np.inf, np.inf)),
+            deadzone=dead,
+            sign_speed=float(getattr(loop.plant, "sign_speed", 0.0)),
+            rest_speed=loop.monitor.rest_speed,
+            still_speed=self.still_speed,
+            only_moving=loop.monitor.update_when == "moving",
+            wait=bank.wait,
+            stride=self.stride,
+            every=self.every,
+            scale=tuning.scale,
+            basis=basis,
+            theta=theta,
+            origin=tuning.theta,
+            P_d=back @ tuning.P_d @ back.T,
+            R=tuning.R,
+            a=lags,
+            heads=heads,
+            variance=float(tuning.noise.gamma[0]),
+            memory=self.memory,
+            extra=estimators.extra_state_size(name, bank.n, self.memory),
+            watch=watch,
+            view=view,
+        )
+
+    def blank(self) -> Tuning:
+        """Return a tuning that only serves to form regressors: scale 1, unit noise."""
+        n = self.bank.n
+        noise = ArmaNoise(np.zeros(1), np.zeros(0), np.ones(1), 1.0)
+        return Tuning(np.zeros(n), np.ones(n), np.eye(n), 1.0, noise)
+
+    def input(self, r: FloatArray, u: FloatArray, restart: BoolArray) -> FloatArray:
+        """Return the input of the regression, shape (N,): u_a of stage 1, or u itself without one."""
+        stage = StageOneRunner(self.loop, self.stage_one)
+        return stage.run(stage.start(), r, u, restart)
+
+    @cached_property
+    def valve(self) -> ValveLaw:
+        """The law of the valve, before all else; it lets u pass where the law is linear."""
+        return ValveLaw(self.loop)
+
+    @cached_property
+    def _behind_valve(self) -> LinearSystem:
+        """The bank without the delay that the valve law takes over."""
+        if not integer_delay(self.loop):
+            return self.bank.system
+        instrument = instrument_model(self.loop, self.instrument) if self.bank.has_instrument else None
+        rest = self.loop.model_copy(update={"delay": self.loop.delay - integer_delay(self.loop)})
+        return filter_bank.build_filter_bank(rest, instrument).system
+
+    def flow(self, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
+        """Return the flow of the valve, shape (N,); u itself where its law is linear."""
+        return self.valve.run(self.valve.start(), u, y, restart)
+
+    @cached_property
+    def _plain(self) -> Recursion:
+        """The recursion that only forms regressors; cached, for signatures need it many times."""
+        from servoscope.estimation.recursion import Recursion
+
+        return Recursion([self.constants(self.blank())])
+
+    def regression(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
+        """Form eta, phi and z of a block, each input of shape (N,); phi and z in physical units."""
+        return RegressionRunner(self).advance(r, u, y, restart)
+
+    def estimate(self, tuning: Tuning, recording: Recording, watch: CusumConstants | None = None) -> Estimates:
+        """Run the recursion over a recording, from the tuning's theta, with or without the sequential test."""
+        return EstimationRunner(self, tuning, watch).advance(recording)
+
+    def unpack(self, c: RecursionConstants, rows: FloatArray, index: IntArray) -> Estimates:
+        """Turn rows of a recursion, shape (K, row), into estimates in physical units."""
+        n, basis = self.bank.n, c.basis
+        theta, S, Psi = np.split(rows[:, 5:], [n, n + n * n], axis=1)
+        # basis S basis' and basis Psi/basis, each a product with the elements in one row
+        both, back = np.kron(basis, basis), np.kron(basis, np.linalg.inv(basis).T)
+        return Estimates(
+            index=index,
+            updates=rows[:, 0],
+            skipped=rows[:, 1],
+            power=rows[:, 2] / c.variance,
+            level=rows[:, 3],
+            crossed=rows[:, 4],
+            theta=c.origin + _transform_rows(theta, basis),
+            S=_transform_rows(S, both).reshape(-1, n, n),
+            Psi=_transform_rows(Psi, back).reshape(-1, n, n),
+        )
+
+
+def _transform_rows(rows: FloatArray, matrix: npt.NDArray[np.floating[Any]]) -> FloatArray:
+    """Return a matrix (p, m) times each of K rows, shape (K, p); a row's bits do not depend on the others."""
+    columns, found = np.ascontiguousarray(rows.T), np.zeros((len(matrix), len(rows)))
+    for i, j in np.argwhere(matrix):
+        found[i] += matrix[i, j] * columns[j]
+    return np.ascontiguousarray(found.T)
+
+
+class RegressionRunner:
+    """Forms eta, phi and z block by block; the result does not depend on where a recording is cut."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline, self._ahead = pipeline, _InputStage(pipeline)
+        self._state = pipeline._plain.start()[0]
+
+    def advance(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
+        """Return the regression of the next block, each input of shape (N,)."""
+        bank = self._pipeline.bank
+        out, ok = self._pipeline._plain.regressors(self._state, r, self._ahead.input(r, u, y, restart), y, restart)
+        phi = out[:, 1 : 1 + bank.n].copy()
+        return Regression(out[:, 0], phi, out[:, -bank.n :].copy() if bank.has_instrument else phi, ok == 1)
+
+
+class EstimationRunner:
+    """Runs the recursion block by block, from the tuning's theta, to the same result wherever a recording is cut."""
+
+    def __init__(self, pipeline: Pipeline, tuning: Tuning, watch: CusumConstants | None = None) -> None:
+        from servoscope.estimation.recursion import Recursion
+
+        self._pipeline, self._ahead = pipeline, _InputStage(pipeline)
+        self._constants = pipeline.constants(tuning, watch)
+        self._recursion = Recursion([self._constants])
+        self._state = self._recursion.start()
+
+    def advance(self, block: Recording) -> Estimates:
+        """Return the estimates of the next block; their samples count from the first block on."""
+        r, y, restart = block.r, block.y, block.restart
+        u = self._ahead.input(r, block.u, y, restart)
+        index = self._recursion.rows(self._state, block.samples)
+        self._state, out = self._recursion.run(self._state, r[None], u[None], y[None], restart[None])
+        return self._pipeline.unpack(self._constants, out[0], index)
+
+
+class _InputStage:
+    """The valve's law and stage 1, which come before the bank, with their states."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._valve, self._stage = pipeline.valve, StageOneRunner(pipeline.loop, pipeline.stage_one)
+        self._of_valve, self._of_stage = self._valve.start(), self._stage.start()
+
+    def input(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
+        """Return the input of the bank for the next block, shape (N,)."""
+        flow = self._valve.run(self._of_valve, u, y, restart)
+        return self._stage.run(self._of_stage, r, flow, restart)

@@ -1,0 +1,345 @@
+"""The compiled recursion: from constants, state and a block of samples to a new state and evaluations.
+
+One sample, a log and a fleet run through the same lines (`kernel.sample_steps`), compiled for the sizes at hand. The
+state of an asset is one row of floats, described by `Recursion.slices`. A recording may be split anywhere, because all
+that is carried from sample to sample is in that row.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import itertools
+import os
+from collections import deque
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.estimation.kernel.buffers import BufferPool
+from servoscope.estimation.kernel.build import build_kernels
+from servoscope.estimation.kernel.cusum import LAGS, CusumConstants
+from servoscope.estimation.kernel.sample_steps import CUSUM_BATCH, HEADER_SIZE, SAMPLE, KernelSizes, KernelSpec
+from servoscope.estimation.kernel.sparse_lti import pack_coefficients, sparsity_pattern
+from servoscope.models.lti import LinearSystem
+
+LANE_COUNT = {"float64": 8, "float32": 16}  # assets side by side: one vector; twice as many leave the first-level cache
+VECTOR_WIDTH = {"float64": 8, "float32": 16}  # numbers in a vector
+ZERO_TOLERANCE = 1e-12  # of the first coefficient of a filter
+MIN_PARALLEL_SAMPLES = 200_000  # samples from which a second core pays
+PARTS_PER_CORE = 12  # taken in turn, so that a core that is held up leaves its share to the others
+
+
+class EvaluationConstants(NamedTuple):
+    """Constants of complete evaluations; `response` holds Re and Im of E(f).
+
+    `covariance` (n, n) and `origin` (n,) are the baseline's covariance and coefficients in physical units, `response`
+    has shape (2 F, n), and `rate` is that of the samples [Hz].
+    """
+
+    covariance: FloatArray
+    origin: FloatArray
+    response: FloatArray
+    rate: float
+
+
+class RecursionConstants(NamedTuple):
+    """The numbers of a loop and its baseline.
+
+    The recursion's coordinates: phi is `basis`' times the physical one, theta what is left when the baseline's is taken
+    off and the rest divided by `basis` (n, n). With `steady` they are chosen so that P_d is the identity, and P stays
+    there. `theta` is the baseline's in these coordinates, `origin` the same in physical units.
+
+    `bank` and `velocity` are filters, `codes` the non-linear inputs, `limits` and `deadzone` of u; `a` (lags,) and
+    `heads` (lags,) are the noise's model as `moments.propagate_covariance` takes it, `variance` that of v, in updates:
+    of every `stride`-th sample; `extra` is the size of the estimator's private state, and `watch` is the sequential
+    test.
+    """
+
+    estimator: str
+    steady: bool
+    bank: LinearSystem
+    velocity: LinearSystem
+    v_of_r: bool
+    codes: tuple[int, ...]
+    limits: tuple[float, float]
+    deadzone: tuple[float, float]
+    sign_speed: float
+    rest_speed: float
+    still_speed: float
+    only_moving: bool
+    wait: int
+    stride: int
+    every: int
+    scale: FloatArray
+    basis: FloatArray
+    theta: FloatArray
+    origin: FloatArray
+    P_d: FloatArray
+    R: float
+    a: FloatArray
+    heads: FloatArray
+    variance: float
+    memory: float
+    extra: int
+    watch: CusumConstants | None
+    view: EvaluationConstants | None = None
+
+
+def _offsets(sizes: dict[str, int]) -> dict[str, int]:
+    ends = list(itertools.accumulate(sizes.values(), initial=0))
+    return dict(zip((*sizes, "end"), ends, strict=True))
+
+
+def _shadow_system(c: RecursionConstants) -> LinearSystem:
+    """Return r -> [residual of the healthy loop, phi] for the sequential test."""
+    w = c.watch
+    assert w is not None
+    first = np.concatenate([[1.0], -w.theta])[None, :]
+    return LinearSystem(w.A, w.B, np.vstack([first @ w.C, w.C[1:]]), np.vstack([first @ w.D, w.D[1:]]))
+
+
+def _whitening_order(test: CusumConstants) -> int:
+    """Return the order of the whitening filter, without coefficients that are zero but for rounding."""
+    size = np.maximum(np.abs(test.numerator), np.abs(test.denominator))
+    return int(np.flatnonzero(size > ZERO_TOLERANCE)[-1])
+
+
+class Recursion:
+    """The recursion of one asset, or of several of one structure; with `single`, in single precision."""
+
+    def __init__(self, constants: Sequence[RecursionConstants], *, single: bool = False) -> None:
+        self.constants = tuple(constants)
+        first = self.constants[0]
+        self._spec = _kernel_spec(self.constants)
+        self.sizes = self._spec.sizes
+        self._type = np.dtype(np.float32 if single else np.float64)
+        to = dict(self._spec.to)
+        names = list(to)
+        spans = {a: slice(HEADER_SIZE + to[a], HEADER_SIZE + to[b]) for a, b in itertools.pairwise(names)}
+        lowest = HEADER_SIZE + to["end"]
+        self.size = lowest + self.sizes.watched + first.extra
+        self.slices = {
+            **spans,
+            "cusum": slice(lowest, lowest + self.sizes.watched),
+            "extra": slice(lowest + self.sizes.watched, self.size),
+        }
+        self._buffers = BufferPool()
+        self._per_asset = len({id(c) for c in self.constants}) > 1
+        table = np.array([_pack_constants(c, self._spec) for c in (self.constants if self._per_asset else (first,))])
+        self._table = table
+        self._lanes = 1 if (len(self.constants) == 1 and not single) or first.extra else LANE_COUNT[self._type.name]
+        self._blocks = -(-len(self.constants) // self._lanes)
+        self._block_constants = self._arrange_constants()
+        self._code = build_kernels(
+            self._spec, self._lanes, min(self._lanes, VECTOR_WIDTH[self._type.name]), int(self._per_asset)
+        )
+
+    @property
+    def number(self) -> np.dtype[Any]:
+        """The type of signals and evaluations."""
+        return self._type
+
+    def _arrange_constants(self) -> npt.NDArray[Any]:
+        """Return the constants as the compiled blocks take them, (blocks, rows times lanes)."""
+        if not self._per_asset:
+            return np.ascontiguousarray(self._table, dtype=self._type)
+        lanes = np.minimum(np.arange(self._blocks * self._lanes), len(self._table) - 1)
+        table = self._table[lanes].reshape(self._blocks, self._lanes, -1).swapaxes(1, 2)
+        return np.ascontiguousarray(table.reshape(self._blocks, -1), dtype=self._type)
+
+    def start(self) -> FloatArray:
+        """Return the states before the first sample, shape (assets, size): theta at the baseline, P = P_d."""
+        state = np.zeros((len(self.constants), self.size))
+        n, at = self.sizes.n, self.slices
+        for row, c in zip(state, self.constants, strict=True):
+            row[at["power"]] = c.variance
+            if not self.sizes.steady:
+                row[at["P"]] = c.P_d.ravel()
+        if self.sizes.start:
+            state[:, at["Psi"]] = np.eye(n).ravel()
+        return state
+
+    def rows(self, state: FloatArray, samples: int) -> IntArray:
+        """Return the samples, counted from 0 since the start, at whose end a block of so many evaluates."""
+        number, every = int(state[0, SAMPLE]), self.constants[0].every
+        return np.arange(number // every + 1, (number + samples) // every + 1) * every - 1
+
+    def run(
+        self,
+        state: FloatArray,
+        r: npt.NDArray[Any],
+        u: npt.NDArray[Any],
+        y: npt.NDArray[Any],
+        restart: BoolArray | None = None,
+    ) -> tuple[FloatArray, npt.NDArray[Any]]:
+        """Feed a block of samples, shape (assets, N); return the new states and evaluations (assets, K, row)."""
+        c = self.constants[0]
+        state = np.ascontiguousarray(state)
+        new = self._buffers.empty(state.shape, state.dtype)
+        out = self._buffers.empty((len(state), len(self.rows(state, r.shape[1])), self.sizes.row), self._type)
+        flags = np.zeros((0, 0), dtype=np.bool_) if restart is None else restart
+        signals = state, new, r, u, y, flags, c.every, c.stride
+
+        workers = min(_cores(), self._blocks) if r.size >= MIN_PARALLEL_SAMPLES else 1
+        edges = np.linspace(0, self._blocks, PARTS_PER_CORE * workers + 1 if workers > 1 else 2).astype(int).tolist()
+        parts = deque(itertools.pairwise(edges))
+
+        def work() -> None:
+            with contextlib.suppress(IndexError):  # there is no part left
+                while True:
+                    self._code.run_blocks(self._block_constants, *signals, out.reshape(len(out), -1), *parts.popleft())
+
+        if workers == 1:
+            work()
+        else:  # this thread works as well: waking another one takes time
+            others = [_pool(workers - 1).submit(work) for _ in range(workers - 1)]
+            work()
+            for other in others:
+                if not other.cancel():
+                    other.result()
+        return new, out
+
+    @property
+    def stepper(self) -> tuple[Callable[[FloatArray, FloatArray, float, float, float], bool], FloatArray]:
+        """The kernel for one sample of the first asset, and its first argument; the second is the state (size,)."""
+        return build_kernels(self._spec, 1, 1, 1).run_sample, np.ascontiguousarray(self._table[0])
+
+    def evaluate(self, state: FloatArray) -> FloatArray:
+        """Return the evaluations of states as they are, shape (assets, row)."""
+        out = np.empty((len(state), self.sizes.row))
+        build_kernels(self._spec, 1, 1, int(self._per_asset)).evaluate_states(
+            self._table, np.ascontiguousarray(state), out
+        )
+        return out
+
+    def regressors(
+        self, state: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
+    ) -> tuple[FloatArray, IntArray]:
+        """Return [eta, phi, z] of every sample of the first asset (N, rows) and its status (N,); change the state."""
+        out = np.zeros((len(r), self.sizes.rows))  # a missing sample writes nothing
+        ok = np.empty(len(r), dtype=np.int64)
+        build_kernels(self._spec, 1, 1, 1).write_regressors(
+            self._table[0], state, r, u, y, restart, self.constants[0].stride, out, ok
+        )
+        return out, ok
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@functools.cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    """Return threads that stay alive: starting them takes as long as ten thousand samples."""
+    return ThreadPoolExecutor(workers, "servoscope")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # its threads did not come along
+
+
+def structure_key(c: RecursionConstants) -> Hashable:
+    """Return the sizes and settings that assets of one fleet must have in common."""
+    spec = _kernel_spec([c])
+    sizes = spec.sizes._replace(lags=0, memory=0, watched=0, floats=0)
+    return spec.estimator, sizes, spec.bank, c.stride, c.every, c.memory
+
+
+def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
+    first = constants[0]
+    watched = [c for c in constants if c.watch is not None]
+    shadows = [_shadow_system(c) for c in watched]
+    n, rows = len(first.basis), len(first.bank.C)
+    nxs = len(shadows[0].A) if shadows else 0
+    memory = max((_whitening_order(c.watch) for c in watched if c.watch), default=0)
+    count = max((len(c.watch.limits) for c in watched if c.watch), default=0)
+    lags = max(len(c.a) for c in constants)
+    speed = 0
+    if first.codes or first.only_moving or first.still_speed > 0.0:
+        speed = 2 if first.v_of_r else 1
+    start = first.view is None
+    frequencies = 0 if first.view is None else len(first.view.response) // 2
+    to = _offsets(
+        {
+            **{"power": 1, "drift": 1, "level": 1, "peak": 1, "x": len(first.bank.A), "velocity": 2 * bool(speed)},
+            **{"theta": n, "P": 0 if first.steady else n * n, "S": n * (n + 1) // 2, "M": n * lags},
+            **{"Psi": n * n * start, "shadow": nxs, "white": (n + 1) * memory, "psi": (n + LAGS) * bool(nxs)},
+        }
+    )
+    bank, shadow = sparsity_pattern([c.bank for c in constants]), sparsity_pattern(shadows) if shadows else ((), ())
+    entries = [sum(len(row) for part in p for row in part) for p in (bank, shadow)]
+    names = ("low", "high", "dead_low", "dead_high", "sign_speed", "rest_speed", "still_speed", "wait", "forget")
+    at = _offsets(
+        {
+            **dict.fromkeys(("every", "stride", *names, "memory", "share", "R", "warm"), 1),
+            **{"velocity": 11, "bank": entries[0], "steady": len(first.bank.A) * first.bank.B.shape[1]},
+            **{"P_d": 0 if first.steady else n * n, "noise": 1 + 2 * lags, "shadow": entries[1], "shadow_steady": nxs},
+            **{"apart": n, "white": 1 + 2 * memory, "prior": 0 if start else n * n, "origin": 0 if start else n},
+            **{"basis": 0 if start else n * n, "rate": 0 if start else 1, "response": frequencies * 2 * (n + 1)},
+        }
+    )
+    sizes = KernelSizes(
+        n=n,
+        rows=rows,
+        inputs=first.bank.B.shape[1],
+        states=len(first.bank.A),
+        speed=speed,
+        gated=first.only_moving,
+        codes=first.codes,
+        lags=lags,
+        shadow=nxs,
+        memory=memory,
+        watched=-(-count // CUSUM_BATCH) * CUSUM_BATCH,
+        steady=first.steady,
+        extra=first.extra,
+        frequencies=frequencies,
+        start=start,
+        row=5 + n + 2 * n * n if start else 4 + n + n * n + 6 * frequencies,
+        floats=to["end"],
+    )
+    return KernelSpec(
+        first.estimator, sizes, tuple(to.items()), tuple((*at.items(), ("tail", at["end"]))), bank, shadow
+    )
+
+
+def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
+    """Return the constants of one asset as one row."""
+    n, lags, memory, watched, v = spec.sizes.n, spec.sizes.lags, spec.sizes.memory, spec.sizes.watched, c.velocity
+    test, view = c.watch, c.view
+
+    def pad(x: FloatArray, size: int) -> FloatArray:
+        return np.pad(x, (0, size - len(x)))
+
+    shadow = pad(np.zeros(0), dict(spec.at)["white"] - dict(spec.at)["shadow"] + 1 + 2 * memory)
+    members = np.zeros((n + LAGS + 1, watched))
+    if test is not None:
+        system = _shadow_system(c)
+        apart = np.linalg.solve(c.basis, test.theta / c.scale) - c.theta
+        shadow = np.concatenate(
+            [
+                *(pack_coefficients(spec.shadow, system), test.X0[:, 0], apart, [test.gain]),
+                *(pad(test.numerator[1 : 1 + memory], memory), pad(test.denominator[1 : 1 + memory], memory)),
+            ]
+        )
+        members[:, : len(test.limits)] = np.vstack([test.changes.T / test.limits, -0.5 * test.limits])
+    evaluation: list[Any] = []
+    if view is not None:
+        E = view.response.reshape(-1, 2, n)
+        parts = [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E]
+        back = np.linalg.inv(c.basis)
+        evaluation = [(back @ view.covariance @ back.T).ravel(), view.origin, c.basis.ravel(), [view.rate], *parts]
+    counts = [c.every, c.stride]
+    gates = [*c.limits, *c.deadzone, c.sign_speed, c.rest_speed, c.still_speed, c.wait, 1.0 / c.wait]
+    return np.concatenate(
+        [
+            *([float(x) for x in (*counts, *gates, c.memory, 1.0 / c.memory, c.R, test.warm if test else 0)],),
+            *(v.A.ravel(), v.B[:, 0], v.C[0], v.D[0], v.steady[:, 0]),
+            *(pack_coefficients(spec.bank, c.bank), c.bank.steady.ravel(), np.zeros(0) if c.steady else c.P_d.ravel()),
+            *([c.variance], pad(c.a, lags), pad(c.heads, lags), shadow, *evaluation, members.ravel()),
+        ]
+    )

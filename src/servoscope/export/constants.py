@@ -1,0 +1,133 @@
+"""What an exported monitor is made of: the sizes and constants of one baseline, or the reason why it has none."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import Any
+
+from servoscope import __version__
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import BaselineError
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.monitor import MonitorConstants
+from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.estimation.kernel.sample_steps import ARMED, SAMPLE, KernelSpec
+from servoscope.estimation.recursion import Recursion
+from servoscope.export.image import fingerprint
+
+__all__ = ["ExportConstants", "check_name", "common_words", "plain_text"]
+
+
+@dataclass(frozen=True, eq=False)
+class ExportConstants:
+    """Sizes and constants of one baseline's monitor, for generators of source text."""
+
+    baseline: Baseline
+    recursion: Recursion
+    spec: KernelSpec
+    table: FloatArray  # the constants, in the order of `spec.at`
+    start: FloatArray  # the state before the first sample
+    healthy: FrequencyResponse
+    members: int  # CUSUMs
+    delays: tuple[int, int]  # of the alarm, in evaluations
+    mark: bytes  # of the baseline, in images
+    input_stage: str  # what the caller has to do to u beforehand; empty: nothing
+
+    @classmethod
+    def of(cls, baseline: Baseline, only_coefficients: bool = False, single: bool = False) -> ExportConstants:
+        """Derive the constants of a baseline.
+
+        With `only_coefficients`, what stands before the estimator and behind T^2 is left out: the stages that u goes
+        through, and the sequential test; with `single`, numbers are floats.
+
+        Raises
+        ------
+        BaselineError
+            If the baseline has something that cannot be exported; the message names it.
+        """
+        loop = baseline.loop
+        if baseline.others:
+            raise BaselineError(
+                f"an exported monitor follows one operating point, this baseline has {', '.join(baseline.points)}: "
+                f"give --point {baseline.points[0]}"
+            )
+        stage = _input_stage(baseline)
+        if stage and not only_coefficients:
+            raise BaselineError(
+                f"{loop.name}: {stage} cannot be exported: learn a baseline without it, or give "
+                "--only-coefficients and hand u over as it is behind that stage"
+            )
+        derived = MonitorConstants.from_baseline(baseline)
+        if only_coefficients:
+            derived = replace(derived, constants=derived.constants._replace(watch=None))
+        if single and not derived.constants.steady:
+            raise BaselineError(
+                f"[monitor] estimator = {loop.monitor.estimator!r} cannot be exported in single precision: take "
+                "akf, or double precision"
+            )
+        recursion = Recursion([derived.constants], single=single)
+        table, start = recursion._table[0], recursion.start()[0]
+        on, off = derived.pipeline.delays
+        watch = derived.constants.watch
+        return cls(
+            baseline=baseline,
+            recursion=recursion,
+            spec=recursion._spec,
+            table=table,
+            start=start,
+            healthy=derived.healthy,
+            members=0 if watch is None else len(watch.limits),
+            delays=(on, off),
+            mark=fingerprint(
+                repr(recursion._spec) + "single" * single, table, start, (baseline.limit, float(on), float(off))
+            ),
+            input_stage=stage,
+        )
+
+    @property
+    def coefficients(self) -> list[tuple[str, str]]:
+        """Name and unit of each coefficient."""
+        return list(zip(self.baseline.names, self.baseline.loop.plant.coefficient_units, strict=True))
+
+
+def common_words(made: ExportConstants, name: str) -> dict[str, Any]:
+    """Return what the templates of all languages name."""
+    baseline, c = made.baseline, made.recursion.constants[0]
+    of_y, of_u = baseline.loop.plant.units[0] or "y", baseline.loop.plant.units[1] or "u"
+    return {
+        "version": __version__,
+        "hash": baseline.hash,
+        "loop": plain_text(baseline.loop.name),
+        "prefix": name,
+        "upper": name.upper(),
+        "u_unit": plain_text(f"{of_u}, behind the stage {made.input_stage}" if made.input_stage else of_u),
+        "y_unit": plain_text(of_y),
+        "response_unit": plain_text(f"{of_u}/{of_y}"),
+        "stride": c.stride,
+        "every": c.every,
+        "sample": SAMPLE,
+        "armed": ARMED,
+    }
+
+
+def _input_stage(baseline: Baseline) -> str:
+    """Return the setting by which u goes through a stage of its own before the filters, empty if none does."""
+    loop = baseline.loop
+    if loop.monitor.two_stage != "none":
+        return f"[monitor] two_stage = {loop.monitor.two_stage!r}"
+    law = getattr(loop.plant, "valve_law", "linear")
+    return "" if law == "linear" else f"[plant] valve_law = {law!r}"
+
+
+def check_name(name: str) -> None:
+    """Raise BaselineError if a name cannot begin the names of a source text."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name):
+        raise BaselineError(
+            f"{name!r} is no prefix for names of C: give lower-case letters, digits and _, as in axis_3"
+        )
+
+
+def plain_text(text: str) -> str:
+    """Return a text that cannot end a comment, of C or of Structured Text."""
+    return re.sub(r"\*/|\*\)|\(\*|[\\\"\n]", " ", text).replace("/*", " ")

@@ -1,0 +1,213 @@
+"""The exported monitor as a co-simulation unit (FMU) of FMI 3.0: description, sources, a binary for this platform."""
+
+from __future__ import annotations
+
+import io
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree as Xml
+
+from servoscope import __version__
+from servoscope.core.errors import OutputError
+from servoscope.core.files import atomic_write
+from servoscope.detection.baseline import Baseline
+from servoscope.export.c_monitor import NAME, CMonitor, export_c, fill_template
+
+__all__ = ["export_fmu"]
+
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
+LIBRARY = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
+PROCESSORS = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
+EPOCH = (1980, 1, 1, 0, 0, 0)  # of all files in the archive: the same baseline gives the same bytes
+FIRST_NUMBER = 10  # value reference of the first number of an evaluation; fmi3.c calls it NUMBERS
+RESPONSE = ("real", "imag", "variance_real", "covariance", "covariance_again", "variance_imag")
+VERDICTS = ("waiting", "healthy", "fault")
+
+
+def export_fmu(baseline: Baseline, path: str | Path, name: str = NAME, *, only_coefficients: bool = False) -> bool:
+    """Write the monitor of a baseline as a co-simulation unit of FMI 3.0.
+
+    Parameters
+    ----------
+    baseline
+        Of one operating point.
+    path
+        Of the unit, a ZIP archive; its name ends in ``.fmu`` as a rule.
+    name
+        Identifier of the model, and what the names in the sources begin with.
+    only_coefficients
+        As for `export_c`.
+
+    Returns
+    -------
+    bool
+        Whether there is a binary for this platform inside; without a C compiler there are the sources alone.
+
+    Raises
+    ------
+    BaselineError
+        If the baseline has something that cannot be exported; the message names it.
+    OutputError
+        If the compiler refuses the sources, or the file cannot be written.
+    """
+    made = export_c(baseline, name, only_coefficients=only_coefficients)
+    source = fill_template("fmi3.c", {"prefix": name, "upper": name.upper(), "token": _token(made)})
+    sources = {each: made.files[each] for each in (f"{name}.c", f"{name}.h")} | {"fmi3.c": source}
+    contents = {f"sources/{each}": text.encode() for each, text in sources.items()}
+    contents["modelDescription.xml"] = _xml(_model_description(baseline, made, name))
+    contents["sources/buildDescription.xml"] = _xml(_build_description(name))
+    binary = _compile(sources, name)
+    if binary is not None:
+        contents[_binary_path(name)] = binary
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as unit:
+        for each, content in contents.items():
+            unit.writestr(zipfile.ZipInfo(each, EPOCH), content, zipfile.ZIP_DEFLATED)
+    atomic_write(path, archive.getvalue())
+    return binary is not None
+
+
+def _token(made: CMonitor) -> str:
+    """Return what ties description and binary together: the mark of the baseline and the version of the interface."""
+    return f"{{servoscope-{__version__}-{made.mark.hex()}}}"
+
+
+def _binary_path(name: str) -> str:
+    system, suffix = LIBRARY.get(sys.platform, LIBRARY["linux"])
+    machine = platform.machine().lower()
+    return f"binaries/{PROCESSORS.get(machine, machine)}-{system}/{name}{suffix}"
+
+
+def _compile(sources: dict[str, str], name: str) -> bytes | None:
+    """Return the library that this platform's compiler makes, None where there is no compiler."""
+    compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    if compiler is None:
+        return None
+    with tempfile.TemporaryDirectory() as scratch:
+        for each, text in sources.items():
+            Path(scratch, each).write_text(text, encoding="utf-8")
+        command = [compiler, *FLAGS, "-o", "unit", "fmi3.c", f"{name}.c", "-lm"]
+        done = subprocess.run(command, cwd=scratch, capture_output=True, text=True, check=False)
+        if done.returncode:
+            last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+            raise OutputError(f"{compiler} cannot compile the co-simulation unit: {last}; give another compiler as cc")
+        return Path(scratch, "unit").read_bytes()
+
+
+def _xml(root: Xml.Element) -> bytes:
+    Xml.indent(root)
+    text = Xml.tostring(root, encoding="unicode")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
+
+
+def _build_description(name: str) -> Xml.Element:
+    root = Xml.Element("fmiBuildDescription", fmiVersion="3.0")
+    configuration = Xml.SubElement(root, "BuildConfiguration", modelIdentifier=name)
+    files = Xml.SubElement(configuration, "SourceFileSet", language="C99", compilerOptions="-ffp-contract=off")
+    for each in ("fmi3.c", f"{name}.c"):
+        Xml.SubElement(files, "SourceFile", name=each)
+    Xml.SubElement(configuration, "Library", name="m", external="true")
+    return root
+
+
+def _model_description(baseline: Baseline, made: CMonitor, name: str) -> Xml.Element:
+    outputs = list(_outputs(baseline))
+    y_unit, u_unit = (unit or "1" for unit in (baseline.loop.plant.units[0], baseline.loop.plant.units[1]))
+    root = Xml.Element(
+        "fmiModelDescription",
+        fmiVersion="3.0",
+        modelName=baseline.loop.name,
+        instantiationToken=_token(made),
+        description="Condition monitoring of a servo loop from reference, control input and measured output",
+        generationTool=f"servoscope {__version__}",
+        variableNamingConvention="structured",
+    )
+    sample_time = repr(1.0 / baseline.loop.sample_rate)
+    Xml.SubElement(
+        root,
+        "CoSimulation",
+        modelIdentifier=name,
+        canGetAndSetFMUState="true",
+        canSerializeFMUState="true",
+        fixedInternalStepSize=sample_time,
+    )
+    units = Xml.SubElement(root, "UnitDefinitions")
+    for unit in sorted({"s", y_unit, u_unit, *(unit for _, unit, _ in outputs if unit)}):
+        Xml.SubElement(units, "Unit", name=unit)
+    types = Xml.SubElement(Xml.SubElement(root, "TypeDefinitions"), "EnumerationType", name="Verdict")
+    for value, verdict in enumerate(VERDICTS):
+        Xml.SubElement(types, "Item", name=verdict, value=str(value))
+    Xml.SubElement(root, "DefaultExperiment", startTime="0", stepSize=sample_time)
+    variables = Xml.SubElement(root, "ModelVariables")
+    _describe_variables(variables, (y_unit, u_unit), baseline.limit, outputs)
+    structure = Xml.SubElement(root, "ModelStructure")
+    for kind, attribute, known in (("Output", "causality", "output"), ("InitialUnknown", "initial", "calculated")):
+        for each in variables:
+            if each.get(attribute) == known:
+                Xml.SubElement(structure, kind, valueReference=each.get("valueReference", ""))
+    return root
+
+
+def _describe_variables(
+    variables: Xml.Element, units: tuple[str, str], limit: float, outputs: list[tuple[str, str, str]]
+) -> None:
+    """Write the variables; fmi3.c has the same value references."""
+
+    def variable(kind: str, reference: int, **attributes: str) -> None:
+        Xml.SubElement(variables, kind, {"valueReference": str(reference), **attributes})
+
+    variable("Float64", 0, name="time", causality="independent", variability="continuous", unit="s")
+    signals = (("r", units[0], "reference"), ("u", units[1], "control input"), ("y", units[0], "measured output"))
+    for reference, (signal, unit, text) in enumerate(signals, 1):
+        variable(
+            "Float64",
+            reference,
+            name=signal,
+            causality="input",
+            variability="discrete",
+            start="0",
+            unit=unit,
+            description=f"{text}; NaN is a missing sample",
+        )
+    variable(
+        "Boolean",
+        4,
+        name="restart",
+        causality="input",
+        variability="discrete",
+        start="false",
+        description="the sample does not follow the one before by one sample time",
+    )
+    made = {"causality": "output", "variability": "discrete", "initial": "calculated"}
+    variable("Enumeration", 5, name="verdict", declaredType="Verdict", **made)
+    variable("UInt64", 6, name="evaluations", description="evaluations so far; 0: nothing else is known yet", **made)
+    limited = {"causality": "output", "variability": "constant", "initial": "exact", "start": repr(limit)}
+    variable("Float64", 7, name="limit", description="of the statistic T^2", **limited)
+    for reference, (name, unit, text) in enumerate(outputs, FIRST_NUMBER):
+        extra = ({"unit": unit} if unit else {}) | ({"description": text} if text else {})
+        variable("Float64", reference, name=name, **made, **extra)
+
+
+def _outputs(baseline: Baseline) -> Iterator[tuple[str, str, str]]:
+    """Yield name, unit and description of the numbers of an evaluation, in the order of its struct."""
+    plant, n = baseline.loop.plant, len(baseline.names)
+    yield "updates", "", "samples that the estimate has taken so far"
+    yield "statistic", "", "T^2"
+    yield "level", "", "of the sequential test, largest since the evaluation before; its limit is 1"
+    yield "crossed_s", "s", "first sample at which the level passed its limit; NaN: it has not"
+    for name, unit in zip(baseline.names, plant.coefficient_units, strict=True):
+        yield f"theta.{name}", unit, "estimated coefficient"
+    for k in range(n * n):
+        yield f"covariance[{k // n + 1},{k % n + 1}]", "", "of theta"
+    for f, frequency in enumerate(baseline.loop.monitor.frequencies, 1):
+        for part in RESPONSE:
+            yield f"response[{f}].{part}", "", f"inverse frequency response at {frequency:g} Hz, u over y"
+    for f, frequency in enumerate(baseline.loop.monitor.frequencies, 1):
+        for part in ("real", "imag"):
+            yield f"gamma[{f}].{part}", "", f"estimated minus healthy response at {frequency:g} Hz"

@@ -1,0 +1,122 @@
+"""Golden samples: what a monitor makes of them, for the self-test of an exported one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.chi2_test import apply_alarm_delays, consecutive_exceedances
+from servoscope.estimation.recursion import Recursion
+
+__all__ = ["GoldenRun", "golden_signals", "golden_text"]
+
+SHORTEST, LONGEST = 2000, 20_000  # samples
+SEED = 27
+WAITING, HEALTHY, FAULT = range(3)
+FNV_OFFSET, FNV_PRIME = 14695981039346656037, 1099511628211
+
+
+def golden_signals(
+    baseline: Baseline, samples: int, seed: int = SEED
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return r, u, y and restarts (samples,): a healthy loop, then a weaker u, and all that can be wrong with data.
+
+    Where the loop can be simulated, that is its multisine; else sines with noise. Missing values, infinities, values
+    that are no physical signal, restarts, a rest and zeros of both signs are among them.
+    """
+    rng, loop = np.random.default_rng(seed), baseline.loop
+    if loop.controller is not None and loop.plant.has_physics:
+        from servoscope.simulation import reference, simulate
+
+        recording = simulate(loop, reference("multisine", samples / loop.sample_rate, loop.sample_rate), seed=seed)[0]
+        r, u, y = (x[:samples].copy() for x in (recording.r, recording.u, recording.y))
+    else:
+        t = np.arange(samples) / loop.sample_rate
+        cutoff = max(baseline.loop.monitor.frequencies)
+        r = sum(np.sin(2.0 * np.pi * f * t + f) for f in np.linspace(0.1, 1.0, 5) * cutoff)
+        y = r + 1e-3 * rng.standard_normal(samples)
+        u = np.gradient(r) * loop.sample_rate + 1e-2 * rng.standard_normal(samples)
+    u[samples // 2 :] *= 0.8
+    restart = np.zeros(samples, dtype=np.bool_)
+    restart[rng.integers(0, samples, 3)] = True
+    rest = slice(3 * samples // 4, 3 * samples // 4 + samples // 20)
+    r[rest], u[rest], y[rest] = 0.0, -0.0, 0.0
+    for signal, wrong in zip((r, u, y, u), (np.nan, np.inf, np.nan, 1e150), strict=True):
+        begin = int(rng.integers(samples // 10, samples - 20))
+        signal[begin : begin + int(rng.integers(1, 6))] = wrong
+    return r, u, y, restart
+
+
+@dataclass(frozen=True, eq=False)
+class GoldenRun:
+    """Samples, and what a monitor makes of them."""
+
+    signals: tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]
+    restart: BoolArray
+    rows: FloatArray  # evaluations, shape (K, row)
+    verdicts: tuple[int, ...]
+    state: FloatArray  # at the end
+    alarm: tuple[float, float]  # counters of the alarm at the end
+
+    @classmethod
+    def of(cls, baseline: Baseline, recursion: Recursion, limit: float, delays: tuple[int, int]) -> GoldenRun:
+        """Run a monitor over its golden samples."""
+        c = recursion.constants[0]
+        samples = int(np.clip(8 * c.wait + 20 * c.every, SHORTEST, LONGEST))
+        *signals, restart = golden_signals(baseline, samples)
+        with np.errstate(over="ignore"):  # of values that are no physical signal
+            r, u, y = (x.astype(recursion.number) for x in signals)
+        state, rows = recursion.run(recursion.start(), r[None], u[None], y[None], restart[None])
+        verdicts, alarm = judge(rows[0], limit, delays)
+        return cls((r, u, y), restart, rows[0].copy(), verdicts, state[0].copy(), alarm)
+
+
+def judge(rows: FloatArray, limit: float, delays: tuple[int, int]) -> tuple[tuple[int, ...], tuple[float, float]]:
+    """Return the verdict of each evaluation, and the counters of the alarm behind the last."""
+    on, off = delays
+    ready = rows[:, 0] > 0.0
+    exceeded = ready & ((rows[:, 1] > limit) | (rows[:, 2] >= 1.0))
+    verdict = np.where(ready, np.where(apply_alarm_delays(exceeded, on, off), FAULT, HEALTHY), WAITING)
+    exceeding = consecutive_exceedances(exceeded)
+    raised = np.flatnonzero(exceeding > on)
+    since = min(len(rows) - 1 - raised[-1], off + 1) if raised.size else off + 1
+    return tuple(verdict.tolist()), (float(exceeding[-1]) if len(rows) else 0.0, float(since))
+
+
+def row_digest(row: npt.NDArray[Any]) -> int:
+    """Return FNV-1a, 64 bits, over the bits of numbers."""
+    value = FNV_OFFSET
+    for byte in row.astype(row.dtype.newbyteorder("<")).tobytes():
+        value = ((value ^ byte) * FNV_PRIME) & 0xFFFFFFFFFFFFFFFF
+    return value
+
+
+def golden_text(run: GoldenRun, prefix: str, image: bytes) -> str:
+    """Return the header with the golden samples and results."""
+    samples_of = np.ascontiguousarray(np.stack(run.signals, axis=1))
+    bits = samples_of.view(np.dtype(f"u{samples_of.itemsize}"))
+    digests = [row_digest(row) for row in run.rows]
+    samples = ",\n".join("{" + ", ".join(f"0x{x:0{2 * bits.itemsize}X}u" for x in row) + "}" for row in bits.tolist())
+    return "\n".join(
+        [
+            f"/* Golden samples of {prefix}.c as the bits of numbers, and the digests (FNV-1a) of its evaluations. */",
+            f"#define GOLDEN_SAMPLES {len(bits)}",
+            f"#define GOLDEN_EVALUATIONS {len(digests)}",
+            f"static const uint{8 * bits.itemsize}_t golden_samples[GOLDEN_SAMPLES][3] = {{\n{samples}}};",
+            f"static const unsigned char golden_restart[GOLDEN_SAMPLES] = {{{_list(map(int, run.restart.tolist()))}}};",
+            f"static const uint64_t golden_evaluations[] = {{{_list(f'0x{x:016X}u' for x in digests)}}};",
+            f"static const unsigned char golden_verdicts[] = {{{_list(run.verdicts)}}};",
+            f"static const unsigned char golden_image[] = {{{_list(image)}}};",
+            "",
+        ]
+    )
+
+
+def _list(items: object) -> str:
+    texts = [str(item) for item in items]  # type: ignore[attr-defined]
+    return ",\n".join(", ".join(texts[i : i + 24]) for i in range(0, len(texts), 24))

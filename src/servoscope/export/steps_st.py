@@ -1,0 +1,136 @@
+"""The steps of a sample and of an evaluation as Structured Text, traced from the text that the monitor itself runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from servoscope.core.errors import BaselineError
+from servoscope.core.jit.c_source import CRows
+from servoscope.core.jit.st_source import STBuilder
+from servoscope.estimation import estimators
+from servoscope.estimation.kernel.cusum import LAGS, update_cusum
+from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
+from servoscope.estimation.kernel.sample_steps import TILE, KernelSpec, SampleSteps
+
+__all__ = ["StepTexts", "step_texts"]
+
+SIGNALS = {0: "signal_r", TILE: "signal_u", 2 * TILE: "signal_y"}
+# parameters of the steps -> variables of the function block
+VARIABLES = {
+    "c": "constants",
+    "s": "numbers",
+    "h": "counters",
+    "v": "regressors",
+    "e": "residual",
+    "w": "whitened",
+    "g": "cusums",
+    "when": "moment",
+}
+TEMPORARY = re.compile(r"\b[tb]\d+\b")
+
+StepTexts = dict[str, list[str]]
+
+
+def step_texts(spec: KernelSpec, members: int) -> StepTexts:
+    """Return the statements of each step by its name; `members` is the number of CUSUMs.
+
+    Raises
+    ------
+    BaselineError
+        If the estimator's P moves: its loops and branches are translated to C only.
+    """
+    size = spec.sizes
+    if not size.steady:
+        raise BaselineError(
+            f"[monitor] estimator = {spec.estimator!r} cannot be exported as Structured Text: take akf, or export C"
+        )
+    steps = SampleSteps(spec, estimators.load_estimator(spec.estimator).steady_gain, single_lane=True)
+    texts = {
+        "begin_filters": _traced(
+            lambda c, s, h, tile: steps.begin_filters(c, s, h, tile, 0), ("c", "s", "h"), tile=SIGNALS
+        ),
+        "advance_filters": _advance_filters(steps),
+        "reset_noise": _traced(steps.reset_noise, ("s", "h")),
+        "update_estimate": _traced(steps.update_estimate, ("c", "s", "h", "v", "shadow", "e")),
+        "begin_evaluation": _traced(steps.begin_evaluation, ("s", "h")),
+        "store_residual": [],
+        "update_cusums": [],
+        "update_alarm": [],
+        "evaluate": _evaluate(spec),
+    }
+    if size.watched:
+        texts["store_residual"] = _traced(
+            lambda c, s, h, status, e, w, when: steps.store_residual(c, s, h, status, e, w, when, 0),
+            ("c", "s", "h", "status", "e", "w", "when"),
+        )
+        texts["update_cusums"] = _update_cusums(spec, members)
+        texts["update_alarm"] = _traced(
+            lambda s, h, top, when: steps.update_alarm(s, h, top, when, 0), ("s", "h", "top", "when")
+        )
+    return texts
+
+
+def temporaries(texts: StepTexts) -> tuple[list[str], list[str]]:
+    """Return the names of numbers and of conditions that the statements need between them."""
+    found = {name for lines in texts.values() for line in lines for name in TEMPORARY.findall(line)}
+    names = sorted(found, key=lambda name: int(name[1:]))
+    return [name for name in names if name[0] == "t"], [name for name in names if name[0] == "b"]
+
+
+def _traced(
+    body: Callable[..., Any], parameters: Sequence[str], /, builder: STBuilder | None = None, **places: dict[int, str]
+) -> list[str]:
+    """Return the statements of a step, which is called with one array per parameter and per table of places."""
+    builder = builder or STBuilder()
+    rows = [CRows(builder, VARIABLES.get(name, name)) for name in parameters]
+    rows += [CRows(builder, "", place) for place in places.values()]
+    body(*rows)
+    for row in rows:
+        row.flush()
+    return builder.text()
+
+
+def _advance_filters(steps: SampleSteps) -> list[str]:
+    builder = STBuilder()
+    due = builder.condition("update_due")
+
+    def body(c: CRows, s: CRows, h: CRows, status: CRows, v: CRows, shadow: CRows, tile: CRows) -> None:
+        steps.advance_filters(c, s, h, status, v, shadow, tile, 0, due)
+
+    return _traced(body, ("c", "s", "h", "status", "v", "shadow"), builder, tile=SIGNALS)
+
+
+def _update_cusums(spec: KernelSpec, members: int) -> list[str]:
+    """Return the loop over the CUSUMs; those that only fill up a vector stay at zero and are left out."""
+    builder, columns, watched, tail = STBuilder(), spec.sizes.n + LAGS, spec.sizes.watched, dict(spec.at)["tail"]
+    table = [builder.read(f"constants[{tail + watched * k} + j]") for k in range(columns + 1)]
+    psi = [builder.read(f"whitened[{k}]") for k in range(columns)]
+    new = update_cusum(table[:columns], psi, builder.read(f"whitened[{columns}]"), builder.read("cusums[j]"), table[-1])
+    builder.store("cusums[j]", new)
+    inside = [*builder.text(), "top[0] := SEL(top[0] > cusums[j], cusums[j], top[0]);"]
+    return [
+        "top[0] := 0.0;",
+        f"FOR j := 0 TO {members - 1} DO",
+        *(f"    {line}" for line in inside),
+        "END_FOR;",
+    ]
+
+
+def evaluation_variables(n: int, frequencies: int) -> dict[int, str]:
+    """Return the output in which each number of an evaluation stands."""
+    names = ["updates", "statistic", "level", "crossed_s", *(f"theta[{i}]" for i in range(n))]
+    names += [f"covariance[{i}]" for i in range(n * n)]
+    return dict(enumerate([*names, *(f"response[{i}]" for i in range(6 * frequencies))]))
+
+
+def _evaluate(spec: KernelSpec) -> list[str]:
+    steps, size = EvaluationSteps(spec), spec.sizes
+
+    def body(c: CRows, s: CRows, h: CRows, q: CRows) -> None:
+        steps.write_evaluation(c, s, h, q)
+        for f in range(size.frequencies):
+            steps.write_response(c, s, f, q)
+
+    return _traced(body, ("c", "s", "h"), q=evaluation_variables(size.n, size.frequencies))

@@ -1,0 +1,112 @@
+/*
+ * Self-test of @{prefix}.c: the golden samples have to lead to the golden results, bit by bit. Run it with `make check`.
+ *
+ * It prints the bytes of state and constants and the time of a sample, and returns 0 if all is as it should be.
+ */
+#include "@{prefix}.h"
+#include "@{prefix}_golden.h"
+
+#include <stdio.h>
+#include <string.h>
+#include <time.h>
+
+#define MAX_PASSES 50 /* over the golden samples, to measure the time; they end after a second */
+
+static @{number} from_bits(@{bits} bits)
+{
+    @{number} number;
+
+    memcpy(&number, &bits, sizeof number);
+    return number;
+}
+
+/* FNV-1a over the bits of numbers. */
+static uint64_t digest(const @{number} *numbers, size_t count)
+{
+    uint64_t hash = 14695981039346656037u;
+    size_t i;
+    int byte;
+
+    for (i = 0; i < count; i++) {
+        @{bits} bits;
+
+        memcpy(&bits, &numbers[i], sizeof bits);
+        for (byte = 0; byte < (int)sizeof bits; byte++) {
+            hash ^= (bits >> (8 * byte)) & 0xFFu;
+            hash *= 1099511628211u;
+        }
+    }
+    return hash;
+}
+
+static @{number} r[GOLDEN_SAMPLES];
+static @{number} u[GOLDEN_SAMPLES];
+static @{number} y[GOLDEN_SAMPLES];
+
+int main(void)
+{
+    static @{prefix}_state state;
+    static @{prefix}_evaluation q;
+    static unsigned char image[@{upper}_IMAGE_BYTES];
+    @{number} row[@{upper}_ROW];
+    size_t evaluations = 0;
+    size_t wrong = 0;
+    size_t first = 0;
+    size_t k;
+    int pass;
+    int intact;
+    clock_t begin;
+
+    for (k = 0; k < GOLDEN_SAMPLES; k++) {
+        r[k] = from_bits(golden_samples[k][0]);
+        u[k] = from_bits(golden_samples[k][1]);
+        y[k] = from_bits(golden_samples[k][2]);
+    }
+    @{prefix}_init(&state);
+    for (k = 0; k < GOLDEN_SAMPLES; k++) {
+        if (golden_restart[k] != 0u) {
+            @{prefix}_restart(&state);
+        }
+        if (@{prefix}_step(&state, r[k], u[k], y[k], &q) != 0) {
+            memcpy(row, &q, sizeof row);
+            if ((digest(row, @{upper}_ROW) != golden_evaluations[evaluations]) ||
+                ((int)q.verdict != (int)golden_verdicts[evaluations])) {
+                if (wrong == 0u) {
+                    first = k;
+                }
+                wrong++;
+            }
+            evaluations++;
+        }
+        if (k == GOLDEN_SAMPLES / 2u) { /* through a power loss */
+            @{prefix}_save(&state, image);
+            @{prefix}_init(&state);
+            if (@{prefix}_load(&state, image) == 0) {
+                wrong++;
+            }
+        }
+    }
+    @{prefix}_save(&state, image);
+    if (memcmp(image, golden_image, sizeof image) != 0) {
+        wrong++;
+    }
+    image[5] ^= 1u;
+    intact = @{prefix}_load(&state, image);
+    if (intact != 0) {
+        wrong++;
+    }
+    begin = clock();
+    for (pass = 0; (pass < MAX_PASSES) && ((pass == 0) || ((clock() - begin) < CLOCKS_PER_SEC)); pass++) {
+        evaluations += @{prefix}_block(&state, GOLDEN_SAMPLES, r, u, y, golden_restart, &q, 1);
+    }
+    printf("state %lu bytes, saved %lu, constants %lu\n", (unsigned long)sizeof(@{prefix}_state),
+           (unsigned long)@{upper}_IMAGE_BYTES, (unsigned long)@{upper}_CONSTANT_BYTES);
+    printf("%.0f ns per sample\n",
+           (1e9 * (double)(clock() - begin)) / (double)CLOCKS_PER_SEC / (double)pass / (double)GOLDEN_SAMPLES);
+    if ((wrong != 0u) || (evaluations == 0u)) {
+        printf("WRONG: %lu results differ, the first at sample %lu\n", (unsigned long)wrong, (unsigned long)first);
+        return 1;
+    }
+    printf("ok: %d samples, %d evaluations, bit by bit\n", GOLDEN_SAMPLES, GOLDEN_EVALUATIONS);
+    return 0;
+}

@@ -1,0 +1,105 @@
+/*
+ * Condition monitoring of one servo loop, from reference r, control input u and measured output y.
+ *
+ * Made by servoscope @{version} from the baseline @{hash} of the loop "@{loop}".@{left_out}@{rounding}
+ * This file and @{prefix}.c are yours: use, change and pass them on as you like; no licence of servoscope applies.
+ *
+ * No memory is allocated, nothing is recursive, every loop is bounded, and all state is in one struct. Of the C library
+ * fma, fabs, sqrt and memcpy are called. A double has to be an IEEE 754 binary64; rounding is to nearest, subnormal
+ * numbers are kept (no flush to zero), and no option such as -ffast-math may be given.
+ */
+#ifndef @{guard}
+#define @{guard}
+
+#include <stddef.h>
+#include <stdint.h>
+
+#define @{upper}_SAMPLE_RATE_HZ @{rate} /* of r, u and y */
+#define @{upper}_EVERY @{every}u /* samples per evaluation */
+#define @{upper}_COEFFICIENTS @{n}
+#define @{upper}_FREQUENCIES @{frequencies}
+#define @{upper}_STATE_NUMBERS @{size}u /* of the state of the monitor, as the program on the server keeps it */
+#define @{upper}_COUNTERS @{header}u /* of them, at the head; the others follow */
+#define @{upper}_NUMBERS (@{upper}_STATE_NUMBERS - @{upper}_COUNTERS)
+#define @{upper}_ROW @{row} /* numbers at the head of an evaluation */
+#define @{upper}_CONSTANT_BYTES @{constant_bytes}
+#define @{upper}_IMAGE_BYTES @{image_bytes}u /* of a saved state */
+
+/* State between two samples. Set it up with @{prefix}_init or @{prefix}_load. */
+typedef struct {
+    double counters[@{upper}_COUNTERS]; /* samples, updates and the like: exact up to 2^53 */
+    @{number} numbers[@{upper}_NUMBERS];
+    double exceeding; /* evaluations above a limit without interruption */
+    double since;     /* evaluations since the alarm was last raised; no more than the off-delay + 1 */
+} @{prefix}_state;
+
+/* What is known of the actuator. */
+typedef enum {
+    @{upper}_WAITING = 0, /* there is no estimate yet */
+    @{upper}_HEALTHY = 1,
+    @{upper}_FAULT = 2 /* a statistic has been above its limit for longer than the on-delay, @{on_delay} evaluations, */
+                       /* and for no longer than the off-delay, @{off_delay} evaluations, below it since */
+} @{prefix}_verdict;
+
+/* The inverse frequency response at one frequency, u over y, [@{response_unit}]. */
+typedef struct {
+    @{number} real;
+    @{number} imag;
+    @{number} variance_real;
+    @{number} covariance; /* of real and imaginary part */
+    @{number} covariance_again;
+    @{number} variance_imag;
+} @{prefix}_response;
+
+/* The estimated minus the healthy response, [@{response_unit}]. */
+typedef struct {
+    @{number} real;
+    @{number} imag;
+} @{prefix}_residual;
+
+/* One evaluation. */
+typedef struct {
+    @{number} updates;   /* samples that the estimate has taken so far */
+    @{number} statistic; /* T^2; its limit is @{prefix}_limit */
+    @{number} level;     /* of the sequential test, largest since the evaluation before; its limit is 1 */
+    @{number} crossed_s; /* time of the first sample at which it passed its limit, [s] since the start; NaN: it has not */
+    @{number} theta[@{upper}_COEFFICIENTS]; /* @{units} */
+    @{number} covariance[@{upper}_COEFFICIENTS * @{upper}_COEFFICIENTS]; /* of theta, row by row */
+    @{prefix}_response response[@{upper}_FREQUENCIES];
+    @{prefix}_residual gamma[@{upper}_FREQUENCIES];
+    @{prefix}_verdict verdict;
+} @{prefix}_evaluation;
+
+/* The monitored frequencies, [Hz], and the limit of T^2. */
+extern const double @{prefix}_frequencies[@{upper}_FREQUENCIES];
+extern const @{number} @{prefix}_limit;
+
+/* Make the state before the first sample. */
+void @{prefix}_init(@{prefix}_state *state);
+
+/* Say that the next sample does not follow the one before by one sample time. */
+void @{prefix}_restart(@{prefix}_state *state);
+
+/*
+ * Take one sample: r [@{y_unit}], u [@{u_unit}], y [@{y_unit}]. NaN in any of them, or a magnitude of 1e100 and more,
+ * is a missing sample: the estimate is held, and the filters begin anew behind it.
+ *
+ * Return 1 if an evaluation was due and has been written to q, else 0, and q is left as it is.
+ */
+int @{prefix}_step(@{prefix}_state *state, @{number} r, @{number} u, @{number} y, @{prefix}_evaluation *q);
+
+/*
+ * Take `count` samples as @{prefix}_step does, with restarts where `restart` is not 0; it may be NULL.
+ *
+ * Return how many evaluations were due; no more than `room` of them, the first ones, are written to q.
+ */
+size_t @{prefix}_block(@{prefix}_state *state, size_t count, const @{number} *r, const @{number} *u, const @{number} *y,
+                       const unsigned char *restart, @{prefix}_evaluation *q, size_t room);
+
+/* Write the state to an image, the same on every machine: little-endian doubles, fingerprint of this baseline, CRC-32. */
+void @{prefix}_save(const @{prefix}_state *state, unsigned char image[@{upper}_IMAGE_BYTES]);
+
+/* Read an image. Return 1; 0 if it is damaged or of another baseline, and the state is left as it is. */
+int @{prefix}_load(@{prefix}_state *state, const unsigned char image[@{upper}_IMAGE_BYTES]);
+
+#endif

@@ -1,0 +1,164 @@
+"""One asset's day, block by block: the pure step (state, rows) -> (state, evaluations) that every engine carries.
+
+The monitor begins each day anew. Around the first alarm, or at the end of the day, a window of raw rows is diagnosed.
+Results depend on the rows alone, not on how they were cut into blocks.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.core.errors import ServoscopeError
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.diagnosis.follower import DiagnosisSchedule, Follower, FollowerState
+from servoscope.fleet.common_cause import trace_evidence
+from servoscope.fleet.rows import MICRO, Rows
+from servoscope.signals.samples import Samples
+from servoscope.signals.timebase import Timebase
+
+WINDOW = 120.0  # s of raw rows that a diagnosis covers, unless the user chooses otherwise
+
+RowLookup = Callable[[int, int], Rows]  # rows of the day with after < t <= to, in order
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluationBlock:
+    """The evaluations of a block: time [us], theta (K, n), T^2, its limit, level, whether one is above its limit."""
+
+    t_us: IntArray
+    theta: FloatArray
+    statistic: FloatArray
+    threshold: FloatArray
+    level: FloatArray
+    exceeded: BoolArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DayState(FollowerState):
+    """What is kept of a day between two blocks; `samples` are the rows that the monitor processed."""
+
+    first_us: int | None = None  # first row of the day [us]
+    last_us: int | None = None  # last row so far [us]
+    repeats: int = 0  # rows with the time of an earlier one
+    missing: int = 0  # rows with an empty cell
+    gaps: int = 0
+    evaluations: int = 0
+    peak: float = 0.0  # largest statistic or level, as a multiple of its limit
+    alarm_us: int | None = None  # first alarm [us]
+    result: dict[str, Any] | None = None  # the diagnosis and its evidence, or the error; None until it is made
+
+    def pack(self) -> bytes:
+        """Return it as bytes: numbers as one line of JSON, then the monitor's array."""
+        numbers = {("said" if key == "result" else key): value for key, value in vars(self).items() if key != "monitor"}
+        return json.dumps(numbers).encode() + b"\n" + np.ascontiguousarray(self.monitor).tobytes()
+
+    @classmethod
+    def unpack(cls, content: bytes) -> DayState:
+        """Return what `pack` packed."""
+        line, _, array = content.partition(b"\n")
+        numbers = json.loads(line)
+        return cls(monitor=np.frombuffer(array, dtype=np.float64).copy(), result=numbers.pop("said"), **numbers)
+
+
+@dataclass
+class RowHistory:
+    """The last rows of a day in memory, for engines that read a day in one go."""
+
+    blocks: list[Rows] = field(default_factory=list)
+
+    def add(self, rows: Rows) -> None:
+        """Add a block."""
+        self.blocks.append(rows)
+
+    def drop_until(self, until_us: int) -> None:
+        """Drop blocks without rows after a time."""
+        self.blocks = [block for block in self.blocks if len(block) and block.t_us[-1] > until_us]
+
+    def __call__(self, after_us: int, to_us: int) -> Rows:
+        """Return the rows with after_us < t <= to_us."""
+        return Rows.concatenate([block.between(after_us, to_us) for block in self.blocks])
+
+
+class DayMonitor:
+    """Follows days of assets of one baseline, which has its share of the fleet's budget of false alarms.
+
+    `window_s`: seconds of raw rows that a diagnosis covers; a shorter day is diagnosed whole.
+    """
+
+    def __init__(self, baseline: Baseline, window_s: float = WINDOW) -> None:
+        self.baseline = baseline
+        self._follower = Follower(baseline)
+        self._window = round(window_s * MICRO)
+        self._schedule = DiagnosisSchedule(self._window, self._window // 2)
+        self._timebase = Timebase(MICRO / baseline.loop.sample_rate)
+
+    def start(self) -> DayState:
+        """Return the state before the first row of a day."""
+        return DayState(monitor=self._follower.init())
+
+    def needed_since(self, state: DayState) -> int:
+        """Return the time [us] up to which rows are not needed any more."""
+        last = state.last_us if state.last_us is not None else 0
+        return last if state.result is not None else last - self._window
+
+    def advance(self, state: DayState, rows: Rows, history: RowLookup) -> tuple[DayState, EvaluationBlock]:
+        """Process a block: rows in the order of time, after all earlier ones; the old state stays valid.
+
+        `history`: rows of this day, those of the block included, as far back as `needed_since` requires.
+        """
+        first = state.last_us is None
+        last = state.last_us if state.last_us is not None else rows.t_us[:1] - 10 * round(self._timebase.period)
+        steps = np.diff(rows.t_us, prepend=last)
+        repeated = self._timebase.is_repeat(steps)
+        steps, taken = steps[~repeated], rows[~repeated]
+        restart = self._timebase.is_gap(steps)
+        samples = Samples(taken.t_us / MICRO, taken.r, taken.u, taken.y, restart)
+        new, (trace, sample, alarms) = self._follower.follow(state, samples)
+        limits = np.full(len(trace.t), self.baseline.limit)
+        block = EvaluationBlock(taken.t_us[sample], trace.theta, trace.statistic, limits, trace.level, trace.exceeded)
+        if not len(rows):
+            return state, block
+        peaks = np.maximum(trace.statistic / limits, trace.level)[trace.ready]
+        empty = np.isnan(taken.r) | np.isnan(taken.u) | np.isnan(taken.y)
+        new = replace(
+            new,
+            first_us=int(rows.t_us[0]) if first else state.first_us,
+            last_us=int(rows.t_us[-1]),
+            repeats=state.repeats + int(repeated.sum()),
+            missing=state.missing + int(empty.sum()),
+            gaps=state.gaps + int(restart.sum()) - first,
+            evaluations=state.evaluations + len(trace.t),
+            peak=float(max(state.peak, peaks.max(initial=0.0))),
+            alarm_us=int(block.t_us[alarms[0]]) if state.alarm_us is None and alarms.size else state.alarm_us,
+        )
+        if new.result is None and new.alarm_us is not None and new.last_us is not None:
+            end = int(self._schedule.end(new.alarm_us, new.first_us))
+            if new.last_us > end:
+                new = replace(new, result=self._diagnose(new, end, history))
+        return new, block
+
+    def finish(self, state: DayState, history: RowLookup) -> DayState:
+        """Return the state at the end of the day, with its result if there was any row."""
+        if state.result is not None or state.last_us is None:
+            return state
+        return replace(state, result=self._diagnose(state, state.last_us, history))
+
+    def _diagnose(self, state: DayState, end_us: int, history: RowLookup) -> dict[str, Any]:
+        """Diagnose the window that ends there; return the error where that is impossible."""
+        assert state.first_us is not None, "there was a row"
+        rows = history(max(end_us - self._window, state.first_us - 1), end_us)
+        try:
+            recording = rows.to_recording(state.first_us, self.baseline.loop, "window")
+            diagnosis, trace = diagnose_with_trace(self.baseline, recording)
+        except ServoscopeError as error:
+            return {"error": str(error).removeprefix("window: ")}
+        evidence = json.dumps(asdict(trace_evidence(self.baseline, trace)))
+        document = diagnosis.model_dump_json(exclude={"recording"})
+        return {"diagnosis": json.loads(document), "evidence": json.loads(evidence)}

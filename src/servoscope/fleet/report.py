@@ -1,0 +1,89 @@
+"""The report on a fleet as one HTML page: who is ill, what is common, what changed, what could not be examined."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+from servoscope.core.files import atomic_write, make_folder
+from servoscope.fleet.rows import MICRO
+from servoscope.fleet.summary import COMMON, FAILED, Fleet
+from servoscope.report.format_values import DASH, format_clock_time, format_count, format_size
+from servoscope.report.page import render_page, write_page
+
+MOST_ROWS = 300  # of a table: a page is read by people
+MOST_DAYS = 60  # of the picture of days
+LEAST_SHOWN = 0.05  # probability of a common cause that is worth its row
+MIN_EPOCH_S = 1e9  # s since 1970 from which a time is a date, not a time since some start
+TONES = {
+    "healthy": "var(--measured)",
+    "fault": "var(--alarm)",
+    COMMON: "var(--ink)",
+    "undetermined": "var(--reference)",
+    FAILED: "none",
+}
+
+
+def write_fleet_report(output: Path, fleet: Fleet, lake: str) -> None:
+    """Write fleet.json and report.html into a folder; nothing half-written stays behind.
+
+    Raises OutputError if a file cannot be written.
+    """
+    make_folder(output)
+    atomic_write(output / "fleet.json", json.dumps(fleet.to_dict(), indent=1, allow_nan=False).encode() + b"\n")
+    write_page(output / "report.html", render_fleet_page(fleet, lake))
+
+
+def render_fleet_page(fleet: Fleet, lake: str) -> str:
+    """Return report.html; it needs nothing from outside."""
+    states = ("healthy", "fault", COMMON, "undetermined", FAILED)
+    late = sorted(fleet.late.items(), key=lambda pair: -pair[1])
+    return render_page(
+        "fleet.html",
+        package="servoscope.fleet",
+        title=f"Fleet: {lake}",
+        kind="fault" if fleet.accepted or fleet.count("fault") else "healthy",
+        lake=lake,
+        fleet=fleet,
+        items=sum(len(days) for days in fleet.states.values()),
+        headline=headline(fleet),
+        counts=[(state, n) for state in states if (n := fleet.count(state)) or state == "healthy"],
+        causes=[
+            (cause, since)
+            for cause, since in zip(fleet.causes, fleet.since, strict=True)
+            if cause.probability >= LEAST_SHOWN
+        ],
+        ill=[one for one in fleet.assets if one.state not in ("healthy", FAILED)],
+        changed=[one for one in fleet.assets if one.before is not None and one.before != one.state],
+        days=sorted({day for some in fleet.states.values() for day in some})[-MOST_DAYS:],
+        shown=[one.asset for one in fleet.assets][:MOST_ROWS],
+        late=[(asset, format_count(rows)) for asset, rows in late],
+        most=MOST_ROWS,
+        tones=TONES,
+        size=lambda one: format_size(one.ratio, *one.interval),
+        time=_format_time,
+    )
+
+
+def headline(fleet: Fleet) -> str:
+    """Return what there is to know first, as plain text."""
+    ill, shared = fleet.count("fault"), len(fleet.accepted)
+    parts = []
+    if shared:
+        named = ", ".join(f"{cause.key} {cause.group}" for cause in fleet.accepted[:3])
+        parts.append(f"{shared} common cause{'s' * (shared > 1)} ({named}{', ...' * (shared > 3)})")
+    if ill:
+        parts.append(f"{ill} asset{'s' * (ill > 1)} ill by {'themselves' if ill > 1 else 'itself'}")
+    return " and ".join(parts) if parts else "No asset has changed from its healthy baseline"
+
+
+def _format_time(t_us: int | None) -> str:
+    if t_us is None:
+        return DASH
+    seconds = t_us / MICRO
+    return (
+        f"{datetime.fromtimestamp(round(seconds), UTC):%Y-%m-%d %H:%M:%S}"
+        if seconds > MIN_EPOCH_S
+        else format_clock_time(seconds)
+    )

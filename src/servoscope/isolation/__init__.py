@@ -1,0 +1,1 @@
+"""Which fault, and how large: signatures, candidates, maximum-likelihood refit."""

@@ -1,0 +1,222 @@
+"""One or two parameters that changed: the most likely sizes, their covariance, and the evidence for the hypothesis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.isolation.ml.least_squares import explained_sum_of_squares, last_unknown_std
+from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.isolation.posterior import Posterior
+from servoscope.models.plants import Fault
+
+STEPS = 12  # of the search, at most
+UNSEEN = 3.0  # standard deviations below which a size is as good as none
+REACH = 5.0  # standard deviations of the size over which its likelihood is integrated
+POINTS = 31
+AT_BOUND = 1e-6
+IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisFit:
+    """A hypothesis at its most likely sizes."""
+
+    faults: tuple[Fault, ...]  # what changed, one or several
+    profile: ChangeProfile
+    # d, x: errors of the healthy parameters and changes of the faults', all in logarithms, shapes (m,) and (k,)
+    d: FloatArray
+    x: FloatArray
+    cost: float  # sum of squares: innovations and prior
+    covariance: FloatArray  # of x, shape (k, k)
+    jacobian: FloatArray  # of the residual, shape (N + m, m + k); (N + m, k) where d was held
+    residual: FloatArray  # shape (N + m,)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that change."""
+        return tuple(fault.parameter for fault in self.faults)
+
+    @property
+    def has_free_nuisances(self) -> bool:
+        """Whether the healthy parameters followed."""
+        return bool(self.jacobian.shape[1] == len(self.d) + len(self.x))
+
+    def intervals(self, noise_variance: float) -> tuple[tuple[float, float], ...]:
+        """Return 95 % intervals of x within the ranges, for innovations of a variance."""
+        std = np.sqrt(np.diag(self.covariance) * noise_variance)
+        low, high = log_ratio_bounds(self.faults)
+        return tuple(
+            (float(max(x - 1.96 * s, a)), float(min(x + 1.96 * s, b)))
+            for x, s, a, b in zip(self.x, std, low, high, strict=True)
+        )
+
+
+def log_ratio_bounds(faults: Sequence[Fault]) -> tuple[FloatArray, FloatArray]:
+    """Return the smallest and largest logarithms of the ratios that are searched, shapes (k,)."""
+    low, high = np.log(np.array([fault.ratio_range for fault in faults]).reshape(-1, 2)).T
+    return low, high
+
+
+def fit_hypothesis(
+    window: RefitWindow,
+    faults: Sequence[Fault],
+    profile: ChangeProfile,
+    d: FloatArray,
+    starts: Sequence[FloatArray],
+    free: bool,
+) -> HypothesisFit:
+    """Find the most likely sizes by least squares on the innovations.
+
+    `d`: errors of the healthy parameters, to begin with, shape (m,); `starts`: sizes at which the search begins,
+    one (k,) each; the best end counts; `free`: whether d follows, within reason, or stays.
+    """
+    from scipy.optimize import least_squares as minimise
+
+    names, m = tuple(fault.parameter for fault in faults), window.nuisance_count
+    held = 0 if free else m
+    low, high = log_ratio_bounds(faults)
+    lowest = np.concatenate([np.full(m, -np.inf), low])[held:]
+    highest = np.concatenate([np.full(m, np.inf), high])[held:]
+
+    def whole(z: FloatArray) -> FloatArray:
+        return z if free else np.concatenate([d, z])
+
+    def residual(z: FloatArray) -> FloatArray:
+        return window.residual(whole(z), names, profile)
+
+    def jacobian(z: FloatArray) -> FloatArray:
+        return window.jacobian(whole(z), names, profile, slice(held, None))
+
+    if not len(lowest):  # nothing is open
+        e = window.residual(d, names, profile)
+        return HypothesisFit((), profile, d, np.zeros(0), float(e @ e), np.zeros((0, 0)), np.zeros((len(e), 0)), e)
+    ends = []
+    for x in starts:
+        z = np.clip(np.concatenate([d, x])[held:], lowest + AT_BOUND, highest - AT_BOUND)
+        found = minimise(
+            residual,
+            z,
+            jacobian,
+            bounds=(lowest, highest),
+            x_scale="jac",
+            ftol=1e-7 if free else 1e-4,
+            xtol=1e-7 if free else 1e-4,
+            gtol=None,
+            max_nfev=STEPS,
+        )
+        ends.append(found)
+    best = min(ends, key=lambda found: float(found.cost))
+    z, J = whole(np.asarray(best.x)), np.asarray(best.jac, dtype=np.float64)
+    H = J.T @ J
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    C = np.linalg.pinv(H / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
+    k = m - held  # rows of d, where it is free
+    return HypothesisFit(tuple(faults), profile, z[:m], z[m:], 2.0 * float(best.cost), C[k:, k:], J, best.fun)
+
+
+def refit_contenders_jointly(
+    window: RefitWindow, fitted: Sequence[HypothesisFit], noise_variance: float, J: float = np.inf
+) -> list[HypothesisFit]:
+    """Let the healthy parameters follow wherever that may bring a hypothesis within reach of the best one.
+
+    One step of Gauss and Newton says how far each would come.
+    """
+    promised = []
+    for f in fitted:
+        jacobian = window.jacobian(np.concatenate([f.d, f.x]), f.names, f.profile)
+        promised.append(f.cost - explained_sum_of_squares(jacobian, f.residual))
+    limit = min(J, *promised) + IN_REACH * noise_variance
+    return [refit_jointly(window, f) if limit >= promise else f for f, promise in zip(fitted, promised, strict=True)]
+
+
+def refit_jointly(window: RefitWindow, fitted: HypothesisFit) -> HypothesisFit:
+    """Return a hypothesis whose healthy parameters followed too."""
+    return fit_hypothesis(window, fitted.faults, fitted.profile, fitted.d, [fitted.x], free=True)
+
+
+@dataclass(frozen=True)
+class SizePrior:
+    """What a fault's size is measured by before anything is known of it.
+
+    The prior of a logarithm x of a ratio is 1/(|x| + m) within the fault's range: every order of magnitude is as likely
+    as the next down to m, the size that just does not show. Two faults of which one shows at 0.1 % and the other at
+    10 % are so compared on equal terms, where a prior uniform in x would call the first a coincidence.
+    """
+
+    fault: Fault
+    noise_floor: float
+
+    @classmethod
+    def from_window(cls, window: RefitWindow, fault: Fault, profile: ChangeProfile) -> SizePrior:
+        """Measure by the information that the window holds about a small change."""
+        m = window.nuisance_count
+        J = window.jacobian(np.zeros(m + 1), (fault.parameter,), profile)
+        (low,), (high,) = log_ratio_bounds([fault])
+        return cls(fault, min(UNSEEN * last_unknown_std(J), (high - low) / 4.0))
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """Return the logarithm of the prior density at x, shape as x."""
+        (low,), (high,) = log_ratio_bounds([self.fault])
+        area = np.log1p(-low / self.noise_floor) + np.log1p(high / self.noise_floor)
+        return np.asarray(-np.log((np.abs(x) + self.noise_floor) * area))
+
+
+@dataclass(frozen=True)
+class HypothesisEvidence:
+    """How well a hypothesis explains the window, averaged over the sizes that it may have."""
+
+    log: float  # logarithm of the integral of likelihood times prior
+    intervals: tuple[tuple[float, float], ...]  # 95 % intervals of the logarithms of the ratios, one per fault
+
+    def widen(self, fitted: HypothesisFit, spread: Mapping[str, float]) -> HypothesisEvidence:
+        """Return the same with intervals that hold what is not known of the onset, `spread` by parameter, too."""
+        intervals = []
+        for name, x, (low, high) in zip(fitted.names, fitted.x, self.intervals, strict=True):
+            more = 1.96 * spread.get(name, 0.0)
+            intervals.append((float(x - np.hypot(x - low, more)), float(x + np.hypot(high - x, more))))
+        return replace(self, intervals=tuple(intervals))
+
+
+def integrate_evidence(
+    window: RefitWindow, found: HypothesisFit, scales: Sequence[SizePrior], noise_variance: float
+) -> HypothesisEvidence:
+    """Integrate likelihood times prior over the sizes.
+
+    One fault: along its size, with the healthy parameters following linearly. Two: a Gaussian around the most likely
+    sizes (Laplace; MacKay, 2003, chapter 27), of which no more than the whole prior can be inside.
+    """
+    m, k = window.nuisance_count, len(found.x)
+    H = found.jacobian.T @ found.jacobian / noise_variance
+    rest = H[:m, :m]
+    volume = -0.5 * float(np.linalg.slogdet(rest)[1]) if m else 0.0
+    if k == 1:
+        return _evidence_along_size(window, found, scales[0], noise_variance, volume)
+    log = volume - 0.5 * found.cost / noise_variance
+    C = noise_variance * found.covariance
+    # each direction's share of the prior is at most all of it
+    conditional = float(np.linalg.slogdet(C)[1]) / 2.0 + k * np.log(2.0 * np.pi) / 2.0
+    priors = sum(float(scale.log_density(np.array(x))) for scale, x in zip(scales, found.x, strict=True))
+    return HypothesisEvidence(log + min(conditional + priors, 0.0), found.intervals(noise_variance))
+
+
+def _evidence_along_size(
+    window: RefitWindow, found: HypothesisFit, scale: SizePrior, noise_variance: float, volume: float
+) -> HypothesisEvidence:
+    m = window.nuisance_count
+    (low,), (high,) = log_ratio_bounds(found.faults)
+    best = float(found.x[0])
+    reach = min(REACH * float(np.sqrt(found.covariance[0, 0] * noise_variance)), high - low)
+    sizes = np.unique(np.clip(best + reach * np.linspace(-1.0, 1.0, POINTS), low, high))
+    H = found.jacobian.T @ found.jacobian
+    follow = -np.linalg.solve(H[:m, :m], H[:m, m]) if m else np.zeros(0)
+    J = []
+    for x in sizes:
+        z = np.append(found.d + follow * (x - best), x)
+        J.append(float((window.residual(z, found.names, found.profile) ** 2).sum()))
+    log_weight = -0.5 * np.array(J) / noise_variance + scale.log_density(sizes)
+    found_at = Posterior.from_log_density(sizes, log_weight)
+    return HypothesisEvidence(volume + found_at.log_area, (found_at.interval,))

@@ -1,0 +1,323 @@
+"""The refit of the seconds around an onset: every fault and every pair, when, how large, how probable, what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.detection.baseline import Baseline
+from servoscope.isolation.ml.goodness_of_fit import GoodnessOfFit, misspecification_columns, score_test
+from servoscope.isolation.ml.hypothesis import (
+    IN_REACH,
+    HypothesisEvidence,
+    HypothesisFit,
+    SizePrior,
+    fit_hypothesis,
+    integrate_evidence,
+    refit_contenders_jointly,
+    refit_jointly,
+)
+from servoscope.isolation.ml.onset import OnsetEstimate, onset_posterior
+from servoscope.isolation.ml.start_values import SizeGrid, fit_further_parameters, pair_start_values
+from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.models.plants import Fault
+from servoscope.signals import Recording
+
+BEFORE_S = 60.0  # of healthy motion before the onset
+AFTER_S = 240.0  # of motion with the change
+MAX_WINDOW_SAMPLES = 40_000  # samples in a window
+PAIRS = 0.02  # probability that two faults come at once, before anything is known
+OUTSIDE = 0.01  # and that it is a parameter outside the list of faults
+LOOKS = 4  # for the onset, each with the sizes that fit the one before
+WORTH_A_LOOK = 1.0  # of the sum of squares that a look gained, for another one
+SHARP = 20  # samples of an onset's interval, up to which the step is loud
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One explanation: its fit, its evidence and its probability."""
+
+    fitted: HypothesisFit
+    evidence: HypothesisEvidence
+    probability: float
+
+    @property
+    def name(self) -> str:
+        """Names of its faults, joined by plus signs."""
+        return " + ".join(fault.name for fault in self.fitted.faults)
+
+
+@dataclass(frozen=True, eq=False)
+class RefitResult:
+    """Result of the refit."""
+
+    window: RefitWindow  # what it looked at
+    hypotheses: tuple[Hypothesis, ...]  # most probable first
+    other_parameters: tuple[
+        HypothesisFit, ...
+    ]  # parameters outside the list of faults, each as if it alone had changed
+    unknown_probability: float  # probability that it is none of the hypotheses
+    goodness: GoodnessOfFit  # of the most probable one
+    onset: OnsetEstimate  # onset, in samples of the window
+    noise_variance: float  # variance of the innovations under it, 1 for the baseline's noise
+    initial_onset: int  # sample of the window from which the search for the onset started
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether none of the hypotheses is the most probable answer."""
+        return self.unknown_probability > self.best.probability
+
+    @property
+    def best(self) -> Hypothesis:
+        """The most probable hypothesis."""
+        return self.hypotheses[0]
+
+
+def onset_window(baseline: Baseline, recording: Recording, onset: int, last: int) -> RefitWindow:
+    """Return the stretch around an onset, to the sample `last` at most."""
+    rate = recording.sample_rate
+    first = max(onset - min(round(BEFORE_S * rate), MAX_WINDOW_SAMPLES // 4), 0)
+    end = min(last + 1, onset + round(AFTER_S * rate), first + MAX_WINDOW_SAMPLES)
+    return RefitWindow.from_recording(baseline, recording, first, end)
+
+
+def fit_hypotheses(
+    baseline: Baseline,
+    recording: Recording,
+    onset: int,
+    announced: int,
+    last: int,
+    progress: Callable[[], None] = lambda: None,
+) -> RefitResult:
+    """Fit every fault and every pair of faults to the seconds around an onset.
+
+    Maximum likelihood on the innovations of the exact sampled plant (Ljung, 1999, chapter 7), so that sizes scatter as
+    little as the Cramer-Rao bound allows; the healthy parameters are free as far as the baseline does not know them.
+
+    The search for the onset starts at the sample `onset` and ends at that of the alarm, `announced`.
+    """
+    search = _HypothesisSearch(
+        onset_window(baseline, recording, onset, last), baseline.plant.all_faults, onset, announced, progress
+    )
+    return search.run()
+
+
+class _HypothesisSearch:
+    def __init__(
+        self, window: RefitWindow, faults: Sequence[Fault], onset: int, announced: int, progress: Callable[[], None]
+    ) -> None:
+        self.window, self.faults, self.progress = window, faults, progress
+        # a ray is several parameters at once already: pairs are made of the plant's own faults
+        self.rays = tuple(ray.fault for ray in window.plant.rays)
+        self.latest = min(announced - window.first_sample, window.samples - 1)
+        self.initial_onset = max(min(onset - window.first_sample, self.latest), 0)
+        self.profile = ChangeProfile(self.initial_onset)
+        self.noise_variance = 1.0
+
+    def run(self) -> RefitResult:
+        nothing = np.zeros(self.window.nuisance_count)
+        found, singles = self._fit_singles(nothing)
+        self.profile = found.profile
+        pairs = [
+            self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
+            for one, other in combinations([f for f in singles if f.faults[0] not in self.rays], 2)
+        ]
+        found, everything = self._iterate_onset(found, [*singles, *pairs])
+        if not self._explains(self._update_noise_variance(everything)):
+            # no fault alone is near the truth, nor are the sizes that the pairs started from
+            pairs = [
+                self._fit(p.faults, nothing, [p.x, *pair_start_values(self.window, p.faults, self.profile)])
+                for p in pairs
+            ]
+            found, everything = self._iterate_onset(found, [*singles, *pairs])
+        best = self._update_noise_variance(everything)
+        everything = [self._refit_own_onset(f, best) for f in everything]
+        if found.high - found.low <= SHARP and not found.profile.duration:
+            found, everything = self._sharpen_onset(found, everything)
+        return self._weigh(everything, found)
+
+    def _sharpen_onset(
+        self, found: OnsetEstimate, fitted: Sequence[HypothesisFit]
+    ) -> tuple[OnsetEstimate, list[HypothesisFit]]:
+        """Move the onset of a loud step sample by sample: its sizes do not follow linearly from one to the next."""
+        best = self._update_noise_variance(fitted)
+        for step in (4, 2, 1):
+            for way in (-step, step):
+                while 0 <= best.profile.onset + way <= self.latest:
+                    moved = self._refit_jointly(self._refit_at(best, ChangeProfile(best.profile.onset + way)))
+                    if best.cost - WORTH_A_LOOK * self.noise_variance < moved.cost:
+                        break
+                    best = moved
+        profile = best.profile
+        if profile == found.profile:
+            return found, list(fitted)
+        onset = replace(found, profile=profile, low=min(found.low, profile.onset), high=max(found.high, profile.onset))
+        everything = self._refit_contenders([self._refit_at(f, profile) for f in fitted])
+        return onset, [best if f.names == best.names else f for f in everything]
+
+    def _iterate_onset(
+        self, found: OnsetEstimate, fitted: Sequence[HypothesisFit]
+    ) -> tuple[OnsetEstimate, list[HypothesisFit]]:
+        """Find the onset and the sizes of the best hypothesis in turns if it is a pair, then let the others follow."""
+        best = self._update_noise_variance(fitted)
+        for _ in range(LOOKS if len(best.faults) > 1 else 0):
+            found = self._onset(best)
+            after = self._refit_at(best, found.profile)
+            gained, best = best.cost - after.cost, after
+            if gained < WORTH_A_LOOK * self.noise_variance:
+                break
+        self.profile = found.profile
+        everything = self._refit_contenders([self._refit_at(f, found.profile) for f in fitted])
+        self._update_noise_variance(everything)
+        return found, everything
+
+    def _explains(self, fitted: HypothesisFit) -> bool:
+        good = self._goodness(fitted)
+        return good.statistic <= good.limit
+
+    def _fit_singles(self, d: FloatArray) -> tuple[OnsetEstimate, list[HypothesisFit]]:
+        """Find the onset and the sizes of single faults in turns; drifts are tried once the steps have settled.
+
+        The recursion's onset may be far off where a fault moves its coefficients along a curve, as oil does; the alarm
+        is never far behind. Sizes that fit a wrong onset may be stuck: a grid over all sizes is searched each time.
+        """
+        grids = [SizeGrid.from_window(self.window, fault, d) for fault in self.faults]
+        begin = min(
+            sorted({self.initial_onset, self.latest}),
+            key=lambda k: min(float(grid.sums_of_squares(self.window, ChangeProfile(k)).min()) for grid in grids),
+        )
+        singles = self._fit_each_fault(ChangeProfile(begin), d, grids)
+        for drifts in (False, True):
+            for _ in range(LOOKS):
+                best = self._update_noise_variance(singles)
+                found = self._onset(best, drifts)
+                if found.profile == self.profile:
+                    break
+                singles = self._fit_each_fault(found.profile, d, grids, singles)
+                gained = best.cost - self._update_noise_variance(singles).cost
+                if gained < WORTH_A_LOOK * self.noise_variance:
+                    break
+        return found, singles
+
+    def _fit_each_fault(
+        self, profile: ChangeProfile, d: FloatArray, grids: Sequence[SizeGrid], known: Sequence[HypothesisFit] = ()
+    ) -> list[HypothesisFit]:
+        """Fit every fault alone, from the local minima of its grid and from a known size."""
+        self.profile = profile
+        starts = [grid.local_minima(self.window, profile) for grid in grids]
+        for each, other in zip(starts, known, strict=False):
+            each.append(other.x)
+        return [self._fit([fault], d, each) for fault, each in zip(self.faults, starts, strict=True)]
+
+    def _fit(self, faults: Sequence[Fault], d: FloatArray, starts: Sequence[FloatArray]) -> HypothesisFit:
+        self.progress()
+        return fit_hypothesis(self.window, faults, self.profile, d, starts, free=False)
+
+    def _refit_contenders(self, fitted: Sequence[HypothesisFit]) -> list[HypothesisFit]:
+        """Let the healthy parameters follow: a second fault that stands in for their error must not outrun the first.
+
+        Under a large fault they matter.
+        """
+        self.progress()
+        followed = refit_contenders_jointly(self.window, fitted, self.noise_variance)
+        best = self._update_noise_variance(followed)
+        return [
+            self._refit_jointly(f) if self._is_contender(f, best) and not f.has_free_nuisances else f for f in followed
+        ]
+
+    def _refit_jointly(self, fitted: HypothesisFit) -> HypothesisFit:
+        self.progress()
+        return refit_jointly(self.window, fitted)
+
+    def _refit_at(self, fitted: HypothesisFit, profile: ChangeProfile) -> HypothesisFit:
+        if fitted.profile == profile:
+            return fitted
+        return fit_hypothesis(self.window, fitted.faults, profile, fitted.d, [fitted.x], free=False)
+
+    def _refit_own_onset(self, fitted: HypothesisFit, best: HypothesisFit) -> HypothesisFit:
+        """Let another single fault that is within reach have its own onset."""
+        if fitted is best or len(fitted.names) > 1 or not self._is_contender(fitted, best):
+            return fitted
+        profile = self._onset(fitted).profile
+        return fitted if profile == fitted.profile else self._refit_jointly(self._refit_at(fitted, profile))
+
+    def _is_contender(self, fitted: HypothesisFit, best: HypothesisFit) -> bool:
+        return IN_REACH * self.noise_variance >= fitted.cost - best.cost
+
+    def _best(self, fitted: Sequence[HypothesisFit]) -> HypothesisFit:
+        """Return the closest hypothesis; a second fault must be worth its freedom."""
+        return min(fitted, key=lambda f: f.cost + 2.0 * np.log(1.0 / PAIRS) * (len(f.names) - 1) * self.noise_variance)
+
+    def _update_noise_variance(self, fitted: Sequence[HypothesisFit]) -> HypothesisFit:
+        """Return the closest hypothesis, and take the variance of the noise from it."""
+        best = self._best(fitted)
+        self.noise_variance = best.cost / self.window.samples
+        return best
+
+    def _onset(self, fitted: HypothesisFit, drifts: bool = True) -> OnsetEstimate:
+        return onset_posterior(self.window, fitted, self.latest, self.noise_variance, drifts)
+
+    def _weigh(self, fitted: Sequence[HypothesisFit], found: OnsetEstimate) -> RefitResult:
+        window, n = self.window, len(self.faults)
+        scales = {fault: SizePrior.from_window(window, fault, found.profile) for fault in self.faults}
+        own = n - len(self.rays)
+        several = PAIRS if own > 1 else 0.0
+        prior = {1: (1.0 - several - OUTSIDE) / n, 2: several / max(own * (own - 1) / 2, 1)}
+        best = self._update_noise_variance(fitted)
+        top = self._evidence(best, scales)
+        told = [
+            self._evidence(f, scales)
+            if self._is_contender(f, best)
+            else HypothesisEvidence(
+                top.log - 0.5 * (f.cost - best.cost) / self.noise_variance, f.intervals(self.noise_variance)
+            )
+            for f in fitted
+        ]
+        logs = np.array([e.log + np.log(prior[len(f.names)]) for e, f in zip(told, fitted, strict=True)])
+        likeliest = int(np.argmax(logs))
+        good = self._goodness(fitted[likeliest])
+        # unknown: what nothing explains, or what a parameter outside the list explains better
+        others = fit_further_parameters(window, fitted[likeliest].profile, fitted[likeliest], self.noise_variance)
+        rivals = [
+            self._evidence(f, {}).log - np.log(len(others) / OUTSIDE)
+            for f in others
+            if f.has_free_nuisances and self._is_contender(f, best)
+        ]
+        nothing = logs[likeliest] + 0.5 * (good.statistic - good.limit)
+        logs = np.append(logs, np.logaddexp.reduce([nothing, *rivals]))
+        probability = np.exp(logs - logs.max())
+        probability /= probability.sum()
+        told = [e.widen(f, found.size_std) for e, f in zip(told, fitted, strict=True)]
+        # by their logarithms: under a change that is unknown all probabilities may vanish
+        order = np.argsort(-logs[:-1], kind="stable")
+        hypotheses = tuple(Hypothesis(fitted[i], told[i], float(probability[i])) for i in order)
+        return RefitResult(
+            window,
+            hypotheses,
+            tuple(others),
+            float(probability[-1]),
+            good,
+            found,
+            self.noise_variance,
+            self.initial_onset,
+        )
+
+    def _evidence(self, fitted: HypothesisFit, scales: Mapping[Fault, SizePrior]) -> HypothesisEvidence:
+        each = [
+            scales.get(fault) or SizePrior.from_window(self.window, fault, fitted.profile) for fault in fitted.faults
+        ]
+        return integrate_evidence(self.window, fitted, each, self.noise_variance)
+
+    def _goodness(self, fitted: HypothesisFit) -> GoodnessOfFit:
+        window, profile = self.window, fitted.profile
+        predictor = window.predictor(fitted.d, fitted.names, fitted.x, profile)
+        healthy = window.predictor(fitted.d, (), np.zeros(0), profile)
+        where = np.arange(window.samples) >= profile.onset
+        e = fitted.residual[: window.samples]
+        shift = float(np.linalg.norm(window.innovations(healthy, profile) - e))
+        Z = misspecification_columns(window, predictor, profile, where)
+        return score_test(Z, fitted.jacobian, fitted.residual, self.noise_variance, shift)

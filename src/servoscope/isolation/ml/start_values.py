@@ -1,0 +1,88 @@
+"""Sizes at which the search for a change begins, and the fit of parameters outside the list of faults from there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import FloatArray
+from servoscope.isolation.ml.hypothesis import (
+    HypothesisFit,
+    fit_hypothesis,
+    log_ratio_bounds,
+    refit_contenders_jointly,
+)
+from servoscope.isolation.ml.predictor import Predictor
+from servoscope.isolation.ml.window import SENSOR_GAIN, ChangeProfile, RefitWindow
+from servoscope.models.plants import Fault
+
+RUNGS = 33  # sizes of one fault that are looked at
+FURTHER_RANGE = (0.3, 3.0)  # ratios of a parameter outside the list of faults
+GRID = 17  # of each of two
+VALLEYS = 3  # from which searches begin
+BESIDE_S = 2.0, 10.0  # before and after the onset that the grid over two looks at
+
+
+@dataclass(frozen=True, eq=False)
+class SizeGrid:
+    """Sizes of one fault from one end of its range to the other, where a search may begin."""
+
+    sizes: FloatArray  # logarithms of the ratios
+    predictors: tuple[Predictor, ...]  # of the healthy plant and the one of each size
+
+    @classmethod
+    def from_window(cls, window: RefitWindow, fault: Fault, d: FloatArray) -> Self:
+        """Make the predictors, for errors d (m,) of the healthy parameters."""
+        (low,), (high,) = log_ratio_bounds([fault])
+        sizes, step = np.linspace(low, high, RUNGS), ChangeProfile(0)
+        return cls(sizes, tuple(window.predictor(d, (fault.parameter,), np.array([x]), step) for x in sizes))
+
+    def sums_of_squares(self, window: RefitWindow, profile: ChangeProfile) -> FloatArray:
+        """Return the sum of squares of each size, a drift taken as a step in its middle."""
+        step = ChangeProfile(profile.onset + profile.duration // 2)
+        return np.array([float((window.innovations(each, step) ** 2).sum()) for each in self.predictors])
+
+    def local_minima(self, window: RefitWindow, profile: ChangeProfile) -> list[FloatArray]:
+        """Return the sizes (1,) at the lowest valleys: what a fault does to fast dynamics comes back as an alias."""
+        return [self.sizes[at] for at in _local_minima(self.sums_of_squares(window, profile))]
+
+
+def pair_start_values(window: RefitWindow, faults: Sequence[Fault], profile: ChangeProfile) -> list[FloatArray]:
+    """Return the sizes (2,) of two faults at the lowest valleys of a grid over both ranges.
+
+    Only the seconds around the onset are looked at: far from the truth they say enough.
+    """
+    rate, step = window.factory.loop.sample_rate, profile.onset + profile.duration // 2
+    first, end = max(step - round(BESIDE_S[0] * rate), 0), step + round(BESIDE_S[1] * rate)
+    near, names, d = window.cut(first, end), [fault.parameter for fault in faults], np.zeros(window.nuisance_count)
+    low, high = log_ratio_bounds(faults)
+    axes = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]
+    cost = np.empty((GRID, GRID))
+    for i, x in enumerate(axes[0]):
+        for j, z in enumerate(axes[1]):
+            cost[i, j] = (near.residual(np.append(d, [x, z]), names, ChangeProfile(step - first)) ** 2).sum()
+    return [np.array([axes[0][i], axes[1][j]]) for i, j in _local_minima(cost)]
+
+
+def fit_further_parameters(
+    window: RefitWindow, profile: ChangeProfile, best: HypothesisFit, noise_variance: float
+) -> list[HypothesisFit]:
+    """Fit every further parameter of the plant, and the gain of the sensor of y."""
+    known = {**window.plant.causes, SENSOR_GAIN: "a gain error of the sensor of y"}
+    found = []
+    for name, words in known.items():
+        fault = Fault(name, name, FURTHER_RANGE, words)
+        starts = SizeGrid.from_window(window, fault, best.d).local_minima(window, profile)
+        found.append(fit_hypothesis(window, [fault], profile, best.d, starts, free=False))
+    return refit_contenders_jointly(window, found, noise_variance, best.cost)
+
+
+def _local_minima(cost: FloatArray) -> npt.NDArray[np.int64]:
+    """Return where the lowest valleys of a table are, the lowest first, shape (v, cost.ndim)."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(cost, 1, constant_values=np.inf), (3,) * cost.ndim)
+    found = np.argwhere(cost <= around.min(axis=tuple(range(-cost.ndim, 0))))
+    return found[np.argsort(cost[tuple(found.T)])][:VALLEYS]

@@ -1,0 +1,133 @@
+"""What a baseline can promise: the smallest change it sees, the budget its data support, the model error they show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.messages import Message, message
+from servoscope.detection.baseline import DetectableChange
+from servoscope.detection.chi2_test import (
+    SECONDS_PER_YEAR,
+    noncentrality,
+    required_noncentrality,
+    t2_statistic,
+    threshold,
+)
+from servoscope.estimation.filter_bank import FilterBank, filter_cutoff
+from servoscope.estimation.pipeline import Estimates, Pipeline
+from servoscope.estimation.tuning import TuningFit
+from servoscope.models.loop import Loop
+from servoscope.models.lti import autocovariances, solve_scaled
+
+WORTH_TELLING = 1.0 / 3.0  # standard deviations that noise in phi may move the iFRF in silence
+WORTH_A_LOOK = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
+
+
+def baseline_misfit(
+    estimates: Sequence[Estimates], deviations: Sequence[FloatArray], covariance: FloatArray, fit: TuningFit
+) -> tuple[float, float]:
+    """Return T^2 per coefficient on the healthy data themselves, and the model error that would bring it to one."""
+    from scipy.optimize import brentq
+
+    learned = [e.updates > 0 for e in estimates]
+    S = np.concatenate([e.S[ok] for e, ok in zip(estimates, learned, strict=True)])
+    d = np.concatenate([each[ok] for each, ok in zip(deviations, learned, strict=True)])
+    if not len(d):
+        return 0.0, 0.0
+    unit = np.diag((fit.rms_eta / fit.tuning.scale) ** 2)
+
+    def mean(rho: float) -> float:
+        T2 = t2_statistic(d, np.zeros_like(d), S + covariance + rho**2 * unit)
+        return float(T2.mean()) / float(d.shape[1])
+
+    excess = mean(0.0)
+    if excess <= 1.0 or mean(0.5) > 1.0:
+        return excess, 0.0 if excess <= 1.0 else 0.5
+    root = brentq(lambda rho: mean(rho) - 1.0, 0.0, 0.5, xtol=1e-4)
+    return excess, float(root)
+
+
+def supported_budget(n: int, loop: Loop, dof: float, excess: float) -> float:
+    """Return the smallest budget that the data speak for [false alarms per year].
+
+    The tail of T^2 is extrapolated from the estimated noise; that is trusted while the noise's own uncertainty raises
+    the threshold by less than half, and not at all where healthy data contradict the noise model.
+    """
+    if excess > WORTH_A_LOOK:
+        return SECONDS_PER_YEAR / loop.monitor.memory
+    looks = loop.monitor.evaluation_rate, loop.monitor.memory
+    for exponent in np.arange(-3.0, 9.0, 0.5):
+        budget = float(10.0**exponent)
+        if threshold(n, *looks, budget, dof) <= 1.5 * threshold(n, *looks, budget, 1e9):
+            return budget
+    return SECONDS_PER_YEAR * looks[0]
+
+
+def noise_moments(bank: FilterBank) -> FloatArray:
+    """Return the covariance of phi under white noise of variance one in y, shape (n, n)."""
+    of_y = bank.linear.input(np.eye(2, 1, -1)).output(np.eye(bank.n, 1 + bank.n, 1))
+    return np.asarray(autocovariances(of_y, 0)[0])
+
+
+def noise_bias(pipeline: Pipeline, fit: TuningFit, estimates: Sequence[Estimates]) -> tuple[FloatArray, FloatArray]:
+    """Return what noise in phi does to the iFRF, and the standard deviation of one estimate, both relative to |H|.
+
+    Least squares are off by -(R_phi + S)^-1 S theta, S the covariance that the sensor's white noise has behind the
+    filters (errors in variables; Soderstrom, 2007). Shapes (F,), (F,); zeros with an instrument and where the noise is
+    not known.
+    """
+    loop, bank = pipeline.loop, pipeline.bank
+    nothing = np.zeros(len(loop.monitor.frequencies))
+    last = [e.S[-1] for e in estimates if len(e.S) and e.updates[-1] > 0]
+    if bank.has_instrument or fit.noises is None or not last:
+        return nothing, nothing
+    S = fit.noises.noise.y_std**2 * noise_moments(bank)
+    R_phi = np.asarray(fit.tuning.R / pipeline.memory * np.linalg.inv(fit.tuning.P_d), dtype=np.float64)
+    E = bank.E(loop.monitor.frequencies)
+    H = np.abs(E @ fit.tuning.theta)
+    bias = np.abs(E @ solve_scaled(R_phi, S @ fit.tuning.theta))
+    spread = np.mean(last, axis=0)
+    std = np.sqrt(np.einsum("fi,ij,fj->f", E, spread, E.conj()).real)
+    return bias / H, std / H
+
+
+def noise_notes(pipeline: Pipeline, fit: TuningFit, estimates: Sequence[Estimates], simulated: bool) -> list[Message]:
+    """Note where noise in phi moves the iFRF by more than a third of its standard deviation, and what helps."""
+    loop = pipeline.loop
+    bias, std = noise_bias(pipeline, fit, estimates)
+    if not np.any(bias > WORTH_TELLING * std):
+        return []
+    at = int(np.argmax(bias / np.maximum(std, 1e-12)))
+    if simulated:
+        remedy = message("learning.bias_corrected")
+    elif loop.controller is not None:
+        remedy = message("learning.bias_instrument")
+    else:
+        remedy = message("learning.bias_cutoff", cutoff_hz=filter_cutoff(loop) / 2.0)
+    values = {"bias": float(bias[at]), "std": float(std[at]), "frequency_hz": loop.monitor.frequencies[at]}
+    return [message("learning.noise_bias", remedy=remedy, **values)]
+
+
+def detectable_changes(
+    loop: Loop, directions: dict[str, FloatArray], estimates: Sequence[Estimates], covariance: FloatArray, limit: float
+) -> tuple[DetectableChange, ...]:
+    """Return the smallest change of each fault's parameter that the baseline's own excitation shows."""
+    rows = np.array(list(directions.values()))
+    seen = []
+    for e in estimates:
+        half = slice(len(e.theta) // 2, None)
+        if len(e.theta[half]):
+            seen.append(np.median(noncentrality(e.S[half] + covariance, e.Psi[half], rows), axis=0))
+    needed = required_noncentrality(covariance.shape[0], limit)
+    best = np.max(seen, axis=0) if seen else np.zeros(len(rows))
+    return tuple(
+        DetectableChange(
+            name=fault.name,
+            parameter=fault.parameter,
+            change=float(np.sqrt(needed / information)) if information > 0.0 else None,
+        )
+        for fault, information in zip(loop.plant.faults, best, strict=True)
+    )

@@ -1,0 +1,316 @@
+"""Healthy recordings -> Baseline: coefficients, noise, delay, healthy parameters, threshold, promises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.blas import with_one_blas_thread
+from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
+from servoscope.core.messages import Message, message
+from servoscope.detection.baseline import Baseline, BaselineSource, digest
+from servoscope.detection.cusum_design import CusumHypothesis
+from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system
+from servoscope.detection.homogeneity import describe_outliers, find_outliers, scatter
+from servoscope.detection.plant_fit import (
+    MOST_SATURATED,
+    can_simulate,
+    describe_healthy_plant,
+    fault_directions,
+    fit_healthy_plant,
+    saturated_share,
+    split_residual_noise,
+)
+from servoscope.detection.sensors import learn_sensors
+from servoscope.detection.signal_defects import describe_misfit, find_signal_defect
+from servoscope.detection.threshold_calibration import CalibrationFactors, design_sequential_test, t2_threshold
+from servoscope.estimation import estimators, two_stage
+from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.estimation.noise_model import AR_ORDER, fit_white_noise, sample_autocovariance, yule_walker
+from servoscope.estimation.pipeline import Pipeline, Regression
+from servoscope.estimation.tuning import TuningFit, fit_tuning, prefers_white_noise
+from servoscope.isolation.ml.validity import fit_exact_predictor
+from servoscope.learning.delay import check_delay
+from servoscope.learning.detectability import (
+    WORTH_A_LOOK,
+    baseline_misfit,
+    detectable_changes,
+    noise_notes,
+    supported_budget,
+)
+from servoscope.learning.innovation_fit import FILE_ERROR, fit_innovations
+from servoscope.learning.instrument import learn_instrument, learns_instrument
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
+from servoscope.simulation import reference, simulate
+
+SHORTEST = 10.0  # memories; a shorter baseline is warned about
+FEWEST_PER_COEFFICIENT = 20  # usable samples of every recording
+SPEED_OVER = 0.05  # s over which a speed is measured here
+STILL_SHARE = 0.02  # of the speed of motion, below which an axis stands still
+WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
+MOST_SIMULATED = 2e6  # samples behind a nominal baseline
+LEAST_EXPLAINED = 0.9  # share of u's variance
+NOTHING = 1e-9  # of the residual's variance: what is left below is rounding
+UNLIKELY = 1e-3  # probability below which the physics are not believed to hold
+
+Progress = Callable[[str], None]
+
+
+@with_one_blas_thread
+def learn_baseline(
+    loop: Loop, recordings: Sequence[Recording], progress: Progress = lambda _: None, accept_delay: bool = False
+) -> Baseline:
+    """Learn what healthy looks like.
+
+    With several recordings their scatter counts. NotEnoughError: too short or too little excitation; RecordingError: u
+    and y are out of step, unless that is accepted.
+    """
+    if not recordings:
+        raise NotEnoughError("no recording to learn from: give at least one healthy recording")
+    progress("regressors")
+    for rec in recordings:
+        _check_signals(loop, rec)
+        if (share := saturated_share(loop, rec)) > MOST_SATURATED:
+            raise NotEnoughError(
+                f"{rec.name}: u is at a limit in {share:.0%} of the rows: lower the demand, or check input_limits"
+            )
+    pipeline, regressions, fit, notes = _tune(loop, recordings)
+    progress("delay")
+    delay_s, warnings = check_delay(pipeline.loop, recordings, accept_delay)
+    name = pipeline.loop.monitor.estimator
+    notes += [
+        message("learning.simplified_estimator", estimator=name, reason=reason)
+        for check, reason in estimators.exceptions(name).items()
+        if check in ("mean", "covariance")
+    ]
+    notes += warnings
+    return _assemble_baseline(pipeline.loop, recordings, pipeline, regressions, fit, delay_s, notes, progress)
+
+
+def _check_signals(loop: Loop, recording: Recording) -> None:
+    """Refuse a recording with stuck, wrapped or exchanged signals, of another sign or in another unit."""
+    if (defect := find_signal_defect(recording)) is not None:
+        raise RecordingError(f"{recording.name}: {defect.description}; or leave that part out")
+    if loop.plant.has_physics:
+        plain = loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"two_stage": "none"})})
+        misfit = describe_misfit(Pipeline.of(plain), nominal_theta(loop), recording)
+        if misfit is not None:
+            raise RecordingError(f"{recording.name}: {misfit}")
+
+
+def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
+    """Return the speed below which the axis stands still: a small share of the speed at which it moves.
+
+    At rest the controller may push as it likes against static friction, and u then says nothing of the plant. Where
+    the loop can be simulated, rest is part of what is expected, and nothing is held (0).
+    """
+    if loop.monitor.update_when != "auto" or can_simulate(loop):
+        return 0.0
+    span = max(1, round(SPEED_OVER * loop.sample_rate))
+    speeds = []
+    for rec in recordings:
+        source = rec.r if getattr(loop.plant, "sign_from", "output") == "reference" else rec.y
+        stretch = np.cumsum(rec.restart)
+        together = stretch[span:] == stretch[:-span]
+        speeds.append(np.abs(source[span:] - source[:-span])[together] * loop.sample_rate / span)
+    speed = np.concatenate(speeds)
+    if not len(speed) or not speed.max() > 0.0:
+        return 0.0
+    moving = speed[speed > 0.1 * speed.max()]
+    return STILL_SHARE * float(np.sqrt((moving**2).mean()))
+
+
+def _tune_pipeline(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline, list[Regression], TuningFit]:
+    pipeline = Pipeline.of(loop, two_stage.tune_stage_one(loop, recordings), still_speed(loop, recordings))
+    regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
+    fewest = FEWEST_PER_COEFFICIENT * pipeline.bank.n
+    for rec, g in zip(recordings, regressions, strict=True):
+        if (usable := int(g.ok.sum())) < fewest:
+            raise NotEnoughError(
+                f"{rec.name}: only {usable} usable samples of at least {fewest} when filters have settled and rest is "
+                "left out: record longer, lower rest_speed, or learn without it"
+            )
+    return pipeline, regressions, fit_tuning(pipeline, regressions)
+
+
+def _tune(
+    loop: Loop, recordings: Sequence[Recording]
+) -> tuple[Pipeline, Sequence[Regression], TuningFit, list[Message]]:
+    """Tune the recursion, with an instrument where noise in y biases least squares; the pipeline's loop tells."""
+    plain = loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"estimator": "akf"})})
+    if not learns_instrument(loop):
+        pipeline, regressions, fit = _tune_pipeline(loop, recordings)
+        if fit.strength >= WEAKEST_INSTRUMENT:
+            return pipeline, regressions, fit, []
+        note = message("learning.weak_instrument", strength=fit.strength, least=WEAKEST_INSTRUMENT)
+        return *_tune_pipeline(plain, recordings), [note]
+    pipeline, regressions, fit = _tune_pipeline(plain, recordings)
+    found, notes = learn_instrument(pipeline, recordings, fit)
+    if found is None:
+        return pipeline, regressions, fit, notes
+    return found.pipeline, found.regressions, found.fit, notes
+
+
+def nominal_baseline(loop: Loop, progress: Progress = lambda _: None, duration_s: float = 60.0) -> Baseline:
+    """Compute the baseline from the plant's nominal parameters, as the paper does, instead of learning it.
+
+    The recursion is tuned on a simulated healthy recording (the built-in profile at the paper's noise).
+
+    Raises LoopError if the plant's nominal values or the controller are missing.
+    """
+    if not loop.plant.has_physics or loop.controller is None:
+        raise LoopError(f"{loop.name}: a nominal baseline needs [controller] and the plant's nominal values")
+    duration_s = min(duration_s, MOST_SIMULATED / loop.sample_rate)
+    healthy, _ = simulate(loop, reference("profile", duration_s, loop.sample_rate))
+    pipeline, regressions, fit = _tune_pipeline(loop, [healthy])
+    note = message("learning.nominal")
+    return _assemble_baseline(loop, [healthy], pipeline, regressions, fit, loop.delay, [note], progress, exact=True)
+
+
+def _assemble_baseline(
+    loop: Loop,
+    recordings: Sequence[Recording],
+    pipeline: Pipeline,
+    regressions: Sequence[Regression],
+    fit: TuningFit,
+    delay_s: float | None,
+    notes: list[Message],
+    progress: Progress,
+    exact: bool = False,
+) -> Baseline:
+    calibration = CalibrationFactors()
+    theta_covariance, deviations_between = fit.covariance, fit.each
+    error = np.diag((loop.monitor.model_error * fit.rms_eta / fit.tuning.scale) ** 2)
+    theta, noise, model_theta, loudest = fit.tuning.theta, None, np.zeros(0), None
+    ratios: dict[str, float] = {}
+    ratios_std: dict[str, float] = {}
+    ratios_covariance = np.zeros((0, 0))
+    hypotheses: tuple[CusumHypothesis, ...] = ()
+    expectations: list[Expectation] = []
+    known: tuple[tuple[str, ...], FloatArray, FloatArray] | None = None
+    if can_simulate(loop):
+        from scipy import special
+
+        progress("healthy parameters")
+        noise = split_residual_noise(pipeline, fit, regressions)
+        expectations = [Expectation(pipeline, fit.tuning, noise, reference_path(rec)) for rec in recordings]
+        if exact:
+            theta = model_theta = expectations[0].batch_estimate(loop.plant)
+        else:
+            healthy = fit_healthy_plant(expectations, regressions, fit, nominal_theta(loop), fit.tuning.noise)
+            innovations = fit_innovations(loop, recordings, noise)
+            if innovations is not None and innovations.contradicts(np.log(list(healthy.ratios.values()))):
+                # what y does between the samples is part of the recursion's residual, as if it were noise
+                known = innovations.names, innovations.x, innovations.covariance
+                noise = innovations.noise
+                if len(innovations.names) > len(loop.plant.parameters):
+                    notes.append(message("learning.wrong_file", share=FILE_ERROR))
+                healthy = describe_healthy_plant(expectations, regressions, fit, *known)
+            # what the plant leaves of the residual is noise alone: its colour is known better now
+            plant = loop.plant.scaled(healthy.ratios)
+            gamma = sample_autocovariance(healthy.residuals, AR_ORDER)
+            silent = not gamma[0] > NOTHING * fit.tuning.R  # simulated without noise, for example
+            model = fit.tuning.noise if silent else yule_walker(gamma)
+            if pipeline.stage_one is None and not silent:
+                noises = fit_white_noise(residual_system(pipeline, plant), healthy.residuals, pipeline.stride)
+                if prefers_white_noise(healthy.residuals, noises, model):
+                    noise, loudest = noises.noise, noises.loudest
+                    model = residual_noise_model(pipeline, plant, noise)
+                    fit = replace(fit, tuning=replace(fit.tuning, noise=model))
+            expectations = [replace(e, tuning=fit.tuning, noise=noise) for e in expectations]
+            if known is not None:
+                healthy = describe_healthy_plant(expectations, regressions, fit, *known)
+            else:
+                healthy = fit_healthy_plant(expectations, regressions, fit, healthy.true_theta, model)
+            ratios, ratios_std, model_theta = healthy.ratios, healthy.std(), healthy.theta
+            plant = loop.plant.scaled(ratios)
+            deviations_between = fit.each - np.array(
+                [e.batch_estimate(plant) for e in expectations]
+            )  # each reference has its own bias
+            ratios_covariance = healthy.covariance
+            if healthy.misfit <= special.chdtri(pipeline.bank.n, UNLIKELY):
+                # the physics hold: what they say is known better than the coefficients one by one
+                theta, theta_covariance = model_theta, healthy.theta_covariance
+                if loudest and not loop.monitor.model_error:
+                    progress("rehearsal")
+                    calibration, hypotheses, warnings = design_sequential_test(
+                        recordings, expectations, plant, healthy.theta, healthy.covariance, loudest
+                    )
+                    notes += warnings
+            if healthy.misfit > 10.0 * pipeline.bank.n:
+                notes.append(message("learning.physics_misfit", misfit=healthy.misfit, expected=pipeline.bank.n))
+    covariance = theta_covariance + scatter(deviations_between, fit.each_covariance) + error
+    outliers = find_outliers(deviations_between, fit.each_covariance + error)
+    notes += describe_outliers(outliers, [rec.name for rec in recordings], pipeline.bank.names)
+    tuning = replace(fit.tuning, theta=theta)
+    plant = loop.plant.scaled(ratios) if ratios else loop.plant
+    limit = t2_threshold(loop, pipeline.bank.n, fit.dof, calibration, bool(hypotheses))
+    progress("promises")
+    estimates = [pipeline.estimate(tuning, rec) for rec in recordings]
+    expected = [replace(e, tuning=tuning).healthy_path(plant, model_theta) for e in expectations] or [theta] * len(
+        estimates
+    )
+    deviations = [e.theta - mean for e, mean in zip(estimates, expected, strict=True)]
+    notes += noise_notes(pipeline, fit, estimates, can_simulate(loop))
+    excess, suggestion = baseline_misfit(estimates, deviations, covariance, fit)
+    if fit.explained < LEAST_EXPLAINED:
+        notes.append(message("learning.hardly_explained", share=fit.explained))
+    duration = sum(rec.duration_s for rec in recordings)
+    if excess > WORTH_A_LOOK and loop.monitor.model_error < suggestion:
+        notes.append(message("learning.model_error", excess=excess, model_error=suggestion))
+    memory, least = loop.monitor.memory, SHORTEST * loop.monitor.memory
+    if duration < least:
+        notes.append(message("learning.short", duration_s=duration, memory_s=memory, least_s=least))
+    supported = supported_budget(pipeline.bank.n, loop, fit.dof, excess)
+    budget = loop.monitor.false_alarms_per_year
+    if supported > budget:
+        notes.append(message("learning.budget", supported=supported, budget=budget))
+    directions = fault_directions(loop, plant, theta)
+    baseline = Baseline(
+        loop=loop.to_dict(),
+        sources=tuple(BaselineSource(name=r.name, samples=r.samples, duration_s=r.duration_s) for r in recordings),
+        hash=digest(loop, [a for rec in recordings for a in (rec.t, rec.r, rec.u, rec.y)]),
+        names=pipeline.bank.names,
+        theta=tuple(theta),
+        covariance=_rows(covariance),
+        scale=tuple(tuning.scale),
+        P_d=_rows(tuning.P_d),
+        stage_one=pipeline.stage_one,
+        R=tuning.R,
+        noise_a=tuple(tuning.noise.a),
+        noise_b=tuple(tuning.noise.b),
+        noise_gamma=tuple(tuning.noise.gamma),
+        noise_variance=tuning.noise.variance,
+        noise=noise,
+        ratios=ratios,
+        ratios_std=ratios_std,
+        ratios_covariance=_rows(ratios_covariance),
+        model_theta=tuple(model_theta),
+        dof=fit.dof,
+        limit=limit,
+        explained=fit.explained,
+        still_speed=pipeline.still_speed,
+        delay_s=delay_s,
+        suggested_model_error=suggestion,
+        supported_false_alarms_per_year=supported,
+        loudest=loudest,
+        rehearsed=calibration,
+        members=hypotheses,
+        promises=detectable_changes(loop, directions, estimates, covariance, limit),
+        notes=tuple(notes),
+        sensors=learn_sensors(loop, recordings),
+        instrument=pipeline.instrument,
+    )
+    progress("predictor")
+    predictor = fit_exact_predictor(baseline, recordings)
+    if predictor is not None and predictor.misfit > 1.0:
+        notes.append(message("learning.no_refit", misfit=predictor.misfit))
+    return baseline.model_copy(update={"exact": predictor, "notes": tuple(notes)})
+
+
+def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(x) for x in row) for row in matrix)

@@ -1,0 +1,1 @@
+"""The loop file and the plants behind it: physics, coefficients, linear systems."""

@@ -1,0 +1,268 @@
+"""What the user knows about one closed loop, read from TOML, checked once and frozen."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    Field,
+    SerializeAsAny,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from servoscope.core.errors import LoopError
+from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
+from servoscope.core.settings_errors import describe_error
+from servoscope.models import plants
+
+DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
+RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # names that mean something else
+LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a rule
+
+Interval = tuple[Finite, Finite]
+
+
+class Columns(Settings):
+    """Where the signals stand in a recording."""
+
+    time: NonEmptyStr | None = "t"  # column of the time stamps; None when there is none and the samples are uniform
+    # reference, input, output: columns of r, u, y, or linear combinations of columns, for example ``"set_point -
+    # position_error"``; where the command is u itself, the reference may be left out
+    reference: NonEmptyStr = "r"
+    input: NonEmptyStr = "u"
+    # of the output, several of the same quantity may be listed: y is their mean, and they are compared with each other
+    output: NonEmptyStr | Annotated[tuple[NonEmptyStr, ...], Field(min_length=2)] = "y"
+    time_unit: Literal["s", "ms", "us", "ns", "min"] = "s"  # unit of a numeric time column
+    segment: tuple[NonEmptyStr, ...] = ()  # columns whose change starts a new run; a time reset does too
+
+    @field_validator("output")
+    @classmethod
+    def _different_sensors(cls, value: str | tuple[str, ...]) -> str | tuple[str, ...]:
+        if not isinstance(value, str) and len(set(value)) < len(value):
+            raise ValueError("names a channel twice, remove one")
+        return value
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The channels whose mean is y, as a rule one."""
+        return (self.output,) if isinstance(self.output, str) else self.output
+
+
+class Controller(Settings):
+    """Discrete PI controller, u(k) = k_p e(k) + k_i T sum e, e = r - y."""
+
+    kind: Literal["pi"]
+    k_p: Positive
+    k_i: NonNegative
+
+
+class MonitorSettings(Settings):
+    """How the loop is watched; every setting has a default."""
+
+    # ``svf``, state-variable filter, ``tustin``, the paper's discretisation, or ``tustin-held``, the same with (u(k) +
+    # u(k-1))/2 in place of u, which suits a held input
+    structure: Literal["svf", "tustin", "tustin-held"] = "svf"
+    # cutoff of the state-variable filter [Hz]; None: chosen from the sample rate and the loop's bandwidth
+    cutoff: Positive | None = None
+    estimator: NonEmptyStr = "akf"  # name of a recursive estimator
+    # ``adaptive`` puts the paper's stage 1 in front: u_a, simulated from r, takes the place of u
+    two_stage: Literal["none", "adaptive"] = "none"
+    # what stage 1 makes of r: ``fir``, its past samples, or ``laguerre``, Laguerre functions
+    stage_one: Literal["fir", "laguerre"] = "fir"
+    # how many of them; None: 40 samples or 12 functions
+    stage_one_length: Annotated[int, Field(strict=True, ge=1, le=500)] | None = None
+    stage_one_pole: Annotated[Finite, Field(gt=-1.0, lt=1.0)] = 0.5  # pole of the Laguerre functions, per sample
+    memory: Positive = 5.0  # memory of the estimator [s]
+    # share of u (rms) that the model may leave unexplained, 0 to 1
+    model_error: Annotated[NonNegative, Field(lt=1.0)] = 0.0
+    # when the estimator may learn: ``auto``, until the axis has stood still for longer than the filters remember (a
+    # loop that can be simulated learns at rest too, which is then expected); ``always``; ``moving``, neither at the
+    # shortest rest nor inside the dead zone
+    update_when: Literal["auto", "always", "moving"] = "auto"
+    rest_speed: NonNegative = 0.0  # speed [output per s] below which the output counts as resting
+    evaluation_rate: Positive = 10.0  # how often iFRF, residual and statistic are evaluated [Hz]
+    # monitored frequencies [Hz]
+    frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
+    false_alarms_per_year: Positive = 1.0  # budget that the alarm is set for, after its delays
+    on_delay: NonNegative = 0.0  # how long a limit must be exceeded before the alarm is raised [s]
+    # how long the alarm stays after the limit was exceeded last [s]; None: for the memory
+    off_delay: NonNegative | None = None
+
+
+class Loop(Settings):
+    """One closed loop: sampling, columns, plant, controller and how it is monitored."""
+
+    name: NonEmptyStr = "loop"  # what the loop is called in reports
+    sample_rate: Positive  # sample rate of r, u and y [Hz]
+    hold: Literal["zoh", "foh"] = "zoh"  # how the controller holds u between samples
+    delay: NonNegative = 0.0  # from u as logged to u acting [s]
+    # whether u was logged after or before the limiter; before it, `input_limits` is needed
+    input_logged: Literal["after_limiter", "before_limiter"] = "after_limiter"
+    input_limits: Interval | None = None  # limits [lo, hi] of u
+    input_deadzone: Interval | None = None  # range [lo, hi] of u in which the valve is shut
+    # columns, plant, controller, monitor: the sections of the file; the controller is optional
+    columns: Columns = Columns()
+    plant: SerializeAsAny[plants.Plant]
+    controller: Controller | None = None
+    monitor: MonitorSettings = MonitorSettings()
+    # faults that move several parameters at once: by name, the ratios of the parameters at full size
+    faults: dict[NonEmptyStr, dict[NonEmptyStr, Positive]] | None = None
+
+    @field_validator("plant", mode="before")
+    @classmethod
+    def _parse_plant(cls, value: object) -> object:
+        return plants.parse_plant(value) if isinstance(value, Mapping) else value
+
+    @model_validator(mode="before")
+    @classmethod
+    def _defaults_below_nyquist(cls, data: Any) -> Any:
+        """Let defaults give way to a slow sample rate; what the user wrote is never changed."""
+        rate = data.get("sample_rate") if isinstance(data, Mapping) else None
+        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 < rate < float("inf"):
+            return data
+        monitor, plant = data.get("monitor", {}), data.get("plant")
+        updates: dict[str, Any] = {}
+        frequencies = tuple(f for f in DEFAULT_FREQUENCIES if f < rate / 2) or (rate / 10,)
+        evaluation = min(MonitorSettings.model_fields["evaluation_rate"].default, float(rate))
+        if isinstance(monitor, Mapping):
+            updates["monitor"] = {"frequencies": frequencies, "evaluation_rate": evaluation, **monitor}
+        elif isinstance(monitor, MonitorSettings):
+            slow = {"frequencies": frequencies, "evaluation_rate": evaluation}
+            kept = {key: value for key, value in slow.items() if key not in monitor.model_fields_set}
+            updates["monitor"] = monitor.model_copy(update=kept)
+        if isinstance(plant, plants.Plant) and "sign_cutoff" not in plant.model_fields_set:
+            sign_cutoff = getattr(plant, "sign_cutoff", None)
+            if sign_cutoff is not None and sign_cutoff >= rate / 2:
+                updates["plant"] = plant.model_copy(update={"sign_cutoff": rate / 4})
+        return {**data, **updates}
+
+    @model_validator(mode="after")
+    def _rays_of_plant(self) -> Self:
+        if self.faults or self.plant.rays:
+            rays = tuple(self._check_ray(name, ratios) for name, ratios in (self.faults or {}).items())
+            # a frozen model may still be completed while it is made
+            object.__setattr__(self, "plant", self.plant.with_rays(rays))
+        return self
+
+    def _check_ray(self, name: str, ratios: Mapping[str, float]) -> plants.FaultRay:
+        """Return the fault that a table of the file defines."""
+        own = [fault.name for fault in self.plant.faults]
+        if name in (*own, *self.plant.parameters, *self.plant.causes, *RESERVED_FAULTS) or " + " in name:
+            taken = ", ".join(dict.fromkeys([*own, *self.plant.parameters, *RESERVED_FAULTS]))
+            raise ValueError(f"[faults.{name}]: the name is taken ({taken} are), give the fault another")
+        known = (*self.plant.parameters, *self.plant.causes)
+        for parameter, ratio in ratios.items():
+            if parameter not in known:
+                raise ValueError(f"[faults.{name}] {parameter}: unknown, choose from {', '.join(known)}")
+            if ratio == 1.0:
+                raise ValueError(f"[faults.{name}] {parameter}: a ratio of 1 changes nothing, leave it out")
+        if len(ratios) < 2:
+            raise ValueError(f"[faults.{name}]: needs the ratios of two or more parameters, as inertia = 2.0")
+        return plants.FaultRay(name, tuple(ratios.items()))
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        nyquist = self.sample_rate / 2
+        checked = [("[monitor] cutoff", self.monitor.cutoff)]
+        checked += [("[monitor] frequencies", frequency) for frequency in self.monitor.frequencies]
+        checked += [("[plant] sign_cutoff", getattr(self.plant, "sign_cutoff", None))]
+        for key, frequency in checked:
+            if frequency is not None and frequency >= nyquist:
+                raise ValueError(
+                    f"{key}: {frequency:g} Hz is not below the Nyquist frequency of {nyquist:g} Hz"
+                    f" (sample_rate = {self.sample_rate:g} Hz), lower it"
+                )
+        if len(set(self.monitor.frequencies)) < len(self.monitor.frequencies):
+            raise ValueError("[monitor] frequencies: a frequency stands twice, remove one")
+        if self.monitor.evaluation_rate > self.sample_rate:
+            raise ValueError(
+                f"[monitor] evaluation_rate: {self.monitor.evaluation_rate:g} Hz is above"
+                f" sample_rate = {self.sample_rate:g} Hz, lower it"
+            )
+        if self.monitor.memory * self.sample_rate < 2:
+            raise ValueError(
+                f"[monitor] memory: {self.monitor.memory:g} s is shorter than two samples, give it in seconds"
+            )
+        if self.monitor.update_when == "moving" and not (self.monitor.rest_speed or self.input_deadzone):
+            raise ValueError(
+                '[monitor] rest_speed: missing, update_when = "moving" needs the speed below which the axis rests '
+                "(inspect tells one), or input_deadzone"
+            )
+        if self.delay * self.sample_rate > LONGEST_DELAY:
+            raise ValueError(f"delay: {self.delay:g} s is more than {LONGEST_DELAY} samples, give it in seconds")
+        for key, interval in (("input_limits", self.input_limits), ("input_deadzone", self.input_deadzone)):
+            if interval is not None and interval[0] >= interval[1]:
+                raise ValueError(f"{key}: [{interval[0]:g}, {interval[1]:g}] must be [lo, hi] with lo below hi")
+        if self.input_logged == "before_limiter" and self.input_limits is None:
+            raise ValueError('input_limits: missing, input_logged = "before_limiter" needs input_limits = [lo, hi]')
+        return self
+
+    @property
+    def needs_reference(self) -> bool:
+        """Whether r has a part in the loop; elsewhere u may stand for it in recordings that have none."""
+        of_sign = getattr(self.plant, "sign_from", "output") == "reference"
+        return self.controller is not None or self.monitor.two_stage != "none" or of_sign
+
+    @classmethod
+    def load(cls, path: str | Path) -> Loop:
+        """Read a loop file.
+
+        Raises LoopError if the file cannot be read, is not TOML, or a setting in it is wrong.
+        """
+        path = Path(path)
+        return cls.from_dict(
+            parse_toml(read_toml_text(path, "loop file", LoopError), path, LoopError), source=str(path)
+        )
+
+    @classmethod
+    def from_dict(cls, mapping: Mapping[str, Any], source: str = "loop") -> Loop:
+        """Build a loop from nested mappings laid out like the loop file.
+
+        Parameters
+        ----------
+        mapping
+            Tables ``columns``, ``plant``, ``controller``, ``monitor`` and the keys before them.
+        source
+            What error messages call it, for example the file's name.
+
+        Raises LoopError if a key is unknown or missing or a value is wrong.
+        """
+        if not isinstance(mapping, Mapping):
+            raise LoopError(f"{source}: must be a table of settings, found {type(mapping).__name__}")
+        data = dict(mapping)
+        if isinstance(data.get("plant"), Mapping):
+            data["plant"] = _parse_plant_table(data["plant"], source)
+        try:
+            return cls.model_validate(data)
+        except ValidationError as error:
+            raise LoopError(f"{source}: {describe_error(error, cls)}") from None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return nested plain values, ready for JSON, that `from_dict` turns into an equal loop."""
+        plain: dict[str, Any] = self.model_dump(mode="json")
+        return {key: value for key, value in plain.items() if value is not None}
+
+    def hash(self) -> str:
+        """Return a digest of all settings, the same on every machine: 16 hexadecimal digits."""
+        canonical = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def _parse_plant_table(mapping: Mapping[str, Any], source: str) -> plants.Plant:
+    try:
+        if "kind" not in mapping:
+            return plants.parse_plant(mapping)
+        found = plants.plant_class(mapping["kind"])
+    except LoopError as error:
+        raise LoopError(f"{source}: {error}") from None
+    try:
+        # Strict, so that "4.0" in quotes or `true` is refused as in every other section.
+        return found.model_validate(dict(mapping), strict=True)
+    except ValidationError as error:
+        raise LoopError(f"{source}: {describe_error(error, found, section='plant')}") from None

@@ -1,0 +1,55 @@
+"""Plants: physics behind the coefficients theta; a new plant is a new file in this folder, or another package's."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import pkgutil
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any
+
+from servoscope.core.errors import LoopError
+from servoscope.models.plants.base import EXTRA_COLUMNS, Fault, FaultRay, Plant, StateSpace
+
+__all__ = ["EXTRA_COLUMNS", "Fault", "FaultRay", "Plant", "StateSpace", "parse_plant", "plant_class", "plant_kinds"]
+
+ENTRY_POINTS = "servoscope.plants"  # of other packages: name is the kind, object the subclass of `Plant`
+
+
+@functools.cache
+def _built_in() -> dict[str, type[Plant]]:
+    modules = [importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__)]
+    classes = {each for module in modules for each in vars(module).values() if isinstance(each, type)}
+    plants = [each for each in classes if issubclass(each, Plant) and each is not Plant]
+    return {str(each.model_fields["kind"].default): each for each in plants}
+
+
+def plant_kinds() -> list[str]:
+    """Return the kinds of plants that exist, sorted."""
+    return sorted({*_built_in(), *entry_points(group=ENTRY_POINTS).names})
+
+
+def plant_class(kind: object) -> type[Plant]:
+    """Return the class of a kind.
+
+    Raises LoopError if there is no such kind.
+    """
+    if isinstance(kind, str) and kind in _built_in():
+        return _built_in()[kind]
+    found = next((each for each in entry_points(group=ENTRY_POINTS) if each.name == kind), None)
+    if found is None:
+        raise LoopError(f"[plant] kind = {kind!r}: unknown, choose from {', '.join(plant_kinds())}")
+    loaded: type[Plant] = found.load()
+    return loaded
+
+
+def parse_plant(mapping: Mapping[str, Any]) -> Plant:
+    """Build the plant that a mapping describes, for example the table ``[plant]`` of a loop file.
+
+    Raises LoopError if ``kind`` is missing or unknown; raises pydantic.ValidationError if another setting is
+    missing, unknown or out of range.
+    """
+    if "kind" not in mapping:
+        raise LoopError(f"[plant] kind: missing, choose from {', '.join(plant_kinds())}")
+    return plant_class(mapping["kind"]).model_validate(dict(mapping))

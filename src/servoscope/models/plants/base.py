@@ -1,0 +1,211 @@
+"""What every plant offers: an inverse with coefficients theta, named faults and, where known, physics."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import LoopError
+
+StateSpace = tuple[FloatArray, FloatArray, FloatArray]
+
+BEYOND = 1.5  # times the logarithms of the full size of a fault ray, as far as it is searched
+
+EXTRA_COLUMNS = ("sign_v", "forward_v", "backward_v", "one")
+"""Columns beyond the powers of s: sign(y'), max(y', 0), min(y', 0) and the constant one."""
+
+
+def _not_zero(value: float) -> float:
+    if value == 0.0:
+        raise ValueError("must not be 0")
+    return value
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One way in which a plant fails: a physical parameter that leaves its nominal value."""
+
+    name: str  # short word of the vocabulary, for example ``leakage``
+    parameter: str  # the parameter that moves, for example ``C_ie``
+    ratio_range: tuple[float, float]  # smallest and largest ratio to the nominal value that is searched
+    words: str  # what the fault means to the person who reads the report
+
+
+@dataclass(frozen=True)
+class FaultRay:
+    """A fault that moves several parameters at once: a ray in their log-ratios, from 1 to its full size and beyond.
+
+    Its size is told as the ratio of the first parameter, so that the others are ``ratio ** exponent``.
+    """
+
+    name: str
+    full: tuple[tuple[str, float], ...]  # parameters and their ratios at full size, none of them 1
+
+    @property
+    def exponents(self) -> dict[str, float]:
+        """By parameter, the logarithm of its ratio over that of the first one."""
+        first = float(np.log(self.full[0][1]))
+        return {name: float(np.log(ratio)) / first for name, ratio in self.full}
+
+    @property
+    def fault(self) -> Fault:
+        """The ray as a fault, whose parameter has the name of the ray."""
+        ends = sorted((1.0, self.full[0][1] ** BEYOND))
+        words = " with ".join(f"{name} x {ratio:g}" for name, ratio in self.full)
+        return Fault(self.name, self.name, (ends[0], ends[1]), f"{words} at full size")
+
+
+class Plant(BaseModel, abc.ABC):
+    """Settings and physics of a plant without finite zeros.
+
+    Its inverse is ``input_gain u = sum theta_i s^powers_i y + sum theta_j extra_j(y')``; `theta` lists the
+    coefficients of the powers first, those of the extras after them. SI units throughout.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: str  # name of the plant in a loop file
+    # factor on u as recorded, before anything else is done with it, for example a torque constant
+    input_gain: Annotated[float, AfterValidator(_not_zero), Field(allow_inf_nan=False)] = 1.0
+
+    # of the loop file, no setting of the plant's own table
+    _rays: tuple[FaultRay, ...] = PrivateAttr(default=())
+
+    @property
+    @abc.abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Names of the n coefficients, in column order."""
+
+    @property
+    @abc.abstractmethod
+    def powers(self) -> tuple[int, ...]:
+        """Powers of s of the linear columns; the first ``len(powers)`` coefficients belong to them."""
+
+    @property
+    def extras(self) -> tuple[str, ...]:
+        """Columns after the powers, out of `EXTRA_COLUMNS`."""
+        return ()
+
+    @property
+    def units(self) -> tuple[str, str]:
+        """Units of y and u; empty where they depend on the machine."""
+        return "", ""
+
+    @property
+    def coefficient_units(self) -> tuple[str, ...]:
+        """Units of the n coefficients, in u and y themselves where theirs are not known."""
+        of_y, of_u = self.units[0] or "y", self.units[1] or ("u" if self.input_gain == 1.0 else "input_gain u")
+        extra = [f"{of_u} s/{of_y}" if name in ("forward_v", "backward_v") else of_u for name in self.extras]
+        return (*(f"{of_u}{('', ' s', ' s²', ' s³', ' s⁴')[power]}/{of_y}" for power in self.powers), *extra)
+
+    @property
+    def linear(self) -> bool:
+        """Whether it is linear but for `extras`, which are simulated and regressed as what they are."""
+        return True
+
+    @property
+    @abc.abstractmethod
+    def has_physics(self) -> bool:
+        """Whether nominal values are known, so that `theta`, `state_space` and simulation work."""
+
+    @abc.abstractmethod
+    def theta(self) -> FloatArray:
+        """Nominal coefficients, shape (n,), in the order of `names`.
+
+        Raises LoopError if no nominal values are known (`has_physics` is false).
+        """
+
+    @property
+    @abc.abstractmethod
+    def faults(self) -> tuple[Fault, ...]:
+        """The faults that the plant knows, in the order in which they are reported."""
+
+    @property
+    def rays(self) -> tuple[FaultRay, ...]:
+        """The faults that the loop file defines as directions of several parameters."""
+        return self._rays
+
+    def with_rays(self, rays: tuple[FaultRay, ...]) -> Self:
+        """Return the same plant with faults that move several parameters."""
+        plant = self.model_copy()
+        plant._rays = rays
+        return plant
+
+    @property
+    def all_faults(self) -> tuple[Fault, ...]:
+        """Its own faults, then those of the loop file."""
+        return (*self.faults, *(ray.fault for ray in self.rays))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that move one by one; `with_ratios` takes names of `rays` too."""
+        return tuple(fault.parameter for fault in self.faults)
+
+    @property
+    def physical_parameters(self) -> tuple[str, ...]:
+        """Names of all that may move one by one: `parameters`, then those of `causes`."""
+        return (*self.parameters, *(name for name in self.causes if name not in self.parameters))
+
+    @property
+    def error_factors(self) -> Mapping[str, float]:
+        """How much larger the error of a parameter is than that of one in the loop file, for those that count others'.
+
+        Parameters that move the plant alike cannot be told apart; the errors of all are then counted to one of them.
+        """
+        return {}
+
+    def expand_rays(self, factors: Mapping[str, Any]) -> dict[str, Any]:
+        """Return factors by parameter, in which those of rays have become those of what they move."""
+        expanded = dict(factors)
+        for ray in self.rays:
+            if ray.name in expanded:
+                size = expanded.pop(ray.name)
+                for name, exponent in ray.exponents.items():
+                    expanded[name] = expanded.get(name, 1.0) * size**exponent
+        return expanded
+
+    @property
+    def causes(self) -> Mapping[str, str]:
+        """Further names that `scaled` takes, changes that are no fault of the list, each with what it would mean."""
+        return {}
+
+    def with_ratios(self, ratios: Mapping[str, float]) -> Self:
+        """Return the same plant with some parameters multiplied, ``{"C_ie": 1.2}``.
+
+        Raises LoopError if a parameter is not one of `parameters`, a ratio is not positive, or no nominal value
+        is known.
+        """
+        self._check_ratios(ratios)
+        return self.scaled(self.expand_rays({name: float(ratio) for name, ratio in ratios.items()}))
+
+    @abc.abstractmethod
+    def scaled(self, factors: Mapping[str, Any]) -> Self:
+        """Return the same plant with `parameters` and `causes` multiplied by factors that nobody checks.
+
+        They may be complex, as complex-step derivatives of `state_space` need them (Squire and Trapp, 1998).
+
+        Raises LoopError if no nominal value is known.
+        """
+
+    @abc.abstractmethod
+    def state_space(self) -> StateSpace:
+        """Continuous linear part from u as recorded to y: A (n, n), B (n, 1), C (1, n), in physical states.
+
+        The states keep their meaning when a parameter changes, so a switch of plants carries them over.
+
+        Raises LoopError if no nominal values are known.
+        """
+
+    def _check_ratios(self, ratios: Mapping[str, float]) -> None:
+        for name, ratio in ratios.items():
+            known = (*self.parameters, *(ray.name for ray in self.rays))
+            if name not in known:
+                raise LoopError(f"{name}: not a parameter of plant {self.kind}, which has {', '.join(known)}")
+            if not (np.isfinite(ratio) and ratio > 0.0):
+                raise LoopError(f"{name}={ratio:g}: the ratio to the nominal value must be positive and finite")

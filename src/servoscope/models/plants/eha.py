@@ -1,0 +1,197 @@
+"""Electrohydraulic actuator: voice-coil current [A] to load displacement [m], THEORY section 1."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import LoopError
+from servoscope.core.settings import NonNegative
+from servoscope.models.plants.base import Fault, Plant, StateSpace
+
+PlausiblePositive = Annotated[float, Field(gt=1e-30, lt=1e30, allow_inf_nan=False)]  # SI values beyond are typos
+
+FAULTS = (
+    Fault("pump", "p_s", (0.3, 3.0), "pump or valve gain (p_s cannot be told from K_m, C_d, W, rho)"),
+    Fault("leakage", "C_ie", (0.3, 5.0), "internal leakage"),
+    Fault("friction", "b_p", (0.2, 100.0), "friction"),
+    Fault("contamination", "beta", (0.001, 30.0), "oil contamination (bulk modulus)"),
+)
+
+OTHER_CAUSES = {"m_p": "another mass", "k_p": "another stiffness of the load", "A_p": "another piston area"}
+
+
+class EHA(Plant):
+    """Valve-controlled hydraulic cylinder with mass, friction and spring.
+
+    ::
+
+        m_p y'' = A_p p_L - b_p y' - k_p y
+        V_o/(2 beta) p_L' = K_q u - C_ie p_L - A_p y',   K_q = K_m C_d W sqrt(p_s/rho)
+        1/G(s) = ((V_o/(2 beta) s + C_ie)(m_p s^2 + b_p s + k_p) + A_p^2 s)/(A_p K_q)      (1), (2)
+    """
+
+    names: ClassVar[tuple[str, ...]] = ("theta_0", "theta_1", "theta_2", "theta_3")
+    units: ClassVar[tuple[str, str]] = ("m", "A")
+    powers: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
+    has_physics: ClassVar[bool] = True
+    faults: ClassVar[tuple[Fault, ...]] = FAULTS
+    causes: ClassVar[Mapping[str, str]] = OTHER_CAUSES
+
+    kind: Literal["eha"] = "eha"
+    m_p: PlausiblePositive  # mass [kg]
+    b_p: PlausiblePositive  # viscous friction [N s/m]
+    k_p: NonNegative  # stiffness of the load [N/m]; 0 for a cylinder without a spring, whose theta_0 is 0
+    A_p: PlausiblePositive  # piston area [m^2]
+    V_o: PlausiblePositive  # oil volume [m^3]
+    beta: PlausiblePositive  # bulk modulus of the oil [Pa]
+    C_ie: PlausiblePositive  # leakage [m^3/(s Pa)]
+    p_s: PlausiblePositive  # supply pressure [Pa]
+    rho: PlausiblePositive  # density of the oil [kg/m^3]
+    C_d: PlausiblePositive  # discharge coefficient of the valve [1]
+    W: PlausiblePositive  # area gradient of the valve [m]
+    K_m: PlausiblePositive  # spool displacement per current [m/A]
+    # ``square-root``: the flow is K_q u sqrt(1 - sign(u) p_L/p_s), with the coefficients as they are; ``linear``: it is
+    # K_q u
+    valve_law: Literal["linear", "square-root"] = "linear"
+    # coulomb friction [N] beside b_p y'. Simulations know it, and with them expectations and signatures; the
+    # coefficients do not.
+    coulomb: NonNegative = 0.0
+
+    @property
+    def error_factors(self) -> Mapping[str, float]:
+        """Errors of rho, C_d, W and K_m look like some of p_s, whose root counts; those of V_o like some of beta."""
+        return {"p_s": math.sqrt(1.0 + 1.0 + 3.0 * 2.0**2), "beta": math.sqrt(2.0)}
+
+    @property
+    def linear(self) -> bool:
+        """Whether `state_space` says all: no square root, no Coulomb friction."""
+        return self.valve_law == "linear" and self.coulomb == 0.0
+
+    @property
+    def flow_gain(self) -> float:
+        """K_q = K_m C_d W sqrt(p_s/rho) [m^3/(s A)]."""
+        flow_gain: float = self.K_m * self.C_d * self.W * np.sqrt(self.p_s / self.rho)  # complex where `scaled` was
+        return flow_gain
+
+    @property
+    def capacity(self) -> float:
+        """Hydraulic capacity V_o/(2 beta) [m^3/Pa]."""
+        return self.V_o / (2.0 * self.beta)
+
+    def theta(self) -> FloatArray:
+        """Coefficients of 1/G, shape (4,) [A/m, A s/m, A s^2/m, A s^3/m], eq. (2)."""
+        capacity = self.capacity
+        coefficients = [
+            self.C_ie * self.k_p,
+            capacity * self.k_p + self.C_ie * self.b_p + self.A_p**2,
+            capacity * self.b_p + self.C_ie * self.m_p,
+            capacity * self.m_p,
+        ]
+        return np.array(coefficients) / (self.A_p * self.flow_gain)
+
+    def scaled(self, factors: Mapping[str, Any]) -> Self:
+        """Return the same plant with any of the twelve parameters multiplied."""
+        return self.model_copy(update={name: getattr(self, name) * factor for name, factor in factors.items()})
+
+    def state_space(self) -> StateSpace:
+        """Return A (3, 3), B (3, 1), C (1, 3), states y [m], y' [m/s], p_L [Pa]; integrates if k_p = 0.
+
+        Where the actuator is not `linear` this is the linear part: flow at p_L = 0, no Coulomb friction.
+        """
+        m_p, capacity = self.m_p, self.capacity
+        A = np.array(
+            [
+                [0.0, 1.0, 0.0],
+                [-self.k_p / m_p, -self.b_p / m_p, self.A_p / m_p],
+                [0.0, -self.A_p / capacity, -self.C_ie / capacity],
+            ]
+        )
+        return (
+            A,
+            np.array([[0.0], [0.0], [self.input_gain * self.flow_gain / capacity]]),
+            np.array([[1.0, 0.0, 0.0]]),
+        )
+
+    def frequency_response(self, f_hz: npt.ArrayLike) -> npt.NDArray[np.complex128]:
+        """Inverse frequency response H(j 2 pi f) [A/m] at frequencies [Hz], same shape as `f_hz`, eq. (2)."""
+        s = 2j * np.pi * np.asarray(f_hz, dtype=np.float64)
+        return np.asarray(np.polyval(self.theta()[::-1], s), dtype=np.complex128)
+
+    def kappa_from_theta(self, theta: npt.ArrayLike) -> dict[str, float]:
+        """Recover p_s, C_ie, b_p and beta from the four coefficients, exactly and for simultaneous faults.
+
+        The remaining parameters (m_p, k_p, A_p, V_o, rho, C_d, W, K_m) are taken as known. With a spring::
+
+            g = theta_3 k_p/(theta_0 m_p)                                   (= capacity/C_ie)
+            b_p = (k_p theta_2/theta_0 - m_p)/g
+            C_ie = A_p^2/(k_p theta_1/theta_0 - g k_p - b_p)
+            V_o/(2 beta) = g C_ie,   K_q = C_ie k_p/(theta_0 A_p)
+
+        Without one, theta_0 = 0 and three coefficients cannot fix four parameters: K_q is taken as known too,
+        so that p_s stays at its nominal value, and the other three follow::
+
+            V_o/(2 beta) = theta_3 A_p K_q/m_p
+            C_ie b_p = A_p K_q theta_1 - A_p^2,   V_o/(2 beta) b_p + C_ie m_p = A_p K_q theta_2
+
+        The last two are a quadratic in C_ie with two positive solutions as a rule: the one closer to the
+        nominal C_ie (in its logarithm) is returned. Where a change of the gain is to be told as well, one
+        of the four must be known from elsewhere.
+
+        Parameters
+        ----------
+        theta
+            Coefficients, shape (4,), in the order of `names`.
+
+        Raises LoopError if no positive parameters belong to these coefficients.
+        """
+        theta_0, theta_1, theta_2, theta_3 = (float(value) for value in np.asarray(theta, dtype=np.float64))
+        if self.k_p > 0.0:
+            kappa = self._with_spring(theta_0, theta_1, theta_2, theta_3)
+        else:
+            kappa = self._without_spring(theta_1, theta_2, theta_3)
+        if not all(np.isfinite(value) and value > 0.0 for value in kappa.values()):
+            raise LoopError(f"theta = {np.asarray(theta)}: no actuator has these coefficients")
+        return kappa
+
+    def from_theta(self, theta: npt.ArrayLike) -> Self:
+        """Return the same actuator with the p_s, C_ie, b_p and beta of `kappa_from_theta`."""
+        return self.model_copy(update=self.kappa_from_theta(theta))
+
+    def _with_spring(self, theta_0: float, theta_1: float, theta_2: float, theta_3: float) -> dict[str, float]:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            compliance = np.float64(self.k_p) / theta_0
+            g = theta_3 * compliance / self.m_p
+            b_p = (theta_2 * compliance - self.m_p) / g
+            C_ie = self.A_p**2 / (theta_1 * compliance - g * self.k_p - b_p)
+            return {
+                "p_s": self._supply(C_ie * compliance / self.A_p),
+                "C_ie": float(C_ie),
+                "b_p": float(b_p),
+                "beta": float(self.V_o / (2.0 * g * C_ie)),
+            }
+
+    def _without_spring(self, theta_1: float, theta_2: float, theta_3: float) -> dict[str, float]:
+        scale = self.A_p * self.flow_gain
+        capacity = scale * theta_3 / self.m_p
+        product, total = scale * theta_1 - self.A_p**2, scale * theta_2
+        # m_p C_ie^2 - total C_ie + capacity product = 0; a discriminant below zero by rounding only is a
+        # double root.
+        root = np.sqrt(max(total**2 - 4.0 * self.m_p * capacity * product, 0.0))
+        large = (total + root) / (2.0 * self.m_p)
+        small = capacity * product / (self.m_p * large) if large > 0.0 else np.nan
+        candidates = [value for value in (large, small) if value > 0.0]
+        C_ie = min(candidates, key=lambda value: abs(np.log(value / self.C_ie)), default=np.nan)
+        beta = self.V_o / (2.0 * capacity) if capacity > 0.0 else np.nan
+        return {"p_s": self.p_s, "C_ie": float(C_ie), "b_p": float(product / C_ie), "beta": float(beta)}
+
+    def _supply(self, flow_gain: float) -> float:
+        if not flow_gain > 0.0:
+            return float("nan")
+        return float(self.rho * (flow_gain / (self.K_m * self.C_d * self.W)) ** 2)

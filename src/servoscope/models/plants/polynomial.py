@@ -1,0 +1,138 @@
+"""Polynomial inverse with friction and offset; a motor axis is u = M y'' + F_v y' + F_c sign(y') + offset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import LoopError
+from servoscope.models.plants.base import Fault, Plant, StateSpace
+
+POWER_NAMES = ("stiffness", "viscous_friction", "inertia", "jerk", "snap")
+EXTRA_NAMES = {
+    "sign_v": "coulomb_friction",
+    "forward_v": "viscous_friction_forward",
+    "backward_v": "viscous_friction_backward",
+    "one": "offset",
+}
+RATIO_RANGES = {"inertia": (0.2, 5.0), "input_gain": (0.3, 3.0)}
+DEFAULT_RANGE = (0.1, 10.0)
+INPUT_GAIN_WORDS = "more u for the same motion (weak motor, magnet or amplifier, or all coefficients up together)"
+
+FrictionKind = Literal["none", "coulomb", "directional"]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class PolynomialPlant(Plant):
+    """Plant whose inverse is a polynomial in s, plus Coulomb friction, friction per direction and a constant."""
+
+    kind: Literal["polynomial"] = "polynomial"
+    order: Annotated[int, Field(ge=1, le=4)]  # highest power of s, 1 to 4; a motor axis has 2
+    stiffness: bool = False  # whether the power 0 belongs to it
+    # ``coulomb`` adds F_c sign(y'); ``directional`` also lets the viscous friction differ by direction
+    friction: FrictionKind = "none"
+    offset: bool = False  # whether a constant is added, for example gravity or a biased amplifier
+    # speed [output per s] below which sign(y') is not trusted and set to 0
+    sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    # where the sign comes from: the measured output, or the reference where y is noisy or slow
+    sign_from: Literal["output", "reference"] = "output"
+    # cutoff [Hz] of the differentiator behind the sign
+    sign_cutoff: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 50.0
+    # nominal values by name, all of `names`; needed for simulation and for a nominal baseline only
+    coefficients: dict[str, Finite] | None = None
+
+    @model_validator(mode="after")
+    def _coefficients_fit(self) -> Self:
+        if self.coefficients is None:
+            return self
+        unknown = [name for name in self.coefficients if name not in self.names]
+        missing = [name for name in self.names if name not in self.coefficients]
+        if unknown or missing:
+            told = [
+                f"{word} {', '.join(names)}" for word, names in (("unknown", unknown), ("missing", missing)) if names
+            ]
+            raise ValueError(f"coefficients: {'; '.join(told)} (this plant has {', '.join(self.names)})")
+        for name, value in self.coefficients.items():
+            if name != "offset" and value < 0.0:
+                raise ValueError(f"coefficients: {name} = {value:g} must not be negative")
+        for name in self._leading:
+            if self.coefficients[name] == 0.0:
+                raise ValueError(f"coefficients: {name} is the highest power and must not be 0")
+        return self
+
+    @property
+    def _leading(self) -> tuple[str, ...]:
+        if self.order == 1 and self.friction == "directional":
+            return EXTRA_NAMES["forward_v"], EXTRA_NAMES["backward_v"]
+        return (POWER_NAMES[self.order],)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Stiffness, viscous friction, inertia, jerk, snap as far as present, then the extras."""
+        return tuple(POWER_NAMES[power] for power in self.powers) + tuple(EXTRA_NAMES[extra] for extra in self.extras)
+
+    @property
+    def powers(self) -> tuple[int, ...]:
+        """Powers of s up to the order; without 1 where the viscous friction goes by direction."""
+        first = 0 if self.stiffness else 1
+        return tuple(p for p in range(first, self.order + 1) if p != 1 or self.friction != "directional")
+
+    @property
+    def extras(self) -> tuple[str, ...]:
+        """Friction by direction, sign and constant as far as present."""
+        friction = {"none": (), "coulomb": ("sign_v",), "directional": ("forward_v", "backward_v", "sign_v")}
+        return (*friction[self.friction], *(("one",) if self.offset else ()))
+
+    @property
+    def has_physics(self) -> bool:
+        """Whether nominal coefficients are given."""
+        return self.coefficients is not None
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """One per coefficient, and the input gain, which scales them all."""
+        single = tuple(self._fault(name, name.replace("_", " ")) for name in self.names)
+        return (*single, self._fault("input_gain", INPUT_GAIN_WORDS))
+
+    @staticmethod
+    def _fault(name: str, words: str) -> Fault:
+        return Fault(name, name, RATIO_RANGES.get(name, DEFAULT_RANGE), words)
+
+    def _nominal(self) -> dict[str, float]:
+        if self.coefficients is None:
+            raise LoopError("[plant] coefficients: missing, simulation and nominal values need them")
+        return self.coefficients
+
+    def theta(self) -> FloatArray:
+        """Nominal coefficients, shape (n,) [u per output per s^power]."""
+        nominal = self._nominal()
+        return np.array([nominal[name] for name in self.names], dtype=np.float64)
+
+    def scaled(self, factors: Mapping[str, Any]) -> Self:
+        """Return the same plant with coefficients multiplied; ``input_gain`` multiplies all of them.
+
+        A factor of the input gain above 1 means that the same motion asks for more u.
+        """
+        common = factors.get("input_gain", 1.0)
+        scaled = {name: value * common * factors.get(name, 1.0) for name, value in self._nominal().items()}
+        return self.model_copy(update={"coefficients": scaled})
+
+    def state_space(self) -> StateSpace:
+        """Continuous linear part: A (n, n), B (n, 1), C (1, n), n the order; states y and its derivatives.
+
+        Friction by direction enters with the mean of both directions; sign and offset are left out.
+        """
+        nominal = dict(self._nominal())
+        if self.friction == "directional":
+            nominal["viscous_friction"] = 0.5 * (
+                nominal["viscous_friction_forward"] + nominal["viscous_friction_backward"]
+            )
+        polynomial = [nominal.get(POWER_NAMES[power], 0.0) for power in range(self.order + 1)]
+        last = -np.array(polynomial[:-1]) / polynomial[-1]
+        A = np.vstack([np.eye(self.order, k=1)[:-1], last])
+        B = np.append(np.zeros(self.order - 1), self.input_gain / polynomial[-1])[:, None]
+        return A, B, np.eye(1, self.order)

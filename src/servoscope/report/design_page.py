@@ -1,0 +1,130 @@
+"""A study before deployment as one self-contained HTML page, and its tables, which a terminal prints too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from servoscope.design import DesignStudy
+from servoscope.report.format_values import (
+    DASH,
+    format_change,
+    format_clock_time,
+    format_number,
+    format_percent,
+)
+from servoscope.report.page import ResultTable, render_page, say, write_page
+
+UNKNOWABLE = 10.0  # standard deviation from which a number says nothing
+
+
+def write_design_page(path: str | Path, study: DesignStudy) -> None:
+    """Write the page on a study; nothing half-written stays behind.
+
+    Raises OutputError if the file cannot be written.
+    """
+    write_page(path, render_design_page(study))
+
+
+def render_design_page(study: DesignStudy) -> str:
+    """Return the page that `write_design_page` writes; it needs nothing from outside, no script and no network."""
+    from servoscope.report import design_figures  # late: matplotlib takes half a second to import
+    from servoscope.report.plotting import render_svg
+
+    u, y = format_number(study.noise_u_std, 3), format_number(study.noise_y_std, 3)
+    after = format_clock_time(study.after_s, 0)
+    drawn = (
+        design_figures.plot_radii(study),
+        design_figures.plot_delays(study),
+        design_figures.plot_size_precision(study),
+    )
+    return render_page(
+        "design.html",
+        title=f"Before deployment: {study.loop}",
+        kind="healthy",
+        study=study,
+        size=(
+            say("report.design.reference", reference=study.reference, after=after),
+            say("report.design.noise", u=u, y=y),
+            say("report.design.false_alarms", count=study.false_alarms_per_year),
+        ),
+        gain=format_number(study.frequencies.gain, 3),
+        radii=render_svg(drawn[0], "f0"),
+        delays=render_svg(drawn[1], "f1"),
+        precision=render_svg(drawn[2], "f2"),
+        faults=faults_table(study),
+        cosines=cosines_table(study),
+        mimics=mimics_table(study, described=True),
+        frequencies=frequencies_table(study),
+        dither=dither_table(study),
+    )
+
+
+def faults_table(study: DesignStudy) -> ResultTable:
+    """Return from which size on each fault is detected and named, in both directions."""
+    rows = []
+    for fault in study.faults.values():
+        for direction, side in (("up", fault.up), ("down", fault.down)):
+            sizes = (side.detectable, side.first_isolable, side.bound)
+            again = ", ".join(
+                f"{format_change(low)} to {format_change(high) if high else 'the end'}"
+                for low, high in side.unclear[1:]
+            )
+            name = f"{fault.name} {direction}", fault.parameter
+            rows.append((*name, *map(format_change, sizes), side.nearest, again or DASH))
+    head = ("Change", "Parameter", "Detected from", "Named from", "Linear bound", "Else taken for", "Unclear again")
+    return ResultTable(head, rows, words=2)
+
+
+def cosines_table(study: DesignStudy) -> ResultTable:
+    """Return how alike small changes look, each against each."""
+    names = tuple(study.faults)
+    rows = [(one, *(f"{study.cosines[one][other]:.3f}".replace("-", "−") for other in names)) for one in names]
+    return ResultTable(("Alike (cosine)", *names), rows)
+
+
+def mimics_table(study: DesignStudy, *, described: bool = False) -> ResultTable:
+    """Return the changes that are no fault of the list, in words where `described`, and the fault each looks like."""
+
+    def amount(value: float | None, unit: str) -> str:
+        if value is None:
+            return "never"
+        return format_percent(value) if unit == "relative" else f"{value:.2g} samples"
+
+    rows: list[tuple[str, ...]] = [
+        (
+            f"{each.words} ({each.name})" if described else each.name,
+            each.imitates,
+            format_number(each.cosines[each.imitates], 3),
+            amount(each.amount, each.unit),
+            format_change(each.looks_like),
+            amount(each.told_apart, each.unit),
+        )
+        for each in study.mimics
+    ]
+    head = ("Not in the list", "Is most like", "Cosine", "So much", "Looks like", "Told apart from")
+    return ResultTable(head, rows, words=2)
+
+
+def frequencies_table(study: DesignStudy) -> ResultTable:
+    """Return the standard deviation of each size as the iFRF of one frequency shows it."""
+    compared = [("monitored", each) for each in study.frequencies.own] + [("best", x) for x in study.frequencies.best]
+    rows = [
+        (kind, f"{each.frequency_hz:g} Hz", *(format_std(each.apart[name]) for name in study.faults))
+        for kind, each in compared
+    ]
+    return ResultTable(("Std. dev. of each size", "Frequency", *study.faults), rows)
+
+
+def dither_table(study: DesignStudy) -> ResultTable:
+    """Return from which size on each fault is named with a sine on the reference."""
+    rows = []
+    for each in study.dither:
+        name = f"{format_percent(each.share)} at {each.frequency_hz:g} Hz" if each.share else "none"
+        radii = (format_change(each.radius[fault]) for fault in study.faults)
+        rows.append((name, format_number(each.extra_u_rms, 3), *radii))
+    return ResultTable(("Sine on the reference", "Adds to u (rms)", *(f"{name} from" for name in study.faults)), rows)
+
+
+def format_std(value: float | None) -> str:
+    """Return a relative standard deviation, as far as it says anything."""
+    return f"{100.0 * value:.3g} %" if value is not None and value < UNKNOWABLE else DASH

@@ -1,0 +1,129 @@
+"""The reproduction as files: every figure as PNG and SVG, the claims as JSON and Markdown; jobs over the cores."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from servoscope.core.files import atomic_write, make_folder
+from servoscope.core.workers import available_cores, create_pool
+from servoscope.research.paper import claims, jobs
+from servoscope.research.paper.claims import Claim
+from servoscope.research.paper.jobs import SeedJob
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".png", ".svg")
+FIGURE_COUNT = 17  # figures that are drawn
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+StepCallback = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """What came out."""
+
+    seeds: tuple[int, ...]  # that were run
+    metrics: dict[str, list[float]]  # name -> one value per seed
+    claims: tuple[Claim, ...]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return seeds and claims, ready for JSON."""
+        return {"seeds": list(self.seeds), "claims": [claim.to_dict() for claim in self.claims]}
+
+
+def run_reproduction(
+    seeds: Sequence[int], told: StepCallback = lambda _: None, processes: int | None = None
+) -> Reproduction:
+    """Measure everything.
+
+    `told`: told the name of each job that is done; `processes`: none: one per core.
+    """
+    work = jobs.list_jobs(seeds)
+    count = min(available_cores() if processes is None else processes, len(work))
+    done: list[tuple[SeedJob, dict[str, float]]] = []
+    for job, found in run_jobs(work, count):
+        done.append((job, found))
+        told(f"seed {job.seed}, {job.part}")
+    metrics = jobs.merge_metrics(done)
+    return Reproduction(tuple(seeds), metrics, tuple(claims.evaluate_claims(metrics)))
+
+
+def run_jobs(work: Sequence[SeedJob], processes: int) -> Iterator[tuple[SeedJob, dict[str, float]]]:
+    """Yield each job with what it measured, as they are done, on so many processes."""
+    if processes <= 1:
+        yield from ((job, jobs.run_job(job)) for job in work)
+        return
+    with _one_thread_each(), create_pool(processes) as pool:
+        futures = {pool.submit(jobs.run_job, job): job for job in work}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Let processes that start within use one thread for linear algebra each: more only get into each other's way."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def list_figures(found: Reproduction) -> Iterator[tuple[str, Callable[[], Figure]]]:
+    """Yield the name of each figure and what draws it: for the paper's method, and for the default on the same data."""
+    from servoscope.research.paper import charts, figures
+    from servoscope.research.paper.drawings import figure_1, figure_3
+    from servoscope.research.paper.table import table_2_residuals
+
+    seed, metrics = found.seeds[0], found.metrics
+    yield "figure-1", figure_1
+    yield "figure-2", figures.figure_2
+    yield "figure-3", figure_3
+    yield "figure-4", lambda: figures.figure_4(seed)
+    for version in figures.METHODS:
+        method = figures.METHODS[version][-1]
+        yield f"figure-5-{version}", partial(figures.figure_5, seed, version)
+        yield f"figure-6-{version}", partial(figures.figure_6, seed, version)
+        yield f"figure-7-{version}", partial(figures.figure_7, table_2_residuals(method, seed))
+        yield f"figure-8-{version}", partial(figures.figure_8, metrics, version)
+    yield "trade-off", lambda: charts.draw_trade_off(metrics)
+    yield "conditions", lambda: charts.draw_conditions(metrics)
+    yield "windup", lambda: charts.draw_windup(seed)
+    yield "stability", charts.draw_poles
+    yield "fault-tolerance", lambda: charts.draw_tolerance(seed)
+
+
+def write_reproduction(found: Reproduction, folder: Path, told: StepCallback = lambda _: None) -> list[Path]:
+    """Write all figures and the table of claims; return the files.
+
+    Raises OutputError if the folder or a file cannot be written.
+    """
+    from servoscope.report.plotting import save_figure
+
+    make_folder(folder)
+    written = []
+    for name, draw in list_figures(found):
+        figure = draw()
+        for suffix in SUFFIXES:
+            save_figure(figure, folder / f"{name}{suffix}")
+            written.append(folder / f"{name}{suffix}")
+        told(name)
+    content = json.dumps(found.to_dict(), indent=1, allow_nan=False) + "\n"
+    atomic_write(folder / "claims.json", content.encode())
+    atomic_write(folder / "claims.md", claims.format_markdown(found.claims, len(found.seeds)).encode())
+    return [*written, folder / "claims.json", folder / "claims.md"]

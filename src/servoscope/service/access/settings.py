@@ -1,0 +1,64 @@
+"""The section `[web]`: where the pages are served, to whom, and within which limits."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from servoscope.core.networks import Network
+from servoscope.core.settings import NonEmptyStr, Positive, Settings
+from servoscope.service.access.allowed_hosts import LOOPBACK, is_loopback, split_address
+from servoscope.service.access.oidc import OidcSettings
+
+
+class WebSettings(Settings):
+    """Where pages and HTTP interface are served; every key has a default."""
+
+    # ``host:port``; port 0 takes a free one
+    listen: Annotated[str, Field(strict=True, pattern=r"^.+:\d{1,5}$")] = "127.0.0.1:8080"
+    # names under which it is reached, beside those of the loopback interface and numeric addresses
+    hosts: tuple[NonEmptyStr, ...] = ()
+    users: NonEmptyStr | None = None  # file of users, see ``servoscope users``; required beyond loopback
+    oidc: OidcSettings | None = None  # single sign-on
+    password_login: bool = True  # whether the users of the file may log in, beside those of `oidc`
+    # where uploads, baselines, diagnoses of uploads and designs are kept; relative to the service file
+    folder: NonEmptyStr = "servoscope-web"
+    certificate: NonEmptyStr | None = None  # certificate, key: PEM files: then it speaks HTTPS
+    key: NonEmptyStr | None = None
+    proxies: tuple[Network, ...] = ()  # whose X-Forwarded-For and X-Forwarded-Proto are believed
+    # most connections of one address at a time; those of `proxies` are not counted
+    connections_per_address: Annotated[int, Field(strict=True, ge=1)] = 100
+    session_hours: Positive = 12.0  # how long a login lasts [h]
+    upload_mb: Positive = 200.0  # largest upload [MB]
+    keep_days: Positive = 7.0  # how long uploads are kept [days]
+    # processor time [s] and memory [MB] of one diagnosis, learning or design
+    job_s: Positive = 300.0
+    job_memory_mb: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1000.0)] = 4000.0
+
+    @model_validator(mode="after")
+    def _safe(self) -> Self:
+        host, port = split_address(self.listen)
+        if port > 65535:
+            raise ValueError(f"listen: there is no port {port}")
+        elsewhere = [name for name in (host, *self.hosts) if not is_loopback(name) and name not in LOOPBACK]
+        if not self.password_login and self.oidc is None:
+            raise ValueError("password_login: without [web.oidc] nobody could log in")
+        if elsewhere and not self.login:
+            raise ValueError(
+                f"users: missing, {elsewhere[0]} can be reached by others: give a file of users, "
+                "which servoscope users add makes, or [web.oidc]"
+            )
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate: goes with key, give both or none")
+        return self
+
+    @property
+    def login(self) -> bool:
+        """Whether users have to log in."""
+        return self.users is not None or self.oidc is not None
+
+    @property
+    def secure(self) -> bool:
+        """Whether it serves HTTPS."""
+        return self.certificate is not None

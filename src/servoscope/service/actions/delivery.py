@@ -1,0 +1,209 @@
+"""One attempt to deliver an entry of the outbox: a signed POST, a program run without a shell, an MQTT message."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import os
+import signal
+import ssl
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from servoscope.core.addresses import hide_secrets, show_address
+from servoscope.core.errors import ConfigError
+from servoscope.service.actions.outbox import DeliveryAttempt, OutboxEntry, schedule_retry
+from servoscope.service.actions.settings import (
+    PLACEHOLDERS,
+    ActionSettings,
+    CommandSettings,
+    MqttMessageSettings,
+    Sink,
+    WebhookSettings,
+)
+from servoscope.service.mqtt.client import create_mqtt_client
+
+if TYPE_CHECKING:
+    import httpx
+
+MAX_DETAIL_CHARS = 200  # of an answer that are kept
+
+
+class _DeliveryError(Exception):
+    """An attempt failed; its text says why."""
+
+    def __init__(self, reason: str, min_wait_s: float = 0.0) -> None:
+        super().__init__(reason)
+        self.min_wait_s = min_wait_s
+
+
+def deliver(row: OutboxEntry, settings: ActionSettings, now: float) -> DeliveryAttempt:
+    """Try once to deliver an entry that is due, now (epoch, s).
+
+    It blocks for up to the sink's `timeout_s`, and raises nothing.
+    """
+    sink, attempt = settings.sinks.get(row.sink), (row.key, row.sink, now, row.attempts + 1)
+    try:
+        if sink is None:
+            raise _DeliveryError(f"no webhook, command or mqtt is called {row.sink!r} any more")
+        return DeliveryAttempt(*attempt, True, _send(row, sink))
+    except _DeliveryError as failure:
+        again = schedule_retry(settings.retry, row, now, failure.min_wait_s)
+        return DeliveryAttempt(*attempt, False, _shorten(hide_secrets(str(failure))), again)
+
+
+def signature(secret: bytes, timestamp: str, body: bytes) -> str:
+    """Return the header ``X-Servoscope-Signature``: HMAC-SHA256 (RFC 2104) of "timestamp.body"."""
+    return "sha256=" + hmac.new(secret, timestamp.encode() + b"." + body, hashlib.sha256).hexdigest()
+
+
+def _send(row: OutboxEntry, sink: Sink) -> str:
+    match sink:
+        case WebhookSettings():
+            return _post(row, sink)
+        case CommandSettings():
+            return _run_command(row, sink)
+        case MqttMessageSettings():
+            return _publish(row, sink)
+
+
+def _publish(row: OutboxEntry, sink: MqttMessageSettings) -> str:
+    host, port = sink.broker.address
+    try:
+        client = create_mqtt_client(sink.broker, Path(), "")
+    except ConfigError as error:
+        raise _DeliveryError(str(error)) from None
+    client.connect_timeout = sink.timeout_s
+    try:
+        client.connect(host, port)
+        client.loop_start()
+        message = client.publish(sink.topic, json.dumps(row.event, allow_nan=False), qos=1)
+        message.wait_for_publish(sink.timeout_s)
+        done = message.is_published()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _DeliveryError(f"{host}:{port}: {error or type(error).__name__}") from None
+    finally:
+        client.disconnect()
+        client.loop_stop()
+    if not done:
+        raise _DeliveryError(f"{host}:{port}: not taken within {sink.timeout_s:g} s")
+    return "taken by the broker"
+
+
+def _post(row: OutboxEntry, sink: WebhookSettings) -> str:
+    try:
+        import httpx
+    except ImportError:
+        raise _DeliveryError("webhooks need httpx: pip install 'servoscope[service]'") from None
+    body = json.dumps(row.event, allow_nan=False).encode()
+    headers = {"Content-Type": "application/json", "Idempotency-Key": row.key}
+    try:
+        secret = load_secret(sink)
+    except ValueError as error:
+        raise _DeliveryError(str(error)) from None
+    if secret is not None:
+        # by the clock of the machine, which receivers compare with theirs
+        stamp = str(int(time.time()))
+        headers |= {"X-Servoscope-Timestamp": stamp, "X-Servoscope-Signature": signature(secret, stamp, body)}
+    try:
+        target = _checked_request(sink)
+        # Redirects are not followed: the event goes where the configuration says, or nowhere. The answer's body is
+        # not read: it might never end.
+        with (
+            httpx.Client(verify=target.verify, timeout=sink.timeout_s, trust_env=target.trust_env) as client,
+            client.stream(
+                "POST", target.url, content=body, headers=headers | target.headers, extensions=target.extensions
+            ) as response,
+        ):
+            status, wait = response.status_code, response.headers.get("Retry-After", "")
+    except (httpx.HTTPError, httpx.InvalidURL, ConfigError, OSError) as error:
+        raise _DeliveryError(f"{show_address(sink.url)}: {error or type(error).__name__}") from None
+    if not 200 <= status < 300:
+        raise _DeliveryError(f"{show_address(sink.url)}: answered {status}", float(wait) if wait.isdecimal() else 0.0)
+    return f"answered {status}"
+
+
+class _Target(NamedTuple):
+    """Where a webhook's request goes."""
+
+    url: httpx.URL
+    headers: dict[str, str]
+    extensions: dict[str, str]
+    verify: ssl.SSLContext | bool
+    trust_env: bool  # whether the proxies of the environment are used
+
+
+def _checked_request(sink: WebhookSettings) -> _Target:
+    """Return where to send a request: with rules for networks to a numeric address, under the name it was found by.
+
+    Raises OSError if there is no such address, or no permitted one.
+    """
+    import httpx
+
+    url = httpx.URL(sink.url)
+    verify = sink.create_tls_context(Path(), url.host) if sink.has_certificates else True
+    if not sink.rules.refused:
+        return _Target(url, {}, {}, verify, True)
+    address = sink.rules.resolve(url.host, url.port or (443 if url.scheme == "https" else 80))
+    name = {"sni_hostname": url.host}  # the certificate is compared with it
+    # a proxy would look up the name itself
+    return _Target(url.copy_with(host=address), {"Host": url.netloc.decode()}, name, verify, False)
+
+
+def load_secret(sink: WebhookSettings) -> bytes | None:
+    """Return the secret that a webhook is signed with; None where it is not signed; ValueError if it is missing."""
+    if sink.secret_env is not None:
+        value = os.environ.get(sink.secret_env, "")
+        if not value:
+            raise ValueError(f"the environment variable {sink.secret_env} holds no secret, set it")
+        return value.encode()
+    if sink.secret_file is None:
+        return None
+    try:
+        content = Path(sink.secret_file).read_bytes().strip()
+    except OSError as error:
+        raise ValueError(f"{sink.secret_file}: cannot be read ({error.strerror})") from None
+    if not content:
+        raise ValueError(f"{sink.secret_file}: holds no secret, write it there")
+    return content
+
+
+def _run_command(row: OutboxEntry, sink: CommandSettings) -> str:
+    argv = [_fill_placeholder(argument, row) for argument in sink.argv]
+    body = json.dumps(row.event, allow_nan=False).encode()
+    with tempfile.TemporaryFile() as errors:
+        try:
+            process = subprocess.Popen(
+                argv,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+                start_new_session=True,  # so that what it started itself can be killed with it
+            )
+        except (OSError, ValueError) as error:
+            raise _DeliveryError(f"{argv[0]}: cannot be run ({getattr(error, 'strerror', None) or error})") from None
+        try:
+            process.communicate(body, timeout=sink.timeout_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            raise _DeliveryError(f"{argv[0]}: not done after {sink.timeout_s:g} s, killed") from None
+        if process.returncode:
+            errors.seek(0)
+            text = _shorten(errors.read(4 * MAX_DETAIL_CHARS).decode(errors="replace"))
+            raise _DeliveryError(f"{argv[0]}: exit code {process.returncode}" + (f", {text}" if text else ""))
+    return "exit code 0"
+
+
+def _fill_placeholder(argument: str, row: OutboxEntry) -> str:
+    name = argument[1:-1]
+    return str(row.event.get(name, "")) if argument == f"{{{name}}}" and name in PLACEHOLDERS else argument
+
+
+def _shorten(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= MAX_DETAIL_CHARS else f"{line[: MAX_DETAIL_CHARS - 3]}..."

@@ -1,0 +1,220 @@
+"""What is done about alarms, from the section `[actions]`: webhooks, commands, fault-tolerant changes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Annotated, Literal, Self, TypeVar
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from servoscope.core.settings import Finite, NonEmptyStr, Positive, Settings
+from servoscope.service.alarms import LifecycleEvent, LifecycleState, Priority
+from servoscope.service.mqtt.client import BrokerSettings
+from servoscope.service.network import NetworkSettings, TlsSettings, apply_network
+
+
+def _check_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", value):
+        raise ValueError(f"{value!r} is no name for an action: a letter, then letters, digits, _ and -")
+    return value
+
+
+ActionName = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
+PositiveInt = Annotated[int, Field(strict=True, ge=1)]
+
+DIAGNOSIS_EVENT = "diagnosed"  # an event that is none of the life-cycle: the cause of an alarm is known
+MAX_RATIO = 1e3  # ratio to healthy, or its inverse, beyond which a change is not left to a formula
+PLACEHOLDERS = ("key", "time", "asset", "alarm", "event", "after", "priority", "quantity", "value", "previous")
+
+
+TLS_FILES = ("ca_file", "cert_file", "key_file")
+
+
+class RetrySettings(Settings):
+    """How often, and for how long, an action is tried again."""
+
+    # wait before the second attempt, which doubles with each further one, and its bound [s]; jitter shortens each by
+    # up to half, so that what failed together is not tried again together
+    first_s: Positive = 1.0
+    longest_s: Positive = 900.0
+    # how old an event may get; then it is given up, which is logged and stays in the history
+    give_up_s: Positive = 7 * 86400.0
+
+
+class SinkSettings(Settings):
+    """Which events are sent, and how long an attempt may take."""
+
+    alarms: tuple[NonEmptyStr, ...] | None = None  # alarms, assets: names that concern it; None: all
+    assets: tuple[NonEmptyStr, ...] | None = None
+    # priorities, events, states: which of their transitions, the states being those entered; None: all. By default a
+    # new alarm, and its return to normal. The event ``diagnosed``, that the cause of an alarm is known, is sent where
+    # new alarms are.
+    priorities: tuple[Priority, ...] | None = None
+    events: tuple[LifecycleEvent | Literal["diagnosed"], ...] | None = None
+    states: tuple[LifecycleState, ...] | None = (
+        LifecycleState.UNACKNOWLEDGED,
+        LifecycleState.RETURNED,
+        LifecycleState.LATCHED_UNACKNOWLEDGED,
+    )
+    timeout_s: Positive = 10.0  # how long one attempt may take [s]
+
+
+class WebhookSettings(TlsSettings, SinkSettings):
+    """A POST of the event as JSON; over https the other side has to prove its identity."""
+
+    url: NonEmptyStr  # where to; http or https
+    # secret_env, secret_file: the environment variable or file with the secret of the signature; none: no signature
+    secret_env: NonEmptyStr | None = None
+    secret_file: NonEmptyStr | None = None
+
+    @field_validator("url")
+    @classmethod
+    def _check_url(cls, value: str) -> str:
+        try:
+            parts = urlsplit(value)
+            good = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port is None or parts.port > 0)
+        except ValueError:
+            good = False
+        if not good:
+            raise ValueError("is no address, write http://... or https://...")  # it may hold a token
+        return value
+
+    @model_validator(mode="after")
+    def _check_secret(self) -> Self:
+        if self.secret_env is not None and self.secret_file is not None:
+            raise ValueError("give secret_env or secret_file, not both")
+        if self.has_certificates and not self.url.lower().startswith("https:"):
+            raise ValueError("url: certificates are given, but it is no https://")
+        if self.key_file is not None and self.cert_file is None:
+            raise ValueError("cert_file: missing, key_file is the key of it")
+        return self
+
+
+class CommandSettings(SinkSettings):
+    """A program that is run with the event as JSON on its standard input; no shell has a part in it."""
+
+    # program and arguments. An argument that is one of `PLACEHOLDERS` in braces is replaced, whole.
+    argv: Annotated[tuple[NonEmptyStr, ...], Field(min_length=1)]
+
+    @field_validator("argv")
+    @classmethod
+    def _check_placeholders(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        known = {f"{{{name}}}" for name in PLACEHOLDERS}
+        for argument in set(value) - known:
+            if part := next((one for one in known if one in argument), None):
+                raise ValueError(f"{argument!r}: a placeholder is an argument of its own, write {part!r} alone")
+            if re.fullmatch(r"\{\w+\}", argument):
+                raise ValueError(f"{argument!r} is no placeholder, choose from {', '.join(sorted(known))}")
+            if "\0" in argument:
+                raise ValueError("an argument must not hold a zero byte")
+        if value[0] in known:
+            raise ValueError("the program must be named, not be a placeholder")
+        return value
+
+
+class MqttMessageSettings(SinkSettings):
+    """The event as JSON, published to an MQTT broker with QoS 1."""
+
+    broker: BrokerSettings
+    topic: Annotated[str, Field(strict=True, pattern=r"^[^#+\x00]+$", max_length=1000)]
+
+
+Sink = WebhookSettings | CommandSettings | MqttMessageSettings
+
+
+class FaultToleranceSettings(Settings):
+    """A change of a set-point or a gain with which the loop tolerates a fault; off by default."""
+
+    # ``off``; ``recommend``: the change is recorded; ``execute``: it is also sent to `sink`
+    mode: Literal["off", "recommend", "execute"] = "off"
+    sink: NonEmptyStr | None = None  # name of the webhook or command that executes it
+    assets: Annotated[tuple[NonEmptyStr, ...], Field(min_length=1)]  # for which it is meant
+    fault: NonEmptyStr  # name of the fault, alone in the diagnosis, that calls for it
+    # quantity, kind: what is changed, as the sink knows it, and whether that is a ``gain`` or a ``set_point``
+    quantity: NonEmptyStr
+    kind: Literal["gain", "set_point"]
+    nominal: Finite  # its value while healthy
+    value: Finite | None = None  # its value under the fault; or
+    # nominal * ratio^exponent, with the fault's ratio to healthy: -1 makes up for a lost gain
+    exponent: Annotated[Finite, Field(ge=-10.0, le=10.0)] | None = None
+    min: Finite  # min, max: bounds of the value
+    max: Finite
+    max_step: Positive  # largest change at a time; what is beyond waits for the next occasion
+    per_hour: PositiveInt = 1  # most changes within an hour
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> Self:
+        if (self.value is None) == (self.exponent is None):
+            raise ValueError("give value or exponent, one of them")
+        if not self.min <= self.nominal <= self.max:
+            raise ValueError(f"nominal: {self.nominal:g} must lie between min and max")
+        if self.value is not None and not self.min <= self.value <= self.max:
+            raise ValueError(f"value: {self.value:g} must lie between min and max")
+        if self.mode == "execute" and self.sink is None:
+            raise ValueError('sink: missing, mode = "execute" needs the name of a webhook or a command')
+        return self
+
+    def target_value(self, ratio: float) -> float:
+        """Return the value under a fault of a size, before limits; NaN for a size that is not credible."""
+        if not 1.0 / MAX_RATIO < ratio < MAX_RATIO:
+            return math.nan
+        return self.value if self.value is not None else self.nominal * math.pow(ratio, self.exponent or 0.0)
+
+
+class ActionSettings(Settings):
+    """The section `[actions]`."""
+
+    retry: RetrySettings = RetrySettings()  # the table `[actions.retry]`
+    # tables by name: `[actions.webhook.NAME]` and so on; no name may be used twice
+    webhook: dict[ActionName, WebhookSettings] = Field(default_factory=dict)
+    command: dict[ActionName, CommandSettings] = Field(default_factory=dict)
+    mqtt: dict[ActionName, MqttMessageSettings] = Field(default_factory=dict)
+    tolerance: dict[ActionName, FaultToleranceSettings] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Self:
+        twice = [name for name, count in Counter([*self.webhook, *self.command, *self.mqtt]).items() if count > 1]
+        if twice:
+            raise ValueError(f"{min(twice)!r} names two of webhook, command and mqtt, rename one")
+        for name, one in self.tolerance.items():
+            if one.sink is not None and one.sink not in self.sinks:
+                raise ValueError(f"tolerance.{name}: sink: no webhook, command or mqtt is called {one.sink!r}")
+        return self
+
+    def resolve_paths(self, folder: Path) -> ActionSettings:
+        """Return the same with the paths of programs and secrets relative to a folder; plain names stay names."""
+        webhook, command, mqtt = dict(self.webhook), dict(self.command), dict(self.mqtt)
+        for name, hook in webhook.items():
+            webhook[name] = _with_paths(hook, folder, "secret_file", *TLS_FILES)
+        for name, message in mqtt.items():
+            broker = _with_paths(message.broker, folder, "password_file", *TLS_FILES)
+            mqtt[name] = message.model_copy(update={"broker": broker})
+        for name, tool in command.items():
+            if "/" in tool.argv[0]:
+                argv = (str(folder / tool.argv[0]), *tool.argv[1:])
+                command[name] = tool.model_copy(update={"argv": argv})
+        return self.model_copy(update={"webhook": webhook, "command": command, "mqtt": mqtt})
+
+    def with_network(self, network: NetworkSettings) -> ActionSettings:
+        """Return the same with rules for those that have none of their own."""
+        brokers = apply_network({name: one.broker for name, one in self.mqtt.items()}, network)
+        mqtt = {name: one.model_copy(update={"broker": brokers[name]}) for name, one in self.mqtt.items()}
+        return self.model_copy(update={"webhook": apply_network(self.webhook, network), "mqtt": mqtt})
+
+    @property
+    def sinks(self) -> dict[str, Sink]:
+        """Webhooks, commands and messages, by name."""
+        return {**self.webhook, **self.command, **self.mqtt}
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def _with_paths(settings: S, folder: Path, *names: str) -> S:
+    """Return settings in which these paths are relative to a folder."""
+    paths = {name: getattr(settings, name) for name in names}
+    return settings.model_copy(update={name: str(folder / path) for name, path in paths.items() if path is not None})

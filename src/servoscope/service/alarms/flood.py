@@ -1,0 +1,91 @@
+"""A flood of alarms across a fleet: detected; lower priorities are held and counted, and announced at its end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+from servoscope.service.alarms.records import AlarmTransition, PersistentState
+from servoscope.service.alarms.settings import PRIORITIES, FloodSettings, Priority
+from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
+
+
+@dataclass(frozen=True)
+class HeldAlarm:
+    """An alarm that a flood keeps from being announced: its latest transition, and how often it was new meanwhile."""
+
+    transition: AlarmTransition
+    priority: Priority
+    count: int
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Asset and alarm."""
+        return self.transition.asset, self.transition.alarm
+
+
+@dataclass(frozen=True)
+class FloodState(PersistentState):
+    """What is remembered of a fleet's new alarms; times are (epoch, s)."""
+
+    saved_as: ClassVar[str] = "flood state"
+
+    recent: tuple[float, ...] = ()  # when they occurred, as far as they count
+    since: float | None = None  # beginning of the flood; None: there is none
+    counted: int = 0  # counted, peak: new alarms in it so far, and the most within one period
+    peak: int = 0
+    held: tuple[HeldAlarm, ...] = ()  # those that wait for its end
+
+
+@dataclass(frozen=True)
+class Notification:
+    """What operators are notified of."""
+
+    # ``alarm``: one that is new; ``change``: another transition; ``held``: the latest transition of one that a flood
+    # has held, at its end; ``flood_begins`` and ``flood_ends``
+    kind: Literal["alarm", "change", "held", "flood_begins", "flood_ends"]
+    time: float  # (epoch, s)
+    transition: AlarmTransition | None = None  # transition, priority: of the first three kinds
+    priority: Priority | None = None
+    counted: int = 1  # how often a held alarm was new; new alarms in the flood
+    peak: int = 0  # of a flood: the most new alarms within one period
+
+
+def notify_transition(
+    settings: FloodSettings, state: FloodState, transition: AlarmTransition, priority: Priority
+) -> tuple[FloodState, tuple[Notification, ...]]:
+    """Take each transition of any asset's alarm, about in the order of time; return what operators are notified of."""
+    state, notices = advance_flood(settings, state, transition.time)
+    if transition.is_new:
+        recent = (*state.recent, transition.time)
+        counted = len(recent) if state.since is None else state.counted + 1
+        state = replace(state, recent=recent, counted=counted, peak=max(state.peak, len(recent)))
+        if state.since is None and len(recent) > settings.limit:
+            state = replace(state, since=transition.time)
+            notices += (Notification("flood_begins", transition.time, counted=counted, peak=state.peak),)
+    before = next((one for one in state.held if one.key == (transition.asset, transition.alarm)), None)
+    low = PRIORITIES.index(priority) < PRIORITIES.index(settings.announced_from)
+    waits = transition.is_new or (before is not None and transition.after in UNACKNOWLEDGED_STATES)
+    if state.since is not None and low and waits:
+        held = HeldAlarm(transition, priority, (before.count if before else 0) + transition.is_new)
+        others = (held if one is before else one for one in state.held)
+        return replace(state, held=(*others, *([] if before else [held]))), notices
+    # Somebody has dealt with a held alarm, or its priority is high now: it is not announced once more at the end.
+    state = replace(state, held=tuple(one for one in state.held if one is not before))
+    kind: Literal["alarm", "change"] = "alarm" if transition.is_new else "change"
+    return state, (*notices, Notification(kind, transition.time, transition, priority))
+
+
+def advance_flood(
+    settings: FloodSettings, state: FloodState, time: float
+) -> tuple[FloodState, tuple[Notification, ...]]:
+    """Advance to a time (epoch, s): a flood ends when few enough alarms are new, and what it held is announced."""
+    # Assets report transitions one after the other: what is a little ahead counts, a clock that was set does not.
+    recent = tuple(one for one in state.recent if abs(time - one) < settings.period_s)
+    if state.since is None:
+        return replace(state, recent=recent, counted=0, peak=0), ()
+    if len(recent) >= settings.ends_below:
+        return replace(state, recent=recent), ()
+    end = Notification("flood_ends", time, counted=state.counted, peak=state.peak)
+    held = (Notification("held", time, one.transition, one.priority, one.count) for one in state.held)
+    return FloodState(recent), (end, *held)

@@ -1,0 +1,166 @@
+"""The life-cycle of an alarm: its state is advanced by observations, time and commands; each transition is returned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+from servoscope.core.errors import AlarmError
+from servoscope.core.messages import message, render
+from servoscope.service.alarms.conditions import AssetSnapshot, describe_cause, evaluate_condition
+from servoscope.service.alarms.records import AlarmState, AlarmTransition, OperatorCommand
+from servoscope.service.alarms.settings import AlarmDefinition
+from servoscope.service.alarms.state_table import (
+    COMMANDS,
+    LATCHED_STATES,
+    LifecycleEvent,
+    LifecycleState,
+    ReleaseCondition,
+    next_state,
+)
+
+SYSTEM_USER = "system"  # where nobody commanded a transition
+EVENT_FLAGS: dict[LifecycleEvent, dict[str, Any]] = {  # what an event says of condition and design
+    LifecycleEvent.OCCUR: {"active": True},
+    LifecycleEvent.CLEAR: {"active": False},
+    LifecycleEvent.CLEAR_LATCHED: {"active": False},
+    LifecycleEvent.SUPPRESS: {"suppressed": True},
+    LifecycleEvent.UNSUPPRESS: {"suppressed": False},
+}
+
+
+def initial_alarm_state(asset: str, alarm: str, time: float) -> AlarmState:
+    """Return the state of an alarm of which nothing is known yet, at a time (epoch, s)."""
+    return AlarmState(asset, alarm, at=time, since=time, condition_since=time)
+
+
+def step_alarm(
+    definition: AlarmDefinition, state: AlarmState, update: AssetSnapshot | OperatorCommand | None, time: float
+) -> tuple[AlarmState, tuple[AlarmTransition, ...]]:
+    """Advance one alarm to a time (epoch, s): first the delays that end until then, each at its time, then `update`.
+
+    An observation holds until the next one, so that further steps in between, with None, change only when transitions
+    are returned. A clock that is set back moves running delays along. Raises AlarmError if a command has no meaning
+    in the alarm's state.
+    """
+    step = _LifecycleStep(definition, _shift_times(state, time))
+    step.run_to(time)
+    if isinstance(update, OperatorCommand):
+        step.execute(update, time)
+    elif update is not None:
+        step.observe(update, time)
+        step.run_to(time)
+    return replace(step.state, at=time), tuple(step.transitions)
+
+
+def advance_alarms(
+    definitions: Mapping[str, AlarmDefinition],
+    states: Mapping[str, AlarmState],
+    update: AssetSnapshot | None,
+    time: float,
+) -> tuple[dict[str, AlarmState], tuple[AlarmTransition, ...]]:
+    """Advance all alarms of an asset to a time (epoch, s), in the order of `AlarmSettings.asset_alarms`.
+
+    An alarm that suppresses others comes before them there, so that both happen at the same moment.
+    """
+    new, found = dict(states), list[AlarmTransition]()
+    for name, definition in definitions.items():
+        active = tuple(other for other, one in new.items() if one.active)
+        if update is not None and update.alarms != active:
+            update = replace(update, alarms=active)
+        new[name], transitions = step_alarm(definition, new[name], update, time)
+        found += transitions
+    return new, tuple(sorted(found, key=lambda one: one.time))
+
+
+class _LifecycleStep:
+    """One step in progress."""
+
+    def __init__(self, definition: AlarmDefinition, state: AlarmState) -> None:
+        self.definition, self.state = definition, state
+        self.transitions: list[AlarmTransition] = []
+
+    def run_to(self, time: float) -> None:
+        """Apply the events that are due until then, the earliest first."""
+        while due := [one for one in self._due_events() if one[0] <= time]:
+            when, event = min(due, key=lambda one: one[0])
+            # A delay made shorter while it runs may have ended in the past, whose history is already written.
+            when, expired = max(when, self.state.at), event is LifecycleEvent.EXPIRE
+            self._apply(event, when, render(message("alarm.shelving_expired")) if expired else self.state.cause)
+
+    def observe(self, snapshot: AssetSnapshot, time: float) -> None:
+        """Replace what was known by what is known now."""
+        definition, state = self.definition, self.state
+        suppressors = [word for word in definition.suppressed_when if word in (*snapshot.quality, *snapshot.alarms)]
+        if bool(suppressors) != state.suppressed:
+            event = LifecycleEvent.SUPPRESS if suppressors else LifecycleEvent.UNSUPPRESS
+            self._apply(event, time, ", ".join(suppressors or definition.suppressed_when))
+        was_abnormal = state.condition == "abnormal" or (state.condition == "unknown" and state.active)
+        now = evaluate_condition(definition, was_abnormal, snapshot)
+        since = state.condition_since if now == state.condition else time
+        cause = describe_cause(definition, snapshot)
+        self.state = replace(self.state, condition=now, condition_since=since, cause=cause)
+
+    def execute(self, command: OperatorCommand, time: float) -> None:
+        """Execute a command; raises AlarmError if it has no meaning in this state."""
+        state, event, until = self.state, command.event, command.until
+        name = f"{state.asset}: {state.alarm}"
+        if event not in COMMANDS:
+            raise AlarmError(f"{name}: {event} is not a command, choose from {', '.join(COMMANDS)}")
+        if next_state(state.state, event, self._release_condition()) is None:
+            raise AlarmError(f"{name} is {state.state}: {event} means nothing there")
+        if event is LifecycleEvent.SHELVE and (until is None or not time < until < math.inf):
+            raise AlarmError(f"{name}: shelving needs an end in the future, say until when")
+        self._apply(event, time, command.reason, command.user)
+        if event is LifecycleEvent.SHELVE:
+            self.state = replace(self.state, shelved_until=until)
+
+    def _due_events(self) -> Iterator[tuple[float, LifecycleEvent]]:
+        state, definition = self.state, self.definition
+        if state.condition == "abnormal" and not state.active:
+            yield state.condition_since + definition.on_delay_s, LifecycleEvent.OCCUR
+        if state.condition == "normal" and state.active:
+            event = LifecycleEvent.CLEAR_LATCHED if definition.latching else LifecycleEvent.CLEAR
+            yield state.condition_since + definition.off_delay_s, event
+        if state.shelved_until is not None:
+            yield state.shelved_until, LifecycleEvent.EXPIRE
+
+    def _release_condition(self) -> ReleaseCondition:
+        state = self.state
+        if state.suppressed:
+            return "suppressed"
+        if state.active:
+            return "abnormal"
+        return "latched" if state.latched else "normal"
+
+    def _apply(self, event: LifecycleEvent, time: float, cause: str, user: str = SYSTEM_USER) -> None:
+        """Set what the event says of condition and design, then what the table says of the state."""
+        state = self.state = replace(self.state, **EVENT_FLAGS.get(event, {}))
+        to = next_state(state.state, event, self._release_condition())
+        if to is None:
+            raise AssertionError(f"{event} cannot happen in {state.state}")
+        latches = to in LATCHED_STATES or (to is LifecycleState.UNACKNOWLEDGED and self.definition.latching)
+        self.state = replace(
+            state,
+            state=to,
+            since=state.since if to is state.state else time,
+            latched=(state.latched or latches) and event not in (LifecycleEvent.RESET, LifecycleEvent.CLEAR),
+            shelved_until=state.shelved_until if to is LifecycleState.SHELVED else None,
+            sequence=state.sequence + 1,
+        )
+        number = self.state.sequence
+        self.transitions.append(
+            AlarmTransition(time, state.asset, state.alarm, number, state.state, to, event, cause, user)
+        )
+
+
+def _shift_times(state: AlarmState, time: float) -> AlarmState:
+    """Return the state with its times moved along, if the clock has been set back."""
+    if time >= state.at:
+        return state
+    back = state.at - time
+    until = None if state.shelved_until is None else state.shelved_until - back
+    since, condition_since = state.since - back, state.condition_since - back
+    return replace(state, at=time, since=since, condition_since=condition_since, shelved_until=until)

@@ -1,0 +1,322 @@
+"""One asset of the service: blocks in, rows for the store out; all it remembers is its state and its window."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from servoscope.core.errors import AlarmError, StateError
+from servoscope.core.settings_errors import suggest_name
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.follower import DiagnosisSchedule, Follower
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.alarms import (
+    AlarmSettings,
+    AlarmTransition,
+    AssetSnapshot,
+    OperatorCommand,
+    advance_alarms,
+    initial_alarm_state,
+    step_alarm,
+)
+from servoscope.service.asset_status import AssetStatus, asset_metadata, asset_status, asset_summary
+from servoscope.service.checkpoint import AssetState, StreamPosition
+from servoscope.service.config import DiagnosisSettings
+from servoscope.service.examination import StoredDiagnosis, examine_blocks
+from servoscope.service.examination_schedule import (
+    ExaminationState,
+    PendingDiagnosis,
+    examination_phase,
+    schedule_full_diagnosis,
+    update_examination,
+)
+from servoscope.service.records import StepResult, TableRow, transition_row
+from servoscope.service.residual_history import evaluation_status, update_history
+from servoscope.service.sources.block import Block
+from servoscope.service.sources.continuity import BlockContinuity, check_continuity
+from servoscope.signals import quality
+from servoscope.signals.samples import Samples
+from servoscope.signals.timebase import Timebase
+
+
+@dataclass(frozen=True)
+class AssetPolicy:
+    """How assets are followed: the sections of the service file that each of them needs."""
+
+    diagnosis: DiagnosisSettings
+    quality: quality.QualitySettings
+    alarms: AlarmSettings
+    residual_every_s: float
+
+
+class Asset:
+    """Follows one asset.
+
+    `baseline`: of one operating point; `monitor`: of this baseline, shared by all assets that have it; `group`: what
+    the asset belongs to, for users.
+    """
+
+    def __init__(self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "") -> None:
+        self.name, self.baseline, self.policy = name, baseline, policy
+        self._follower, self._rate = Follower(baseline, monitor), baseline.loop.sample_rate
+        self._timebase = Timebase(1.0 / self._rate)
+        self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
+        self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s)
+        self._limits = policy.quality.limits(self._rate)
+        self._definitions = policy.alarms.asset_alarms
+        self._window: deque[Block] = deque()
+        self._result = StepResult([], [])
+        self.state: AssetState | None = None
+
+    def compile_kernels(self) -> None:
+        """Compile what blocks need, so that the first one does not wait for it."""
+        nothing = np.full(2, np.nan)
+        monitor = self._follower.monitor
+        monitor.run(monitor.init(), nothing, nothing, nothing)
+        quality.check_block(self._limits, quality.init_state(), np.arange(2.0), nothing, nothing, nothing)
+
+    def resume(self, state: AssetState, window: Iterable[Block]) -> None:
+        """Continue from a checkpoint.
+
+        Raises StateError if it belongs to another baseline.
+        """
+        if state.baseline != self.baseline.hash or state.monitor.shape != self._follower.init().shape:
+            raise StateError(
+                f"{self.name}: its saved state belongs to another baseline ({state.baseline}, now "
+                f"{self.baseline.hash}): run --anew {self.name} begins with a new state, behind the samples counted"
+            )
+        t = state.position.t
+        alarms = {name: state.alarms.get(name) or initial_alarm_state(self.name, name, t) for name in self._definitions}
+        self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
+        self._window = deque(window)
+
+    def begin(self, position: StreamPosition) -> None:
+        """Begin with a new state, before the first sample or behind those that were counted."""
+        due = position.t + self.policy.diagnosis.window_s * (1.0 + examination_phase(self.name))
+        self.state = AssetState(
+            asset=self.name,
+            baseline=self.baseline.hash,
+            position=position,
+            monitor=self._follower.init(),
+            quality=quality.init_state(),
+            examination=ExaminationState(due=due, since=position.t),
+            alarms={name: initial_alarm_state(self.name, name, position.t) for name in self._definitions},
+        )
+
+    def status(self, state: AssetState) -> AssetStatus:
+        """Return what users see of a state."""
+        return asset_status(state, self._definitions, self._metadata)
+
+    @property
+    def first_needed_sequence(self) -> int:
+        """The number of the first block of the window: earlier ones are no longer needed."""
+        return self._window[0].sequence if self._window else self._current.position.blocks
+
+    def process(self, block: Block) -> StepResult:
+        """Process a block; one that was counted before has no effect.
+
+        Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
+        """
+        start = block.start_time()
+        continuity = check_continuity(self.state.position if self.state is not None else None, block)
+        if self.state is None:
+            self.begin(StreamPosition(start, start, stream=block.stream))
+        position, self._result = self._current.position, StepResult([], [])
+        if continuity is None:
+            self.state = replace(self._current, position=replace(position, repeated=position.repeated + 1))
+            return self._result
+        # stored under a number of our own, because the sender's may begin anew
+        self._window.append(replace(block, sequence=position.blocks))
+        self._result.rows.append(TableRow("recent", {"sequence": position.blocks, "samples": block.pack()}))
+        if continuity.lost or continuity.anew:
+            what = "blocks lost" if continuity.lost else "stream began anew"
+            streams = {"after": [position.stream, position.sequence], "before": [block.stream, block.sequence]}
+            document = {"blocks": continuity.lost, **streams}
+            self._result.rows.append(TableRow("audit", {"who": "servoscope", "what": what, "document": document}))
+        self._process_samples(block, continuity)
+        self._examine()
+        self._advance_alarms(self._current.position.t)
+        self._trim_window()
+        return self._result
+
+    def advance_time(self, elapsed_s: float) -> StepResult:
+        """Advance the asset's clock without a block: after a while, silence is an alarm."""
+        self._result = StepResult([], [])
+        if self.state is None:
+            return self._result
+        now = self.state.position.t + elapsed_s
+        quality_state, changed = quality.tick(self._limits, self.state.quality, now)
+        self.state = replace(self.state, quality=quality_state)
+        if changed or "silent" in quality.active_findings(quality_state):
+            self._advance_alarms(now)
+        return self._result
+
+    def execute(self, alarm: str, command: OperatorCommand) -> StepResult:
+        """Execute an operator's command.
+
+        Raises AlarmError if there is no such alarm, or the command has no meaning in its state.
+        """
+        if self.state is None or alarm not in self._definitions:
+            raise AlarmError(f"{self.name}: has no alarm {alarm!r}, {suggest_name(alarm, self._definitions)}")
+        self._result, before = StepResult([], []), self.state.alarms[alarm]
+        t = max(before.at, self.state.position.t)
+        after, transitions = step_alarm(self._definitions[alarm], before, command, t)
+        self.state = replace(self.state, alarms={**self.state.alarms, alarm: after})
+        self._add_transitions(transitions)
+        return self._result
+
+    def due_diagnoses(self, *, ended: bool = False) -> list[tuple[PendingDiagnosis, list[Block]]]:
+        """Return the full diagnoses whose windows are complete, or end here, with their samples."""
+        if self.state is None:
+            return []
+        t, after_s, pending = self.state.position.t, self._schedule.after, self.state.pending_diagnoses
+        # complete, or never to be because the clock was set back
+        ready = [window for window in pending if ended or not window.until - after_s <= t < window.until]
+        return [
+            (window, [block for block in self._window if block.sequence >= window.first and block.t[0] < window.until])
+            for window in ready
+        ]
+
+    def is_news(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> bool:
+        """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
+        names = fault_names(diagnosis.document.get("faults", []))
+        return self._is_first_diagnosis(window) or bool(
+            names and names != fault_names(self._current.examination.faults)
+        )
+
+    def _is_first_diagnosis(self, window: PendingDiagnosis) -> bool:
+        return window.until <= self._schedule.end(self._current.examination.since)
+
+    def apply_diagnosis(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> StepResult:
+        """Store the result of one of `due_diagnoses`; a second result for it has no effect."""
+        state = self._current
+        if window not in state.pending_diagnoses:
+            return StepResult([], [])
+        examination, first = state.examination, self._is_first_diagnosis(window)
+        if not first:
+            diagnosis = diagnosis.with_onset(examination.onset)
+        # not of a fault before this one; a later window that names nothing keeps the name
+        if diagnosis.verdict == "fault" and (examination.verdict != "fault" or window.until > examination.since):
+            faults = diagnosis.document.get("faults", [])
+            if faults or not examination.named:
+                examination = replace(examination, named=diagnosis.summary)
+            if examination.verdict == "fault":
+                onset = diagnosis.onset if first and diagnosis.onset is not None else examination.onset
+                examination = replace(examination, faults=faults or examination.faults, onset=onset)
+        pending = tuple(one for one in state.pending_diagnoses if one != window)
+        self.state = replace(state, examination=examination, pending_diagnoses=pending)
+        values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
+        self._trim_window()
+        return StepResult([TableRow("diagnoses", values)], [])
+
+    @property
+    def _current(self) -> AssetState:
+        assert self.state is not None, "begin or resume comes first"
+        return self.state
+
+    def _next_row_number(self) -> int:
+        position = self._current.position
+        self.state = replace(self._current, position=replace(position, rows=position.rows + 1))
+        return position.rows + 1
+
+    def _add_row(self, table: str, **values: Any) -> None:
+        self._result.rows.append(TableRow(table, {"number": self._next_row_number(), **values}))
+
+    def _process_samples(self, block: Block, continuity: BlockContinuity) -> None:
+        """Update monitor, data quality and the history of residuals."""
+        state = self._current
+        order = self._timebase.order_block(block.t, np.nan if state.last_t is None else state.last_t)
+        order.restart[:1] |= continuity.lost > 0 or continuity.anew
+        t, signals = block.t[order.rows], block.signals[1:, order.rows]
+        r, u, y = np.where(np.isfinite(signals), signals, np.nan)
+        followed, evaluations = self._follower.follow(state, Samples(t, r, u, y, order.restart))
+        last_t = order.t if np.isfinite(order.t) else None
+        quality_state, _ = quality.check_block(self._limits, state.quality, *block.signals[:, order.order])
+        quality_state, _ = quality.tick(self._limits, quality_state, state.position.t if last_t is None else last_t)
+        times = t[evaluations.sample]
+        history, rows = update_history(state.history, evaluations.trace, times, self.policy.residual_every_s)
+        position = state.position
+        self.state = replace(
+            followed,
+            quality=quality_state,
+            history=history,
+            evaluation=evaluation_status(evaluations.trace, float(times[-1])) if times.size else state.evaluation,
+            last_t=last_t,
+            position=replace(
+                position,
+                t=position.t if last_t is None else last_t,
+                sequence=block.sequence,
+                stream=block.stream,
+                blocks=position.blocks + 1,
+                samples=position.samples + block.t.size,
+                lost=position.lost + continuity.lost,
+                digest=block.digest(position.digest),
+            ),
+        )
+        for row in rows:
+            self._add_row("residuals", **row)
+
+    def _examine(self) -> None:
+        """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
+        state, settings = self._current, self.policy.diagnosis
+        t = state.position.t
+        recent = [block for block in self._window if block.t[-1] > t - settings.window_s]
+        examination, result = update_examination(
+            state.examination,
+            settings,
+            t,
+            state.evaluation.exceeded,
+            lambda: examine_blocks(self.baseline, self.name, recent),
+            examination_phase(self.name),
+        )
+        self.state = replace(state, examination=examination)
+        if result is None:
+            return
+        if result.verdict != state.examination.verdict:
+            self._add_row("diagnoses", t=t, grounds="examination", **result.columns())
+        examination, in_full = schedule_full_diagnosis(examination, self._schedule, t)
+        if in_full:
+            window = PendingDiagnosis(self._next_row_number(), recent[0].sequence, self._schedule.end(t), "full")
+            pending = (*self._current.pending_diagnoses, window)
+            self.state = replace(self._current, examination=examination, pending_diagnoses=pending)
+
+    def _advance_alarms(self, t: float) -> None:
+        """Update the alarms at time `t` [UTC s]."""
+        state = self._current
+        findings = tuple(quality.active_findings(state.quality))
+        statistic, level = state.evaluation.peaks
+        snapshot = AssetSnapshot(
+            verdict=quality.limit_verdict(state.examination.verdict, findings),
+            quality=findings,
+            statistic=statistic,
+            level=level,
+            cause=asset_summary(state.examination, findings),
+        )
+        alarms, transitions = advance_alarms(self._definitions, state.alarms, snapshot, t)
+        self.state = replace(state, alarms=alarms)
+        self._add_transitions(transitions)
+
+    def _add_transitions(self, transitions: Sequence[AlarmTransition]) -> None:
+        self._result.transitions.extend(transitions)
+        for one in transitions:
+            self._add_row("transitions", **transition_row(one, self._definitions[one.alarm]))
+
+    def _trim_window(self) -> None:
+        """Drop samples that no examination needs any more; also where the clock was set back."""
+        state, window_s = self._current, self.policy.diagnosis.window_s
+        first = min((window.first for window in state.pending_diagnoses), default=None)
+        size = sum(block.t.size for block in self._window)
+        while self._window and (first is None or self._window[0].sequence < first):
+            old = self._window[0].t[-1] <= state.position.t - window_s
+            if not old and size <= 2.0 * window_s * self._rate:
+                return
+            size -= self._window.popleft().t.size
+
+
+def fault_names(faults: Iterable[Mapping[str, Any]]) -> set[str]:
+    """Return which faults are named."""
+    return {str(fault["name"]) for fault in faults}

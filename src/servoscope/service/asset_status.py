@@ -1,0 +1,153 @@
+"""What users see of an asset and of the service: the status that is stored beside each checkpoint.
+
+`model_validate` reads a stored status, of any version; `to_json` returns what is stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from servoscope.core.messages import message, render
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import FaultEstimate
+from servoscope.service.alarms import FAULT_ALARM, AlarmDefinition, LifecycleState, Ne107, Priority, evaluate_ne107
+from servoscope.service.checkpoint import AssetState, StreamPosition
+from servoscope.service.examination_schedule import ExaminationState
+from servoscope.service.residual_history import EvaluationStatus
+from servoscope.signals import quality
+
+
+class _StatusRecord(BaseModel):
+    model_config = ConfigDict(frozen=True, populate_by_name=True)
+
+
+class AlarmStatus(_StatusRecord):
+    """An alarm; the service's own ones have no priority and no cause."""
+
+    state: LifecycleState
+    since: float  # [UTC s]
+    priority: Priority | None = None
+    cause: str = ""
+    until: float | None = None  # end of its shelving [UTC s]
+
+
+class AssetMetadata(_StatusRecord):
+    """What never changes of an asset, and is needed to read its numbers."""
+
+    group: str = ""
+    loop: str | None = None
+    plant: str | None = None
+    baseline: str | None = None  # its hash
+    point: str | None = None  # its operating point
+    sample_rate_hz: float | None = None
+    units: tuple[str, ...] = ()  # of y and u
+    coefficient_units: tuple[str, ...] = ()
+    faults: dict[str, str] = {}  # what their names mean
+    window_s: float | None = None  # what an examination covers
+
+
+class AssetStatus(EvaluationStatus):
+    """An asset as users see it, with its newest evaluation."""
+
+    verdict: Literal["healthy", "fault", "undetermined"]
+    summary: str
+    since: float  # since when the verdict holds [UTC s]
+    onset: float | None  # of the fault [UTC s]
+    faults: tuple[FaultEstimate, ...] = ()  # by the last full diagnosis
+    examined: float | None  # when it was examined last [UTC s]
+    ne107: Ne107
+    reasons: tuple[str, ...]  # for the status after NE 107
+    quality: dict[str, float]  # findings of data quality that hold now, and since when [UTC s]
+    alarms: dict[str, AlarmStatus]  # those that are not normal
+    pending_diagnoses: tuple[int, ...] = Field((), alias="awaited")  # numbers of their rows
+    position: StreamPosition = Field(alias="counted")
+    metadata: AssetMetadata = Field(AssetMetadata(), alias="about")
+
+
+class FloodCounts(_StatusRecord):
+    """A flood of alarms: since when [UTC s], how many alarms there were, and how many are held back."""
+
+    since: float | None
+    counted: int
+    held: int
+
+
+class ServiceStatus(_StatusRecord):
+    """The service itself as users see it."""
+
+    service: Literal[True] = True
+    flood: FloodCounts
+    alarms: dict[str, AlarmStatus]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as stored."""
+        return {"service": True, **self.model_dump(mode="json", exclude_unset=True)}
+
+
+def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:
+    """Return a stored status as the record that it is."""
+    return (ServiceStatus if stored.get("service") else AssetStatus).model_validate(stored)
+
+
+def asset_metadata(baseline: Baseline, group: str, window_s: float) -> AssetMetadata:
+    """Return the metadata of an asset with this baseline."""
+    loop = baseline.loop
+    return AssetMetadata(
+        group=group,
+        loop=loop.name,
+        plant=loop.plant.kind,
+        baseline=baseline.hash,
+        point=baseline.point or None,
+        sample_rate_hz=loop.sample_rate,
+        units=tuple(loop.plant.units),
+        coefficient_units=tuple(loop.plant.coefficient_units),
+        faults={fault.name: fault.words for fault in loop.plant.all_faults},
+        window_s=window_s,
+    )
+
+
+def asset_summary(examination: ExaminationState, findings: Iterable[str]) -> str:
+    """Return the last examination's sentence, unless data quality overrules it."""
+    if quality.limit_verdict(examination.verdict, findings) == examination.verdict:
+        return examination.summary
+    return render(message("service.examination.data_quality", findings=quality.describe_findings(findings)))
+
+
+def asset_status(state: AssetState, definitions: Mapping[str, AlarmDefinition], metadata: AssetMetadata) -> AssetStatus:
+    """Return the status of an asset."""
+    examination, findings = state.examination, quality.active_findings(state.quality)
+    verdict = quality.limit_verdict(examination.verdict, findings)
+    ne107 = evaluate_ne107(verdict, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
+    named = examination.named
+    return AssetStatus.model_validate(
+        {
+            "verdict": verdict,
+            "summary": named if verdict == "fault" and named else asset_summary(examination, findings),
+            "since": examination.since,
+            "onset": examination.onset,
+            "faults": examination.faults,
+            "examined": examination.examined,
+            "ne107": ne107.ne107,
+            "reasons": ne107.reasons,
+            "quality": findings,
+            "alarms": {
+                name: AlarmStatus(
+                    state=alarm.state,
+                    since=alarm.since,
+                    priority=definitions[name].priority,
+                    # the cause at the last sample would be, once the fault has gone, that all is well
+                    cause=named if name == FAULT_ALARM and named else alarm.cause,
+                    until=alarm.shelved_until,
+                )
+                for name, alarm in state.alarms.items()
+                if alarm.state is not LifecycleState.NORMAL
+            },
+            "awaited": [window.number for window in state.pending_diagnoses],
+            "counted": state.position,
+            "about": metadata,
+            **state.evaluation.model_dump(exclude_unset=True),
+        }
+    )

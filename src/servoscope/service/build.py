@@ -1,0 +1,179 @@
+"""From a service file to what runs: assets that continue where they were, sources, publishers, store."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from servoscope.core.errors import BaselineError, ConfigError
+from servoscope.core.settings_errors import suggest_name
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.actions import CommandSettings, WebhookSettings, load_secret
+from servoscope.service.actions.settings import Sink
+from servoscope.service.asset import Asset, AssetPolicy
+from servoscope.service.checkpoint import StreamPosition, unpack_state
+from servoscope.service.config import ServiceFile
+from servoscope.service.notifications import Notifier
+from servoscope.service.publishers.base import StatusPublisher
+from servoscope.service.sources.base import BlockSource, SourceAsset
+from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.store import Store
+
+
+@dataclass(frozen=True)
+class ServiceComponents:
+    """The parts of a service; sources and publishers are open."""
+
+    assets: dict[str, Asset]
+    notifier: Notifier
+    sources: dict[str, BlockSource]
+    publishers: dict[str, StatusPublisher]
+    store: Store
+    restarted: tuple[str, ...] = ()  # those that begin with a new state
+
+
+def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> ServiceComponents:
+    """Open what a service file names.
+
+    Assets in `restarted` begin with a new state, behind the samples that were counted; so does the service itself,
+    under its name. Raises ServoscopeError if a baseline, a recording, the store or a saved state cannot be used;
+    nothing is left open.
+    """
+    known = [*config.assets, config.name]
+    if strange := set(restarted) - set(known):
+        raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(known)}")
+    assets = _build_assets(config)
+    check_actions(config, assets)
+    sources, publishers = _build_sources(config, assets), _build_publishers(config)
+    store = Store.open(config.store.url, config.folder, write=True)
+    try:
+        store.acquire_lock([config.name, *assets])
+        rows = store.checkpoints([config.name, *assets])
+        notifier = Notifier(config.name, config.alarms, config.actions)
+        if config.name in restarted and config.name in rows:
+            notifier.begin(rows[config.name]["sequence"])
+        elif config.name in rows:
+            notifier.resume(rows[config.name]["state"])
+        for name, asset in assets.items():
+            if name in restarted and name in rows:
+                asset.begin(StreamPosition(**rows[name]["status"]["counted"]))
+            elif name in rows:
+                window = [Block.unpack(name, *one) for one in store.recent_samples(name)]
+                asset.resume(unpack_state(rows[name]["state"], name), window)
+        for name, source in sources.items():
+            source.open(_resume_positions(config, name, assets))
+        for publisher in publishers.values():
+            publisher.open({name: row["status"] for name, row in rows.items()})
+    except BaseException:
+        store.close()
+        raise
+    order = tuple(name for name in known if name in restarted)
+    return ServiceComponents(assets, notifier, sources, publishers, store, order)
+
+
+def check_service_file(config: ServiceFile) -> None:
+    """Read all that a service file names but the store; raises ServoscopeError if something cannot be used."""
+    assets = _build_assets(config)
+    check_actions(config, assets)
+    _build_sources(config, assets)
+    _build_publishers(config)
+
+
+def _resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:
+    found = {}
+    for name, asset in assets.items():
+        if config.assets[name].source == source and asset.state is not None:
+            position = asset.state.position
+            found[name] = ResumePosition(position.sequence, position.began, position.stream, position.t)
+    return found
+
+
+def _build_assets(config: ServiceFile) -> dict[str, Asset]:
+    policy = AssetPolicy(config.diagnosis, config.quality, config.alarms, config.store.residual_every_s)
+    files: dict[Path, Baseline] = {}
+    shared: dict[tuple[Path, str | None], tuple[Baseline, Monitor]] = {}
+    assets = {}
+    for name, settings in config.assets.items():
+        path, point = config.folder / settings.baseline, settings.point
+        if path not in files:
+            try:
+                files[path] = Baseline.load(path)
+            except BaselineError as error:
+                raise ConfigError(f"[assets] {name}.baseline: {error}") from None
+        if (path, point) not in shared:
+            try:
+                baseline = files[path] if point is None else files[path].at(point)
+            except BaselineError as error:
+                raise ConfigError(f"[assets] {name}.point: {path.name}: {error}") from None
+            try:
+                shared[path, point] = baseline, Monitor(baseline)
+            except BaselineError:
+                points = ", ".join(baseline.points)
+                raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
+        assets[name] = Asset(name, *shared[path, point], policy, settings.group)
+    for asset in {id(one.baseline): one for one in assets.values()}.values():
+        asset.compile_kernels()
+    return assets
+
+
+def _build_sources(config: ServiceFile, assets: dict[str, Asset]) -> dict[str, BlockSource]:
+    sources: dict[str, BlockSource] = {}
+    for name, settings in config.sources.items():
+        own = {
+            each: SourceAsset(
+                assets[each].baseline.loop, getattr(one, settings.asset_key) if settings.asset_key else None
+            )
+            for each, one in config.assets.items()
+            if one.source == name
+        }
+        sources[name] = settings.create(f"{config.name}.{name}", own, config.folder)
+    return sources
+
+
+def _build_publishers(config: ServiceFile) -> dict[str, StatusPublisher]:
+    return {name: settings.create(f"{config.name}.{name}", config.folder) for name, settings in config.outlets.items()}
+
+
+def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
+    """Check what actions name: assets, alarms, faults, programs and secrets.
+
+    Raises ConfigError if one of them does not exist: alarms would not be sent, which would go unnoticed.
+    """
+    settings = config.actions.resolve_paths(config.folder)
+    for kind, sinks in (("webhook", settings.webhook), ("command", settings.command), ("mqtt", settings.mqtt)):
+        for name, sink in sinks.items():
+            where = f"[actions] {kind}.{name}"
+            _check_names(f"{where}.assets", "asset", sink.assets or (), [*assets, config.name])
+            _check_names(f"{where}.alarms", "alarm", sink.alarms or (), config.alarms.definitions)
+            _check_sink(where, sink)
+    for name, one in settings.tolerance.items():
+        where = f"[actions] tolerance.{name}"
+        _check_names(f"{where}.assets", "asset", one.assets, assets)
+        for asset in one.assets:
+            baseline = assets[asset].baseline
+            faults = [fault.name for fault in baseline.loop.plant.all_faults] + [
+                fault.name for fault in baseline.learned
+            ]
+            _check_names(f"{where}.fault", f"fault of {asset}", [one.fault], faults)
+
+
+def _check_sink(where: str, sink: Sink) -> None:
+    if isinstance(sink, WebhookSettings):
+        try:
+            load_secret(sink)
+        except ValueError as error:
+            key = "secret_env" if sink.secret_env is not None else "secret_file"
+            raise ConfigError(f"{where}.{key}: {error}") from None
+        if sink.has_certificates:
+            sink.create_tls_context(Path(), where)
+    elif isinstance(sink, CommandSettings) and shutil.which(sink.argv[0]) is None:
+        raise ConfigError(f"{where}.argv: there is no program {sink.argv[0]} that can be run, give its path")
+
+
+def _check_names(where: str, kind: str, names: Collection[str], known: Collection[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{where}: there is no {kind} {name!r}, {suggest_name(name, known)}")

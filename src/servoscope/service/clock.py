@@ -1,0 +1,20 @@
+"""The clock of a service: dates that go on evenly, whoever sets the machine's clock."""
+
+from __future__ import annotations
+
+import time
+
+
+class SteadyClock:
+    """The time of day as it was at the start, and what has passed since then.
+
+    Dates, delays and retries of one run agree with each other that way. The rate still follows a time server, which
+    corrects the monotonic clock's rate too; what is left out are steps, and the next start takes them.
+    """
+
+    def __init__(self) -> None:
+        self._start = time.time() - time.monotonic()
+
+    def now(self) -> float:
+        """Return the time (epoch, s)."""
+        return self._start + time.monotonic()

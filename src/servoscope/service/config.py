@@ -1,0 +1,128 @@
+"""The service file: assets, sources, store, alarms and actions of one `servoscope run`, read and checked at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from servoscope.core.settings import NonEmptyStr, NonNegative, Settings
+from servoscope.service.access import WebSettings
+from servoscope.service.actions import ActionSettings
+from servoscope.service.alarms import AlarmSettings
+from servoscope.service.config_types import Address, FileSettings, Name, Seconds
+from servoscope.service.kinds import PUBLISHERS, SOURCES, parse_tables
+from servoscope.service.network import NetworkSettings, apply_network
+from servoscope.service.opcua.settings import OpcuaNodes
+from servoscope.service.publishers.base import PublisherSettings
+from servoscope.service.sources.base import SourceSettings
+from servoscope.signals.quality import QualitySettings
+
+Paths = Annotated[tuple[NonEmptyStr, ...], Field(min_length=1)]
+
+
+class ServiceSettings(Settings):
+    """How the service runs; every key has a default."""
+
+    listen: Address = "127.0.0.1:9464"  # address of health and metrics, ``host:port``; empty: none
+    # how long results are gathered before they are stored together [s]; 0: each block for itself
+    commit_every_s: Annotated[NonNegative, Field(le=3600.0)] = 0.5
+    # how many blocks may wait for a store that is full, locked or down; then the sources are stopped
+    buffer: Annotated[int, Field(strict=True, ge=1)] = 10_000
+    stop_within_s: NonNegative = 10.0  # how long a stop waits for such a store [s]
+    log: Literal["debug", "info", "warning", "error"] = "info"  # what is logged, at least
+
+
+class StoreSettings(Settings):
+    """Where history goes, and for how long."""
+
+    # A file for SQLite, relative to the service file, or ``postgresql://user@host/database``
+    url: NonEmptyStr = "history.sqlite"
+    residual_every_s: Seconds = 60.0  # time between two stored residuals of an asset [s]
+    residual_days: Seconds = 400.0  # how long they are kept; diagnoses, alarms and audit are kept for ever
+
+
+class DiagnosisSettings(Settings):
+    """How the last minutes are examined; every key has a default."""
+
+    window_s: Seconds = 120.0  # length of the window [s]
+    every_s: Seconds = 600.0  # time between two examinations, where nothing happens [s]
+    after_s: Seconds = 10.0  # from a new fault to the full diagnosis of the window around it [s]
+
+
+class AssetSettings(Settings):
+    """One asset."""
+
+    baseline: NonEmptyStr  # what `learn` wrote; relative to the service file
+    point: NonEmptyStr | None = None  # operating point of it; needed where it has several
+    source: NonEmptyStr  # name of the source that its samples come from
+    files: Paths | None = None  # what a source of kind ``replay`` replays for it, one recording after the other
+    nodes: OpcuaNodes | None = None  # where a source of kind ``opcua`` finds it
+    group: Annotated[str, Field(strict=True, max_length=100)] = ""  # what it belongs to: a line, a hall
+
+
+class ServiceFile(FileSettings):
+    """A service file."""
+
+    kind_of_file: ClassVar[str] = "service file"
+
+    name: Name = "servoscope"  # what the service is called in alarms and messages
+    # service, store, network, diagnosis, quality, alarms, actions, web: the sections of these names; each may be left
+    # out. Without ``[web]`` there are no pages.
+    service: ServiceSettings = ServiceSettings()
+    store: StoreSettings = StoreSettings()
+    network: NetworkSettings = NetworkSettings()
+    diagnosis: DiagnosisSettings = DiagnosisSettings()
+    quality: QualitySettings = QualitySettings()
+    alarms: AlarmSettings = Field(default_factory=lambda: AlarmSettings.model_validate({}))
+    actions: ActionSettings = ActionSettings()
+    web: WebSettings | None = None
+    # sources, outlets, assets: tables by name: ``[sources.NAME]``, ``[outlets.NAME]``, ``[assets.NAME]``
+    sources: Annotated[dict[Name, SourceSettings], Field(min_length=1)]
+    outlets: dict[Name, PublisherSettings] = Field(default_factory=dict)
+    assets: Annotated[dict[Name, AssetSettings], Field(min_length=1)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _parse_kinds(cls, data: Any) -> Any:
+        """Parse the tables whose keys depend on their kind, which may be another package's."""
+        if not isinstance(data, Mapping):
+            return data
+        data = dict(data)
+        if "sources" in data:
+            data["sources"] = parse_tables(data["sources"], SOURCES, SourceSettings, "sources")
+        if "outlets" in data:
+            data["outlets"] = parse_tables(data["outlets"], PUBLISHERS, PublisherSettings, "outlets")
+        return data
+
+    @model_validator(mode="after")
+    def _apply_network(self) -> Self:
+        """Hand the rules of ``[network]`` to everything that connects to somebody."""
+        update = {
+            "sources": apply_network(self.sources, self.network),
+            "outlets": apply_network(self.outlets, self.network),
+            "actions": self.actions.with_network(self.network),
+        }
+        for name, value in update.items():
+            object.__setattr__(self, name, value)  # frozen for everybody else
+        return self
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> Self:
+        for name, asset in self.assets.items():
+            if asset.source not in self.sources:
+                known = ", ".join(self.sources)
+                raise ValueError(f"[assets] {name}.source: there is no source {asset.source!r}, only {known}")
+            source = self.sources[asset.source]
+            for key in ("files", "nodes"):
+                given = getattr(asset, key) is not None
+                if not given and key == source.asset_key:
+                    raise ValueError(
+                        f"[assets] {name}.{key}: missing, a source of kind {source.kind} needs {source.asset_example}"
+                    )
+                if given and key != source.asset_key:
+                    raise ValueError(f"[assets] {name}.{key}: leave it out, its source is of kind {source.kind}")
+        if self.name in self.assets:
+            raise ValueError(f"name: {self.name!r} is an asset's name too, call the service something else")
+        return self

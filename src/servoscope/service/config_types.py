@@ -1,0 +1,73 @@
+"""What files of settings have in common here: names, addresses, times, passwords; and how such a file is read."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, ClassVar, Self
+
+from pydantic import AfterValidator, Field, PrivateAttr, ValidationError
+
+from servoscope.core.errors import ConfigError
+from servoscope.core.settings import Settings, parse_toml, read_toml_text
+from servoscope.core.settings_errors import describe_error
+
+Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e9)]  # what means something as a time
+
+
+def _check_name(value: str) -> str:
+    if not re.fullmatch(r"\w[\w.:-]{0,99}", value):
+        raise ValueError(
+            f"{value!r} is no name: letters, digits, _ and later also - . : are allowed, up to 100, no spaces"
+        )
+    return value
+
+
+def _check_address(value: str) -> str:
+    host, _, port = value.rpartition(":")
+    if value and not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
+        raise ValueError(f'{value!r} is no address, write "127.0.0.1:9464", or "" for none')
+    return value
+
+
+Name = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
+Address = Annotated[str, Field(strict=True), AfterValidator(_check_address)]
+
+
+def read_password(name: str | None, folder: Path) -> str | None:
+    """Return the first line of a password file, or None without one; raises ConfigError if it cannot be read."""
+    if name is None:
+        return None
+    try:
+        lines = (folder / name).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", "no text")
+        raise ConfigError(f"{folder / name}: the password cannot be read ({reason})") from None
+    if not lines or not lines[0]:
+        raise ConfigError(f"{folder / name}: its first line must be the password")
+    return lines[0]
+
+
+class FileSettings(Settings):
+    """Settings that are a file of their own; `kind_of_file` is what messages call it."""
+
+    kind_of_file: ClassVar[str]
+    _folder: Path = PrivateAttr(default=Path())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a file; raises ConfigError if it cannot be read, is not TOML, or a key in it is wrong."""
+        path = Path(path)
+        try:
+            found = cls.model_validate(
+                parse_toml(read_toml_text(path, cls.kind_of_file, ConfigError), path, ConfigError)
+            )
+        except ValidationError as error:
+            raise ConfigError(f"{path}: {describe_error(error, cls)}") from None
+        found._folder = path.absolute().parent
+        return found
+
+    @property
+    def folder(self) -> Path:
+        """What its paths are relative to."""
+        return self._folder

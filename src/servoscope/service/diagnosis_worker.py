@@ -1,0 +1,62 @@
+"""Full diagnoses in a process of their own: seconds of work that would otherwise hold up the samples of all assets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+from servoscope.core.workers import Worker, WorkerError
+from servoscope.detection.baseline import Baseline
+from servoscope.service.examination import StoredDiagnosis, diagnose_blocks, undetermined
+from servoscope.service.log import log
+from servoscope.service.sources.block import Block
+
+MAX_ATTEMPTS = 2  # of a diagnosis that takes its process down with it
+TASK = "servoscope.service.diagnosis_worker:diagnose_packed_blocks"
+
+
+class DiagnosisWorker:
+    """Makes full diagnoses, one after the other."""
+
+    def __init__(self) -> None:
+        self._executor = ThreadPoolExecutor(1, "full-diagnosis")  # waits for results
+        self._worker = Worker()
+        self._closed = False
+
+    def submit(self, baseline: Baseline, name: str, blocks: Sequence[Block]) -> Future[StoredDiagnosis]:
+        """Ask for the diagnosis of a window."""
+        return self._executor.submit(self._diagnose, baseline, name, list(blocks))
+
+    def close(self) -> None:
+        """Stop; a diagnosis under way is dropped."""
+        self._closed = True
+        self._worker.stop()
+        self._executor.shutdown(wait=True, cancel_futures=True)
+
+    def _diagnose(self, baseline: Baseline, name: str, blocks: list[Block]) -> StoredDiagnosis:
+        text = json.dumps(baseline.model_dump(mode="json", by_alias=True))
+        packed = [(block.sequence, block.pack()) for block in blocks]
+        for _ in range(MAX_ATTEMPTS):
+            try:
+                return StoredDiagnosis.model_validate(self._worker.run(TASK, text, name, packed))
+            except WorkerError as error:
+                if self._closed:  # on purpose, then
+                    break
+                log("error", "full diagnosis lost its process", asset=name, why=str(error))
+        return undetermined("crashed")
+
+
+def diagnose_packed_blocks(
+    _: Callable[[str], None], baseline: str, name: str, packed: Sequence[tuple[int, bytes]]
+) -> dict[str, Any]:
+    """Diagnose a window in the worker's process."""
+    blocks = [Block.unpack(name, *one) for one in packed]
+    return diagnose_blocks(_parse_baseline(baseline), name, blocks).model_dump(mode="json")
+
+
+@cache
+def _parse_baseline(text: str) -> Baseline:
+    return Baseline.model_validate(json.loads(text))

@@ -1,0 +1,108 @@
+"""The last minutes as a recording: examined in milliseconds while samples come in, diagnosed in full beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from servoscope.core.errors import ServoscopeError
+from servoscope.core.messages import Message, message, render
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import Verdict
+from servoscope.service.sources.block import Block
+from servoscope.signals import Recording, clean
+
+
+class StoredDiagnosis(BaseModel):
+    """What the store keeps of an examination or a full diagnosis."""
+
+    model_config = ConfigDict(frozen=True)
+
+    verdict: Verdict  # at the end of the window
+    headline: Message
+    onset: float | None = None  # of the fault [UTC s]
+    document: dict[str, Any] = {}  # of a diagnosis: as `diagnose --json` prints it
+    # whether an alarm has gone that is still in the window: until it has left it, the window proves nothing
+    recovering: bool = False
+
+    @property
+    def summary(self) -> str:
+        """The headline as text."""
+        return render(self.headline)
+
+    def columns(self) -> dict[str, Any]:
+        """Return its columns in the table of diagnoses."""
+        return {"verdict": self.verdict, "summary": self.summary, "onset": self.onset, "document": self.document}
+
+    def with_onset(self, onset: float | None) -> StoredDiagnosis:
+        """Return it with the onset [UTC s] that an earlier window has found, if its own window begins after that."""
+        since = self.headline.values.get("since")
+        if onset is None or since is None or since.key != "diagnosis.since_start_date":
+            return self
+        values = {**self.headline.values, "since": message("diagnosis.since_date", t=onset, growth=None)}
+        return self.model_copy(update={"headline": message(self.headline.key, **values), "onset": onset})
+
+
+def undetermined(key: str, **values: Any) -> StoredDiagnosis:
+    """Return that nothing could be determined, for the reason in a message of the section `service.examination`."""
+    return StoredDiagnosis(verdict="undetermined", headline=message(f"service.examination.{key}", **values))
+
+
+def examine_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
+    """Examine the last minutes with the reference that was applied in them, without a refit.
+
+    Where the samples cannot be used, the verdict is ``undetermined`` and the headline has the reason.
+    """
+    from servoscope.diagnosis.diagnose import diagnose_examination
+    from servoscope.diagnosis.examine import Examination
+
+    try:
+        recording, start = blocks_to_recording(baseline, name, blocks)
+        exam = Examination.from_recording(baseline, recording)
+    except ServoscopeError as error:
+        return undetermined("unusable", error=str(error))
+    if not exam.alarm.any():
+        diagnosis, _ = diagnose_examination(exam)
+        document = diagnosis.model_dump(mode="json")
+        return StoredDiagnosis(verdict=diagnosis.verdict, headline=diagnosis.headline, document=document)
+    if not exam.alarm[-1]:
+        return undetermined("recovering").model_copy(update={"recovering": True})
+    first = 0 if exam.alarm.all() else len(exam.alarm) - int(np.argmin(exam.alarm[::-1]))
+    crossed = int(exam.estimates.crossed[first]) - 1
+    onset = start + float(recording.t[crossed if crossed >= 0 else int(exam.estimates.index[first])])
+    excess = float((exam.statistic / baseline.limit)[first:].max())
+    level = message("service.examination.level", level=float(exam.estimates.level[first:].max()))
+    headline = message("service.examination.fault", excess=excess, level=level if baseline.members else None)
+    return StoredDiagnosis(verdict="fault", headline=headline, onset=onset)
+
+
+def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
+    """Diagnose a window, refit included, which takes seconds.
+
+    Times in the document count from the beginning of the window, its key ``began``; those of the headline are dates,
+    because months later nobody knows when the window began.
+    """
+    from servoscope.diagnosis.diagnose import diagnose
+
+    try:
+        recording, start = blocks_to_recording(baseline, name, blocks)
+        diagnosis = diagnose(baseline, recording)
+    except ServoscopeError as error:
+        return undetermined("unusable", error=str(error))
+    onset = start + diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
+    document = {"began": start, **diagnosis.model_dump(mode="json")}
+    headline = diagnosis.dated_headline(start)
+    return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
+
+
+def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) -> tuple[Recording, float]:
+    """Return blocks as a recording, whose time begins at 0, and the time of its beginning [UTC s].
+
+    Raises RecordingError if they cannot be used as one.
+    """
+    t, r, u, y = np.concatenate([block.signals for block in blocks], axis=1)
+    loop, start = baseline.loop, float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0
+    return clean(t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=loop.input_limits), start

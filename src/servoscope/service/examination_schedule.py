@@ -1,0 +1,111 @@
+"""When the last minutes are examined, and what the verdict is after that.
+
+The recursion tests every sample against the baseline's own coefficients. An examination compares the last minutes with
+what a healthy loop would have shown under the reference that was really applied; it takes milliseconds. There is one
+from time to time, and one at once when the recursion and the verdict disagree; while they go on disagreeing, the time
+between two of them doubles. A new fault is diagnosed in full some seconds later (`servoscope.diagnose`), and again each
+time it has become twice as old.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from servoscope.core.messages import message, render
+from servoscope.diagnosis.follower import DiagnosisSchedule
+from servoscope.service.config import DiagnosisSettings
+from servoscope.service.examination import StoredDiagnosis
+
+FIRST_RETRY_S = 1.0  # until a disagreement is examined for the second time
+DAY_S = 86400.0  # between two full diagnoses of a fault that lasts, at most
+
+
+@dataclass(frozen=True)
+class PendingDiagnosis:
+    """A full diagnosis that is due: number of its row, first sequence, end of its window [UTC s], and the reason."""
+
+    number: int
+    first: int
+    until: float
+    why: str
+
+
+@dataclass(frozen=True)
+class ExaminationState:
+    """What is kept between two examinations; times are [UTC s]."""
+
+    due: float  # the next one
+    verdict: str = "undetermined"  # of the last one
+    summary: str = field(default_factory=lambda: render(message("service.examination.none")))
+    since: float = 0.0  # since when the verdict holds
+    onset: float | None = None  # since when the fault is there
+    examined: float | None = None  # the last one; None: there was none
+    doubts: int = 0  # how many examinations in a row have not confirmed the recursion
+    retry: float = 0.0  # until when it is not examined again for that reason
+    faults: list[dict[str, Any]] = field(default_factory=list)  # by the last full diagnosis of this fault
+    named: str = ""  # the summary of its last full diagnosis that named a fault, or of the first one
+    again: float = 0.0  # when a fault that lasts is diagnosed in full once more
+
+
+def examination_phase(asset: str) -> float:
+    """Return where in the period an asset's examinations lie, 0 to 1: so that a fleet's are spread over it."""
+    return zlib.crc32(asset.encode()) / 2.0**32
+
+
+def update_examination(
+    state: ExaminationState,
+    settings: DiagnosisSettings,
+    t: float,
+    exceeded: bool,
+    examine: Callable[[], StoredDiagnosis],
+    phase: float = 0.0,
+) -> tuple[ExaminationState, StoredDiagnosis | None]:
+    """Return the state at time `t` [UTC s], and the result of the examination if one was due.
+
+    `exceeded`: whether the recursion is above a limit.
+    """
+    if state.examined is not None and t < state.examined:  # the clock was set back
+        state = replace(state, due=t, retry=t, again=t)
+    disagrees = exceeded != (state.verdict == "fault")
+    if not disagrees:
+        state = replace(state, doubts=0)
+    if t < state.due and not (disagrees and t >= state.retry):
+        return state, None
+    result = examine()
+    if exceeded == (result.verdict == "fault"):
+        state = replace(state, doubts=0, retry=t + FIRST_RETRY_S)
+    else:
+        wait = min(FIRST_RETRY_S * 2.0**state.doubts, settings.every_s)
+        state = replace(state, doubts=min(state.doubts + 1, 30), retry=t + wait)
+    unchanged = result.verdict == state.verdict
+    every = settings.every_s
+    # the asset's own next turn, half a period away at least
+    due = every * (math.floor((t + every / 2.0) / every - phase) + 1.0 + phase)
+    if result.recovering:
+        due = min(due, t + settings.window_s)
+    new = replace(
+        state,
+        due=due,
+        verdict=result.verdict,
+        summary=result.summary,
+        since=state.since if unchanged else t,
+        # the onset has left a window that is above its limits throughout; an earlier examination has found it
+        onset=state.onset if unchanged and state.onset is not None else result.onset,
+        examined=t,
+        faults=state.faults if result.verdict == "fault" else [],
+        named=state.named if unchanged or result.verdict != "fault" else "",
+    )
+    return new, result
+
+
+def schedule_full_diagnosis(
+    state: ExaminationState, schedule: DiagnosisSchedule, t: float
+) -> tuple[ExaminationState, bool]:
+    """Return the state after an examination at `t` [UTC s], and whether that calls for a full diagnosis."""
+    if state.verdict != "fault" or (t < state.again and t != state.since):
+        return state, False
+    return replace(state, again=schedule.next_alarm(state.since, t, DAY_S)), True

@@ -1,0 +1,136 @@
+"""What a service does beside its samples, about once a second: commands, deliveries, its own alarms, retention."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+from servoscope.core.errors import AlarmError, StoreUnavailableError
+from servoscope.service.actions.dispatcher import OutboxDispatcher
+from servoscope.service.alarms import LifecycleEvent, OperatorCommand
+from servoscope.service.asset import Asset
+from servoscope.service.clock import SteadyClock
+from servoscope.service.log import log
+from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.notifications import Notifier
+from servoscope.service.records import StepResult, audit_row
+from servoscope.service.sources.base import BlockSource, RejectionCounter
+from servoscope.service.store import CommandOutcome, CommandRow, Store
+from servoscope.service.writer import StoreWriter
+
+RETENTION_EVERY_S = 3600.0
+REJECTIONS_EVERY_S = 60.0  # between two audit rows about a flood of bad messages
+DAY_S = 86400.0
+
+
+class HousekeepingContext(Protocol):
+    """What housekeeping needs of a service."""
+
+    assets: dict[str, Asset]
+    clock: SteadyClock
+    sources: dict[str, BlockSource]
+    store: Store
+    writer: StoreWriter
+    notifier: Notifier
+    dispatcher: OutboxDispatcher
+    metrics: ServiceMetrics
+    residual_days: float  # how long residuals are kept
+
+    def handle_result(self, asset: Asset, result: StepResult) -> None:
+        """Store and announce what a step of an asset has led to."""
+
+
+class Housekeeping:
+    """Done by a service for itself."""
+
+    def __init__(self, service: HousekeepingContext) -> None:
+        self._service = service
+        self._executed: set[int] = set()  # commands whose outcome is not yet stored
+        self._rejections = RejectionCounter()
+        self._next_retention = self._next_rejections = 0.0
+
+    def run_due(self) -> None:
+        """Do what is due."""
+        self._update_service_alarms()
+        self._store_deliveries()
+        self._store_rejections()
+        try:
+            if self._service.writer.unavailable_since is None:
+                self._execute_commands()
+                self._delete_old_residuals()
+        except StoreUnavailableError as error:
+            log("debug", "store unavailable", why=str(error))  # the next commit reports it as an error
+
+    def _update_service_alarms(self) -> None:
+        """Advance the service's own alarms, and the flood."""
+        writer, notifier, now = self._service.writer, self._service.notifier, self._service.clock.now()
+        self._handle_own(notifier.check_buffer(writer.fill_ratio, now), now)
+        clocks = [asset.state.position.t for asset in self._service.assets.values() if asset.state is not None]
+        writer.add(notifier.name, notifier.advance_time(max(clocks, default=0.0), now))
+
+    def _handle_own(self, result: StepResult, now: float) -> None:
+        writer, notifier = self._service.writer, self._service.notifier
+        writer.add(notifier.name, result.rows)
+        writer.add(notifier.name, notifier.notify(result.transitions, {}, now))
+
+    def _store_deliveries(self) -> None:
+        for one in self._service.dispatcher.take_attempts():
+            log("info" if one.delivered else "warning", "delivery", key=one.key, sink=one.sink, outcome=one.detail)
+            due = None if one.retry_entry is None else one.retry_entry.due
+            row = {"attempts": one.attempt, "due": due, "outcome": one.detail}
+            self._service.writer.batch.deliveries[one.key] = row
+
+    def _store_rejections(self) -> None:
+        """Store what came from outside and could not be used: at once, then once a minute."""
+        for name, source in self._service.sources.items():
+            for one in source.rejections.take():
+                self._service.metrics.record_rejection(name, one)
+                self._rejections.add(one.asset or name, one.kind, one.reason, one.count)
+        now = time.monotonic()
+        if now < self._next_rejections:
+            return
+        for one in self._rejections.take():
+            self._next_rejections = now + REJECTIONS_EVERY_S
+            log("warning", "refused", of=one.asset, kind=one.kind, count=one.count, why=one.reason)
+            document = {"kind": one.kind, "count": one.count, "why": one.reason}
+            self._service.writer.add(one.asset, [audit_row("refused", document)])
+
+    def _execute_commands(self) -> None:
+        pending = self._service.store.pending_commands()
+        self._executed &= {row["id"] for row in pending}
+        for row in pending:
+            if row["id"] not in self._executed:
+                self._executed.add(row["id"])
+                self._execute_command(row)
+
+    def _execute_command(self, row: CommandRow) -> None:
+        service, name, document = self._service, row["asset"], row["document"]
+        asset, notifier = service.assets.get(name), service.notifier
+        if asset is None and name != notifier.name:
+            return  # it belongs to another service on the same store
+        now = service.clock.now() if asset is None or asset.state is None else asset.state.position.t
+        until = now + document["for_s"] if document.get("for_s") is not None else None
+        command = OperatorCommand(LifecycleEvent(row["command"]), row["who"], document.get("why", ""), until)
+        outcome = CommandOutcome(accepted=True)
+        try:
+            if asset is not None:
+                service.handle_result(asset, asset.execute(row["alarm"], command))
+                service.writer.set_checkpoint(asset)
+            else:
+                self._handle_own(notifier.execute(row["alarm"], command, now), now)
+        except AlarmError as error:
+            outcome = CommandOutcome(accepted=False, refusal=str(error))
+        document = outcome.extend(document)
+        service.writer.batch.outcomes[row["id"]] = {"outcome": outcome.text, "document": document}
+        audit = {"alarm": row["alarm"], "asked": row["at"], **document, "outcome": outcome.text}
+        service.writer.add(name, [audit_row(row["command"], audit, row["who"])])
+
+    def _delete_old_residuals(self) -> None:
+        now, kept_s = time.monotonic(), self._service.residual_days * DAY_S
+        if now < self._next_retention:
+            return
+        self._next_retention = now + RETENTION_EVERY_S
+        assets = self._service.assets
+        before = {name: one.state.position.t - kept_s for name, one in assets.items() if one.state is not None}
+        if count := self._service.store.delete_before("residuals", before):
+            log("info", "old residuals deleted", rows=count)

@@ -1,0 +1,53 @@
+"""Structured logs: one JSON object per line."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import TextIO
+
+from servoscope.core.addresses import hide_secrets
+
+LOGGER = logging.getLogger("servoscope")
+LIBRARIES = ("psycopg", "asyncua")  # they log lost connections themselves
+
+
+def _hide(value: object) -> object:
+    """Return a value as JSON takes it, without the secrets of addresses."""
+    if isinstance(value, Mapping):
+        return {key: _hide(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_hide(one) for one in value]
+    return value if isinstance(value, bool | int | float | None) else hide_secrets(str(value))
+
+
+class _JsonFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        entry = {
+            "at": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "event": record.getMessage(),
+            **getattr(record, "fields", {}),
+        }
+        if record.exc_info:
+            entry["trace"] = self.formatException(record.exc_info)
+        # libraries log addresses as they were given; JSON would escape quotes, so the values are searched first
+        return json.dumps(_hide(entry), default=str)
+
+
+def set_up_logging(level: str, stream: TextIO | None = None) -> None:
+    """Send the logs of this process to a stream, by default stderr."""
+    handler = logging.StreamHandler(stream or sys.stderr)
+    handler.setFormatter(_JsonFormatter())
+    LOGGER.setLevel(level.upper())
+    for logger in (LOGGER, *map(logging.getLogger, LIBRARIES)):
+        logger.handlers[:] = [handler]
+        logger.propagate = False
+
+
+def log(level: str, event: str, **fields: object) -> None:
+    """Log an event with its fields."""
+    LOGGER.log(logging.getLevelNamesMapping()[level.upper()], event, extra={"fields": fields})

@@ -1,0 +1,102 @@
+"""Metrics for Prometheus: read from the service when they are scraped, so that nothing is counted twice."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from servoscope.core.errors import ConfigError
+from servoscope.service.asset import Asset
+from servoscope.service.health import status_gauges
+from servoscope.service.sources.base import BlockSource, Rejection
+from servoscope.service.writer import StoreWriter
+
+if TYPE_CHECKING:
+    from prometheus_client.core import Metric
+
+
+BUCKETS_S = tuple(float(f"{base}e{power}") for power in (-3, -2, -1, 0, 1) for base in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0))
+STREAM_COUNTERS = {
+    "blocks": "Blocks that were counted",
+    "samples": "Samples that were counted",
+    "lost": "Blocks that never came",
+    "repeated": "Blocks that came once more and were left out",
+}
+
+
+class MetricsContext(Protocol):
+    """What the metrics read of a service."""
+
+    assets: dict[str, Asset]
+    sources: dict[str, BlockSource]
+    writer: StoreWriter
+    buffer: int  # how many blocks may wait to be stored
+    last_turn: float  # when it last polled its sources, by the monotonic clock [s]
+
+
+class ServiceMetrics:
+    """The metrics of one service; counts of assets are those of their checkpoints, and continue over restarts."""
+
+    def __init__(self, service: MetricsContext) -> None:
+        try:
+            from prometheus_client import CollectorRegistry, Counter, Histogram
+        except ModuleNotFoundError:
+            raise ConfigError("prometheus-client is missing, pip install 'servoscope[service]'") from None
+        self._service, self.registry = service, CollectorRegistry()
+
+        def histogram(name: str, text: str) -> Histogram:
+            return Histogram(f"servoscope_{name}_seconds", text, buckets=BUCKETS_S, registry=self.registry)
+
+        def counter(name: str, text: str, labels: Sequence[str] = ()) -> Counter:
+            return Counter(f"servoscope_{name}", text, labelnames=labels, registry=self.registry)
+
+        self.failures = counter("store_failures", "Attempts to store that failed")
+        self._latency = histogram("latency", "Last sample of a block to its results stored")
+        self._commits = histogram("commit", "Duration of a commit")
+        self._rejections = counter("refused", "Messages that could not be used", ["source", "asset", "kind"])
+        self.registry.register(self)  # calls `collect`
+
+    def record_commit(self, latencies: Sequence[float], seconds: float) -> None:
+        """Count a commit."""
+        self._commits.observe(seconds)
+        for latency in latencies:
+            self._latency.observe(latency)
+
+    def record_rejection(self, source: str, one: Rejection) -> None:
+        """Count messages that could not be used."""
+        self._rejections.labels(source, one.asset, one.kind).inc(one.count)
+
+    def render(self) -> bytes:
+        """Return all of them in the format of Prometheus."""
+        from prometheus_client import generate_latest
+
+        return generate_latest(self.registry)
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield what is read from the service."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        service, followed = self._service, {}
+        for name, asset in self._service.assets.items():
+            if asset.state is not None:
+                followed[name] = asset.state.position, asset.status(asset.state)
+        for key, words in STREAM_COUNTERS.items():
+            family = CounterMetricFamily(f"servoscope_{key}", words, labels=["asset"])
+            for name, (position, _) in followed.items():
+                family.add_metric([name], getattr(position, key))
+            yield family
+        last = GaugeMetricFamily("servoscope_last_sample_time_seconds", "Time of the last sample", labels=["asset"])
+        for name, (position, _) in followed.items():
+            last.add_metric([name], position.t)
+        up = GaugeMetricFamily("servoscope_source_up", "Whether a source is connected", labels=["source"])
+        for name, source in service.sources.items():
+            up.add_metric([name], float(source.connected))
+        yield from (last, *status_gauges((name, status) for name, (_, status) in followed.items()), up)
+        for name, words, value in (
+            ("store_up", "Whether the last attempt to store succeeded", service.writer.unavailable_since is None),
+            ("buffered_blocks", "Blocks that wait to be stored", service.writer.waiting),
+            ("buffer_blocks", "How many may wait", service.buffer),
+            ("last_turn_age_seconds", "Since the service last looked for blocks", time.monotonic() - service.last_turn),
+        ):
+            yield GaugeMetricFamily(f"servoscope_{name}", words, value=float(value))

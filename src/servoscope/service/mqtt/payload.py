@@ -1,0 +1,181 @@
+"""Blocks as bytes of a message: compact binary, or JSON; read without trusting a single byte.
+
+Binary, little-endian:
+
+    offset  bytes  what
+         0      4  "SVSB"
+         4      1  version, 1
+         5      1  flags: 1 sender keeps blocks, 2 a time stamp per sample, 4 samples as binary32 instead of binary64
+         6      2  0
+         8      4  N, number of samples
+        12      4  CRC-32 of all that follows
+        16      8  stream
+        24      8  sequence
+        32      8  oldest: of the blocks that the sender keeps; 0 where it keeps none
+        40      8  time of the first sample, binary64 [UTC s]
+        48      8  sample time, binary64 [s]; 0 where there is a time stamp per sample
+        56         time stamps, N binary64, if flag 2 is set; then r, u and y, N numbers each
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import zlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import MessageError
+from servoscope.service.sources.block import Block
+
+MAGIC, VERSION = b"SVSB", 1
+HEADER = struct.Struct("<4sBBHII")
+BODY_HEADER = struct.Struct("<QQQdd")
+FLAG_RETAINED, FLAG_TIMES, FLAG_BINARY32 = 1, 2, 4
+MAX_COUNT = 2**63 - 1  # what a database can count
+MAX_TIME_S = 253402300800.0  # s: the year 10000, from which on calendars end
+JSON_KEYS = {"version", "stream", "sequence", "oldest", "t", "t0", "dt", "r", "u", "y"}
+
+
+class DecodedBlock(NamedTuple):
+    """A block, and the number of the oldest one that its sender retains; None: it retains none."""
+
+    block: Block
+    oldest: int | None
+
+
+def encode_binary(block: Block, oldest: int | None = None) -> bytes:
+    """Return a block as a binary message; `decode_block` gives it back bit by bit."""
+    n, stamps = block.t.size, block.t
+    dt = float(stamps[1] - stamps[0]) if n > 1 else 1.0
+    uniform = dt > 0.0 and bool((stamps == stamps[0] + dt * np.arange(n)).all())
+    flags = (0 if oldest is None else FLAG_RETAINED) | (0 if uniform else FLAG_TIMES)
+    body = BODY_HEADER.pack(block.stream, block.sequence, oldest or 0, float(stamps[0]), dt if uniform else 0.0)
+    columns = [block.r, block.u, block.y] if uniform else [stamps, block.r, block.u, block.y]
+    body += np.stack(columns).astype("<f8").tobytes()
+    return HEADER.pack(MAGIC, VERSION, flags, 0, n, zlib.crc32(body)) + body
+
+
+def encode_json(block: Block, oldest: int | None = None) -> bytes:
+    """Return a block as a JSON message."""
+    plain: dict[str, Any] = {"version": VERSION, "stream": block.stream, "sequence": block.sequence}
+    if oldest is not None:
+        plain["oldest"] = oldest
+    for name in "truy":
+        plain[name] = [x if math.isfinite(x) else None for x in getattr(block, name).tolist()]
+    return json.dumps(plain, separators=(",", ":"), allow_nan=False).encode()
+
+
+def decode_block(asset: str, message: bytes, received_at: float = 0.0) -> DecodedBlock:
+    """Return the block of a message, binary or JSON, that came at `received_at` by the monotonic clock [s].
+
+    Memory is allocated for what is there, not for what a header announces. Raises MessageError if it is no block.
+    """
+    if message[:4] == MAGIC:
+        return _decode_binary(asset, message, received_at)
+    if message[:1] in (b"{", b" ", b"\n", b"\r", b"\t"):
+        return _decode_json(asset, message, received_at)
+    raise MessageError("not a block", f"begins with {message[:8]!r}: neither a binary block nor a JSON object")
+
+
+def _decode_binary(asset: str, message: bytes, received_at: float) -> DecodedBlock:
+    if len(message) < HEADER.size + BODY_HEADER.size:
+        shortest = HEADER.size + BODY_HEADER.size
+        raise MessageError("truncated", f"{len(message)} bytes, a binary block has at least {shortest}")
+    _, version, flags, zero, n, checksum = HEADER.unpack_from(message)
+    if version != VERSION:
+        raise MessageError("version", f"binary block of version {version}, only {VERSION} is known")
+    if flags & ~(FLAG_RETAINED | FLAG_TIMES | FLAG_BINARY32) or zero:
+        raise MessageError("not a block", f"flags {flags} and {zero}: some of them have no meaning")
+    width = 4 if flags & FLAG_BINARY32 else 8
+    stamps = 8 * n if flags & FLAG_TIMES else 0
+    expected = HEADER.size + BODY_HEADER.size + stamps + 3 * width * n
+    if len(message) != expected:
+        kind = "truncated" if len(message) < expected else "oversized"
+        raise MessageError(kind, f"{len(message)} bytes, {n} samples need {expected}")
+    body = memoryview(message)[HEADER.size :]
+    if zlib.crc32(body) != checksum:
+        raise MessageError("checksum", "the CRC-32 does not fit, the message is damaged")
+    stream, sequence, oldest, t0, dt = BODY_HEADER.unpack_from(body)
+    at = BODY_HEADER.size + stamps
+    t = np.frombuffer(body[BODY_HEADER.size : at], "<f8").astype(np.float64) if stamps else _uniform_times(t0, dt, n)
+    numbers = np.frombuffer(body[at:], f"<f{width}").astype(np.float64).reshape(3, -1)
+    return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, t, numbers, received_at)
+
+
+def _decode_json(asset: str, message: bytes, received_at: float) -> DecodedBlock:
+    try:
+        plain = json.loads(message)
+    except (ValueError, RecursionError) as error:
+        raise MessageError("not a block", f"no JSON: {' '.join(str(error).split())[:100]}") from None
+    if not isinstance(plain, dict):
+        raise MessageError("not a block", "JSON, but no object")
+    if strange := set(plain) - JSON_KEYS:
+        raise MessageError("keys", f"unknown key {min(strange)[:40]!r}, choose from {', '.join(sorted(JSON_KEYS))}")
+    if plain.get("version") != VERSION:
+        raise MessageError("version", f"version {str(plain.get('version'))[:20]!r}, only {VERSION} is known")
+    stream, sequence = _parse_int(plain, "stream", 0), _parse_int(plain, "sequence", None)
+    oldest = None if plain.get("oldest") is None else _parse_int(plain, "oldest", None)
+    numbers = np.stack(_parse_columns(plain, ("r", "u", "y")))
+    if "t" in plain:
+        (t,) = _parse_columns(plain, ("t",))
+    else:
+        t = _uniform_times(_parse_number(plain, "t0"), _parse_number(plain, "dt"), numbers.shape[1])
+    return _build_block(asset, stream, sequence, oldest, t, numbers, received_at)
+
+
+def _parse_int(plain: dict[str, Any], name: str, otherwise: int | None) -> int:
+    value = plain.get(name, otherwise)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise MessageError("wrong type", f"{name}: missing, or no whole number")
+    return value
+
+
+def _parse_number(plain: dict[str, Any], name: str) -> float:
+    value = plain.get(name)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise MessageError("wrong type", f"{name}: missing, or no number; give t, or t0 and dt")
+    try:
+        return float(value)
+    except OverflowError:
+        raise MessageError("wrong type", f"{name}: no number that a computer can hold") from None
+
+
+def _parse_columns(plain: dict[str, Any], names: tuple[str, ...]) -> list[FloatArray]:
+    found = []
+    for name in names:
+        values = plain.get(name)
+        if not isinstance(values, list) or not set(map(type, values)) <= {int, float, type(None)}:
+            raise MessageError("wrong type", f"{name}: missing, or no list of numbers and nulls")
+        try:
+            found.append(np.array([math.nan if x is None else x for x in values], dtype=np.float64))
+        except OverflowError:
+            raise MessageError("wrong type", f"{name}: holds a number that no computer can hold") from None
+    if len({column.size for column in found}) > 1:
+        raise MessageError("lengths", f"{', '.join(f'{x.size} of {n}' for n, x in zip(names, found, strict=True))}")
+    return found
+
+
+def _uniform_times(t0: float, dt: float, n: int) -> FloatArray:
+    if not (0.0 <= t0 < MAX_TIME_S and 0.0 < dt < MAX_TIME_S):
+        raise MessageError("times", f"t0 = {t0:g} and dt = {dt:g} are no clock")
+    return t0 + dt * np.arange(n, dtype=np.float64)
+
+
+def _build_block(
+    asset: str, stream: int, sequence: int, oldest: int | None, t: FloatArray, numbers: FloatArray, received_at: float
+) -> DecodedBlock:
+    if not t.size:
+        raise MessageError("empty", "no samples")
+    if t.size != numbers.shape[1]:
+        raise MessageError("lengths", f"{t.size} time stamps, {numbers.shape[1]} samples")
+    for name, value in (("stream", stream), ("sequence", sequence), ("oldest", oldest or 0)):
+        if not 0 <= value <= MAX_COUNT:
+            raise MessageError("out of range", f"{name}: must lie between 0 and 2^63 - 1")
+    if not ((t >= 0.0) & (t < MAX_TIME_S)).all():
+        raise MessageError("times", "a time stamp is missing, or outside of the years 1970 to 9999")
+    r, u, y = numbers
+    return DecodedBlock(Block(asset, sequence, t, r, u, y, received_at, stream, oldest is not None), oldest)

@@ -1,0 +1,189 @@
+"""Blocks from an MQTT broker, acknowledged only after their results are stored: to the broker and to their senders."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+from pydantic import Field
+
+from servoscope.core.errors import MessageError
+from servoscope.service.config_types import Seconds
+from servoscope.service.log import log
+from servoscope.service.mqtt import topics
+from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerSettings, create_mqtt_client
+from servoscope.service.mqtt.payload import DecodedBlock, decode_block
+from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
+from servoscope.service.sources.block import Block, ResumePosition
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import MQTTMessage
+
+
+POLL_S = 0.02
+OVERSIZE_FACTOR = 4  # times the largest message: so far it is received and rejected, beyond that the broker drops it
+
+
+class MqttSourceSettings(BrokerSettings, SourceSettings):
+    """A source of kind ``mqtt``."""
+
+    kind: Literal["mqtt"]
+    # what all topics begin with; blocks of an asset are expected under ``TOPIC/v1/data/ASSET``
+    topic: topics.TopicPrefix = "servoscope"
+    # name of the session at the broker; None: ``SERVICE.SOURCE``. No two clients may share one.
+    client: Annotated[str, Field(strict=True, min_length=1, max_length=200)] | None = None
+    # most messages that are received before the first of them is acknowledged. The broker may have a lower limit.
+    in_flight: Annotated[int, Field(strict=True, ge=1, le=65535)] = 1000
+    largest: Annotated[int, Field(strict=True, ge=1024, le=2**28)] = 2**20  # longest message that is accepted [bytes]
+    # how long the broker keeps the session, and what comes for it, while we are disconnected [s]
+    session_s: Annotated[Seconds, Field(lt=2**32 - 1)] = 7 * 86400.0
+
+    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
+        """Return the source."""
+        return MqttSource(self, frozenset(assets), folder, name)
+
+
+class _AckHandle(NamedTuple):
+    """How a message is acknowledged, and in which connection; stream and sequence, if its sender waits for them."""
+
+    mid: int
+    qos: int
+    connection: int
+    position: tuple[int, int] | None
+
+
+class MqttSource(BlockSource):
+    """Receives blocks of several assets from a broker; `client` names its session, unless the settings do."""
+
+    def __init__(self, settings: MqttSourceSettings, assets: frozenset[str], folder: Path, client: str) -> None:
+        super().__init__()
+        self.settings, self._assets = settings, assets
+        self._client = create_mqtt_client(settings, folder, settings.client or client, manual_ack=True)
+        self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
+        self._client.on_connect_fail, self._client.on_message = self._on_connect_fail, self._on_message
+        self._lock = threading.Lock()  # held while a message is acknowledged: never one of another connection
+        self._connection = 0
+        self._trouble = ""
+        self._waiting: dict[tuple[Any, ...], tuple[Block, _AckHandle]] = {}
+        self._unacknowledged: dict[str, deque[_AckHandle]] = {name: deque() for name in assets}
+        self._newest: dict[str, tuple[int, int]] = {}  # stream and sequence of the newest block that was received
+        self._acknowledged: dict[str, tuple[int, int]] = {}
+        self.connected = False
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Connect, now or as soon as the broker is there."""
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
+        self._newest = {asset: (one.stream, one.sequence) for asset, one in resume.items()}
+        self._acknowledged = dict(self._newest)
+        session: Any = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        session.SessionExpiryInterval = int(self.settings.session_s)
+        session.ReceiveMaximum = self.settings.in_flight
+        session.MaximumPacketSize = OVERSIZE_FACTOR * self.settings.largest
+        self._client.connect_async(*self.settings.address, keepalive=KEEPALIVE_S, clean_start=False, properties=session)
+        self._client.loop_start()
+
+    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        if reason.is_failure:
+            self._log_trouble(f"refused: {reason}")
+            return
+        with self._lock:
+            self._connection += 1
+        self.connected, self._trouble = True, ""
+        # also where the broker has the session: that of a killed process may have an old subscription
+        self._client.subscribe(topics.data_topic(self.settings.topic, "+"), qos=1)
+        log("info", "broker connected", broker=self.settings.host)
+
+    def _on_connect_fail(self, _client: Any, _data: Any) -> None:
+        self._log_trouble(str(sys.exc_info()[1] or "no answer"))
+
+    def _log_trouble(self, trouble: str) -> None:
+        if trouble != self._trouble:  # the client retries every few seconds; once in the log is enough
+            log("error", "broker cannot be reached", broker=self.settings.host, why=trouble)
+        self._trouble = trouble
+
+    def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        with self._lock:
+            self._connection += 1
+        if self.connected:
+            log("warning", "broker lost", broker=self.settings.host, why=str(reason))
+        self.connected = False
+
+    def _on_message(self, _client: Any, _data: Any, message: MQTTMessage) -> None:
+        """Queue a message, in the client's thread."""
+        handle = _AckHandle(message.mid, message.qos, self._connection, None)
+        try:
+            asset = topics.parse_asset(message.topic)
+            if asset not in self._assets:
+                raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
+            if len(message.payload) > self.settings.largest:
+                raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
+            decoded = decode_block(asset, bytes(message.payload), time.monotonic())
+            self._check_order(decoded)
+            if not message.qos and len(self._waiting) >= self.settings.in_flight:
+                raise MessageError("overflow", "sent without acknowledgement, faster than it can be processed")
+        except MessageError as error:
+            self.rejections.add("" if error.kind == "unknown asset" else asset, error.kind, str(error))
+            self._ack(handle)
+            return
+        block = decoded.block
+        position = block.stream, block.sequence
+        self._newest[asset] = max(position, self._newest.get(asset, position))
+        with self._lock:
+            # sent again in a new connection, it replaces its earlier copy: the queue does not grow by it
+            key: tuple[Any, ...] = asset, *position, float(block.t[0])
+            if key in self._waiting and self._waiting[key][1].connection == handle.connection:
+                key = *key, handle.mid  # sent twice
+            self._waiting[key] = block, handle._replace(position=position if block.retained else None)
+
+    def _check_order(self, decoded: DecodedBlock) -> None:
+        """Reject a block that comes before an earlier one which its sender retains, and will send again."""
+        block, oldest = decoded
+        stream, sequence = self._newest.get(block.asset, (0, -1))
+        following = sequence + 1 if stream == block.stream else 0
+        if oldest is not None and block.stream >= stream and block.sequence > max(following, oldest):
+            reason = f"block {block.sequence} came before block {following}, which its sender keeps"
+            raise MessageError("ahead", reason)
+
+    def poll(self, limit: int) -> list[Block]:
+        """Return blocks in the order in which they came."""
+        with self._lock:
+            found = [self._waiting.pop(key) for key in list(islice(self._waiting, limit))]
+        for block, handle in found:
+            self._unacknowledged[block.asset].append(handle)
+        return [block for block, _ in found]
+
+    def acknowledge(self, asset: str, blocks: int) -> None:
+        """Acknowledge to the broker, and to a sender that retains its blocks, that they are stored."""
+        position: tuple[int, int] | None = None
+        for _ in range(blocks):
+            handle = self._unacknowledged[asset].popleft()
+            self._ack(handle)
+            if handle.position is not None:
+                position = max(handle.position, self._acknowledged.get(asset, handle.position))
+                self._acknowledged[asset] = position
+        if position is not None and self.connected:
+            message = topics.encode_ack(*position)
+            self._client.publish(topics.ack_topic(self.settings.topic, asset), message, qos=1, retain=True)
+
+    def _ack(self, handle: _AckHandle) -> None:
+        with self._lock:
+            if handle.connection == self._connection:  # otherwise the broker sends it again, and it is a repetition
+                self._client.ack(handle.mid, handle.qos)
+
+    @property
+    def next_block_s(self) -> float:
+        """How long until the next block may be due [s]."""
+        return 0.0 if self._waiting else POLL_S
+
+    def close(self) -> None:
+        """Disconnect; the broker keeps what comes meanwhile."""
+        self._client.disconnect()
+        self._client.loop_stop()

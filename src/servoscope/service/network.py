@@ -1,0 +1,100 @@
+"""Whom the service connects to: networks that are refused to it, and the certificates of encrypted connections."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Self, TypeVar
+
+from pydantic import AfterValidator, Field, model_validator
+
+from servoscope.core.errors import ConfigError
+from servoscope.core.networks import INTERNAL, check_network, is_member
+from servoscope.core.settings import NonEmptyStr, Settings
+
+
+def _check_rule(value: str) -> str:
+    return value if value == INTERNAL else check_network(value)
+
+
+NetworkRule = Annotated[str, Field(strict=True), AfterValidator(_check_rule)]
+
+
+class NetworkSettings(Settings):
+    """The section `[network]`: which addresses webhooks, brokers and servers may have."""
+
+    # Networks, or ``internal``: all that is not public. What is in `allowed` may be reached, else what is in `refused`
+    # may not, and everything else may.
+    allowed: tuple[NetworkRule, ...] = ()
+    refused: tuple[NetworkRule, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> Self:
+        if self.allowed and not self.refused:
+            raise ValueError('refused: missing, allowed names exceptions of it: write refused = ["0.0.0.0/0", "::/0"]')
+        return self
+
+    def resolve(self, host: str, port: int) -> str:
+        """Return the address to connect to; with rules a numeric one, so that a name cannot change meanwhile.
+
+        Raises OSError if there is none, or none that may be reached.
+        """
+        if not self.refused:
+            return host
+        found = [str(one[4][0]) for one in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
+        permitted = (one for one in found if is_member(one, self.allowed) or not is_member(one, self.refused))
+        address = next(permitted, None)
+        if address is None:
+            raise PermissionError(f"{found[0]} is in a network that [network] refuses")
+        return address
+
+
+class ConnectionSettings(Settings):
+    """A section that names somebody to connect to."""
+
+    network: NetworkSettings | None = None  # as in ``[network]``, for this one alone; None: as there
+
+    @property
+    def rules(self) -> NetworkSettings:
+        """The rules that hold."""
+        return self.network if self.network is not None else NetworkSettings()
+
+
+class TlsSettings(ConnectionSettings):
+    """Such a section whose connection may be encrypted; files are relative to the file of settings."""
+
+    ca_file: NonEmptyStr | None = None  # certificates that are trusted, instead of those of the system (PEM)
+    # cert_file, key_file: our own certificate, where the other side requires one (PEM)
+    cert_file: NonEmptyStr | None = None
+    key_file: NonEmptyStr | None = None
+
+    @property
+    def has_certificates(self) -> bool:
+        """Whether a certificate is given."""
+        return self.ca_file is not None or self.cert_file is not None
+
+    def create_tls_context(self, folder: Path, host: str) -> ssl.SSLContext:
+        """Return a context that verifies the other side; raises ConfigError if a file cannot be used."""
+        try:
+            context = ssl.create_default_context(cafile=str(folder / self.ca_file) if self.ca_file else None)
+            if self.cert_file is not None:
+                key = folder / self.key_file if self.key_file else None
+                context.load_cert_chain(folder / self.cert_file, key)
+        except (OSError, ssl.SSLError) as error:
+            raise ConfigError(f"{host}: its certificates cannot be used ({error}), give PEM files") from None
+        return context
+
+
+T = TypeVar("T", bound=Settings)
+
+
+def apply_network(tables: Mapping[str, T], network: NetworkSettings) -> dict[str, T]:
+    """Return tables in which those that connect to somebody have rules."""
+
+    def apply(one: T) -> T:
+        is_open = isinstance(one, ConnectionSettings) and one.network is None
+        return one.model_copy(update={"network": network}) if is_open else one
+
+    return {name: apply(one) for name, one in tables.items()}

@@ -1,0 +1,120 @@
+"""Values of several nodes, each reported when it changes, resampled to one clock by their source's time stamps."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+
+MAX_FILL_SAMPLES = 100_000  # samples of constant values that are made at once
+CLOCK_STEP_S = 10.0  # a value that is older than the last sample by more shows that the clock was set back
+
+
+class SampleGap(NamedTuple):
+    """A time without samples: from the last one to the next one [UTC s], and how many are missing."""
+
+    start: float
+    end: float
+    samples: int
+
+
+class ResampledSignals(NamedTuple):
+    """Samples that are complete: time stamps [UTC s], shape (N,), and values, shape (signals, N); gaps before them."""
+
+    t: FloatArray
+    values: FloatArray
+    gaps: list[SampleGap]
+
+
+class Resampler:
+    """Makes samples of single values, of `signals` nodes at a sample time `period` [s], behind `last_t` [UTC s].
+
+    A value holds until the next one: a source reports only changes. What lies between two changes is filled as long
+    as the source is known to be alive; after `restart` it is not, and the next sample begins anew.
+    """
+
+    def __init__(self, signals: int, period: float, last_t: float = math.nan) -> None:
+        self._period, self._values = period, np.full(signals, math.nan)
+        self._known = np.zeros(signals, dtype=np.bool_)
+        self._pending: list[tuple[float, int, int, float]] = []  # a heap: time, order, signal, value
+        self._order = 0
+        self._newest = -math.inf
+        self._restarted, self._restart_t = True, math.inf
+        self._samples: list[tuple[float, FloatArray]] = []
+        self._gaps: list[SampleGap] = []
+        self.last_t = last_t  # time of the last sample that was made
+        self.late = 0  # values that came after their sample had been made
+
+    def restart(self, t: float, *, complete: bool = False) -> None:
+        """Continue with a subscription from `t` on; older values only say what holds, and make no samples.
+
+        Unless all changes of the time between are known (`complete`), earlier values are unknown now.
+        """
+        self._restarted, self._restart_t = True, t
+        if not complete:
+            self._known[:] = False
+            self._pending.clear()
+            self._newest = -math.inf
+
+    def add(self, signal: int, t: float, value: float) -> None:
+        """Take a value; NaN where its status says that it is bad."""
+        self._order += 1
+        self._newest = max(self._newest, t)
+        heapq.heappush(self._pending, (t, self._order, signal, value))
+
+    def take_samples(self, alive_until: float) -> ResampledSignals:
+        """Return the samples that are complete: those older than the newest value, and all up to `alive_until` [UTC s].
+
+        A source reports changes in their order. Where none comes any more, something else has to show that it is
+        alive, and has reported all changes up to `alive_until`.
+        """
+        settled = max(alive_until, self._newest)
+        while self._pending and self._pending[0][0] + 0.5 * self._period <= settled:
+            t, group = self._pending[0][0], dict[int, float]()
+            while self._pending and self._pending[0][0] < t + 0.5 * self._period:
+                _, _, signal, value = heapq.heappop(self._pending)
+                group[signal] = value
+            self._add_group(t, group)
+        if self._restarted and self._known.all() and self._restart_t + 2.0 * self._period <= alive_until:
+            self._add_sample(self._restart_t)  # nothing has changed since then
+        if not self._restarted and alive_until - self.last_t < MAX_FILL_SAMPLES * self._period:
+            while self.last_t + 2.0 * self._period <= alive_until:
+                self._add_sample(self.last_t + self._period)
+        if not self._pending:
+            self._newest = -math.inf
+        samples, self._samples = self._samples, []
+        gaps, self._gaps = self._gaps, []
+        values = np.array([held for _, held in samples]).reshape(-1, self._values.size).T
+        return ResampledSignals(np.array([t for t, _ in samples]), values, gaps)
+
+    def _add_group(self, t: float, group: dict[int, float]) -> None:
+        """Take values of one moment."""
+        if t < self.last_t - CLOCK_STEP_S and not (self._restarted and t < self._restart_t):
+            self.restart(t, complete=True)
+            self.last_t = math.nan
+        behind = t <= self.last_t + 0.5 * self._period
+        if behind and not self._restarted:
+            self.late += len(group)
+        is_new = not behind and not (self._restarted and t < self._restart_t)
+        steps = round((t - self.last_t) / self._period) if is_new and not self._restarted else 1
+        if steps > MAX_FILL_SAMPLES:
+            self.restart(t, complete=True)  # a clock that was set, or a source whose end was not noticed in time
+        elif steps > 1:
+            for between in np.linspace(self.last_t, t, steps + 1)[1:-1].tolist():
+                self._add_sample(between)
+        for signal, value in group.items():
+            self._values[signal], self._known[signal] = value, True
+        if is_new and self._known.all():
+            self._add_sample(t)
+
+    def _add_sample(self, t: float) -> None:
+        first = self._restarted and not math.isnan(self.last_t)
+        missing = round((t - self.last_t) / self._period) - 1 if first else 0
+        if missing > 0:
+            self._gaps.append(SampleGap(self.last_t, t, missing))
+        self._samples.append((t, self._values.copy()))
+        self.last_t, self._restarted = t, False

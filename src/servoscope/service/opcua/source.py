@@ -1,0 +1,237 @@
+"""Blocks from an OPC UA server: arrays as they are written, or single values on one clock; history fills gaps."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import AfterValidator, Field
+
+from servoscope.core.addresses import show_address
+from servoscope.core.errors import ConfigError
+from servoscope.core.settings import NonEmptyStr
+from servoscope.service.config_types import Seconds, read_password
+from servoscope.service.log import log
+from servoscope.service.network import ConnectionSettings
+from servoscope.service.opcua.settings import CertificateSettings, OpcuaNodes, check_files, import_asyncua
+from servoscope.service.opcua.subscriptions import ArraySubscription, ScalarSubscription, timestamp
+from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
+from servoscope.service.sources.block import Block, ResumePosition
+
+POLL_S = 0.02
+SETTLING_S = 2.0  # behind the server's clock: a change that has not been reported by then has not happened
+RECONNECT_S = 1.0  # between two attempts to connect
+MAX_BUFFERED = 10_000  # blocks that wait to be polled; then the oldest are dropped, and counted as rejected
+SERVER_TIME = "i=2258"  # Server_ServerStatus_CurrentTime, which every server has
+
+
+def _check_url(value: str) -> str:
+    if not re.fullmatch(r"opc\.tcp://[^\s/]+(/.*)?", value):
+        raise ValueError("is no address, write opc.tcp://host:4840")  # it may hold a password
+    return value
+
+
+class OpcuaSourceSettings(ConnectionSettings, CertificateSettings, SourceSettings):
+    """A source of kind ``opcua``."""
+
+    asset_key: ClassVar[str] = "nodes"
+    asset_example: ClassVar[str] = "nodes: nodes = { r = ..., u = ..., y = ... }"
+
+    kind: Literal["opcua"]
+    # of the server, ``opc.tcp://host:4840``
+    url: Annotated[str, Field(strict=True), AfterValidator(_check_url)]
+    # user, password_file: who we are; the password is the first line of a file, relative to the service file
+    user: NonEmptyStr | None = None
+    password_file: NonEmptyStr | None = None
+    server_cert_file: NonEmptyStr | None = None  # the certificate that the server must have; None: any
+    publishing_s: Seconds = 0.2  # how often the server sends what has changed [s]
+    block: Seconds = 1.0  # length of the blocks that are made of single values [s]
+    # node whose time shows that the server is alive: a date, or any value with a time stamp of its source
+    heartbeat: NonEmptyStr = SERVER_TIME
+    heartbeat_s: Seconds = 5.0  # without a heartbeat for so long, the connection is made anew [s]
+
+    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> OpcuaSource:
+        """Return the source of these nodes."""
+        return OpcuaSource(self, {each: (one.address, one.loop.sample_rate) for each, one in assets.items()}, folder)
+
+
+async def create_opcua_client(settings: OpcuaSourceSettings, password: str | None, folder: Path) -> Any:
+    """Return a client that is not yet connected."""
+
+    class CheckedOpcuaClient(import_asyncua().Client):  # type: ignore[misc]  # the library is loaded only here
+        """Connects to an address that was checked, and not to a name that may mean another one by then."""
+
+        async def connect_socket(self) -> None:
+            host, port = self.server_url.hostname, self.server_url.port
+            await self.uaclient.connect_socket(await asyncio.to_thread(settings.rules.resolve, host, port), port)
+
+    client = CheckedOpcuaClient(settings.url, timeout=settings.heartbeat_s)
+    client.name, client.application_uri = "servoscope", "urn:servoscope:client"
+    if settings.user is not None:
+        client.set_user(settings.user)
+        client.set_password(password or "")
+    if certificate := settings.certificate(folder):
+        from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+
+        server = str(folder / settings.server_cert_file) if settings.server_cert_file else None
+        await client.set_security(SecurityPolicyBasic256Sha256, *certificate, server_certificate=server)
+    return client
+
+
+class _SubscriptionHandler:
+    """Queues what a subscription reports; the library calls its methods."""
+
+    def __init__(self, values: deque[tuple[Any, Any]]) -> None:
+        self._values, self.end_status = values, ""
+
+    def datachange_notification(self, node: Any, _value: Any, data: Any) -> None:
+        """Queue a value."""
+        self._values.append((node.nodeid, data.monitored_item.Value))
+
+    def status_change_notification(self, status: Any) -> None:
+        """Note that the server has ended the subscription."""
+        self.end_status = str(status.Status)
+
+
+class OpcuaSource(BlockSource):
+    """Subscribes to the nodes of several assets, given with their sample rates [Hz].
+
+    A server waits for no acknowledgement: what was not stored is read from its history after a restart.
+    """
+
+    def __init__(
+        self, settings: OpcuaSourceSettings, assets: Mapping[str, tuple[OpcuaNodes, float]], folder: Path
+    ) -> None:
+        super().__init__()
+        import_asyncua()
+        self.settings, self._folder = settings, folder
+        self._password = read_password(settings.password_file, folder)
+        check_files(folder, settings.cert_file, settings.key_file, settings.server_cert_file)
+        self._assets = dict(assets)
+        self._waiting: deque[Block] = deque()
+        self._stop_event = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="opcua", daemon=True)
+        self._subscriptions: list[ArraySubscription | ScalarSubscription] = []
+        self._last_heartbeat = self._server_time = math.nan
+        self._trouble = ""
+        self.connected = False
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Connect, now or as soon as the server is there."""
+        for name, (nodes, rate) in self._assets.items():
+            at, common = resume.get(name, ResumePosition(-1, math.nan)), (self._enqueue, self.rejections)
+            if nodes.block is not None:
+                self._subscriptions.append(ArraySubscription(name, [nodes.block], at, *common))
+            else:
+                signals = [node for node in nodes.signals if node is not None]
+                size = max(1, round(self.settings.block * rate))
+                self._subscriptions.append(ScalarSubscription(name, signals, at, *common, rate, size))
+        self._thread.start()
+
+    def _enqueue(self, block: Block) -> None:
+        if len(self._waiting) >= MAX_BUFFERED:
+            lost = self._waiting.popleft()
+            self.rejections.add(lost.asset, "overflow", "blocks wait longer than there is room for them")
+        self._waiting.append(block)
+
+    async def _run(self) -> None:
+        """Follow the server through its restarts, in a thread of its own."""
+        while not self._stop_event.is_set():
+            try:
+                async with await create_opcua_client(self.settings, self._password, self._folder) as client:
+                    await self._run_subscription(client)
+            except Exception as error:  # whatever a library, a network or a server comes up with: try again
+                if not self._stop_event.is_set():
+                    self._log_trouble(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
+            self.connected = False
+            await asyncio.sleep(RECONNECT_S if not self._stop_event.is_set() else 0.0)
+
+    def _log_trouble(self, trouble: str) -> None:
+        if trouble != self._trouble:
+            log("error", "OPC UA server cannot be followed", url=show_address(self.settings.url), why=trouble)
+        self._trouble = trouble
+
+    async def _run_subscription(self, client: Any) -> None:
+        """Subscribe, read what was missed, and continue until the server is silent."""
+        from asyncua import ua
+
+        by_node: dict[Any, list[tuple[ArraySubscription | ScalarSubscription, int]]] = {}
+        for one in self._subscriptions:
+            for k, node in enumerate(one.nodes):
+                by_node.setdefault(ua.NodeId.from_string(node), []).append((one, k))
+        values: deque[tuple[Any, Any]] = deque()
+        handler = await self._subscribe(client, values)
+        heartbeat = ua.NodeId.from_string(self.settings.heartbeat)
+        now = _parse_heartbeat(await client.get_node(heartbeat).read_data_value())
+        period = self.settings.publishing_s
+        for one in self._subscriptions:
+            await one.read_missed(client, now)
+        self.connected, self._trouble, self._last_heartbeat = True, "", time.monotonic()
+        log("info", "OPC UA server followed", url=show_address(self.settings.url))
+        while not self._stop_event.is_set():
+            await asyncio.sleep(period / 2.0)
+            while values:
+                node, value = values.popleft()
+                if node == heartbeat:
+                    self._server_time, self._last_heartbeat = _parse_heartbeat(value), time.monotonic()
+                for one, k in by_node.get(node, ()):
+                    one.add_value(k, value)
+            if time.monotonic() - self._last_heartbeat > self.settings.heartbeat_s:
+                raise ConnectionError(f"no heartbeat for {self.settings.heartbeat_s:g} s")
+            if handler.end_status:
+                raise ConnectionError(f"the server has ended the subscription ({handler.end_status})")
+            for one in self._subscriptions:
+                one.emit_blocks(self._server_time - max(SETTLING_S, 4.0 * period))
+
+    async def _subscribe(self, client: Any, values: deque[tuple[Any, Any]]) -> _SubscriptionHandler:
+        """Subscribe to all nodes and the heartbeat."""
+        from asyncua import ua
+        from asyncua.ua.attribute_ids import AttributeIds
+
+        handler, period = _SubscriptionHandler(values), self.settings.publishing_s
+        subscription = await client.create_subscription(1000.0 * period, handler)
+        stamped = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
+        wanted = {node: (one.sampling_ms, one.queue_size(period)) for one in self._subscriptions for node in one.nodes}
+        wanted[self.settings.heartbeat] = (1000.0 * period, 1)
+        items = [
+            ua.MonitoredItemCreateRequest(
+                ua.ReadValueId(NodeId=ua.NodeId.from_string(node), AttributeId=AttributeIds.Value),
+                ua.MonitoringMode.Reporting,
+                ua.MonitoringParameters(ClientHandle=k, SamplingInterval=sampling, QueueSize=queue, Filter=stamped),
+            )
+            for k, (node, (sampling, queue)) in enumerate(wanted.items(), 1)
+        ]
+        for node, answer in zip(wanted, await subscription.create_monitored_items(items), strict=True):
+            if not isinstance(answer, int):
+                raise ConfigError(f"{node} cannot be subscribed to ({answer.name})")
+        return handler
+
+    def poll(self, limit: int) -> list[Block]:
+        """Return blocks in the order in which they came."""
+        return [self._waiting.popleft() for _ in range(min(limit, len(self._waiting)))]
+
+    @property
+    def next_block_s(self) -> float:
+        """How long until the next block may be due [s]."""
+        return 0.0 if self._waiting else POLL_S
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._stop_event.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0 * self.settings.heartbeat_s)
+
+
+def _parse_heartbeat(value: Any) -> float:
+    """Return the time of a heartbeat [UTC s]: its value if that is a date, else its time stamp."""
+    beat = value.Value.Value if value.Value is not None else None
+    stamp = beat if isinstance(beat, datetime) else value.SourceTimestamp or value.ServerTimestamp
+    return timestamp(stamp) if stamp else math.nan

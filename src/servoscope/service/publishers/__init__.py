@@ -1,0 +1,1 @@
+"""Where results go while the service runs."""

@@ -1,0 +1,37 @@
+"""What a publisher is: it shows others how the assets are, each time that this has been stored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from servoscope.core.settings import Settings
+
+StatusByAsset = Mapping[str, Mapping[str, Any]]  # by asset, and by the name of the service: what `watch --json` shows
+
+
+class StatusPublisher(Protocol):
+    """Shows how assets are now, not what has happened: who missed a status reads the next one."""
+
+    def open(self, statuses: StatusByAsset) -> None:
+        """Start with what the store holds; raises ConfigError or SourceError if that is impossible."""
+
+    def publish(self, statuses: StatusByAsset) -> None:
+        """Take statuses that have been stored; it must neither block nor raise, for it runs between two blocks."""
+
+    def close(self) -> None:
+        """Stop; it may be called twice."""
+
+
+class PublisherSettings(Settings):
+    """A table ``[outlets.NAME]``; a subclass adds the keys of its kind and says which publisher it creates."""
+
+    kind: str
+
+    def create(self, name: str, folder: Path) -> StatusPublisher:
+        """Return the publisher, not yet open; `name` is unique among services, paths are relative to `folder`.
+
+        Raises ConfigError if something that the settings name cannot be used.
+        """
+        raise NotImplementedError

@@ -1,0 +1,33 @@
+"""Rows on their way to the store, and what they are made of."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from servoscope.service.alarms import AlarmDefinition, AlarmTransition
+
+
+class TableRow(NamedTuple):
+    """A row for the store: its table and its values."""
+
+    table: str
+    values: dict[str, Any]
+
+
+class StepResult(NamedTuple):
+    """What a step of an asset leads to: rows for the store, and those of them of which operators may be notified."""
+
+    rows: list[TableRow]
+    transitions: list[AlarmTransition]
+
+
+def audit_row(event: str, document: dict[str, Any], user: str = "servoscope") -> TableRow:
+    """Return a line of the audit: who did what."""
+    return TableRow("audit", {"who": user, "what": event, "document": document})
+
+
+def transition_row(one: AlarmTransition, definition: AlarmDefinition) -> dict[str, Any]:
+    """Return a transition as the store keeps it, without its number."""
+    plain = one.to_dict()
+    columns = {key: plain[key] for key in ("alarm", "before", "after", "cause", "who")}
+    return {"t": one.time, **columns, "document": {"event": plain["event"], "priority": definition.priority}}

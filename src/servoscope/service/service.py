@@ -1,0 +1,227 @@
+"""The service: polls sources for blocks, follows assets, stores the results, and acknowledges what is stored."""
+
+from __future__ import annotations
+
+import math
+import time
+from concurrent.futures import Future
+
+from servoscope import __version__
+from servoscope.core.errors import ServoscopeError, StoreUnavailableError
+from servoscope.core.messages import message, render
+from servoscope.service.actions.dispatcher import OutboxDispatcher
+from servoscope.service.asset import Asset
+from servoscope.service.build import ServiceComponents
+from servoscope.service.clock import SteadyClock
+from servoscope.service.config import ServiceFile
+from servoscope.service.diagnosis_worker import DiagnosisWorker
+from servoscope.service.examination import StoredDiagnosis
+from servoscope.service.examination_schedule import PendingDiagnosis
+from servoscope.service.housekeeping import Housekeeping
+from servoscope.service.log import log
+from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.records import StepResult, audit_row
+from servoscope.service.sources.block import Block
+from servoscope.service.writer import StoreWriter
+
+MAX_BLOCKS_PER_POLL = 256  # blocks of one source that are processed before it is another one's turn
+MAX_PAUSE_S = 0.05
+HOUSEKEEPING_EVERY_S = 1.0
+
+
+class Service:
+    """Runs until it is stopped, or until all sources have ended; it closes its components at the end."""
+
+    def __init__(self, config: ServiceFile, components: ServiceComponents) -> None:
+        self.config, self.sources, self.store = config, components.sources, components.store
+        self.assets, self.notifier = components.assets, components.notifier
+        self._publishers, self._restarted = components.publishers, components.restarted
+        self.buffer, self.residual_days = config.service.buffer, config.store.residual_days
+        self.writer = StoreWriter(self.store, config.name, self.buffer)
+        self.metrics = ServiceMetrics(self)
+        self.clock = SteadyClock()
+        actions = config.actions.resolve_paths(config.folder)
+        self.dispatcher = OutboxDispatcher(self.store, config.name, actions, self.clock)
+        self._diagnosis_worker = DiagnosisWorker()
+        self._diagnosis_jobs: dict[tuple[str, PendingDiagnosis], Future[StoredDiagnosis]] = {}
+        # s: that it has been ready for blocks; a sensor is not silent because the service is busy, or its buffer full
+        self._listening_s = 0.0
+        self._last_block_s: dict[str, float] = {}  # by that clock, when the last block of each asset came
+        self._housekeeping = Housekeeping(self)
+        self._next_commit = self._next_housekeeping = 0.0
+        self._stopping = False
+        self.last_turn = time.monotonic()  # a service that hangs is not alive
+
+    def stop(self) -> None:
+        """Stop soon; for a signal's handler or another thread. Blocks in hand are finished and committed."""
+        self._stopping = True
+
+    @property
+    def unready_reason(self) -> str:
+        """Why it is not ready; empty where it is."""
+        if self._stopping:
+            return "stopping"
+        if self.writer.unavailable_since is not None:
+            return f"the store is unavailable, {self.writer.waiting} blocks wait"
+        return ""
+
+    def run(self) -> None:
+        """Run.
+
+        Raises StoreUnavailableError if at the end the store does not take what is left; the sources return it again.
+        """
+        document = {"version": __version__, "assets": len(self.assets), "store": self.store.name}
+        log("info", "started", service=self.config.name, **document)
+        self.writer.add(self.config.name, [audit_row("started", document)])
+        for name in self._restarted:  # written at once: if no block comes, the next start must not find the torn state
+            self.writer.add(name, [audit_row("began anew", {})])
+            if name in self.assets:
+                self.writer.set_checkpoint(self.assets[name])
+        self.dispatcher.start()
+        try:
+            while not self._stopping and not self._ended:
+                self._run_once()
+                time.sleep(self._pause_s)
+            self._commit_all()
+        finally:
+            self.dispatcher.stop()
+            self._diagnosis_worker.close()
+            for source in self.sources.values():
+                source.close()
+            for publisher in self._publishers.values():
+                publisher.close()
+            self.store.close()
+        log("info", "stopped", service=self.config.name, why=self._stop_reason)
+
+    @property
+    def _stop_reason(self) -> str:
+        return render(message("service.stopped_asked" if self._stopping else "service.stopped_ended"))
+
+    def _run_once(self) -> None:
+        before, self.last_turn = self.last_turn, time.monotonic()
+        now = self.last_turn
+        if self.writer.free:
+            self._listening_s += min(now - before, 2.0 * MAX_PAUSE_S)
+        for source in self.sources.values():
+            for block in source.poll(min(MAX_BLOCKS_PER_POLL, self.writer.free)):
+                self._process_block(block)
+        self._run_diagnoses(ended=self._exhausted)
+        if now >= self._next_housekeeping:
+            self._next_housekeeping = now + HOUSEKEEPING_EVERY_S
+            self._check_silence()
+            self._housekeeping.run_due()
+        if now >= self._next_commit:
+            self._next_commit = now + self.config.service.commit_every_s
+            self._commit()
+
+    def _process_block(self, block: Block) -> None:
+        asset = self.assets[block.asset]
+        self._last_block_s[block.asset] = self._listening_s
+        try:
+            result = asset.process(block)
+        except ServoscopeError as error:  # one asset's trouble must not stop the others
+            log("error", "block refused", asset=block.asset, sequence=block.sequence, why=str(error))
+            result = StepResult([audit_row("block refused", {"sequence": block.sequence, "why": str(error)})], [])
+        self.handle_result(asset, result)
+        self.writer.set_checkpoint(asset, block.completed_at)
+
+    def handle_result(self, asset: Asset, result: StepResult) -> None:
+        """Store and announce what a step of an asset has led to."""
+        self.writer.add(asset.name, result.rows)
+        if not result.transitions or asset.state is None:
+            return
+        now, examination = self.clock.now(), asset.state.examination
+        for one in result.transitions:
+            words = {"asset": one.asset, "alarm": one.alarm, "before": str(one.before), "after": str(one.after)}
+            log("info", "alarm", **words, cause=one.cause, who=one.who, t=one.time)
+            if one.alarm == "fault" and one.event == "clear":
+                self.writer.add(self.config.name, self.notifier.accommodate_fault(asset.name, None, one.time, now))
+        details = {"diagnosis": examination.summary, "onset": examination.onset}
+        self.writer.add(self.config.name, self.notifier.notify(result.transitions, details, now))
+
+    def _run_diagnoses(self, *, ended: bool) -> None:
+        """Start the full diagnoses that are due, and take the results of those that are done."""
+        for asset in self.assets.values():
+            for window, blocks in asset.due_diagnoses(ended=ended):
+                if (asset.name, window) not in self._diagnosis_jobs:
+                    job = self._diagnosis_worker.submit(asset.baseline, asset.name, blocks)
+                    self._diagnosis_jobs[asset.name, window] = job
+        for name, window in [key for key, job in self._diagnosis_jobs.items() if job.done()]:
+            asset, diagnosis = self.assets[name], self._diagnosis_jobs.pop((name, window)).result()
+            log("info", "diagnosis", asset=name, verdict=diagnosis.verdict, summary=diagnosis.summary)
+            is_news = asset.is_news(window, diagnosis)
+            self.handle_result(asset, asset.apply_diagnosis(window, diagnosis))
+            now, rows = self.clock.now(), []
+            if is_news and asset.state is not None:
+                rows = self.notifier.notify_diagnosis(asset.state.alarms, diagnosis, window.until, now)
+            rows += self.notifier.accommodate_fault(name, diagnosis, window.until, now)
+            self.writer.add(self.config.name, rows)
+            self.writer.set_checkpoint(asset)
+
+    def _check_silence(self) -> None:
+        """Advance the clocks of assets from which no block comes, as fast as their samples' clock runs."""
+        for name, asset in self.assets.items():
+            silence = self._listening_s - self._last_block_s.setdefault(name, self._listening_s)
+            if silence >= HOUSEKEEPING_EVERY_S and not self._exhausted:
+                rate = self.sources[self.config.assets[name].source].clock_rate
+                self.handle_result(asset, result := asset.advance_time(silence * rate))
+                if result.rows:
+                    self.writer.set_checkpoint(asset)
+
+    def _commit(self) -> None:
+        """Write what was gathered; what cannot be written waits."""
+        if not self.writer.empty:
+            self.writer.add_checkpoint(self.notifier.checkpoint())
+        start, unavailable_since = time.monotonic(), self.writer.unavailable_since
+        try:
+            stored = self.writer.write()
+        except StoreUnavailableError as error:
+            if unavailable_since is None:
+                log("error", "store unavailable", why=str(error), waiting=self.writer.waiting)
+            self.metrics.failures.inc()
+            return
+        if stored is None:
+            return
+        if unavailable_since is not None:
+            seconds = round(time.time() - unavailable_since, 3)
+            log("info", "store available again", seconds=seconds, waiting=self.writer.waiting)
+            document = {"from": unavailable_since, "seconds": seconds}
+            self.writer.add(self.config.name, [audit_row("store was unavailable", document)])
+        for publisher in self._publishers.values():
+            publisher.publish({name: row["status"] for name, row in stored.batch.checkpoints.items()})
+        self.dispatcher.wake()
+        now = time.monotonic()
+        for name, blocks in stored.blocks.items():
+            self.sources[self.config.assets[name].source].acknowledge(name, blocks)
+        latencies = [now - completed for completed in stored.completion_times]
+        self.metrics.record_commit(latencies, now - start)
+        latest = round(max(latencies, default=0.0), 4)
+        log("debug", "commit", blocks=len(latencies), seconds=round(now - start, 4), latest=latest)
+
+    @property
+    def _exhausted(self) -> bool:
+        return all(math.isinf(source.next_block_s) for source in self.sources.values())
+
+    @property
+    def _ended(self) -> bool:
+        """Whether there is nothing left to do, and never will be."""
+        return self._exhausted and not self._diagnosis_jobs and self.writer.empty and self.dispatcher.idle
+
+    @property
+    def _pause_s(self) -> float:
+        """How long to sleep before the next turn [s]."""
+        due = min(source.next_block_s for source in self.sources.values()) if self.writer.free else math.inf
+        return min(due, MAX_PAUSE_S, max(0.0, self._next_commit - time.monotonic()))
+
+    def _commit_all(self) -> None:
+        """Commit what is in hand, with the end in the audit."""
+        self.writer.add(self.config.name, [audit_row("stopped", {"why": self._stop_reason})])
+        deadline = time.monotonic() + self.config.service.stop_within_s
+        while not self.writer.empty:
+            self._commit()
+            if self.writer.unavailable_since is not None and time.monotonic() > deadline:
+                waiting = self.writer.waiting
+                raise StoreUnavailableError(
+                    f"{self.store.name}: still unavailable; {waiting} blocks are not stored, sources offer them again"
+                )
+            time.sleep(0.0 if self.writer.unavailable_since is None else MAX_PAUSE_S)

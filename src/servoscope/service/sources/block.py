@@ -1,0 +1,68 @@
+"""A block of samples as a source hands it over, and where a source continues after a restart."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import RecordingError
+
+
+class ResumePosition(NamedTuple):
+    """Where an asset continues: last sequence counted, start of its first block, stream, last sample; times [UTC s]."""
+
+    sequence: int
+    stream_start: float
+    stream: int = 0
+    last_t: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Samples of one asset in the order in which they came."""
+
+    asset: str
+    # 0, 1, 2 ... in the asset's stream; a number that was counted before is a repetition, one left out a loss
+    sequence: int
+    t: FloatArray  # time stamps [UTC s], shape (N,)
+    r: FloatArray  # r, u, y: reference, control input, measured output, shape (N,); NaN where a value is missing
+    u: FloatArray
+    y: FloatArray
+    completed_at: float = 0.0  # when its last sample was taken, by `time.monotonic` [s]: latency counts from there
+    stream: int = 0  # name of the asset's stream, greater for a later one; 0: it has none, and there is only one
+    retained: bool = False  # whether its sender retains it, and sends it again, until it is acknowledged
+
+    def start_time(self) -> float:
+        """Return the time of its first sample that has one.
+
+        Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
+        """
+        known = np.flatnonzero(np.isfinite(self.t)) if self.t.ndim == 1 else np.zeros(0, dtype=np.intp)
+        if not known.size or any(signal.shape != self.t.shape for signal in (self.r, self.u, self.y)):
+            raise RecordingError(f"{self.asset}: block {self.sequence}: t, r, u, y must have one length, t a number")
+        return float(self.t[known[0]])
+
+    @property
+    def signals(self) -> FloatArray:
+        """t, r, u and y as rows, shape (4, N)."""
+        return np.stack([self.t, self.r, self.u, self.y])
+
+    def digest(self, before: int = 0) -> int:
+        """Return the CRC-32 of its samples, continued from that of the blocks before it."""
+        return zlib.crc32(self.signals.tobytes(), before)
+
+    def pack(self) -> bytes:
+        """Return its samples as bytes, from which `unpack` restores them bit by bit."""
+        return self.signals.astype("<f8").tobytes()
+
+    @classmethod
+    def unpack(cls, asset: str, sequence: int, packed: bytes) -> Block:
+        """Return the block of packed samples; raises RecordingError if they are not whole."""
+        if len(packed) % 32:
+            raise RecordingError(f"{asset}: block {sequence} in the store is torn: restart with --anew {asset}")
+        return cls(asset, sequence, *np.frombuffer(packed, dtype="<f8").astype(np.float64).reshape(4, -1))

@@ -1,0 +1,32 @@
+"""Which blocks of an asset's stream are new, which were counted before, and how many are missing between them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from servoscope.service.checkpoint import StreamPosition
+from servoscope.service.sources.block import Block
+
+
+class BlockContinuity(NamedTuple):
+    """How many blocks are missing before a new one, and whether it belongs to another stream."""
+
+    lost: int
+    anew: bool
+
+
+def check_continuity(counted: StreamPosition | None, block: Block) -> BlockContinuity | None:
+    """Return how a block follows what was counted; None: it was counted before, or its place has passed.
+
+    Numbers of a named stream begin at 0, and a later stream has a greater name. A stream without a name is accepted
+    from any number on; where its numbers fall back while its time goes on, its sender has restarted.
+    """
+    if counted is None:
+        return BlockContinuity(block.sequence if block.stream else 0, False)
+    if block.stream == counted.stream and block.sequence > counted.sequence:
+        return BlockContinuity(block.sequence - counted.sequence - 1, False)
+    if block.stream > counted.stream:
+        return BlockContinuity(block.sequence, True)
+    if not block.retained and block.t[0] > counted.t:
+        return BlockContinuity(0, True)
+    return None

@@ -1,0 +1,136 @@
+"""Recordings replayed as if they were measured now, at true or accelerated speed, once or over and over."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import AwareDatetime
+
+from servoscope.core.settings import NonNegative
+from servoscope.models.loop import Loop
+from servoscope.service.config_types import Seconds
+from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
+from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.signals import Recording
+from servoscope.signals.readers import read
+
+SEPARATION_SAMPLES = 2  # sample times between two recordings, or two rounds: a gap, for they do not join
+
+
+class ReplaySettings(SourceSettings):
+    """A source of kind ``replay``."""
+
+    asset_key: ClassVar[str] = "files"
+    asset_example: ClassVar[str] = "recordings: files = [...]"
+
+    kind: Literal["replay"] = "replay"
+    speed: NonNegative = 1.0  # how many times as fast as they were recorded; 0: as fast as they are polled
+    block: Seconds = 1.0  # length of a block [s]
+    repeat: bool = False  # whether the recordings begin again when they have ended
+    start: AwareDatetime | None = None  # time of the first sample; None: when the service first ran
+
+    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> ReplaySource:
+        """Return the source of these recordings."""
+        files = {each: (tuple(folder / file for file in one.address), one.loop) for each, one in assets.items()}
+        return ReplaySource(self, files)
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayStream:
+    """The recordings of one asset, laid end to end and cut into blocks."""
+
+    recordings: tuple[Recording, ...]  # what is replayed, in this order
+    block_samples: int  # per block, at most: blocks end where a recording does
+    repeat: bool  # whether it begins again
+
+    def locate(self, sequence: int) -> tuple[Recording, slice, float] | None:
+        """Return a block's recording, its rows there, and when that recording begins in the stream [s].
+
+        None behind the end.
+        """
+        counts = [math.ceil(recording.samples / self.block_samples) for recording in self.recordings]
+        lengths = [x.t[-1] - x.t[0] + SEPARATION_SAMPLES / x.sample_rate for x in self.recordings]
+        rounds, within = divmod(sequence, sum(counts))
+        if rounds and not self.repeat:
+            return None
+        start = rounds * sum(lengths)
+        for recording, count, length in zip(self.recordings, counts, lengths, strict=True):
+            if within < count:
+                last = min((within + 1) * self.block_samples, recording.samples)
+                return recording, slice(within * self.block_samples, last), start
+            within, start = within - count, start + length
+        raise AssertionError("a block of the round lies in one of its recordings")
+
+    def block(self, asset: str, sequence: int, stream_start: float) -> Block | None:
+        """Return a block of the stream that began at `stream_start` [UTC s]; None behind the end."""
+        found = self.locate(sequence)
+        if found is None:
+            return None
+        recording, rows, start = found
+        t = stream_start + start + (recording.t[rows] - recording.t[0])
+        return Block(asset, sequence, np.asarray(t), recording.r[rows], recording.u[rows], recording.y[rows])
+
+
+class ReplaySource(BlockSource):
+    """Replays recordings for several assets, in the order of time; a file has to be acknowledged nothing."""
+
+    def __init__(self, settings: ReplaySettings, assets: Mapping[str, tuple[tuple[Path, ...], Loop]]) -> None:
+        super().__init__()
+        self.settings, self.clock_rate = settings, settings.speed
+        self._streams: dict[str, tuple[ReplayStream, float]] = {}  # with their start [UTC s], once it is open
+        shared: dict[tuple[Path, str], Recording] = {}  # assets may replay the same file
+        for asset, (files, loop) in assets.items():
+            for path in files:
+                if (path, loop.hash()) not in shared:
+                    shared[path, loop.hash()] = read(path, loop)
+            samples = max(1, round(settings.block * loop.sample_rate))
+            recordings = tuple(shared[path, loop.hash()] for path in files)
+            self._streams[asset] = ReplayStream(recordings, samples, settings.repeat), math.nan
+        self._queue: list[tuple[float, int, Block]] = []  # a heap of the next block of each asset: end, order, block
+        self._clock_origin = (0.0, 0.0)  # the same moment by the monotonic clock and by that of the samples
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Start, or continue behind `resume`; the clock of the replay continues with the samples, without a rush."""
+        now = time.time() if self.settings.start is None else self.settings.start.timestamp()
+        for order, (asset, (stream, _)) in enumerate(self._streams.items()):
+            at = resume.get(asset, ResumePosition(-1, now))
+            self._streams[asset] = stream, at.stream_start
+            self._schedule(order, asset, at.sequence + 1)
+        self._clock_origin = time.monotonic(), float(self._queue[0][2].t[0]) if self._queue else 0.0
+
+    def _schedule(self, order: int, asset: str, sequence: int) -> None:
+        stream, start = self._streams[asset]
+        block = stream.block(asset, sequence, start)
+        if block is not None:
+            heapq.heappush(self._queue, (float(block.t[-1]), order, block))
+
+    def _due(self, t: float, now: float) -> float:
+        """Return when a time of the samples is reached, by the monotonic clock [s]."""
+        began, first = self._clock_origin
+        return began + (t - first) / self.settings.speed if self.settings.speed else now
+
+    def poll(self, limit: int) -> list[Block]:
+        """Return the blocks that are due."""
+        now, found = time.monotonic(), list[Block]()
+        while self._queue and len(found) < limit and (due := self._due(self._queue[0][0], now)) <= now:
+            _, order, block = heapq.heappop(self._queue)
+            found.append(replace(block, completed_at=due))
+            self._schedule(order, block.asset, block.sequence + 1)
+        return found
+
+    @property
+    def next_block_s(self) -> float:
+        """How long until the next block is due [s]."""
+        now = time.monotonic()
+        return max(0.0, self._due(self._queue[0][0], now) - now) if self._queue else math.inf
+
+    def close(self) -> None:
+        """Stop."""
+        self._queue.clear()

@@ -1,0 +1,81 @@
+"""What the rows of a store hold, as far as more than the query that reads them has to know it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, NotRequired, TypedDict
+
+from servoscope.core.messages import message, render
+
+Row = Mapping[str, Any]  # of any table
+REFUSED = "refused: "  # how the outcome of a refused command begins in rows of version 0.1, which have no fields for it
+
+
+class CheckpointRow(TypedDict):
+    """The newest checkpoint of an asset, or of the service."""
+
+    asset: str
+    sequence: int
+    state: bytes  # from which the asset continues
+    status: dict[str, Any]  # what `watch --json` shows
+    at: float  # when it was written [UTC s]
+
+
+class OutboxRow(TypedDict):
+    """An event for one sink; `due` is None when it is delivered or given up."""
+
+    key: str
+    sink: str
+    event: dict[str, Any]
+    created: float
+    due: float | None
+    attempts: int
+    outcome: str
+
+
+class CommandDocument(TypedDict, total=False):
+    """Why an operator asks for a command, and what became of it."""
+
+    why: str
+    for_s: NotRequired[float]  # how long an alarm is shelved [s]
+    accepted: NotRequired[bool]
+    refusal: NotRequired[str]  # why it was refused
+
+
+class CommandRow(TypedDict):
+    """What an operator asks for; `outcome` is None until the service has executed it."""
+
+    id: int
+    at: float
+    who: str
+    asset: str
+    alarm: str
+    command: str
+    document: CommandDocument
+    outcome: str | None
+
+
+class CommandOutcome(NamedTuple):
+    """What became of a command: accepted, or refused for a reason."""
+
+    accepted: bool
+    refusal: str = ""
+
+    @property
+    def text(self) -> str:
+        """What people read."""
+        return render(
+            message("service.command_done" if self.accepted else "service.command_refused", reason=self.refusal)
+        )
+
+    def extend(self, document: CommandDocument) -> CommandDocument:
+        """Return a command's document with the outcome."""
+        refusal: CommandDocument = {} if self.accepted else {"refusal": self.refusal}
+        return {**document, "accepted": self.accepted, **refusal}
+
+    @classmethod
+    def from_row(cls, outcome: str, document: CommandDocument) -> CommandOutcome:
+        """Return the outcome that a row of the commands holds."""
+        if "accepted" in document:
+            return cls(document["accepted"], document.get("refusal", ""))
+        return cls(not outcome.startswith(REFUSED), outcome.removeprefix(REFUSED))

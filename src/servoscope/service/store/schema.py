@@ -1,0 +1,50 @@
+"""The version of a store's tables: made, checked, migrated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import sqlalchemy as sa
+
+from servoscope.core.errors import StoreError
+from servoscope.service.store.tables import METADATA, meta
+
+Migration = Callable[[sa.Connection], None]
+FIRST_VERSION = 1
+MIGRATIONS: list[Migration] = []  # the first leads from version 1 to 2; a step that was released is never changed
+
+
+def schema_version() -> int:
+    """Return the version that this program reads and writes."""
+    return FIRST_VERSION + len(MIGRATIONS)
+
+
+def create_or_migrate(connection: sa.Connection, name: str, *, write: bool) -> None:
+    """Create the tables of an empty store, and migrate those of an older version, if `write` allows it.
+
+    The connection is in a transaction, so that a migration is made whole or not at all. Raises StoreError if the store
+    (`name` in messages) is of a newer version, lacks a table, or has tables of another program.
+    """
+    present = set(sa.inspect(connection).get_table_names())
+    if meta.name not in present:
+        if strange := present & set(METADATA.tables):
+            raise StoreError(f"{name}: has a table {min(strange)} that is not servoscope's, give another database")
+        if not write:
+            raise StoreError(f"{name}: holds no history yet, start it with servoscope run")
+        METADATA.create_all(connection)
+        connection.execute(meta.insert(), [{"key": "schema", "value": schema_version()}])
+        return
+    found, newest = connection.execute(sa.select(meta.c.value).where(meta.c.key == "schema")).scalar(), schema_version()
+    if not isinstance(found, int) or found < FIRST_VERSION:
+        raise StoreError(f"{name}: does not say of which version its tables are, restore it from a copy")
+    where = f"{name}: its tables are of version {found}"
+    if found > newest:
+        raise StoreError(f"{where}, this servoscope knows up to {newest}: install a newer one")
+    if found < newest:
+        if not write:
+            raise StoreError(f"{where}, servoscope run brings them to {newest}")
+        for step in MIGRATIONS[found - FIRST_VERSION :]:
+            step(connection)
+        connection.execute(meta.update().where(meta.c.key == "schema").values(value=newest))
+    elif missing := set(METADATA.tables) - present:
+        raise StoreError(f"{name}: its table {min(missing)} is missing, restore it from a copy")

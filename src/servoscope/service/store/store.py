@@ -1,0 +1,240 @@
+"""What one transaction writes: rows of several assets together with the checkpoints of these assets."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import URL
+
+from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.service.store import engine, schema, tables
+from servoscope.service.store.rows import CheckpointRow, CommandDocument, CommandOutcome, CommandRow, OutboxRow, Row
+
+OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
+
+
+@dataclass
+class Batch:
+    """Rows that become visible together, or not at all."""
+
+    rows: dict[str, list[Row]] = field(default_factory=lambda: defaultdict(list))  # new rows by the name of their table
+    checkpoints: dict[str, Row] = field(default_factory=dict)  # the newest per asset: only that is written
+    first_needed: dict[str, int] = field(default_factory=dict)  # per asset, of the sequences of its recent samples
+    outcomes: dict[int, Row] = field(default_factory=dict)  # changes of rows of the commands, by id
+    deliveries: dict[str, Row] = field(default_factory=dict)  # changes of rows of the outbox, by key
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing to write."""
+        return not (any(self.rows.values()) or self.checkpoints or self.outcomes or self.deliveries)
+
+    def write(self, connection: sa.Connection, owner: str, commit: int) -> None:
+        """Write it in the connection's transaction, as commit number `commit` of its owner."""
+        _upsert(connection, tables.meta, [{"key": commit_key(owner), "value": commit}])
+        for name, rows in self.rows.items():
+            if name == tables.recent.name:  # after an outage most of them are old by now
+                rows = [row for row in rows if row["sequence"] >= self.first_needed.get(row["asset"], row["sequence"])]
+            if rows:
+                connection.execute(tables.METADATA.tables[name].insert(), rows)
+        if self.checkpoints:
+            _upsert(connection, tables.checkpoints, list(self.checkpoints.values()))
+        of: sa.BindParameter[Any] = sa.bindparam("of")
+        if self.first_needed:
+            below: sa.BindParameter[int] = sa.bindparam("below")
+            old = tables.recent.delete().where((tables.recent.c.asset == of) & (tables.recent.c.sequence < below))
+            connection.execute(old, [{"of": asset, "below": first} for asset, first in self.first_needed.items()])
+        for key, changes in ((tables.commands.c.id, self.outcomes), (tables.outbox.c.key, self.deliveries)):
+            if changes:
+                rows = [{"of": each, **row} for each, row in changes.items()]
+                connection.execute(key.table.update().where(key == of), rows)
+
+
+def commit_key(owner: str) -> str:
+    """Return the key of `meta` under which the number of an owner's last commit is stored."""
+    return f"commit of {owner}"
+
+
+def _upsert(connection: sa.Connection, table: sa.Table, rows: list[Row]) -> None:
+    dialect = postgresql if connection.dialect.name == "postgresql" else sqlite
+    insert = dialect.insert(table)
+    keys = [column.name for column in table.primary_key]
+    changed = {column.name: insert.excluded[column.name] for column in table.c if column.name not in keys}
+    connection.execute(insert.on_conflict_do_update(index_elements=keys, set_=changed), rows)
+
+
+class Store:
+    """History, checkpoints, commands and outbox; `Store.open` returns one."""
+
+    def __init__(self, url: URL, connections: sa.Engine) -> None:
+        self._url, self._engine = url, connections
+        self._lock: engine.WriterLock | None = None
+
+    @classmethod
+    def open(
+        cls, url: str, folder: Path | None = None, *, write: bool = False, lock_timeout_s: float = engine.LOCK_TIMEOUT_S
+    ) -> Store:
+        """Open a store by its URL, or a path for SQLite, relative to `folder` or else the working directory.
+
+        With `write` tables may be created and migrated; otherwise the store must exist. A locked SQLite file is
+        waited for `lock_timeout_s`. Raises StoreError if it cannot be used.
+        """
+        try:
+            found = engine.parse_store_url(url, folder or Path.cwd())
+            store = cls(found, engine.create_store_engine(found, lock_timeout_s=lock_timeout_s))
+        except ModuleNotFoundError as error:
+            raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
+        if found.get_backend_name() == "sqlite":
+            if not write and not Path(found.database or "").exists():
+                raise StoreError(f"{store.name}: no such store, servoscope run makes it")
+            engine.check_folder(Path(str(found.database)))
+        end = time.monotonic() + (OPENING_S if write and found.get_backend_name() == "sqlite" else 0.0)
+        try:
+            store._prepare(write, end)
+        except BaseException:
+            store.close()
+            raise
+        return store
+
+    def _prepare(self, write: bool, end: float) -> None:
+        """Create or migrate the tables; two processes that begin with an empty file lock each other out for a moment.
+
+        SQLite does not wait there, as one of them would wait for the other for ever.
+        """
+        while True:
+            try:
+                with self._transaction() as connection:
+                    schema.create_or_migrate(connection, self.name, write=write)
+                return
+            except StoreUnavailableError:
+                if time.monotonic() >= end:
+                    raise
+            time.sleep(0.05)
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return engine.display_url(self._url)
+
+    def acquire_lock(self, assets: Sequence[str]) -> None:
+        """Acquire the right to write about these assets, until `close` or the end of the process.
+
+        Raises StoreError if another process has it.
+        """
+        self._lock = engine.WriterLock(self._url, self._engine, assets)
+        self._lock.acquire()
+
+    def close(self) -> None:
+        """Close it."""
+        if self._lock is not None:
+            self._lock.release()
+        self._engine.dispose()
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sa.Connection]:
+        with engine.translate_errors(self._url), self._engine.begin() as connection:
+            yield connection
+
+    def last_commit(self, owner: str) -> int:
+        """Return the number of an owner's last transaction, 0 before the first."""
+        query = sa.select(tables.meta.c.value).where(tables.meta.c.key == commit_key(owner))
+        with self._transaction() as connection:
+            return int(connection.execute(query).scalar() or 0)
+
+    def write(self, batch: Batch, owner: str, commit: int) -> None:
+        """Write a batch whole, as commit number `commit` of its owner, which is one more than `last_commit`.
+
+        Raises StoreUnavailableError if it is not in the store, or that is unknown (`last_commit` shows it), and a
+        retry may help.
+        """
+        if self._lock is not None:
+            self._lock.acquire()
+        with self._transaction() as connection:
+            batch.write(connection, owner, commit)
+
+    def add_command(
+        self, user: str, asset: str, alarm: str, command: str, *, reason: str = "", for_s: float | None = None
+    ) -> int:
+        """Add a command of an operator, from any process; return its id. `for_s`: how long to shelve [s]."""
+        document: CommandDocument = {"why": reason} if for_s is None else {"why": reason, "for_s": for_s}
+        row = {"at": time.time(), "who": user, "asset": asset, "alarm": alarm, "command": command, "document": document}
+        with self._transaction() as connection:
+            return int(connection.execute(tables.commands.insert().returning(tables.commands.c.id), row).scalar_one())
+
+    def command_outcome(self, command: int) -> CommandOutcome | None:
+        """Return what became of a command; None until the service has executed it."""
+        table = tables.commands
+        query = sa.select(table.c.outcome, table.c.document).where(table.c.id == command, table.c.outcome.is_not(None))
+        return next((CommandOutcome.from_row(row["outcome"], row["document"]) for row in self.fetch(query)), None)
+
+    def pending_commands(self) -> list[CommandRow]:
+        """Return the commands that are not yet executed."""
+        table = tables.commands
+        return cast(
+            list[CommandRow], self.fetch(sa.select(table).where(table.c.outcome.is_(None)).order_by(table.c.id))
+        )
+
+    def checkpoints(self, assets: Sequence[str] | None = None) -> dict[str, CheckpointRow]:
+        """Return the newest checkpoint of these assets, or of all, by name; without those that have none."""
+        found = self._checkpoints(sa.select(tables.checkpoints), assets)
+        return cast(dict[str, CheckpointRow], found)
+
+    def statuses(self, assets: Sequence[str] | None = None) -> dict[str, Row]:
+        """Return what `checkpoints` returns, without the states."""
+        columns = [column for column in tables.checkpoints.c if column.name != "state"]
+        return self._checkpoints(sa.select(*columns), assets)
+
+    def checkpoint_times(self) -> dict[str, float]:
+        """Return when each asset's newest checkpoint was written [UTC s]: it changes with every one."""
+        table = tables.checkpoints
+        return {row["asset"]: row["at"] for row in self.fetch(sa.select(table.c.asset, table.c.at))}
+
+    def _checkpoints(self, query: sa.Select[Any], assets: Sequence[str] | None) -> dict[str, Row]:
+        name = tables.checkpoints.c.asset
+        if assets is not None:
+            query = query.where(name.in_(assets))
+        return {row["asset"]: row for row in self.fetch(query.order_by(name))}
+
+    def add_audit(self, user: str, asset: str, event: str, document: Row) -> None:
+        """Add a line of the audit, from any process; an empty asset: of all of them, or of none."""
+        row = {"at": time.time(), "who": user, "asset": asset, "what": event, "document": dict(document)}
+        with self._transaction() as connection:
+            connection.execute(tables.audit.insert(), row)
+
+    def recent_samples(self, asset: str) -> list[tuple[int, bytes]]:
+        """Return an asset's recent samples: sequence and packed block, in order."""
+        table = tables.recent
+        query = sa.select(table).where(table.c.asset == asset).order_by(table.c.sequence)
+        return [(row["sequence"], row["samples"]) for row in self.fetch(query)]
+
+    def due_deliveries(self, now: float, limit: int, service: str, busy: Collection[str] = ()) -> list[OutboxRow]:
+        """Return up to `limit` rows of a service's outbox whose next attempt is due, the oldest first.
+
+        Without those for sinks that are busy.
+        """
+        table = tables.outbox
+        due = table.c.due.is_not(None) & (table.c.due <= now) & table.c.sink.not_in(busy)
+        own = table.c.event["service"].as_string() == service
+        query = sa.select(table).where(due & own).order_by(table.c.due, table.c.key).limit(limit)
+        return cast(list[OutboxRow], self.fetch(query))
+
+    def delete_before(self, table: str, before: Mapping[str, float]) -> int:
+        """Delete rows of a table that are older, by the asset's own clock; return how many."""
+        chosen, count = tables.METADATA.tables[table], 0
+        with self._transaction() as connection:
+            for asset, t in before.items():
+                old = (chosen.c.asset == asset) & (chosen.c.t < t)
+                count += connection.execute(chosen.delete().where(old)).rowcount
+        return count
+
+    def fetch(self, query: sa.Select[Any]) -> list[Row]:
+        """Return the rows of a query."""
+        with self._transaction() as connection:
+            return [dict(row) for row in connection.execute(query).mappings()]

@@ -1,0 +1,117 @@
+"""The tables of a store, for SQLite and PostgreSQL alike.
+
+All times are UTC seconds: `t` by the clock of the asset's own samples, `at` by that of the machine that wrote the row.
+The rows of one asset are numbered: `number` counts through residuals, diagnoses and transitions, so that a row that is
+lost or written twice can be detected.
+"""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+
+METADATA = sa.MetaData()
+
+Identity = sa.BigInteger().with_variant(sa.Integer(), "sqlite")  # the only kind that SQLite counts up by itself
+
+
+def _numbered_table(name: str, *columns: sa.Column[object]) -> sa.Table:
+    """Return a table of an asset's numbered rows."""
+    return sa.Table(
+        name,
+        METADATA,
+        sa.Column("asset", sa.Text, primary_key=True),
+        sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
+        sa.Column("t", sa.Double, nullable=False),
+        *columns,
+        sa.Index(f"{name}_by_time", "asset", "t"),
+        sqlite_with_rowid=False,
+    )
+
+
+meta = sa.Table(  # schema: version of the tables; commit of NAME: number of that service's last transaction
+    "meta", METADATA, sa.Column("key", sa.Text, primary_key=True), sa.Column("value", sa.BigInteger, nullable=False)
+)
+checkpoints = sa.Table(  # the state from which `run` continues each asset, and what `watch` shows
+    "checkpoints",
+    METADATA,
+    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("sequence", sa.BigInteger, nullable=False),
+    sa.Column("state", sa.LargeBinary, nullable=False),
+    sa.Column("status", sa.JSON, nullable=False),
+    sa.Column("at", sa.Double, nullable=False),
+)
+recent = sa.Table(  # the last minutes of samples, block by block: those of a full diagnosis
+    "recent",
+    METADATA,
+    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("sequence", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("samples", sa.LargeBinary, nullable=False),
+)
+# All of it is new every few minutes. Noise does not compress; and dead rows are vacuumed by their number: a share of
+# the table's rows would grow with it, and its statistics are lost in a crash.
+for statement in (
+    "ALTER TABLE recent ALTER COLUMN samples SET STORAGE EXTERNAL",
+    "ALTER TABLE recent SET (autovacuum_vacuum_scale_factor = 0, autovacuum_vacuum_threshold = 1000,"
+    " autovacuum_vacuum_cost_delay = 0, toast.autovacuum_vacuum_scale_factor = 0,"
+    " toast.autovacuum_vacuum_threshold = 10000, toast.autovacuum_vacuum_cost_delay = 0)",
+):
+    on_postgresql = sa.DDL(statement).execute_if(dialect="postgresql")  # type: ignore[no-untyped-call]
+    sa.event.listen(recent, "after_create", on_postgresql)
+residuals = _numbered_table(
+    "residuals",
+    sa.Column("statistic", sa.Double, nullable=False),  # the largest since the row before, over its limit
+    sa.Column("level", sa.Double, nullable=False),
+    sa.Column("residual", sa.JSON, nullable=False),  # per frequency: [Hz, real, imaginary, healthy |H|]
+)
+diagnoses = _numbered_table(
+    "diagnoses",
+    sa.Column("grounds", sa.Text, nullable=False),  # examination: at once; full: seconds later, with the refit
+    sa.Column("verdict", sa.Text, nullable=False),
+    sa.Column("summary", sa.Text, nullable=False),
+    sa.Column("onset", sa.Double),
+    sa.Column("document", sa.JSON, nullable=False),
+)
+transitions = _numbered_table(
+    "transitions",
+    sa.Column("alarm", sa.Text, nullable=False),
+    sa.Column("before", sa.Text, nullable=False),
+    sa.Column("after", sa.Text, nullable=False),
+    sa.Column("cause", sa.Text, nullable=False),
+    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("document", sa.JSON, nullable=False),
+)
+outbox = sa.Table(  # what is still to be delivered to webhooks, commands and brokers, and what was
+    "outbox",
+    METADATA,
+    sa.Column("key", sa.Text, primary_key=True),
+    sa.Column("sink", sa.Text, nullable=False),
+    sa.Column("event", sa.JSON, nullable=False),
+    sa.Column("created", sa.Double, nullable=False),
+    sa.Column("due", sa.Double),  # of the next attempt; none: there will be no more
+    sa.Column("attempts", sa.Integer, nullable=False),
+    sa.Column("outcome", sa.Text, nullable=False),
+    sa.Index("outbox_by_due", "due"),
+)
+audit = sa.Table(
+    "audit",
+    METADATA,
+    sa.Column("id", Identity, primary_key=True),
+    sa.Column("at", sa.Double, nullable=False),
+    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("asset", sa.Text, nullable=False),  # empty: the service as a whole
+    sa.Column("what", sa.Text, nullable=False),
+    sa.Column("document", sa.JSON, nullable=False),
+    sa.Index("audit_by_time", "at"),
+)
+commands = sa.Table(  # what operators ask for; the service executes them
+    "commands",
+    METADATA,
+    sa.Column("id", Identity, primary_key=True),
+    sa.Column("at", sa.Double, nullable=False),
+    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("asset", sa.Text, nullable=False),
+    sa.Column("alarm", sa.Text, nullable=False),
+    sa.Column("command", sa.Text, nullable=False),
+    sa.Column("document", sa.JSON, nullable=False),
+    sa.Column("outcome", sa.Text),  # none until it was executed
+)

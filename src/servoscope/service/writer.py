@@ -1,0 +1,128 @@
+"""Results on their way to the store: gathered, committed together, kept within bounds while it is unavailable."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from servoscope.core.errors import StoreUnavailableError
+from servoscope.service.asset import Asset
+from servoscope.service.checkpoint import pack_state
+from servoscope.service.records import TableRow
+from servoscope.service.store import Batch, Store
+
+MIN_RETRY_S, MAX_RETRY_S = 0.1, 2.0  # between two attempts at a store that is unavailable
+
+
+@dataclass
+class PendingCommit:
+    """A batch, and the blocks that are to be acknowledged when it is stored."""
+
+    batch: Batch = field(default_factory=Batch)
+    blocks: Counter[str] = field(default_factory=Counter)  # how many of each asset
+    completion_times: list[float] = field(default_factory=list)  # of these blocks, by the monotonic clock [s]
+
+
+class StoreWriter:
+    """Gathers what is to be written about up to `capacity` blocks, and writes each batch exactly once.
+
+    A commit whose end was not confirmed may have been made: before it is tried again, the number of the owner's last
+    commit is read from the store.
+    """
+
+    def __init__(self, store: Store, owner: str, capacity: int) -> None:
+        self._store, self._owner, self._capacity = store, owner, capacity
+        self._number = store.last_commit(owner)
+        self._gathered = PendingCommit()
+        self._sealed: PendingCommit | None = None  # on its way: nothing is added to it any more
+        self._checkpoints: dict[str, Callable[[], tuple[Mapping[str, Any], int]]] = {}
+        self._in_doubt = False
+        self._retry_s = self._retry_at = 0.0
+        self.unavailable_since: float | None = None  # [UTC s]
+
+    @property
+    def waiting(self) -> int:
+        """How many blocks wait."""
+        sealed = self._sealed.completion_times if self._sealed else []
+        return len(self._gathered.completion_times) + len(sealed)
+
+    @property
+    def free(self) -> int:
+        """How many more blocks may be taken."""
+        return max(0, self._capacity - self.waiting)
+
+    @property
+    def fill_ratio(self) -> float:
+        """How full it is; 1: no further block is taken."""
+        return self.waiting / self._capacity
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing waits."""
+        return self._sealed is None and self._gathered.batch.empty and not self._checkpoints
+
+    @property
+    def batch(self) -> Batch:
+        """The batch that is being gathered."""
+        return self._gathered.batch
+
+    def add(self, owner: str, rows: Iterable[TableRow]) -> None:
+        """Take rows of an asset, or of the service."""
+        for table, values in rows:
+            # only the audit says when it was written: all else is the same for every run over the same samples
+            at = {"at": time.time()} if table == "audit" else {}
+            self._gathered.batch.rows[table].append({"asset": owner, **at, **values})
+
+    def set_checkpoint(self, asset: Asset, completed_at: float | None = None) -> None:
+        """Take the state of an asset, after a block that had been complete at `completed_at`, if there was one."""
+        if completed_at is not None:
+            self._gathered.blocks[asset.name] += 1
+            self._gathered.completion_times.append(completed_at)
+        if asset.state is None:
+            return
+        state, first_needed, status = asset.state, asset.first_needed_sequence, asset.status
+
+        def checkpoint() -> tuple[Mapping[str, Any], int]:
+            row = {"asset": state.asset, "sequence": state.position.sequence, "state": pack_state(state)}
+            return {**row, "status": status(state).to_json(), "at": time.time()}, first_needed
+
+        self._checkpoints[state.asset] = checkpoint  # called when it is written: of many blocks, only the last counts
+
+    def add_checkpoint(self, row: Mapping[str, Any]) -> None:
+        """Take a checkpoint that is no asset's."""
+        self._gathered.batch.checkpoints[row["asset"]] = {**row, "at": time.time()}
+
+    def write(self) -> PendingCommit | None:
+        """Write what was gathered; return what is stored now, or None if that was nothing.
+
+        Raises StoreUnavailableError if the store cannot take it for now; nothing is lost, try again.
+        """
+        if self._sealed is None:
+            if self.empty:
+                return None
+            self._sealed, self._gathered = self._seal(), PendingCommit()
+        if time.monotonic() < self._retry_at:
+            return None
+        try:
+            if not (self._in_doubt and self._store.last_commit(self._owner) == self._number + 1):
+                self._store.write(self._sealed.batch, self._owner, self._number + 1)
+        except StoreUnavailableError:
+            self._in_doubt = True
+            self._retry_s = min(max(2.0 * self._retry_s, MIN_RETRY_S), MAX_RETRY_S)
+            self._retry_at = time.monotonic() + self._retry_s
+            self.unavailable_since = self.unavailable_since or time.time()
+            raise
+        stored, self._sealed = self._sealed, None
+        self._number += 1
+        self._in_doubt, self._retry_s, self._retry_at, self.unavailable_since = False, 0.0, 0.0, None
+        return stored
+
+    def _seal(self) -> PendingCommit:
+        batch = self._gathered.batch
+        for name, checkpoint in self._checkpoints.items():
+            batch.checkpoints[name], batch.first_needed[name] = checkpoint()
+        self._checkpoints = {}
+        return self._gathered

@@ -1,0 +1,26 @@
+"""Whether the data of an endless stream are sound: silence, standstill, gaps, jitter, sample rate, clock.
+
+limits = QualitySettings.model_validate(section).limits(loop.sample_rate)
+state = init_state()
+state, findings = check_block(limits, state, t, r, u, y)    # each block
+state, findings = tick(limits, state, now)              # each second, and with each block
+verdict = limit_verdict(verdict, active_findings(state))              # never healthy on bad data
+"""
+
+from servoscope.signals.quality.findings import KINDS, QualityFinding, describe_findings, limit_verdict
+from servoscope.signals.quality.monitor import active_findings, check_block, init_state, restart_silence, tick
+from servoscope.signals.quality.settings import QualityLimits, QualitySettings
+
+__all__ = [
+    "KINDS",
+    "QualityFinding",
+    "QualityLimits",
+    "QualitySettings",
+    "active_findings",
+    "check_block",
+    "describe_findings",
+    "init_state",
+    "limit_verdict",
+    "restart_silence",
+    "tick",
+]

@@ -1,0 +1,141 @@
+"""Data quality of an endless stream, block by block: a small state, carried along; exact under any blocking."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import RecordingError, StateError
+from servoscope.signals.quality.findings import KINDS, QualityFinding
+from servoscope.signals.quality.settings import QualityLimits
+
+SILENT = KINDS.index("silent")
+BUFFER = 64  # findings that the compiled loop returns at a time
+
+
+def init_state() -> FloatArray:
+    """Return the state before the first sample, shape (size,): finite numbers, so that JSON can carry it too."""
+    state = np.zeros(STATE_SIZE)
+    named = _state_record(state)
+    named["version"] = STATE_VERSION
+    named["active"][KINDS.index("waiting")] = 1.0
+    return state
+
+
+def check_block(
+    limits: QualityLimits, state: FloatArray, t: npt.ArrayLike, r: npt.ArrayLike, u: npt.ArrayLike, y: npt.ArrayLike
+) -> tuple[FloatArray, tuple[QualityFinding, ...]]:
+    """Check a block of samples of one asset, of any length, in the order of time.
+
+    `state`: of `init_state`, `tick` or an earlier call; it stays valid; `t`: time stamps (epoch, s). A value that is
+    not finite is a missing sample. Returns the new state, and the findings that began or ended. Raises RecordingError
+    if the shapes do not fit together, StateError if the state is of another version.
+    """
+    from servoscope.signals.quality.kernel import check_samples
+
+    t, r, u, y = (np.ascontiguousarray(each, dtype=np.float64) for each in (t, r, u, y))
+    if t.ndim != 1 or not t.shape == r.shape == u.shape == y.shape:
+        raise RecordingError("t, r, u and y of a block must have the same shape (N,)")
+    new, findings = _copy_state(state), []
+    out, begin = np.empty((BUFFER, 5)), 0
+    while begin < len(t):
+        begin, count = check_samples(limits, new.view(STATE_DTYPE), t, r, u, y, begin, out)
+        findings += [QualityFinding(KINDS[int(kind)], bool(on), *rest) for kind, on, *rest in out[:count].tolist()]
+    return new, tuple(findings)
+
+
+def tick(limits: QualityLimits, state: FloatArray, now: float) -> tuple[FloatArray, tuple[QualityFinding, ...]]:
+    """Check for silence by the clock of the service, about once a second and with each block.
+
+    `now`: time (s) of one clock; in a replay it runs as fast as the replay.
+    """
+    new = _copy_state(state)
+    named = _state_record(new)
+    if named["seen_count"] != named["count"] or not named["is_running"] or now < named["seen_at"]:
+        _reset_silence(new, now)
+    quiet, silent = now - float(named["seen_at"]), bool(named["active"][SILENT])
+    if silent == (quiet > limits.silent_s):
+        return new, ()
+    named["active"][SILENT], named["since"][SILENT] = not silent, now
+    return new, (QualityFinding("silent", not silent, now, quiet, limits.silent_s),)
+
+
+def restart_silence(state: FloatArray, now: float) -> FloatArray:
+    """Return a restored state for a service that starts again now (s): the silence before was its own."""
+    new = _copy_state(state)
+    _reset_silence(new, now)
+    return new
+
+
+def active_findings(state: FloatArray) -> dict[str, float]:
+    """Return what is wrong at the moment, and since when (epoch, s); ``waiting`` until the first window is complete."""
+    named = _state_record(state)
+    since = named["since"].tolist()
+    return {kind: since[i] for i, kind in enumerate(KINDS) if named["active"][i]}
+
+
+def _reset_silence(state: FloatArray, now: float) -> None:
+    named = _state_record(state)
+    named["seen_count"], named["seen_at"], named["is_running"] = named["count"], now, 1.0
+
+
+def _state_record(state: FloatArray) -> Any:
+    """Return a view of the state whose places have names."""
+    return state.view(STATE_DTYPE)[0]
+
+
+def _copy_state(state: FloatArray) -> FloatArray:
+    if state.shape != (STATE_SIZE,) or state.dtype != np.float64 or _state_record(state)["version"] != STATE_VERSION:
+        raise StateError(
+            "state of data quality: another version wrote it, or it is not whole; start again with init_state()"
+        )
+    return state.copy()
+
+
+STATE_VERSION = 1
+
+# All of them numbers of the same type: for saving, an array (size,) of float64; for the kernel, a record.
+STATE_DTYPE = np.dtype(
+    [
+        ("version", np.float64),
+        # the stream: samples so far, the last time stamp, and how many of them the service had seen by when
+        ("count", np.float64),
+        ("t", np.float64),
+        ("is_running", np.float64),
+        ("seen_count", np.float64),
+        ("seen_at", np.float64),
+        # the window: samples; steps of about one sample, and those that jitter; whole periods in a span [s], for the
+        # rate; missing samples; jumps
+        ("samples", np.float64),
+        ("steps", np.float64),
+        ("jittery", np.float64),
+        ("periods", np.float64),
+        ("span", np.float64),
+        ("missing", np.float64),
+        ("jumps", np.float64),
+        # r, u and y: samples so far, the last ones, how long each has stayed the same [samples], smallest change
+        ("values", np.float64),
+        ("last", np.float64, (3,)),
+        ("same", np.float64, (3,)),
+        ("smallest_change", np.float64, (3,)),
+        # lowest and highest of r, u, y and r - y: of this epoch, of the one before; windows in this epoch
+        ("ranges", np.float64, (2, 4, 2)),
+        ("windows", np.float64),
+        # lowest and highest while y stays the same: r; while u does: y, r - y; while r does: y
+        ("r_range", np.float64, (2,)),
+        ("y_range", np.float64, (2,)),
+        ("e_range", np.float64, (2,)),
+        ("rest_range", np.float64, (2,)),
+        # turns of y at rest, the direction of its last change, and whether it is known to be noisy there
+        ("turns", np.float64),
+        ("direction", np.float64),
+        ("noisy", np.float64),
+        # which findings are active, 1 or 0, and since when (epoch, s); the order is that of KINDS
+        ("active", np.float64, (len(KINDS),)),
+        ("since", np.float64, (len(KINDS),)),
+    ]
+)
+STATE_SIZE = STATE_DTYPE.itemsize // 8

@@ -1,0 +1,62 @@
+"""Limits for sound data, from the section `[quality]`: allowed silence, standstill, jitter, gaps and drift."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+from pydantic import Field
+
+from servoscope.core.errors import RecordingError
+from servoscope.core.settings import Positive, Settings
+
+Share = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0, lt=1.0)]
+
+MIN_WINDOW_SAMPLES = 200  # samples of a window: fewer do not tell a rate to 0.1 %
+
+
+class QualityLimits(NamedTuple):
+    """The settings for one sample rate, as the compiled loop takes them."""
+
+    period: float  # s
+    window: int  # samples
+    silent_s: float
+    frozen: int  # samples
+    travel: float  # of y; 0: learned
+    jitter: float  # s
+    jittery: float  # share
+    missing: float  # share
+    rate_error: float  # relative
+
+
+class QualitySettings(Settings):
+    """When data are too bad to judge an asset by; every key has a default."""
+
+    # over how long jitter, gaps and sample rate are counted [s]; at least 200 samples are taken
+    window_s: Positive = 10.0
+    silent_s: Positive = 10.0  # longest time without data, and longest step of the time stamps that is a gap [s]
+    frozen_s: Positive = 5.0  # how long y or u may stay exactly the same while the motion demands a change [s]
+    # how far r has to move for y to be expected to change, in units of y; None: a tenth of the range that y itself
+    # has covered
+    frozen_travel: Positive | None = None
+    # jitter, jitter_share: A step that is off by more than `jitter` of a sample time jitters; this share of them is
+    # too much
+    jitter: Share = 0.2
+    jitter_share: Share = 0.05
+    missing_share: Share = 0.02  # share of samples that may be missing
+    rate_error: Share = 0.002  # how far the measured sample rate may be off, relative
+
+    def limits(self, sample_rate: float) -> QualityLimits:
+        """Return the constants for a loop's sample rate [Hz]."""
+        if not sample_rate > 0.0:
+            raise RecordingError(f"sample rate {sample_rate!r} must be greater than 0")
+        return QualityLimits(
+            period=1.0 / sample_rate,
+            window=max(MIN_WINDOW_SAMPLES, round(self.window_s * sample_rate)),
+            silent_s=self.silent_s,
+            frozen=max(2, round(self.frozen_s * sample_rate)),
+            travel=self.frozen_travel or 0.0,
+            jitter=self.jitter / sample_rate,
+            jittery=self.jitter_share,
+            missing=self.missing_share,
+            rate_error=self.rate_error,
+        )

@@ -1,0 +1,6 @@
+"""Files to recordings: CSV, Parquet, MAT, MDF, TDMS; which columns are r, u, y and t."""
+
+from servoscope.signals.readers.formats import readable_suffixes
+from servoscope.signals.readers.recording_file import ChannelInfo, list_channels, read, read_parts
+
+__all__ = ["ChannelInfo", "list_channels", "read", "read_parts", "readable_suffixes"]

@@ -1,0 +1,164 @@
+"""Which columns of a file become r, u, y and t: column mappings and linear combinations of channels."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+from pydantic import ValidationError
+
+from servoscope.core.errors import LoopError, RecordingError
+from servoscope.core.settings_errors import closest_names, describe_error
+from servoscope.models.loop import Columns
+
+FIELDS = {
+    **{key: "time" for key in ("t", "time")},
+    **{key: "reference" for key in ("r", "reference")},
+    **{key: "input" for key in ("u", "input")},
+    **{key: "output" for key in ("y", "output")},
+    "segment": "segment",
+}
+ALLOWED_EXPRESSIONS = "only sums of channels and numbers, times or divided by numbers, are understood"
+MAX_SHOWN = 12
+COLUMNS_HINT = "say where the signals stand: --columns 't=..., r=..., u=..., y=...' or [columns] in the loop file"
+
+
+class LinearCombination(NamedTuple):
+    """A linear combination: constant + sum of factor times channel."""
+
+    factors: dict[str, float]
+    constant: float
+
+    def __add__(self, other: object) -> LinearCombination:
+        """Sum of two combinations."""
+        if not isinstance(other, LinearCombination):
+            return NotImplemented
+        factors = dict(self.factors)
+        for name, factor in other.factors.items():
+            factors[name] = factors.get(name, 0.0) + factor
+        return LinearCombination(factors, self.constant + other.constant)
+
+    def scale(self, factor: float) -> LinearCombination:
+        """Return the combination times a number."""
+        return LinearCombination({name: f * factor for name, f in self.factors.items()}, self.constant * factor)
+
+
+def parse_columns(text: str, base: Columns | None = None) -> Columns:
+    """Read a mapping such as ``"r=qg, u=35.15 * vir, y=qm, t=time[ms]"``.
+
+    The keys are t, r, u, y (or their long names) and segment (several columns with ``+`` between them). A unit in
+    brackets after the time column is its unit; ``t=`` means that there is no such column; y may stand several times,
+    once per sensor. Keys that are not named stay as in `base`. Raises LoopError if a pair cannot be read.
+    """
+    fields: dict[str, object] = (base or Columns()).model_dump()
+    outputs: list[str] = []
+    for pair in re.findall(r"(?:`[^`]*`|[^,`])+", text):
+        key, equals, value = (part.strip() for part in pair.partition("="))
+        if not equals or key not in FIELDS or (not value and key not in ("t", "time")):
+            raise LoopError(f"columns: {pair.strip()!r} is not one of t=, r=, u=, y=, segment= and a column's name")
+        field = FIELDS[key]
+        if field == "segment":
+            fields[field] = tuple(_strip_backticks(part) for part in value.split("+"))
+        elif field == "time":
+            named = re.fullmatch(r"(.*?)\s*\[(\w+)\]", value)
+            fields["time"] = _strip_backticks(named[1] if named else value) or None
+            fields["time_unit"] = named[2] if named else "s"
+        elif field == "output":
+            outputs.append(value)
+            fields[field] = tuple(outputs) if len(outputs) > 1 else value
+        else:
+            fields[field] = value
+    try:
+        return Columns.model_validate(fields)
+    except ValidationError as error:
+        raise LoopError(f"columns: {describe_error(error, Columns)}") from None
+
+
+def find_channel(name: str, known: Iterable[str], where: str) -> str:
+    """Return the channel called `name`.
+
+    `where`: how errors begin, for example ``file.csv: [columns] output``. Raises RecordingError if there is none, with
+    the nearest names, or all of them, and how to name columns where none were named.
+    """
+    known = list(known)
+    name = _strip_backticks(name)
+    if name in known:
+        return name
+    near = closest_names(name, known, count=3)
+    defaults = Columns()
+    key = where.rpartition("[columns] ")[2]
+    if not near and name == getattr(defaults, key if key in Columns.model_fields else "name", None):
+        where = where.removesuffix(f": [columns] {key}")
+        name_ = f"no column {name!r}; {COLUMNS_HINT}; the file has {', '.join(known[:MAX_SHOWN]) or 'none'}"
+        raise RecordingError(f"{where}: {name_}" + (", ..." if len(known) > MAX_SHOWN else ""))
+    shown = ", ".join(near or known[:MAX_SHOWN]) + (", ..." if not near and len(known) > MAX_SHOWN else "")
+    hint = f"did you mean {shown}?" if near else f"the file has {shown or 'none'}"
+    raise RecordingError(f"{where}: no column {name!r}, {hint}")
+
+
+def parse_combination(text: str, known: Iterable[str], where: str) -> LinearCombination:
+    """Read a channel's name or a linear combination, such as ``"0.025 * counts + 3"``.
+
+    Names with blanks or odd characters are put in backticks inside combinations: "-`motor speed`/2". A text that is the
+    name of a channel is that channel. `where`: how errors begin. Raises LoopError if the text is not a linear
+    combination, RecordingError if a channel does not exist.
+    """
+    known = list(known)
+    stripped = text.strip()
+    if _strip_backticks(stripped) in known:
+        return LinearCombination({_strip_backticks(stripped): 1.0}, 0.0)
+    quoted: list[str] = []
+
+    def hide(match: re.Match[str]) -> str:
+        quoted.append(match[1].strip())
+        return f" quoted_{len(quoted) - 1}_ "
+
+    code = re.sub(r"`([^`]+)`", hide, stripped)
+    try:
+        tree = ast.parse(code.strip(), mode="eval").body
+        names = {f"quoted_{index}_": name for index, name in enumerate(quoted)}
+        found = _evaluate(tree, names, known, where)
+    except (SyntaxError, ValueError, RecursionError, ZeroDivisionError, OverflowError, MemoryError):
+        if re.fullmatch(r"[\w .]+", stripped):
+            find_channel(stripped, known, where)
+        raise LoopError(f"{where} = {text!r}: {ALLOWED_EXPRESSIONS}; put odd names in backticks") from None
+    if not any(found.factors.values()):
+        raise LoopError(f"{where} = {text!r}: names no channel")
+    return found
+
+
+def parse_output(columns: Columns, known: Iterable[str], where: str) -> tuple[LinearCombination, ...]:
+    """Read the channels of the output, one per sensor; arguments and errors as for `parse_combination`."""
+    known = list(known)
+    return tuple(parse_combination(text, known, where) for text in columns.outputs)
+
+
+def _evaluate(node: ast.expr, quoted: Mapping[str, str], known: list[str], where: str) -> LinearCombination:
+    if isinstance(node, ast.Name | ast.Attribute | ast.Subscript):
+        name = ast.unparse(node)
+        return LinearCombination({find_channel(quoted.get(name, name), known, where): 1.0}, 0.0)
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and type(node.value) is not bool:
+        return LinearCombination({}, float(node.value))
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.UAdd | ast.USub):
+        return _evaluate(node.operand, quoted, known, where).scale(-1.0 if isinstance(node.op, ast.USub) else 1.0)
+    if not isinstance(node, ast.BinOp):
+        raise ValueError("not linear")
+    left, right = (_evaluate(side, quoted, known, where) for side in (node.left, node.right))
+    if isinstance(node.op, ast.Add):
+        return left + right
+    if isinstance(node.op, ast.Sub):
+        return left + right.scale(-1.0)
+    if isinstance(node.op, ast.Mult) and not left.factors:
+        return right.scale(left.constant)
+    if isinstance(node.op, ast.Mult) and not right.factors:
+        return left.scale(right.constant)
+    if isinstance(node.op, ast.Div) and not right.factors:
+        return left.scale(1.0 / right.constant)
+    raise ValueError("not linear")
+
+
+def _strip_backticks(name: str) -> str:
+    name = name.strip()
+    return name[1:-1].strip() if len(name) > 2 and name[0] == name[-1] == "`" and "`" not in name[1:-1] else name

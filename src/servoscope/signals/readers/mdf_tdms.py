@@ -1,0 +1,180 @@
+"""Measurement files, MDF and TDMS: channels in rasters of their own, read chunk by chunk."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.table import Table, TableFile
+
+CHUNK_ROWS = 1 << 16  # that are read at a time
+DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
+
+
+@dataclass(frozen=True, eq=False)
+class _Raster:
+    """Channels that were sampled together: number of rows, and where each channel is in the file."""
+
+    rows: int
+    places: Mapping[str, Any]
+
+
+# takes file, raster, names, first row, number of rows
+_ReadChannels = Callable[[Any, _Raster, Sequence[str], int, int], Mapping[str, Any]]
+
+
+def open_mdf(path: Path) -> TableFile:
+    """Open an MDF file, version 3 or 4."""
+    try:
+        from asammdf import MDF
+    except ModuleNotFoundError:
+        raise RecordingError(f"{path}: MDF files need asammdf, pip install 'servoscope[mdf]'") from None
+
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # broken files raise an error
+
+    def list_rasters(file: Any) -> list[_Raster]:
+        found = []
+        for g, group in enumerate(file.groups):
+            master = file.masters_db.get(g)
+            names: dict[str, Any] = {}
+            for i, channel in enumerate(group.channels):
+                names.setdefault((channel.name or DEFAULT_TIME_NAME) if i == master else channel.name, (None, g, i))
+            found.append(_Raster(int(group.channel_group.cycles_nr), names))
+        return found
+
+    def read(file: Any, raster: _Raster, names: Sequence[str], first: int, rows: int) -> Mapping[str, Any]:
+        places = [raster.places[name] for name in names]
+        with redirect_stdout(io.StringIO()):  # it prints what it knows of a broken channel
+            signals = file.select(places, record_offset=first, record_count=rows, copy_master=False)
+        return {name: signal.samples for name, signal in zip(names, signals, strict=True)}
+
+    @contextmanager
+    def opened() -> Iterator[Any]:
+        # given a path, the library maps all of the file into memory, and reads whole channels for each chunk
+        with path.open("rb") as raw:
+            try:
+                file = MDF(raw)
+            except Exception as error:
+                _close_partial(error)
+                raise
+            with closing(file):
+                yield file
+
+    return _open_measurement(path, "MDF", opened, list_rasters, read)
+
+
+def open_tdms(path: Path) -> TableFile:
+    """Open a TDMS file."""
+    try:
+        from nptdms import TdmsFile
+        from nptdms.log import log_manager
+    except ModuleNotFoundError:
+        raise RecordingError(f"{path}: TDMS files need npTDMS, pip install 'servoscope[tdms]'") from None
+
+    log_manager.set_level(logging.CRITICAL)  # broken files raise an error; no dump of their bytes on the terminal
+
+    def list_rasters(file: Any) -> list[_Raster]:
+        channels = [channel for group in file.groups() for channel in group.channels()]
+        names = [channel.name for channel in channels]
+        rasters: dict[tuple[Any, ...], dict[str, Any]] = {}
+        for channel in channels:
+            step = float(channel.properties.get("wf_increment", 0.0))
+            begin = float(channel.properties.get("wf_start_offset", 0.0))
+            name = channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}"
+            rasters.setdefault((len(channel), step, begin), {})[name] = (channel.group_name, channel.name)
+        for (_, step, begin), places in rasters.items():
+            if step > 0.0:
+                places.setdefault(DEFAULT_TIME_NAME, (step, begin))
+        return [_Raster(rows, places) for (rows, *_), places in rasters.items()]
+
+    def read(file: Any, raster: _Raster, names: Sequence[str], first: int, rows: int) -> Mapping[str, Any]:
+        found: dict[str, Any] = {}
+        for name in names:
+            place = raster.places[name]
+            if isinstance(place[0], str):
+                group, channel = place
+                found[name] = file[group][channel].read_data(offset=first, length=rows)
+            else:  # a clock that the file describes by its step and its beginning
+                step, begin = place
+                found[name] = begin + step * np.arange(first, first + rows)
+        return found
+
+    return _open_measurement(path, "TDMS", lambda: closing(TdmsFile.open(path)), list_rasters, read)
+
+
+def _close_partial(error: Exception) -> None:
+    """Mark the objects that asammdf has half built as closed; else they print a complaint when they are collected."""
+    trace = error.__traceback__
+    while trace is not None:
+        made: Any = trace.tb_frame.f_locals.get("self")
+        if hasattr(made, "_closed"):
+            made._closed = True
+        trace = trace.tb_next
+
+
+def _open_measurement(
+    path: Path,
+    kind: str,
+    opened: Callable[[], AbstractContextManager[Any]],
+    list_rasters: Callable[[Any], list[_Raster]],
+    read: _ReadChannels,
+) -> TableFile:
+    def damaged(error: Exception) -> RecordingError:
+        text = " ".join(str(error).split())[:80] or type(error).__name__
+        return RecordingError(f"{path}: is a damaged {kind} file ({text}), export it again")
+
+    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
+        import pyarrow as pa
+
+        raster = _common_raster(path, rasters, wanted)
+        try:
+            with opened() as file:
+                for first in range(0, raster.rows, CHUNK_ROWS):
+                    rows = min(CHUNK_ROWS, raster.rows - first)
+                    cells = {name: np.asarray(x) for name, x in read(file, raster, wanted, first, rows).items()}
+                    if len({x.shape[0] for x in cells.values()}) > 1:
+                        raise ValueError("channels end before their raster does")
+                    yield Table(
+                        path.name, {name: pa.chunked_array([_arrow_values(x)]) for name, x in cells.items()}, first + 1
+                    )
+        # both libraries raise nearly anything at damaged files
+        except Exception as error:
+            raise damaged(error) from None
+
+    try:
+        with opened() as file:
+            rasters = [raster for raster in list_rasters(file) if raster.rows]
+    except Exception as error:
+        raise damaged(error) from None
+    names = dict.fromkeys(name for raster in rasters for name in raster.places)
+    if not names:
+        raise RecordingError(f"{path}: holds no channels with values")
+    return TableFile(path, tuple(names), read_chunks, channel_groups=tuple(tuple(raster.places) for raster in rasters))
+
+
+def _common_raster(path: Path, rasters: Sequence[_Raster], wanted: Sequence[str]) -> _Raster:
+    """Return the raster that has all channels that are wanted."""
+    for raster in rasters:
+        if set(wanted) <= set(raster.places):
+            return raster
+    best = max(rasters, key=lambda one: len(set(wanted) & set(one.places)))
+    strange = next(name for name in wanted if name not in best.places)
+    raise RecordingError(
+        f"{path}: {strange!r} was not sampled together with {', '.join(n for n in wanted if n in best.places)}: "
+        "export all of them in one raster"
+    )
+
+
+def _arrow_values(cells: Any) -> Any:
+    """Return values as Arrow takes them: numbers as they are, all else as text."""
+    if cells.dtype.kind in "fiub" and cells.ndim == 1:
+        return cells.astype(cells.dtype.newbyteorder("="))
+    return [str(x) for x in cells.tolist()] if cells.ndim == 1 else [""] * cells.shape[0]

@@ -1,0 +1,60 @@
+"""Reads Parquet files, some rows at a time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from os import SEEK_END
+from pathlib import Path
+
+from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
+
+CHUNK_ROWS = 1 << 16  # that are read at a time
+BUFFER_BYTES = 1 << 20  # of each column
+MAX_FOOTER_BYTES = 32_000_000
+FOOTER_END_BYTES = 8  # at the end of the file: the length of the footer, and PAR1
+
+
+def open_parquet(path: Path) -> TableFile:
+    """Open a Parquet file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    def damaged(error: Exception) -> RecordingError:
+        return RecordingError(f"{path}: is a damaged Parquet file ({shorten_error(error)}), write it again")
+
+    def read(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
+        first = 1
+        try:
+            # neither read_table nor a memory map: the one imports pandas, the other takes the file for memory
+            with pq.ParquetFile(path, buffer_size=BUFFER_BYTES, pre_buffer=False) as file:
+                for batch in file.iter_batches(CHUNK_ROWS, columns=list(wanted)):
+                    columns = {name: pa.chunked_array([batch.column(name)]) for name in wanted}
+                    yield Table(path.name, columns, first)
+                    first += batch.num_rows
+        except (pa.ArrowException, OSError) as error:
+            raise damaged(error) from None
+
+    _check_footer(path)
+    try:
+        with pq.ParquetFile(path) as file:
+            check_width(path, file.metadata.num_columns)  # before anything is made of the columns
+            names = file.schema_arrow.names
+    except (pa.ArrowException, OSError) as error:
+        raise damaged(error) from None
+    count = Counter(names)
+    return TableFile(path, tuple(name for name in names if count[name] == 1), read)
+
+
+def _check_footer(path: Path) -> None:
+    """Refuse a file whose description alone would fill the memory: it is unpacked to many times its size."""
+    with path.open("rb") as file:
+        size = file.seek(0, SEEK_END)
+        file.seek(max(0, size - FOOTER_END_BYTES))
+        footer, magic = int.from_bytes(file.read(4), "little"), file.read(4)
+    if magic == b"PAR1" and footer > MAX_FOOTER_BYTES:  # without it the file is damaged, which its reader says
+        raise RecordingError(
+            f"{path}: describes its columns and row groups in {footer / 1e6:.0f} MB, more than "
+            f"{MAX_FOOTER_BYTES / 1e6:g} MB: write fewer of them"
+        )

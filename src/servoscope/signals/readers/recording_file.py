@@ -1,0 +1,256 @@
+"""Files to recordings: picks columns and rows piece by piece, and cleans what it finds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core import outofcore
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.errors import RecordingError
+from servoscope.core.messages import message
+from servoscope.core.outofcore import GrowableArray
+from servoscope.models.loop import Columns, Loop
+from servoscope.signals import Defect, Recording, clean, with_defects
+from servoscope.signals.readers.columns import LinearCombination, find_channel, parse_combination
+from servoscope.signals.readers.formats import open_file
+from servoscope.signals.readers.select import CellReader, ColumnTypeChanged, RowFilter, format_cell
+from servoscope.signals.readers.table import Table, TableFile, TimeColumn, number_column
+
+TIME_NAMES = ("t", "time", "zeit", "timestamp", "time_s", "seconds", "datetime", "date", "elapsed")
+
+
+@dataclass(frozen=True)
+class ChannelInfo:
+    """A column of a file: its name, Arrow type, and smallest and largest number (NaN if it holds none)."""
+
+    name: str
+    dtype: str
+    min: float
+    max: float
+
+
+def list_channels(path: str | Path) -> list[ChannelInfo]:
+    """Return what columns a file has, in its order.
+
+    Raises RecordingError if the file cannot be read.
+    """
+    opened = open_file(path)
+    ranges: dict[str, list[tuple[float, float]]] = {name: [] for name in opened.columns}
+    types: dict[str, list[str]] = {name: [] for name in opened.columns}
+    for table in (each for names in opened.channel_groups or [opened.columns] for each in opened.iter_chunks(names)):
+        for name, column in table.columns.items():
+            types[name].append(str(column.type))
+            try:
+                numbers = number_column(table, name, "channel")
+            except RecordingError:
+                continue
+            numbers = numbers[np.isfinite(numbers)]
+            if numbers.size:
+                ranges[name].append((float(numbers.min()), float(numbers.max())))
+    return [_channel_info(name, types[name], ranges[name]) for name in opened.columns]
+
+
+def _channel_info(name: str, types: list[str], ranges: list[tuple[float, float]]) -> ChannelInfo:
+    kind = next((each for each in ("string", "double") if each in types), types[0])  # what the whole column would be
+    if not ranges or (kind == "string" and len(ranges) < len(types)):
+        return ChannelInfo(name, kind, float("nan"), float("nan"))
+    return ChannelInfo(name, kind, min(low for low, _ in ranges), max(high for _, high in ranges))
+
+
+def read(
+    path: str | Path,
+    loop: Loop | None = None,
+    *,
+    columns: Columns | None = None,
+    where: Mapping[str, str] | None = None,
+) -> Recording:
+    """Read a recording.
+
+    Parameters
+    ----------
+    path
+        CSV (any delimiter, decimal comma with ``;``), Parquet, MAT (v5 and v7.3), MDF (3 and 4), or TDMS.
+    loop
+        The loop it was taken from: columns, sample rate, input limits. None: columns t, r, u, y, rate as measured.
+    columns
+        Where the signals stand; overrides the loop's.
+    where
+        Rows to take, by column: a value, several with commas, or a range, ``{"load": "20", "run": "1-5"}``.
+
+    Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
+    """
+    (recording,) = read_parts(path, loop, columns=columns, where=where)
+    return recording
+
+
+def read_parts(
+    path: str | Path,
+    loop: Loop | None = None,
+    *,
+    columns: Columns | None = None,
+    where: Mapping[str, str] | None = None,
+    by: str | None = None,
+) -> list[Recording]:
+    """Read several recordings out of one file, one per value of the column `by`, in the order of appearance.
+
+    Parameters and errors are those of `read`; a recording is called ``file.csv[run=6]``. Without `by`, there is one.
+    """
+    columns = columns or (loop.columns if loop is not None else Columns())
+    texts: set[str] = set()
+    while True:
+        try:
+            return _read_table_parts(open_file(path), loop, columns, where or {}, by, texts)
+        except ColumnTypeChanged as found:  # what was taken for numbers belongs to a column of text
+            texts.add(found.column)
+
+
+def _read_table_parts(
+    opened: TableFile, loop: Loop | None, columns: Columns, where: Mapping[str, str], by: str | None, texts: set[str]
+) -> list[Recording]:
+    name, known = opened.name, opened.columns
+    columns = _without_reference(opened, columns, loop)
+    chosen = RowFilter(opened, where)
+    apart = None if by is None else CellReader(find_channel(by, known, f"{name}: by"))
+    keys = {"reference": columns.reference, "input": columns.input, "output": " and ".join(columns.outputs)}
+    sensors = columns.outputs if len(columns.outputs) > 1 else ()
+    texts_by_key = {"reference": (columns.reference,), "input": (columns.input,), "output": columns.outputs}
+    signals = {
+        f"[columns] {key}": [_parse_signal(opened, text, f"{name}: [columns] {key}") for text in several]
+        for key, several in texts_by_key.items()
+    }
+    clock = _find_time_column(opened, columns, loop)
+    segments = [CellReader(find_channel(x, known, f"{name}: [columns] segment")) for x in columns.segment]
+    wanted = {*chosen.columns, *(x for several in signals.values() for signal in several for x in signal.factors)}
+    wanted |= {each.column for each in (apart, clock, *segments) if each is not None}
+    parts: dict[str, _RecordingBuilder] = {}
+    run = 0
+    for table in opened.iter_chunks(wanted, texts):
+        mask = chosen.mask(table)
+        rows: dict[str, BoolArray] = {name: mask}
+        if apart is not None:
+            cells = apart.read(table)
+            rows = {f"{name}[{by}={format_cell(v)}]": mask & (cells == v) for v in dict.fromkeys(cells[mask].tolist())}
+        each = {what: [_evaluate_signal(table, one, what) for one in several] for what, several in signals.items()}
+        values = [several[0] if len(several) == 1 else np.mean(several, axis=0) for several in each.values()]
+        if clock is not None:
+            values.insert(0, clock.seconds(table))
+        if segments:
+            runs = run + np.cumsum(np.any([each.changes(table) for each in segments], axis=0))
+            run = int(runs[-1])
+            values.append(runs)
+        if sensors:
+            values += each["[columns] output"]
+        for label, mine in rows.items():
+            parts.setdefault(label, _RecordingBuilder(clock is not None, sensors)).add(table, values, mine)
+    chosen.check_matched()
+    labels = {
+        letter: letter if letter == text else f"{letter} ({text!r})"
+        for letter, text in zip("ruy", keys.values(), strict=True)
+    }
+    return [part.recording(label, loop, (labels["r"], labels["u"], labels["y"])) for label, part in parts.items()]
+
+
+def _without_reference(opened: TableFile, columns: Columns, loop: Loop | None) -> Columns:
+    """Return columns in which u stands for a reference that nobody named and the file does not have.
+
+    In a loop that r has a part in, it has to be there: one with a controller, stage 1, or a sign from r.
+    """
+    if columns.reference != Columns().reference or columns.reference in opened.columns:
+        return columns
+    defaults = columns.input == Columns().input and columns.input not in opened.columns
+    if defaults or (loop is not None and loop.needs_reference):
+        return columns
+    _parse_signal(opened, columns.input, f"{opened.name}: [columns] input")  # what is missing is told as what it is
+    return columns.model_copy(update={"reference": columns.input})
+
+
+class _RecordingBuilder:
+    """The rows of one recording, as they come: time if the file has it, r, u, y, runs if there are some, sensors."""
+
+    def __init__(self, timed: bool, sensors: tuple[str, ...]) -> None:
+        self._has_time, self._sensors = timed, sensors
+        self._columns: list[GrowableArray] = []
+        self._broken: list[tuple[int, float, int, str]] = []
+        self._rows = 0
+
+    def add(self, table: Table, values: list[npt.NDArray[Any]], rows: BoolArray) -> None:
+        """Take some rows of a piece."""
+        for before, number, text in table.broken:
+            index = min(max(before - 1, 0), rows.size - 1)
+            if rows[index]:
+                at = float(values[0][index]) if self._has_time else float("nan")
+                self._broken.append((self._rows + int(rows[:index].sum()), at, number, text))
+        self._columns = self._columns or [GrowableArray() for _ in values]
+        for column, x in zip(self._columns, values, strict=True):
+            column.append(x if rows.all() else x[rows])
+        self._rows += int(rows.sum())
+
+    def recording(self, name: str, loop: Loop | None, labels: tuple[str, str, str]) -> Recording:
+        """Return the rows cleaned."""
+        rate = loop.sample_rate if loop is not None else None
+        columns = [column.to_array() for column in self._columns]
+        if not self._has_time:
+            columns.insert(0, _uniform_time(self._rows, rate or 1.0))
+        each = dict(zip(self._sensors, columns[len(columns) - len(self._sensors) :], strict=True))
+        t, r, u, y, *runs = columns[: len(columns) - len(self._sensors)]
+        run = runs[0] if runs else None
+        limits = loop.input_limits if loop is not None else None
+        notes = [self._note(*torn, t) for torn in self._broken]
+        recording = clean(t, r, u, y, name=name, sample_rate=rate, run=run, limits=limits, labels=labels, channels=each)
+        if not self._has_time:
+            text = message("defect.no_time", rate=recording.sample_rate)
+            notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))
+        return with_defects(recording, *notes)
+
+    def _note(self, row: int, at: float, number: int, text: str, t: FloatArray) -> Defect:
+        at = at if self._has_time else float(t[row])
+        shown = text if len(text) <= 30 else f"{text[:27]}..."
+        return Defect("text", at, at, 1, message("defect.torn", row=number, text=shown))
+
+
+def _uniform_time(rows: int, rate: float) -> FloatArray:
+    t = outofcore.empty((rows,))
+    for piece in outofcore.iter_chunks(0, rows, t):
+        t[piece] = np.arange(piece.start, piece.stop) / rate
+    return t
+
+
+def _find_time_column(opened: TableFile, columns: Columns, loop: Loop | None) -> TimeColumn | None:
+    """Return the time column; None where rows are uniform."""
+    wanted, known = columns.time, opened.columns
+    if wanted is not None and (wanted in known or wanted != Columns().time):
+        return TimeColumn(find_channel(wanted, known, f"{opened.name}: [columns] time"), columns.time_unit)
+    # A clock under another name must not be thrown away for a uniform one.
+    clock = next((name for name in known if re.split(r"[\s\[(]", name.casefold())[0] in TIME_NAMES), None)
+    if wanted is not None and (clock is not None or loop is None):
+        hint = (
+            f"is it {clock!r}? then say so in [columns] time"
+            if clock
+            else "give a loop, whose sample rate is taken then"
+        )
+        raise RecordingError(f"{opened.name}: [columns] time: no column {wanted!r}, {hint}")
+    if loop is None:
+        raise RecordingError(f"{opened.name}: has no time column, give a loop with its sample rate")
+    return None
+
+
+def _parse_signal(opened: TableFile, text: str, where: str) -> LinearCombination:
+    combination = parse_combination(text, [*opened.columns, *opened.non_channels], where)
+    for name in combination.factors:
+        if name in opened.non_channels:
+            raise RecordingError(f"{where}: {name!r} {opened.non_channels[name]}")
+    return combination
+
+
+def _evaluate_signal(table: Table, combination: LinearCombination, what: str) -> FloatArray:
+    total = np.full(table.rows, combination.constant)
+    for name, factor in combination.factors.items():
+        total += factor * number_column(table, name, what)
+    return total

@@ -1,0 +1,175 @@
+"""Columns of a file, or of a piece of it, as Arrow read them: numbers and times of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import RecordingError
+
+NULL_TEXTS = (
+    *("", "NaN", "nan", "NAN", "-nan", "-NaN", "NA", "N/A", "#N/A", "#NA", "null", "NULL", "None", "-", "?"),
+    "1.#QNAN",
+)
+MAX_COLUMNS = 20_000  # of a file: beyond that the description of the columns is what fills the memory
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Columns of a file, all of its rows or a piece of them."""
+
+    name: str  # what errors call the file
+    columns: dict[str, Any]  # name -> Arrow column; all of equal length
+    first_row: int = 1  # number of the first row in the file, as an editor counts
+    # rows that could not be split into the columns: (rows read before it, number in the file, text)
+    broken: tuple[tuple[int, int, str], ...] = ()
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self.columns.values()), ()))
+
+    def row_number(self, index: int) -> int:
+        """Return where row `index` stands in the file, broken rows before it counted."""
+        return self.first_row + index + sum(before <= index for before, _, _ in self.broken)
+
+
+def check_width(path: Path, count: int) -> None:
+    """Refuse a file with too many columns; raises RecordingError."""
+    if count > MAX_COLUMNS:
+        raise RecordingError(f"{path}: has {count} columns, more than {MAX_COLUMNS}: leave out what is not needed")
+
+
+def number_column(table: Table, name: str, what: str) -> FloatArray:
+    """Return a column as numbers, shape (N,), NaN where a cell is empty.
+
+    `what`: what the column is wanted for, for messages; raises RecordingError if a cell holds text; it names row,
+    column and text.
+    """
+    import pyarrow as pa
+
+    column = table.columns[name]
+    kind = column.type
+    if pa.types.is_dictionary(kind):
+        column, kind = column.cast(kind.value_type), kind.value_type
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        return _parse_numbers(table, name, column.to_pylist())
+    if pa.types.is_temporal(kind):
+        raise RecordingError(f"{table.name}: {what}: column {name!r} holds times, not numbers, choose another column")
+    try:
+        if pa.types.is_boolean(kind):
+            column = column.cast(pa.int8())
+        if not pa.types.is_float64(kind):  # Arrow's functions take a while to import
+            column = column.cast(pa.float64(), safe=False)
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
+        raise RecordingError(f"{table.name}: {what}: column {name!r} holds {kind}, not numbers") from None
+    # not to_numpy: it imports pandas where it finds it, a fifth of a second
+    chunks = (column.fill_null(np.nan) if column.null_count else column).chunks
+    return np.concatenate([np.zeros(0), *(np.from_dlpack(chunk) for chunk in chunks if len(chunk))])
+
+
+class TimeColumn:
+    """A time column in seconds, chunk by chunk; date and time count from the first row that has them.
+
+    `column`: its name; `unit`: of numbers in it.
+    """
+
+    def __init__(self, column: str, unit: str) -> None:
+        self.column, self._unit = column, unit
+        self._origin: tuple[int, float] | None = None
+
+    def seconds(self, table: Table) -> FloatArray:
+        """Return the time of a piece's rows [s], shape (N,).
+
+        Raises RecordingError if a cell holds text that is neither number nor time.
+        """
+        import pyarrow as pa
+
+        column = table.columns[self.column]
+        if not pa.types.is_temporal(column.type):
+            return number_column(table, self.column, "time") * TIME_UNITS[self._unit]
+        missing = np.asarray(column.is_null().to_numpy(zero_copy_only=False), dtype=bool)
+        if pa.types.is_date(column.type):
+            column = column.cast(pa.timestamp("ms"))
+        elif pa.types.is_time32(column.type):
+            column = column.cast(pa.time64("ns"))
+        per_second = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[column.type.unit]
+        whole = column.cast(pa.int64()).fill_null(0).to_numpy()
+        known = np.flatnonzero(~missing)
+        if self._origin is None and known.size:
+            self._origin = int(whole[known[0]]), per_second
+        first, per = self._origin or (0, per_second)
+        # Whole numbers are subtracted first: nanoseconds since 1970 do not fit into a float.
+        if per == per_second:
+            since = (whole - first) / per_second
+        else:  # a later piece of a text file shows other digits
+            begun = first * int(per_second) // int(per)
+            since = (whole - begun) / per_second + (begun / per_second - first / per)
+        return np.where(missing, np.nan, since)
+
+
+def _parse_numbers(table: Table, name: str, cells: list[str | None]) -> FloatArray:
+    numbers = np.empty(len(cells))
+    for index, cell in enumerate(cells):
+        text = "" if cell is None else cell.strip()
+        try:
+            numbers[index] = np.nan if text in NULL_TEXTS else float(text.replace("_", "x"))
+        except ValueError:
+            shown = text if len(text) <= 40 else f"{text[:37]}..."
+            raise RecordingError(
+                f"{table.name}: row {table.row_number(index)}, column {name!r}: {shown!r} is not a number,"
+                " correct it or leave the cell empty"
+            ) from None
+    return numbers
+
+
+@dataclass(frozen=True, eq=False)
+class TableFile:
+    """A file whose columns are known and whose rows are not read yet."""
+
+    path: Path
+    columns: tuple[str, ...]  # names of its columns
+    # takes names of columns, and names of those among them that are text even where they look like numbers; returns
+    # the rows chunk by chunk
+    read_chunks: Callable[[Sequence[str], Collection[str]], Iterator[Table]]
+    non_channels: dict[str, str] = field(default_factory=dict)  # variables that are no channels, and why
+    channel_groups: tuple[tuple[str, ...], ...] = ()  # which columns can be read at once; empty: all of them
+
+    @property
+    def name(self) -> str:
+        """What errors call the file."""
+        return self.path.name
+
+    def iter_chunks(self, wanted: Collection[str], texts: Collection[str] = ()) -> Iterator[Table]:
+        """Yield the rows chunk by chunk, of the columns that are wanted; `texts` among them are text in any case.
+
+        Raises RecordingError if the file is damaged or has no rows.
+        """
+        rows = 0
+        for table in self.read_chunks([name for name in self.columns if name in wanted], texts):
+            rows += table.rows
+            if table.rows:
+                yield table
+        if not rows:
+            raise RecordingError(f"{self.path}: holds no rows")
+
+
+def shorten_error(error: Exception) -> str:
+    """Return what an error of a library says, as one short line."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def is_number(text: str) -> bool:
+    """Tell whether a text is a number as Python writes it."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

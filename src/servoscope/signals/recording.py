@@ -1,0 +1,70 @@
+"""What a recording is: columns of equal length on one clock, and what was wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import Int32Array
+from servoscope.core.errors import RecordingError
+from servoscope.signals.defects import Defect
+from servoscope.signals.samples import Samples
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording(Samples):
+    """Samples of one asset on one rising clock, of at least 20 rows, as `clean` makes them.
+
+    Where the time in the file starts again with a new run, the runs are laid end to end.
+    """
+
+    name: str  # what it is called in reports, for example the file's name
+    sample_rate: float  # sample rate [Hz]
+    run: Int32Array  # index of the run, from 0, shape (N,)
+    defects: tuple[Defect, ...] = ()  # what was wrong with the rows as logged, in the order of time
+
+    @property
+    def samples(self) -> int:
+        """Number of rows N."""
+        return int(self.t.size)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first row to one sample after the last [s], gaps included."""
+        return float(self.t[-1] - self.t[0]) + 1.0 / self.sample_rate
+
+    @property
+    def columns(self) -> tuple[npt.NDArray[Any], ...]:
+        """All that has one value per row, channels aside: t, r, u, y, restart, run."""
+        return *super().columns, self.run
+
+    def __getitem__(self, rows: slice | npt.NDArray[Any]) -> Self:
+        """Return some of the rows without the defects; a slice copies nothing."""
+        return replace(super().__getitem__(rows), run=self.run[rows], defects=())
+
+    def rows(self, rows: slice) -> Self:
+        """Return some of the rows without the defects; nothing is copied."""
+        return self[rows]
+
+    def part(self, from_s: float, to_s: float) -> Recording:
+        """Return the rows with from_s <= t < to_s and the defects that overlap them.
+
+        Raises RecordingError if there are none.
+        """
+        first, end = np.searchsorted(self.t, [from_s, to_s])
+        if first >= end:
+            span = f"{self.t[0]:g} to {self.t[-1]:g} s"
+            raise RecordingError(f"{self.name}: nothing from {from_s:g} to {to_s:g} s, it spans {span}")
+        part = self[first:end]
+        restart = part.restart.copy()
+        restart[0] = True
+        defects = tuple(d for d in self.defects if d.to_s >= from_s and d.from_s < to_s)
+        return replace(part, restart=restart, run=part.run - part.run[0], defects=defects)
+
+
+def with_defects(recording: Recording, *more: Defect) -> Recording:
+    """Return the recording with further defects, all in the order of time."""
+    return replace(recording, defects=tuple(sorted((*recording.defects, *more), key=lambda defect: defect.from_s)))

@@ -1,0 +1,144 @@
+"""Finds isolated spikes: samples that jump out and back again, far beyond the steps around them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core import outofcore
+from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
+
+MAX_WIDTH = 10  # samples
+MAX_NORMAL_WIDTH = 3  # samples; wider ones must be enormous
+WIDE_SPIKE_FACTOR = 10.0  # times the range of the signal
+LOCAL_STEP_FACTOR = 6.0  # times the upper quartile of the local steps: about 9 standard deviations of white noise
+QUANTUM_FACTOR = 4.0  # times the median step that is not zero, so that an encoder's counts at rest are no spikes
+NEIGHBOURS = 20  # samples on either side that define what is normal
+STEP_SHARE = 0.02  # of the reference's range: smaller steps do not make u kick
+REACTION_SAMPLES = 3  # samples in which u may kick after a step of r
+PASSES = 30
+CHUNK_PLACES = 512  # that are looked at together: each of them brings the pages around it into memory
+_NO_ROWS = np.empty(0, dtype=np.intp)
+
+
+def find_spikes(
+    x: FloatArray,
+    run: npt.NDArray[np.int32],
+    *,
+    share: float,
+    excused: Callable[[IndexArray], BoolArray] = lambda rows: np.zeros(rows.size, dtype=np.bool_),
+) -> IndexArray:
+    """Find isolated spikes of at most ten samples.
+
+    A spike rises above both of its neighbours by more than `share` of the signal's range (1 to 99 %
+    quantile) and far more than the steps around it; where it is wider than three samples or stands at the
+    edge of a run, by more than ten times the range. A signal that merely moves does not return within a few
+    samples.
+
+    `x`: signal, shape (N,), finite; `run`: index of the run of each sample, shape (N,); nothing is compared across
+    runs; `share`: smallest height of a spike, as a share of the signal's range; `excused`: tells which of some
+    samples may jump, for example u where the reference steps.
+    """
+    spikes = _NO_ROWS
+    for _ in range(PASSES):  # spikes hide others: range and neighbours are taken again without those found
+        z, runs = outofcore.drop_rows(x, spikes), outofcore.drop_rows(run, spikes)
+        before = spikes - np.arange(spikes.size)
+
+        def logged(rows: IndexArray, before: IndexArray = before) -> IndexArray:
+            return np.asarray(rows + np.searchsorted(before, rows, side="right"))
+
+        found = logged(_find_spikes_once(z, runs, share, lambda rows, logged=logged: excused(logged(rows))))  # type: ignore[misc]
+        if not found.size:
+            break
+        spikes = np.union1d(spikes, found)
+    return spikes
+
+
+def follows_reference_step(r: FloatArray, run: npt.NDArray[np.int32], rows: IndexArray) -> BoolArray:
+    """Return at which of some rows (n,) a controller may kick: where r steps or a run starts, shape (n,)."""
+    low, high = _range(r)
+    kicked = np.zeros(rows.size, dtype=np.bool_)
+    for places in outofcore.iter_chunks(0, rows.size, r, run, at_once=CHUNK_PLACES):
+        for offset in range(-1, REACTION_SAMPLES + 1):
+            at = rows[places] - offset
+            inside = (at > 0) & (at < r.size)
+            at = np.where(inside, at, 1)
+            step = np.abs(r[at] - r[at - 1])
+            is_step = (step > STEP_SHARE * (high - low)) & (
+                step > LOCAL_STEP_FACTOR * _local_step_quartile(r, at, np.zeros_like(at))
+            )
+            kicked[places] |= (inside & (is_step | (run[at] != run[at - 1]))) | (rows[places] == offset)
+    return kicked
+
+
+def _range(x: FloatArray) -> tuple[float, float]:
+    each = [(float(x[rows].min()), float(x[rows].max())) for rows in outofcore.iter_chunks(0, x.size, x)]
+    return min(low for low, _ in each), max(high for _, high in each)
+
+
+def _previous(x: npt.NDArray[Any], rows: slice) -> npt.NDArray[Any]:
+    return x[rows.start - 1 : rows.stop - 1]
+
+
+def _differences(x: FloatArray, rows: slice) -> FloatArray:
+    return np.asarray(x[rows] - _previous(x, rows))
+
+
+def _find_spikes_once(
+    z: FloatArray, run: npt.NDArray[np.int32], share: float, excused: Callable[[IndexArray], BoolArray]
+) -> IndexArray:
+    if z.size < 2 * NEIGHBOURS:
+        return _NO_ROWS
+    some = outofcore.sample_chunks(z.size)
+    span = float(np.subtract(*np.quantile(np.concatenate([z[rows] for rows in some]), [0.99, 0.01])))
+    moving = np.abs(np.concatenate([np.diff(z[rows]) for rows in some]))
+    moving = moving[moving > 0.0]
+    outofcore.release(z)
+    quantum = float(np.median(moving)) if moving.size > NEIGHBOURS else 0.0
+    modest, enormous = max(share * span, QUANTUM_FACTOR * quantum), WIDE_SPIKE_FACTOR * span
+    least = min(modest, enormous) if span > 0.0 else modest
+    # a spike is entered by a high step, or stands where a run starts
+    entered = outofcore.find_rows(
+        lambda rows: (np.abs(_differences(z, rows)) > least) | (run[rows] != _previous(run, rows)), z, run, first=1
+    )
+    entered = np.append(0, entered)
+    for width in range(1, MAX_WIDTH + 1):
+        if width > MAX_NORMAL_WIDTH and span == 0.0:
+            break
+        smallest = modest if width <= MAX_NORMAL_WIDTH else enormous
+        start, height = _find_excursions(z, run, entered, width, smallest, enormous if span > 0.0 else np.inf)
+        # The spike itself takes two steps of its surroundings; a quartile does not notice.
+        start = start[height > LOCAL_STEP_FACTOR * _local_step_quartile(z, start, np.full(start.size, width))]
+        start = start[~excused(start)]
+        if start.size:
+            # narrow ones first: what lies between two of them looks like a wide one of the other sign
+            return np.unique(start + np.arange(width)[:, None])
+    return _NO_ROWS
+
+
+def _find_excursions(
+    z: FloatArray, run: npt.NDArray[np.int32], at: IndexArray, width: int, smallest: float, at_edge: float
+) -> tuple[IndexArray, FloatArray]:
+    """Find at which places `width` samples stand above or below both neighbours: where (n,), and heights (n,)."""
+    from servoscope.signals.spike_kernels import write_excursions  # late: loads numba
+
+    start, height, count = np.empty(at.size, dtype=np.intp), np.empty(at.size), 0
+    for places in outofcore.iter_chunks(0, at.size, z, run, at_once=CHUNK_PLACES):
+        count += write_excursions(z, run, at[places], width, smallest, at_edge, start[count:], height[count:])
+    return start[:count], height[:count]
+
+
+def _local_step_quartile(z: FloatArray, start: IndexArray, width: IndexArray) -> FloatArray:
+    """Upper quartile of the steps around each place, shape (n,)."""
+    from servoscope.signals.spike_kernels import write_local_steps  # late: loads numba
+
+    if start.size == 0 or z.size < 2:
+        return np.zeros(start.size)
+
+    quartile = np.empty(start.size)
+    for places in outofcore.iter_chunks(0, start.size, z, at_once=CHUNK_PLACES):
+        write_local_steps(z, start[places], width[places], np.empty(2 * NEIGHBOURS), quartile[places])
+    return quartile

@@ -1,0 +1,178 @@
+"""Reads the store twice a second, once for all readers, and gives each of them what is new since its last event.
+
+A slow reader gets the newest state when it is ready, and nothing of what it missed in between: no backlog grows. What
+most readers need is turned into text once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import sqlalchemy as sa
+from pydantic_core import to_json
+
+from servoscope.core.errors import StoreError
+from servoscope.service.asset_status import AssetStatus, ServiceStatus
+from servoscope.service.store import Row, Store, tables
+from servoscope.web.schemas.assets import AssetRow, ServiceRow, TransitionRow
+from servoscope.web.schemas.responses import DiagnosisRow
+from servoscope.web.statuses import StatusEntry, asset_statuses, read_statuses, service_statuses
+
+EVERY_S = 0.5
+MAX_EVENTS = 2000  # that a reader may be behind
+MAX_TEXTS = 100  # of a tick, one for each earlier tick at which a reader was last served
+MAX_RANGES_PER_QUERY = 200  # pairs of asset and number
+
+
+class HubEvent(NamedTuple):
+    """Something that happened once: its number, kind (``alarm`` or ``diagnosis``), asset, and text for readers."""
+
+    number: int
+    kind: str
+    asset: str
+    text: bytes
+
+
+@dataclass
+class EventHub:
+    """The newest statuses and events of a store."""
+
+    store: Store
+    tick: int = 0  # counts reads that found something new
+    error: str = ""  # of the last read; empty: the store answers
+    closed: bool = False
+    statuses: dict[str, StatusEntry] = field(default_factory=dict)
+    events: deque[HubEvent] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
+    last_number: int = 0  # of the events
+    _ticks: dict[str, int] = field(default_factory=dict)  # at which each asset was last new
+    # negative severity, name and text of each asset, made once however far behind readers are
+    _assets: dict[str, tuple[float, str, str]] = field(default_factory=dict)
+    _texts: dict[int, bytes] = field(default_factory=dict)  # the newest tick's event by the reader's last tick
+    _change: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def run(self) -> None:
+        """Poll until cancelled."""
+        while True:
+            start = time.monotonic()
+            await self.poll()
+            await asyncio.sleep(max(0.05, EVERY_S - (time.monotonic() - start)))
+
+    async def poll(self) -> None:
+        """Read what is new, and wake the readers."""
+        try:
+            changed, events = await asyncio.to_thread(self._read)
+        except StoreError as error:
+            if not self.error:
+                logging.getLogger("servoscope.web").error("store: %s", error)
+                self._notify()
+            self.error = str(error)
+            return
+        if not changed and not self.error:
+            return
+        self.error = ""
+        self.tick += 1
+        self.statuses.update(changed)
+        self._ticks.update(dict.fromkeys(changed, self.tick))
+        self._texts = {}
+        for stored, status in asset_statuses(changed.values()):
+            row = AssetRow.from_status(stored.name, stored.at, status)
+            self._assets[stored.name] = -row.severity, stored.name, row.model_dump_json()
+        for kind, event in events:
+            self.last_number += 1
+            self.events.append(HubEvent(self.last_number, kind, str(event.asset), format_sse(kind, event)))
+        self._notify()
+
+    def _notify(self) -> None:
+        change, self._change = self._change, asyncio.Event()
+        change.set()
+
+    def close(self) -> None:
+        """End the streams of all readers."""
+        self.closed = True
+        self._notify()
+
+    async def wait(self, seconds: float) -> None:
+        """Wait until something is new, but no longer than this."""
+        try:
+            await asyncio.wait_for(self._change.wait(), seconds)
+        except TimeoutError:
+            return
+
+    def has_changed(self, asset: str, tick: int) -> bool:
+        """Return whether an asset is new to a reader who was last served at this tick."""
+        return self._ticks.get(asset, -1) > tick
+
+    def events_since(self, tick: int) -> bytes:
+        """Return the events that bring a reader up to date who was last served at this tick."""
+        if tick not in self._texts:
+            if len(self._texts) > MAX_TEXTS:
+                self._texts = {}
+            names = [name for name, changed in self._ticks.items() if changed > tick]
+            now, text = time.time(), b""
+            assets = sorted(self._assets[name] for name in names if name in self._assets)
+            if assets or tick < 0:
+                rows = ",".join(row for _, _, row in assets)
+                text = f'event: assets\ndata: {{"now":{now!r},"assets":[{rows}]}}\n\n'.encode()
+            services = service_statuses(self.statuses[name] for name in names)
+            if shown := [ServiceRow.from_status(stored.name, status) for stored, status in services]:
+                text += format_sse("services", {"now": now, "services": shown})
+            self._texts[tick] = text
+        return self._texts[tick]
+
+    def _read(self) -> tuple[dict[str, StatusEntry], list[tuple[str, TransitionRow | DiagnosisRow]]]:
+        """Return the statuses that have changed, and what happened meanwhile; in a thread."""
+        clocks = self.store.checkpoint_times()
+        names = [name for name, at in clocks.items() if name not in self.statuses or self.statuses[name].at != at]
+        if not names:
+            return {}, []
+        read = read_statuses(self.store, names if len(names) < len(clocks) else None)
+        changed = {name: read[name] for name in names if name in read and not self._is_unchanged(read[name])}
+        return changed, self._new_events(changed) if self.tick else []
+
+    def _is_unchanged(self, stored: StatusEntry) -> bool:
+        """Return whether it is a service, which stores its status with every commit, and says the same as before."""
+        before = self.statuses.get(stored.name)
+        return isinstance(stored.status, ServiceStatus) and before is not None and before.status == stored.status
+
+    def _new_events(self, changed: Mapping[str, StatusEntry]) -> list[tuple[str, TransitionRow | DiagnosisRow]]:
+        """Return new transitions and diagnoses, in the order of time."""
+        spans, singles = [], []
+        for name, stored in changed.items():
+            before = self.statuses.get(name)
+            if before is None:
+                continue
+            if (first := before.row_number) < (last := stored.row_number):
+                spans.append((name, first, last))
+            # a full diagnosis has its number from the moment when it was asked for
+            done = _pending_diagnoses(before) - _pending_diagnoses(stored)
+            singles += [(name, number - 1, number) for number in done]
+        return [
+            *(("alarm", TransitionRow.from_stored(row)) for row in self._rows(tables.transitions, spans)),
+            *(("diagnosis", DiagnosisRow.from_stored(row)) for row in self._rows(tables.diagnoses, spans + singles)),
+        ]
+
+    def _rows(self, table: sa.Table, ranges: list[tuple[str, int, int]]) -> list[Row]:
+        """Return the rows of assets with numbers behind one and up to another."""
+        rows: list[Row] = []
+        for i in range(0, len(ranges), MAX_RANGES_PER_QUERY):
+            parts = [
+                (table.c.asset == name) & (table.c.number > first) & (table.c.number <= last)
+                for name, first, last in ranges[i : i + MAX_RANGES_PER_QUERY]
+            ]
+            rows += self.store.fetch(sa.select(table).where(sa.or_(*parts)).order_by(table.c.t, table.c.number))
+        return rows
+
+
+def _pending_diagnoses(stored: StatusEntry) -> set[int]:
+    return set(stored.status.pending_diagnoses) if isinstance(stored.status, AssetStatus) else set()
+
+
+def format_sse(kind: str, content: object) -> bytes:
+    """Return a server-sent event of records and plain values."""
+    return b"event: %b\ndata: %b\n\n" % (kind.encode(), to_json(content, inf_nan_mode="null"))

@@ -1,0 +1,1 @@
+"""Work that takes seconds, outside the server's process: a queue, its worker, its tasks."""

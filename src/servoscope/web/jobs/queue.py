@@ -1,0 +1,155 @@
+"""Work that takes seconds, or that reads what strangers have sent: in processes of its own, with limits, in a queue."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from starlette.exceptions import HTTPException
+
+from servoscope.core.errors import ServoscopeError
+from servoscope.core.messages import message, render
+from servoscope.core.workers import ProcessLimits, Progress, Worker
+from servoscope.web import errors
+from servoscope.web.schemas.responses import JobResponse, JsonObject
+
+MAX_FINISHED = 200  # finished jobs that can still be asked for
+MAX_QUEUED = 20  # jobs that may wait
+MAX_RUNNING = 2  # jobs, and short tasks, at the same time
+SHORT_CPU_S, SHORT_MEMORY_MB = 60.0, 2000.0  # of a short task
+START_S = 20.0  # that a process may take to start by the clock on the wall
+WALL_TIME_FACTOR = 4.0  # times its processor time that it may take after that
+CACHE_VARIABLES = ("NUMBA_CACHE_DIR", "MPLCONFIGDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
+INHERITED_VARIABLES = ("PATH", "HOME", "LANG", "LC_ALL", "PYTHONPATH", "TMPDIR", *CACHE_VARIABLES)
+
+_threads = ThreadPoolExecutor(2 * MAX_RUNNING, "jobs")  # which wait for processes
+
+
+@dataclass
+class Job:
+    """A task in the queue, and what becomes of it."""
+
+    kind: str
+    user: str
+    task: str  # function of `servoscope.web.jobs.tasks`
+    arguments: tuple[Any, ...]
+    folder: Path  # where it runs: the folder of its input, so that messages name files and not the server's folders
+    finish: Callable[[Any], JsonObject]  # turns the task's result into the job's, in a thread
+    discard: Callable[[], None] = lambda: None  # removes what a failed job leaves
+    id: str = field(default_factory=lambda: secrets.token_hex(8))
+    state: Literal["queued", "running", "done", "failed"] = "queued"
+    step: str | None = None
+    created: float = field(default_factory=time.time)
+    finished: float | None = None
+    result: JsonObject | None = None
+    problem: JsonObject | None = None
+    ended: asyncio.Event = field(default_factory=asyncio.Event)
+    handle: asyncio.Task[None] | None = None
+
+    def response(self) -> JobResponse:
+        """Return what users see of it."""
+        return JobResponse(**{name: getattr(self, name) for name in JobResponse.model_fields})
+
+
+class JobQueue:
+    """Runs jobs, a few at the same time, each within the limits."""
+
+    def __init__(self, limits: ProcessLimits) -> None:
+        self._limits = limits
+        self._short_limits = ProcessLimits(min(limits.cpu_s, SHORT_CPU_S), min(limits.memory_mb, SHORT_MEMORY_MB))
+        self._jobs: dict[str, Job] = {}
+        self._slots = asyncio.Semaphore(MAX_RUNNING)
+        self._short_slots = asyncio.Semaphore(MAX_RUNNING)
+
+    def submit(self, job: Job) -> JobResponse:
+        """Put a job into the queue; raises HTTPException 429 if too many wait."""
+        if sum(one.finished is None for one in self._jobs.values()) >= MAX_QUEUED:
+            asyncio.get_running_loop().run_in_executor(None, job.discard)
+            raise HTTPException(429, "too many jobs wait, try again later", headers={"Retry-After": "10"})
+        for old in [one for one in self._jobs.values() if one.finished is not None][: -MAX_FINISHED or None]:
+            del self._jobs[old.id]
+        self._jobs[job.id] = job
+        job.handle = asyncio.create_task(self._run(job))
+        return job.response()
+
+    def find(self, id_: str) -> Job:
+        """Return a job; raises HTTPException 404 if there is none, or it ended long ago."""
+        if id_ not in self._jobs:
+            raise HTTPException(404, f"there is no job {id_}")
+        return self._jobs[id_]
+
+    def cancel(self, job: Job) -> None:
+        """Stop a job."""
+        if job.handle is not None and job.finished is None:
+            job.handle.cancel()
+
+    async def close(self) -> None:
+        """Stop all jobs."""
+        handles = [job.handle for job in self._jobs.values() if job.handle is not None and job.finished is None]
+        for handle in handles:
+            handle.cancel()
+        await asyncio.gather(*handles, return_exceptions=True)
+
+    async def run_now(self, task: str, folder: Path, *arguments: Any) -> Any:
+        """Run a short task at once, within smaller limits, and return its result; raises WorkerError if it failed."""
+        async with self._short_slots:
+            return await run_task(task, arguments, folder, self._short_limits)
+
+    async def _run(self, job: Job) -> None:
+        def show(step: str) -> None:
+            job.step = step
+
+        try:
+            async with self._slots:
+                job.state = "running"
+                result = await run_task(job.task, job.arguments, job.folder, self._limits, show)
+                job.result = await asyncio.to_thread(job.finish, result)
+            job.state = "done"
+        except ServoscopeError as error:
+            job.problem = errors.problem(errors.http_status(error), str(error))
+        except HTTPException as error:
+            job.problem = errors.problem(error.status_code, str(error.detail))
+        except asyncio.CancelledError:
+            job.problem = errors.problem(409, render(message("web.job_stopped")))
+        except Exception:
+            job.problem = errors.problem(500, render(message("web.job_failed")))
+            raise
+        finally:
+            if job.problem is not None:
+                job.state = "failed"
+                await asyncio.to_thread(job.discard)
+            job.finished, job.step = time.time(), None
+            job.ended.set()
+
+
+async def run_task(
+    task: str, arguments: tuple[Any, ...], folder: Path, limits: ProcessLimits, progress: Progress = lambda _: None
+) -> Any:
+    """Run a function of `servoscope.web.jobs.tasks` in a process of its own and return its result.
+
+    Raises WorkerError if it failed, or needed more than its limits.
+    """
+    worker = Worker(limits, folder=folder, environment=_environment())
+    run = partial(worker.run, progress=progress, timeout_s=START_S + WALL_TIME_FACTOR * limits.cpu_s)
+    try:
+        function = f"servoscope.web.jobs.tasks:{task}"
+        return await asyncio.get_running_loop().run_in_executor(_threads, run, function, *arguments)
+    finally:
+        # the wait for the process is milliseconds: it is killed
+        worker.stop()
+
+
+def _environment() -> dict[str, str]:
+    """Return the environment of a worker, which reads what strangers have sent: no secrets of the server."""
+    environment = {name: os.environ[name] for name in INHERITED_VARIABLES if name in os.environ}
+    if paths := environment.get("PYTHONPATH"):  # it runs in another folder
+        environment["PYTHONPATH"] = os.pathsep.join(str(Path(path).absolute()) for path in paths.split(os.pathsep))
+    return {**environment, "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}

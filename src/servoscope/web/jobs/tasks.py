@@ -1,0 +1,244 @@
+"""What jobs do, in processes of their own: they read what was sent, call other packages, and write results.
+
+Each task is a function that a worker calls with a callback for its progress; its result is written as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servoscope.core.errors import LoopError, RecordingError
+from servoscope.core.settings import parse_toml
+from servoscope.core.workers import Progress
+from servoscope.design import design_study
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import Trace
+from servoscope.diagnosis import operating_points
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.estimation.frequency_response import ResponseRow, response_rows
+from servoscope.learning import inspection
+from servoscope.models.loop import Columns, Loop
+from servoscope.report import plain_values
+from servoscope.signals import Recording, readers
+from servoscope.signals.readers.formats import open_file
+from servoscope.signals.readers.guess_columns import guess_mapping
+from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
+from servoscope.web.downsample import downsample_indices, json_numbers, signal_columns
+from servoscope.web.schemas import requests, responses
+from servoscope.web.schemas.responses import JsonObject
+
+PREVIEW_ROWS = 20
+PREVIEW_CELL = 100  # characters
+PREVIEW_CELLS = 10_000
+MAX_COLUMNS, MAX_NAME_CHARS = 2000, 100_000  # of a file; characters of all names together
+SIGNAL_POINTS, TRACE_POINTS = 2000, 1000
+
+
+def preview_file(progress: Progress, file: str) -> JsonObject:
+    """Return the columns of a file, what they may mean, and its first rows."""
+    progress("columns")
+    opened, count, first = open_file(file), 0, None
+    _check_width(file, opened.columns)
+    channels: Any = plain_values.channels_summary(file, readers.list_channels(file))["channels"]
+    names = [str(channel["name"]) for channel in channels]
+    most = max(1, min(PREVIEW_ROWS, PREVIEW_CELLS // len(names)))
+    for table in opened.iter_chunks(opened.columns):
+        count += table.rows
+        first = first if first is not None else table
+    assert first is not None, "a file without rows was refused"
+    head = [[_preview_cell(x) for x in first.columns[name].slice(0, most).to_pylist()] for name in names]
+    preview = responses.TablePreview(columns=names, rows=[list(row) for row in zip(*head, strict=True)])
+    return responses.FilePreview(
+        rows=count, columns=channels, preview=preview, mapping=guess_mapping(names)
+    ).model_dump()
+
+
+def _check_width(file: str, names: Sequence[str]) -> None:
+    """Refuse a file whose preview would be large, because all columns are in it."""
+    if len(names) > MAX_COLUMNS:
+        raise RecordingError(
+            f"{file}: holds {len(names)} columns, more than {MAX_COLUMNS}: leave out what is not needed"
+        )
+    if sum(map(len, names)) > MAX_NAME_CHARS:
+        raise RecordingError(f"{file}: the names of its columns are longer than {MAX_NAME_CHARS} characters together")
+
+
+def _preview_cell(value: Any) -> float | str | None:
+    if isinstance(value, bool | int | float):
+        return float(value) if math.isfinite(value) else None
+    return None if value is None else str(value)[:PREVIEW_CELL]
+
+
+def inspect_file(
+    progress: Progress, file: str, request: requests.InspectionRequest, loop: requests.LoopRef | None
+) -> JsonObject:
+    """Return whether a recording is usable, and if not, why."""
+    settings = load_loop(loop) if loop is not None else None
+    recording = read_recording(file, settings, request)
+    progress("inspecting")
+    result = inspection.inspect(recording, settings)
+    spectra = result.traces.spectra if result.traces is not None else None
+    columns = None
+    if spectra is not None:
+        columns = {"frequency_hz": spectra.f, "u": spectra.U, "y": spectra.Y}
+        columns |= {"coherence_u": spectra.coherence_u, "coherence_y": spectra.coherence_y}
+    return {
+        "inspection": plain_values.to_plain_values(result),
+        "signals": _recording_columns(recording),
+        "spectra": {name: json_numbers(values) for name, values in columns.items()} if columns is not None else None,
+    }
+
+
+def diagnose_file(
+    progress: Progress, file: str, request: requests.DiagnosisRequest, baseline_file: str, name: str, out: str
+) -> JsonObject:
+    """Diagnose a recording with a baseline, for users `name`; data and report go into the folder `out`."""
+    from servoscope import report
+
+    baseline = Baseline.load(baseline_file)
+    baseline = baseline.at(request.point) if request.point is not None else baseline
+    recording = read_recording(file, baseline.loop, request)
+    progress("recursion")
+    diagnosis, trace = diagnose_with_trace(baseline, recording, progress)
+    progress("report")
+    used = baseline.at(diagnosis.point) if diagnosis.point else baseline
+    origin = plain_values.provenance(used, Path(name), Path(file))
+    report.write_diagnosis_page(Path(out) / "report.html", diagnosis, trace, recording, used.loop, origin)
+    plant = used.loop.plant
+    data = responses.DiagnosisData(
+        document=json.loads(diagnosis.model_dump_json()),
+        words={fault.name: fault.words for fault in plant.all_faults},
+        units=list(plant.units),
+        signals=responses.SignalColumns(**_recording_columns(recording)),
+        trace=_trace_columns(trace, plant.coefficient_units),
+    )
+    (Path(out) / "data.json").write_text(data.model_dump_json(), encoding="utf-8")
+    kept = {"verdict": diagnosis.verdict, "summary": str(diagnosis.summary), "recording": diagnosis.recording}
+    return {**kept, "hash": used.hash}
+
+
+def learn_baseline(
+    progress: Progress,
+    request: requests.LearningRequest,
+    loop: requests.LoopRef,
+    uploads: Sequence[str],
+    earlier: str | None,
+    out: str,
+) -> JsonObject:
+    """Learn a baseline from healthy recordings into the folder `out`, and inspect each of them."""
+    settings = load_loop(loop)
+    if request.columns is not None:
+        settings = settings.model_copy(update={"columns": _merge_columns(request.columns, settings)})
+    by_point: dict[str, list[Recording]] = {}
+    rows = []
+    for asked, file in zip(request.recordings, map(Path, uploads), strict=True):
+        progress(f"reading {file.name}")
+        recording = read_recording(str(file), settings, requests.RecordingSelection(where=request.where))
+        by_point.setdefault(asked.point or "", []).append(recording)
+        result = plain_values.to_plain_values(inspection.inspect(recording, settings))
+        rows.append({"upload": asked.upload, "name": file.name, "point": asked.point, "inspection": result})
+    if "" in by_point and len(by_point) > 1:
+        raise RecordingError("name the operating point of each recording, or of none")
+    baseline = operating_points.learn(
+        settings,
+        by_point.get("", by_point),
+        progress,
+        compare=Baseline.load(earlier) if earlier is not None else None,
+        accept_change=request.accept_change,
+    )
+    baseline.save(Path(out) / "baseline.json")
+    return {"summary": plain_values.replace_nan(plain_values.baseline_summary(baseline)), "recordings": rows}
+
+
+def study_design(
+    progress: Progress, request: requests.DesignRequest, loop: requests.LoopRef, uploads: Sequence[str], out: str
+) -> JsonObject:
+    """Study which faults can be detected and isolated; study and page go into the folder `out`."""
+    from servoscope.report import design_page
+
+    settings, selection = load_loop(loop), requests.RecordingSelection(columns=request.columns)
+    study = design_study(
+        settings,
+        [read_recording(file, settings, selection) for file in uploads],
+        progress=progress,
+        reference=request.reference,
+        after_s=request.after_s,
+        noise_u_std=request.noise_u_std if request.noise_u_std is not None else NOISE_U_STD,
+        noise_y_std=request.noise_y_std if request.noise_y_std is not None else NOISE_Y_STD,
+    )
+    design_page.write_design_page(Path(out) / "report.html", study)
+    text = json.dumps(plain_values.to_plain_values(study), allow_nan=False)
+    (Path(out) / "study.json").write_text(text, encoding="utf-8")
+    return {"loop": study.loop, "reference": str(study.reference)}
+
+
+def load_loop(ref: requests.LoopRef) -> Loop:
+    """Return a loop; raises LoopError if it is none."""
+    if ref.baseline is not None:
+        return Baseline.load(ref.baseline).loop
+    name, text = "loop", ref.toml or ""
+    if ref.example is not None:
+        name = f"{ref.example}.toml"
+        text = files("servoscope.simulation").joinpath(name).read_text(encoding="utf-8")
+    return Loop.from_dict(parse_toml(text, name, LoopError), name)
+
+
+def read_recording(file: str, loop: Loop | None, selection: requests.RecordingSelection) -> Recording:
+    """Return the selected part of a file; columns that the selection leaves out stay as in the loop."""
+    columns = _merge_columns(selection.columns, loop) if selection.columns is not None else None
+    if loop is None and columns is None:
+        missing = {"t", "r", "u", "y"} - {channel.name for channel in readers.list_channels(file)}
+        if missing:
+            raise RecordingError(
+                f"{Path(file).name}: has no column {min(missing)}: say which columns are t, r, u and y"
+            )
+    recording = readers.read(file, loop, columns=columns, where=selection.where)
+    first, last = selection.from_s, selection.to_s
+    if first is None and last is None:
+        return recording
+    return recording.part(-math.inf if first is None else first, math.inf if last is None else last)
+
+
+def _merge_columns(mapping: requests.ColumnMapping, loop: Loop | None) -> Columns:
+    base = loop.columns if loop is not None else Columns()
+    return Columns.model_validate({**base.model_dump(), **mapping.to_update()})
+
+
+def _recording_columns(recording: Recording) -> dict[str, list[float | None]]:
+    return signal_columns(recording.t, (recording.r, recording.u, recording.y), SIGNAL_POINTS)
+
+
+def _trace_columns(trace: Trace, units: Sequence[str]) -> responses.TraceColumns:
+    excess = np.where(trace.ready, trace.statistic / trace.threshold, np.nan)
+    at = downsample_indices((excess, trace.level), TRACE_POINTS)
+    std = np.sqrt(np.maximum(np.diagonal(trace.covariance, axis1=1, axis2=2), 0.0))
+    rows = response_rows(trace.ifrf, trace.ifrf_expected, at)
+    return responses.TraceColumns(
+        t=json_numbers(trace.t[at]),
+        statistic=json_numbers(excess[at]),
+        level=json_numbers(trace.level[at]),
+        responses=[
+            responses.TraceResponse(
+                frequency_hz=float(f),
+                **{name: json_numbers(rows[:, i, k + 1]) for k, name in enumerate(ResponseRow._fields[1:5])},
+            )
+            for i, f in enumerate(trace.ifrf.frequencies)
+        ],
+        parameters=[
+            responses.TraceParameter(
+                name=name,
+                unit=units[i] if i < len(units) else "",
+                value=json_numbers(trace.theta[at, i]),
+                std=json_numbers(std[at, i]),
+                nominal=json_numbers(trace.expected[at, i]),
+            )
+            for i, name in enumerate(trace.names)
+        ],
+    )

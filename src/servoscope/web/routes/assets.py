@@ -1,0 +1,136 @@
+"""Monitored assets: the fleet, one of them in detail, its history and its last signals."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated
+
+import numpy as np
+import sqlalchemy as sa
+from fastapi import APIRouter, Query
+from starlette.exceptions import HTTPException
+
+from servoscope.service.asset_status import AssetStatus
+from servoscope.service.sources.block import Block
+from servoscope.service.store import Store, tables
+from servoscope.service.store.queries import query_downsampled, query_history
+from servoscope.web.dependencies import VIEWER, Context, ContextDep
+from servoscope.web.downsample import signal_columns
+from servoscope.web.routes.baselines import asset_baseline_id
+from servoscope.web.schemas import assets as schemas
+from servoscope.web.schemas.requests import FleetQuery, HistoryQuery, RowQuery, SignalQuery
+from servoscope.web.schemas.responses import DiagnosisRow
+from servoscope.web.statuses import StatusEntry, asset_statuses, read_statuses, service_statuses
+
+router = APIRouter(tags=["assets"], dependencies=[VIEWER])
+
+DAY_S = 86400.0
+FIRST_BLOCKS = 16  # of an asset's newest samples that are read at first, as their length is not known
+UNKNOWN_RESIDUAL = (None, None, None)
+
+
+def find_asset(context: Context, asset: str) -> tuple[StatusEntry, AssetStatus]:
+    """Return the newest status of an asset; raises HTTPException 404 if there is no such asset."""
+    for stored in asset_statuses(read_statuses(context.store, [asset]).values()):
+        return stored
+    raise HTTPException(404, f"there is no asset {asset}")
+
+
+def build_asset_detail(context: Context, asset: str, at: float, status: AssetStatus) -> schemas.AssetDetail:
+    """Return all that is known of an asset now."""
+    query = sa.select(tables.diagnoses).where(tables.diagnoses.c.asset == asset)
+    newest = context.store.fetch(query.order_by(tables.diagnoses.c.t.desc()).limit(1))
+    diagnosis = DiagnosisRow.from_stored(newest[0]) if newest else None
+    return schemas.AssetDetail.build(asset, at, status, baseline=asset_baseline_id(context, asset), diagnosis=diagnosis)
+
+
+@router.get("/assets")
+def list_assets(context: ContextDep, query: Annotated[FleetQuery, Query()]) -> schemas.FleetStatus:
+    """List the assets, the most urgent first."""
+    statuses = read_statuses(context.store).values()
+    rows = [schemas.AssetRow.from_status(one.name, one.at, status) for one, status in asset_statuses(statuses)]
+    wanted = [
+        row
+        for row in rows
+        if query.search.casefold() in f"{row.asset} {row.group} {row.summary}".casefold()
+        and query.group in (None, row.group)
+        and query.verdict in (None, row.verdict)
+    ]
+    return schemas.FleetStatus(
+        now=time.time(),
+        assets=sorted(wanted, key=lambda row: (-row.severity, row.asset)),
+        groups=sorted({row.group for row in rows if row.group}),
+        services=[schemas.ServiceRow.from_status(one.name, status) for one, status in service_statuses(statuses)],
+    )
+
+
+@router.get("/assets/{asset}")
+def get_asset(context: ContextDep, asset: str) -> schemas.AssetDetail:
+    """Return all that is known of an asset now."""
+    stored, status = find_asset(context, asset)
+    return build_asset_detail(context, asset, stored.at, status)
+
+
+@router.get("/assets/{asset}/history")
+def get_residuals(context: ContextDep, asset: str, query: Annotated[HistoryQuery, Query()]) -> schemas.ResidualHistory:
+    """Return its statistics and residuals over a time; of each of `points` equal parts of it, the largest."""
+    until = query.until if query.until is not None else find_asset(context, asset)[1].position.t
+    since = query.since if query.since is not None else until - DAY_S
+    if not since < until:
+        raise HTTPException(422, "from must be before to")
+    rows, count = query_downsampled(context.store, asset, (since, until), query.points)
+    by_row = [{f: numbers for f, *numbers in row["residual"]} for row in rows]
+    residuals = []
+    for f in sorted({f for row in by_row for f in row}):
+        columns = [list(column) for column in zip(*(row.get(f, UNKNOWN_RESIDUAL) for row in by_row), strict=True)]
+        residuals.append(schemas.ResidualSeries(frequency_hz=f, real=columns[0], imag=columns[1], healthy=columns[2]))
+    return schemas.ResidualHistory(
+        asset=asset,
+        from_=since,
+        to=until,
+        bucket_s=(until - since) / query.points,
+        rows=count,
+        t=[row["t"] for row in rows],
+        statistic=[row["statistic"] for row in rows],
+        level=[row["level"] for row in rows],
+        residuals=residuals,
+    )
+
+
+@router.get("/assets/{asset}/signals")
+def get_signals(context: ContextDep, asset: str, query: Annotated[SignalQuery, Query()]) -> schemas.RecentSignals:
+    """Return its last seconds, as measured."""
+    units = schemas.signal_units(find_asset(context, asset)[1].metadata.units)
+    sequence, blocks = _read_blocks(context.store, asset, query.seconds)
+    t, *signals = np.concatenate([block.signals for block in blocks], axis=1) if blocks else np.zeros((4, 0))
+    within = t > t[-1] - query.seconds if t.size else np.zeros(0, dtype=np.bool_)
+    t, signals = t[within], [signal[within] for signal in signals]
+    columns = signal_columns(t, signals, query.points)
+    return schemas.RecentSignals(asset=asset, sequence=sequence, samples=int(t.size), units=units, **columns)
+
+
+def _read_blocks(store: Store, asset: str, seconds: float) -> tuple[int | None, list[Block]]:
+    """Return the sequence of the newest block that the store keeps, and the blocks of the last seconds."""
+    table = tables.recent
+    newest = sa.select(sa.func.max(table.c.sequence)).where(table.c.asset == asset)
+    sequence: int | None = next(iter(store.fetch(newest)[0].values()))
+    query = sa.select(table).where(table.c.asset == asset).order_by(table.c.sequence.desc())
+    blocks: list[Block] = []
+    limit = FIRST_BLOCKS
+    while sequence is not None:
+        rows = store.fetch(query.limit(limit))
+        blocks = [Block.unpack(asset, row["sequence"], row["samples"]) for row in reversed(rows)]
+        if blocks[-1].t[-1] - blocks[0].t[0] >= seconds or len(rows) < limit:
+            break
+        limit *= 4
+    return sequence, blocks
+
+
+@router.get("/assets/{asset}/alarms")
+def list_asset_transitions(
+    context: ContextDep, asset: str, query: Annotated[RowQuery, Query()]
+) -> schemas.TransitionList:
+    """List the transitions of its alarms, the newest last."""
+    find_asset(context, asset)
+    rows = query_history(context.store, "alarms", assets=[asset], span=query.span, last=query.last)
+    return schemas.TransitionList(transitions=[schemas.TransitionRow.from_stored(row) for row in rows])

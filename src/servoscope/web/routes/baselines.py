@@ -1,0 +1,210 @@
+"""Baselines: those of the service file and those that were saved here; the loops that come with them; learning."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import tomllib
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter
+from fastapi.responses import FileResponse
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.status import HTTP_201_CREATED, HTTP_202_ACCEPTED, HTTP_204_NO_CONTENT
+
+from servoscope.detection.baseline import Baseline
+from servoscope.models.loop import Loop
+from servoscope.report import plain_values
+from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
+from servoscope.web.jobs.queue import Job
+from servoscope.web.schemas import responses
+from servoscope.web.schemas.assets import signal_units
+from servoscope.web.schemas.requests import BaselineRequest, LearningRequest, LoopRef
+
+router = APIRouter(tags=["baselines"], dependencies=[VIEWER])
+
+SERVICE_PREFIX = "service:"
+EXAMPLES = ("reference-rig",)
+JSON_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/json": {"schema": {"type": "object"}}}, "description": "The file"}
+}
+
+
+@dataclass(frozen=True)
+class BaselineFile:
+    """A baseline's file, and its row in lists."""
+
+    path: Path
+    row: responses.BaselineRow
+
+
+def asset_baseline_id(context: Context, asset: str) -> str | None:
+    """Return the id of the baseline that an asset is compared with; None where no service file is known."""
+    config = context.config
+    if config is None or asset not in config.assets:
+        return None
+    file = config.assets[asset].baseline
+    return SERVICE_PREFIX + next(name for name, one in config.assets.items() if one.baseline == file)
+
+
+def find_baseline(context: Context, id_: str) -> BaselineFile:
+    """Return a baseline.
+
+    Raises HTTPException 404 if there is none; raises BaselineError if its file cannot be used.
+    """
+    if not id_.startswith(SERVICE_PREFIX):
+        return _saved_baseline(context, context.storage.read(responses.BaselineRecord, id_))
+    config, asset = context.config, id_.removeprefix(SERVICE_PREFIX)
+    if config is None or asset_baseline_id(context, asset) != id_:
+        raise HTTPException(404, f"there is no baseline {id_}")
+    file = config.assets[asset].baseline
+    path = config.folder / file
+    sharing = [name for name, one in config.assets.items() if one.baseline == file]
+    facts = _baseline_facts(load_cached(path))
+    return BaselineFile(
+        path, responses.BaselineRow(id=id_, name=path.name, origin="service", assets=sharing, **dict(facts))
+    )
+
+
+def _saved_baseline(context: Context, record: responses.BaselineRecord) -> BaselineFile:
+    path = context.storage.path(responses.BaselineRecord, record.id) / "baseline.json"
+    return BaselineFile(path, responses.BaselineRow(name=record.id, origin="saved", **dict(record)))
+
+
+def _baseline_facts(baseline: Baseline) -> responses.BaselineFacts:
+    sources = [source for one in baseline.per_point for source in one.sources]
+    return responses.BaselineFacts(
+        loop=baseline.loop.name,
+        hash=baseline.hash,
+        points=list(baseline.points),
+        columns=baseline.loop.columns.model_dump(mode="json"),
+        units=signal_units(baseline.loop.plant.units),
+        recordings=len(sources),
+        duration_s=sum(source.duration_s for source in sources),
+    )
+
+
+def load_cached(path: Path) -> Baseline:
+    """Return the baseline in a file, which is read again when it has changed."""
+    try:
+        stamp = path.stat().st_mtime_ns
+    except OSError:
+        stamp = 0  # loading has the better message
+    return _load_version(path, stamp)
+
+
+@lru_cache(maxsize=64)
+def _load_version(path: Path, _: int) -> Baseline:
+    return Baseline.load(path)
+
+
+def resolve_loop(context: Context, ref: LoopRef) -> LoopRef:
+    """Return a loop as a task reads it."""
+    if ref.baseline is None:
+        return ref
+    return ref.model_copy(update={"baseline": str(find_baseline(context, ref.baseline).path)})
+
+
+def _list_files(context: Context) -> list[BaselineFile]:
+    config = context.config
+    ids = dict.fromkeys(asset_baseline_id(context, name) for name in config.assets) if config is not None else {}
+    of_service = [find_baseline(context, id_) for id_ in ids if id_ is not None]
+    return of_service + [_saved_baseline(context, record) for record in context.storage.list(responses.BaselineRecord)]
+
+
+@router.get("/baselines")
+def list_baselines(context: ContextDep) -> responses.BaselineList:
+    """List the baselines."""
+    return responses.BaselineList(baselines=[one.row for one in _list_files(context)])
+
+
+@router.get("/baselines/{id}")
+def get_baseline(context: ContextDep, id: str) -> responses.BaselineDetail:
+    """Return a baseline: what was learned, and which faults it can detect."""
+    found = find_baseline(context, id)
+    summary: Any = plain_values.replace_nan(plain_values.baseline_summary(load_cached(found.path)))
+    return responses.BaselineDetail(**dict(found.row), summary=summary)
+
+
+@router.get("/baselines/{id}/file", response_class=Response, responses=JSON_RESPONSES)
+def download_baseline(context: ContextDep, id: str) -> Response:
+    """Return its file, for `servoscope diagnose`."""
+    found = find_baseline(context, id)
+    load_cached(found.path)
+    name = f"{found.row.name.removesuffix('.json')}.json"
+    return FileResponse(found.path, media_type="application/json", filename=name)
+
+
+@router.delete("/baselines/{id}", status_code=HTTP_204_NO_CONTENT)
+def delete_baseline(context: ContextDep, who: Engineer, id: str) -> None:
+    """Delete a baseline that was saved here."""
+    if id.startswith(SERVICE_PREFIX):
+        raise HTTPException(409, f"{id} belongs to the service file")
+    record = context.storage.read(responses.BaselineRecord, id)
+    context.store.add_audit(who.user, "", "baseline deleted", {"baseline": id, "hash": record.hash})
+    context.storage.remove("baselines", id)
+
+
+@router.get("/loops")
+def list_loops(context: ContextDep) -> responses.LoopList:
+    """List the loops that come with the program, and those of the baselines."""
+    rows = []
+    for name in EXAMPLES:
+        text = files("servoscope.simulation").joinpath(f"{name}.toml").read_text(encoding="utf-8")
+        rows.append(_loop_row({"example": name}, Loop.from_dict(tomllib.loads(text)), text))
+    rows += [_loop_row({"baseline": one.row.id}, load_cached(one.path).loop, None) for one in _list_files(context)]
+    return responses.LoopList(loops=rows)
+
+
+def _loop_row(ref: dict[str, str], loop: Loop, toml: str | None) -> responses.LoopRow:
+    return responses.LoopRow(
+        ref=ref,
+        name=loop.name,
+        plant=loop.plant.kind,
+        sample_rate_hz=loop.sample_rate,
+        controller=loop.controller is not None,
+        columns=loop.columns.model_dump(mode="json"),
+        units=signal_units(loop.plant.units),
+        toml=toml,
+    )
+
+
+@router.post("/learnings", status_code=HTTP_202_ACCEPTED)
+async def start_learning(context: ContextDep, who: Engineer, request: LearningRequest) -> responses.JobResponse:
+    """Learn from healthy uploads, and inspect each of them; a job. Its baseline waits to be saved."""
+    uploads = [one.upload for one in request.recordings]
+    paths = await asyncio.to_thread(context.storage.upload_paths, uploads)
+    loop = await asyncio.to_thread(resolve_loop, context, request.loop)
+    earlier = None
+    if request.compare is not None:
+        earlier = str((await asyncio.to_thread(find_baseline, context, request.compare)).path)
+    id_, out = await asyncio.to_thread(context.storage.create, "learnings")
+
+    def finish(result: responses.JsonObject) -> responses.JsonObject:
+        context.storage.publish(responses.LearningRow(id=id_, who=who.user, uploads=uploads))
+        return {"learning": id_, **result}
+
+    arguments = request, loop, paths, earlier, str(out)
+    discard = partial(context.storage.remove, "learnings", id_)
+    return context.jobs.submit(Job("learning", who.user, "learn_baseline", arguments, out, finish, discard))
+
+
+@router.post("/baselines", status_code=HTTP_201_CREATED)
+def save_baseline(context: ContextDep, who: Engineer, request: BaselineRequest) -> responses.BaselineRow:
+    """Save a learned baseline under a name."""
+    learned = context.storage.path(responses.LearningRow, request.learning) / "baseline.json"
+    facts = _baseline_facts(Baseline.load(learned))
+    id_, folder = context.storage.create("baselines", request.name)
+    try:
+        shutil.copyfile(learned, folder / "baseline.json")
+        context.store.add_audit(who.user, "", "baseline saved", {"baseline": id_, "hash": facts.hash})
+        record = context.storage.publish(responses.BaselineRecord(id=id_, who=who.user, **dict(facts)))
+    except BaseException:
+        context.storage.remove("baselines", id_)
+        raise
+    return _saved_baseline(context, record).row

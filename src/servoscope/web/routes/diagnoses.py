@@ -1,0 +1,159 @@
+"""Diagnoses, of monitored assets and of uploads; each has a permanent address."""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+from typing import Annotated, Any
+
+import sqlalchemy as sa
+from fastapi import APIRouter, Query
+from fastapi.responses import FileResponse
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.status import HTTP_202_ACCEPTED
+
+from servoscope.service.store import tables
+from servoscope.service.store.queries import query_history
+from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
+from servoscope.web.jobs.queue import Job
+from servoscope.web.middleware import API
+from servoscope.web.routes.baselines import asset_baseline_id, find_baseline
+from servoscope.web.schemas import responses
+from servoscope.web.schemas.assets import signal_units
+from servoscope.web.schemas.requests import DiagnosisQuery, DiagnosisRequest
+from servoscope.web.statuses import asset_statuses, read_statuses
+
+router = APIRouter(tags=["diagnoses"], dependencies=[VIEWER])
+
+UPLOAD_PREFIX = "u-"
+MAX_NUMBER = 2**63 - 1
+HTML_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/html": {"schema": {"type": "string"}}}, "description": "A page that needs no other"}
+}
+# the policy of the report itself, which the server repeats: no script, and a frame only on the server's own pages
+REPORT_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'; sandbox allow-popups"
+)
+
+
+@router.get("/diagnoses")
+def list_diagnoses(context: ContextDep, query: Annotated[DiagnosisQuery, Query()]) -> responses.DiagnosisList:
+    """List diagnoses, the newest last."""
+    rows: list[responses.DiagnosisRow] = []
+    if query.grounds != "upload":
+        assets = [query.asset] if query.asset is not None else []
+        # those with the verdict and grounds may be older than the newest rows: then all rows are read
+        last = query.last if query.verdict is None and query.grounds is None else None
+        stored = query_history(context.store, "diagnoses", assets=assets, span=query.span, last=last)
+        rows = [responses.DiagnosisRow.from_stored(row) for row in stored]
+    if query.asset is None and query.grounds in (None, "upload"):
+        since, until = query.span
+        rows += [
+            _upload_row(record)
+            for record in context.storage.list(responses.UploadDiagnosis)
+            if (since is None or since <= record.at) and (until is None or record.at < until)
+        ]
+    rows = [row for row in rows if query.verdict in (None, row.verdict) and query.grounds in (None, row.grounds)]
+    return responses.DiagnosisList(diagnoses=sorted(rows, key=lambda row: (row.t, row.id))[-query.last :])
+
+
+def _upload_row(record: responses.UploadDiagnosis) -> responses.DiagnosisRow:
+    return responses.DiagnosisRow(
+        id=f"{UPLOAD_PREFIX}{record.id}",
+        t=record.at,
+        grounds="upload",
+        verdict=record.verdict,
+        summary=record.summary,
+        recording=record.recording,
+    )
+
+
+@router.get("/diagnoses/{id}")
+def get_diagnosis(context: ContextDep, id: str) -> responses.DiagnosisDetail:
+    """Return a diagnosis."""
+    return _upload_diagnosis(context, id) if _is_upload(id) else _asset_diagnosis(context, id)
+
+
+def _is_upload(id_: str) -> bool:
+    return id_.startswith(UPLOAD_PREFIX) and "@" not in id_
+
+
+def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
+    asset, _, number = id_.rpartition("@")
+    table = tables.diagnoses
+    rows = []
+    if number.isascii() and number.isdecimal() and int(number) <= MAX_NUMBER:
+        query = sa.select(table).where((table.c.asset == asset) & (table.c.number == int(number)))
+        rows = context.store.fetch(query)
+    if not rows:
+        raise HTTPException(404, f"there is no diagnosis {id_}")
+    document = dict(rows[0]["document"])
+    began = document.pop("began", None)
+    facts = next((one.metadata for _, one in asset_statuses(read_statuses(context.store, [asset]).values())), None)
+    baseline = None
+    if facts is not None and facts.model_fields_set:
+        # the baseline that the asset has now: the store does not know which one it had then
+        baseline = responses.BaselineRef(id=asset_baseline_id(context, asset), name=asset, hash=facts.baseline or "")
+    return responses.DiagnosisDetail(
+        **dict(responses.DiagnosisRow.from_stored(rows[0])),
+        began=began,
+        document=document,
+        words=facts.faults if facts is not None else {},
+        baseline=baseline,
+        units=signal_units(facts.units) if facts is not None else None,
+        coefficient_units=list(facts.coefficient_units) if facts is not None else [],
+    )
+
+
+def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
+    record = context.storage.read(responses.UploadDiagnosis, id_.removeprefix(UPLOAD_PREFIX))
+    path = context.storage.path(responses.UploadDiagnosis, record.id) / "data.json"
+    data = responses.DiagnosisData.model_validate_json(path.read_bytes())
+    return responses.DiagnosisDetail(
+        **dict(_upload_row(record)),
+        document=data.document,
+        words=data.words,
+        who=record.who,
+        baseline=record.baseline,
+        units=signal_units(data.units),
+        coefficient_units=[one.unit for one in data.trace.parameters],
+        signals=data.signals,
+        trace=data.trace,
+        report=f"{API}/diagnoses/{id_}/report",
+        upload=record.upload,
+    )
+
+
+@router.get("/diagnoses/{id}/report", response_class=Response, responses=HTML_RESPONSES)
+def get_diagnosis_report(context: ContextDep, id: str) -> Response:
+    """Return the report on an upload, a page to keep and print."""
+    if not _is_upload(id):
+        raise HTTPException(404, f"{id}: reports are made of uploads; the page of a diagnosis can be printed too")
+    return report_response(context, responses.UploadDiagnosis, id.removeprefix(UPLOAD_PREFIX))
+
+
+def report_response(context: Context, model: type[responses.StorageRecord], id_: str) -> Response:
+    """Return the page that a job wrote."""
+    path = context.storage.path(model, id_) / "report.html"
+    return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": REPORT_POLICY})
+
+
+@router.post("/diagnoses", status_code=HTTP_202_ACCEPTED)
+async def start_diagnosis(context: ContextDep, who: Operator, request: DiagnosisRequest) -> responses.JobResponse:
+    """Diagnose an upload with a baseline; a job."""
+    file = await asyncio.to_thread(context.storage.upload, request.upload)
+    baseline = await asyncio.to_thread(find_baseline, context, request.baseline)
+    id_, out = await asyncio.to_thread(context.storage.create, "diagnoses")
+
+    def finish(result: responses.JsonObject) -> responses.JsonObject:
+        used = responses.BaselineRef(id=request.baseline, name=baseline.row.name, hash=result["hash"])
+        note = {"diagnosis": id_, "recording": result["recording"], **used.model_dump()}
+        context.store.add_audit(who.user, "", "diagnosis", note)
+        record = {**result, "id": id_, "who": who.user, "baseline": used, "upload": request.upload}
+        context.storage.publish(responses.UploadDiagnosis.model_validate(record))
+        return {"diagnosis": f"{UPLOAD_PREFIX}{id_}"}
+
+    arguments = file.name, request, str(baseline.path), baseline.row.name, str(out)
+    discard = partial(context.storage.remove, "diagnoses", id_)
+    return context.jobs.submit(Job("diagnosis", who.user, "diagnose_file", arguments, file.parent, finish, discard))

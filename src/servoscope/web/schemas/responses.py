@@ -1,0 +1,320 @@
+"""What the interface answers of sessions, jobs, uploads, diagnoses, baselines and studies."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from servoscope.detection.result import Verdict
+from servoscope.service.access import Role
+
+JsonObject = dict[str, Any]  # a document of another package, passed on as it is
+NullableFloats = list[float | None]
+StorageKind = Literal["uploads", "baselines", "diagnoses", "learnings", "designs"]
+
+
+class ApiResponse(BaseModel):
+    """An answer."""
+
+    model_config = ConfigDict(json_schema_serialization_defaults_required=True)  # no field is ever left out
+
+
+class Problem(ApiResponse):
+    """An error after RFC 9457."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str | None = None
+    errors: list[dict[str, str]] | None = None
+
+
+class SessionResponse(ApiResponse):
+    """The user, and the token that changing requests must repeat."""
+
+    login_required: bool
+    password_login: bool
+    single_sign_on: str | None  # label of its button, which leads to /api/v1/session/oidc?next=PAGE
+    user: str | None
+    role: Role | None
+    csrf: str | None
+    expires: float | None
+    version: str
+
+
+class AuditEntry(ApiResponse):
+    """A line of the audit."""
+
+    id: int
+    at: float
+    who: str
+    asset: str
+    what: str
+    document: JsonObject
+
+
+class AuditList(ApiResponse):
+    """Lines of the audit, the newest last."""
+
+    entries: list[AuditEntry]
+
+
+class JobResponse(ApiResponse):
+    """A job: how far it is, and its result."""
+
+    id: str
+    kind: str
+    state: Literal["queued", "running", "done", "failed"]
+    step: str | None
+    created: float
+    finished: float | None
+    result: JsonObject | None
+    problem: JsonObject | None
+
+
+class StorageRecord(ApiResponse):
+    """Something that the server keeps in a folder of its own."""
+
+    kind: ClassVar[StorageKind]
+
+    id: str
+    at: float = Field(default_factory=time.time)
+    who: str
+
+
+class UploadRow(StorageRecord):
+    """An upload in a line."""
+
+    kind = "uploads"
+
+    name: str
+    bytes: int
+
+
+class TablePreview(ApiResponse):
+    """The first rows of a file."""
+
+    columns: list[str]
+    rows: list[list[float | str | None]]
+
+
+class FilePreview(ApiResponse):
+    """What a file holds: its columns, first rows, and what the columns may mean."""
+
+    rows: int
+    columns: list[JsonObject]
+    preview: TablePreview
+    mapping: JsonObject
+
+
+class UploadDetail(UploadRow, FilePreview):
+    """An upload with its columns and first rows."""
+
+
+class UploadList(ApiResponse):
+    """Uploads, the newest last."""
+
+    uploads: list[UploadRow]
+
+
+class SignalColumns(ApiResponse):
+    """Signals as columns; None where nothing was measured."""
+
+    t: NullableFloats
+    r: NullableFloats
+    u: NullableFloats
+    y: NullableFloats
+
+
+class TraceResponse(ApiResponse):
+    """The iFRF at one frequency over time, and the healthy one."""
+
+    frequency_hz: float
+    real: NullableFloats
+    imag: NullableFloats
+    nominal_real: NullableFloats
+    nominal_imag: NullableFloats
+
+
+class TraceParameter(ApiResponse):
+    """A coefficient over time, its standard deviation, and the healthy value."""
+
+    name: str
+    unit: str
+    value: NullableFloats
+    std: NullableFloats
+    nominal: NullableFloats
+
+
+class TraceColumns(ApiResponse):
+    """The evaluations of a recording as columns."""
+
+    t: NullableFloats
+    statistic: NullableFloats
+    level: NullableFloats
+    responses: list[TraceResponse]
+    parameters: list[TraceParameter]
+
+
+class DiagnosisData(ApiResponse):
+    """The data of a diagnosis of an upload, as its job writes them."""
+
+    document: JsonObject
+    words: dict[str, str]
+    units: list[str]  # of y and u
+    signals: SignalColumns
+    trace: TraceColumns
+
+
+class BaselineRef(ApiResponse):
+    """The baseline of a diagnosis."""
+
+    id: str | None
+    name: str
+    hash: str
+
+
+class UploadDiagnosis(StorageRecord):
+    """A diagnosis of an upload."""
+
+    kind = "diagnoses"
+
+    baseline: BaselineRef
+    upload: str | None = None
+    verdict: Verdict
+    summary: str
+    recording: str
+
+
+class DiagnosisRow(ApiResponse):
+    """A diagnosis in a line."""
+
+    id: str
+    asset: str | None = None
+    number: int | None = None
+    t: float
+    grounds: str
+    verdict: Verdict
+    summary: str
+    onset: float | None = None
+    recording: str | None = None
+
+    @classmethod
+    def from_stored(cls, row: Mapping[str, Any]) -> DiagnosisRow:
+        """Return a diagnosis of a followed asset, a row of the store."""
+        return cls.model_validate({**row, "id": f"{row['asset']}@{row['number']}"})
+
+
+class DiagnosisList(ApiResponse):
+    """Diagnoses, the newest last."""
+
+    diagnoses: list[DiagnosisRow]
+
+
+class DiagnosisDetail(DiagnosisRow):
+    """A diagnosis with its document; uploads have signals, trace and report too."""
+
+    document: JsonObject
+    words: dict[str, str]
+    began: float | None = None
+    who: str | None = None
+    baseline: BaselineRef | None
+    units: dict[str, str] | None
+    coefficient_units: list[str]
+    signals: SignalColumns | None = None
+    trace: TraceColumns | None = None
+    report: str | None = None
+    upload: str | None = None
+
+
+class BaselineFacts(ApiResponse):
+    """What a baseline's file says."""
+
+    loop: str
+    hash: str
+    points: list[str]
+    columns: JsonObject | None = None
+    units: dict[str, str] | None = None
+    recordings: int
+    duration_s: float
+
+
+class BaselineRecord(StorageRecord, BaselineFacts):
+    """A baseline that was saved here."""
+
+    kind = "baselines"
+
+
+class BaselineRow(BaselineFacts):
+    """A baseline in a line."""
+
+    id: str
+    name: str
+    origin: Literal["service", "saved"]
+    assets: list[str] = []
+    at: float | None = None
+    who: str | None = None
+
+
+class BaselineList(ApiResponse):
+    """All baselines."""
+
+    baselines: list[BaselineRow]
+
+
+class BaselineDetail(BaselineRow):
+    """A baseline with what was learned."""
+
+    summary: JsonObject
+
+
+class LearningRow(StorageRecord):
+    """A baseline that was learned, and is not saved yet."""
+
+    kind = "learnings"
+
+    uploads: list[str]
+
+
+class LoopRow(ApiResponse):
+    """A loop: where it comes from, and what its signals are."""
+
+    ref: dict[str, str]
+    name: str
+    plant: str
+    sample_rate_hz: float
+    controller: bool
+    columns: JsonObject
+    units: dict[str, str] | None
+    toml: str | None
+
+
+class LoopList(ApiResponse):
+    """Loops that come with the program, and those of baselines."""
+
+    loops: list[LoopRow]
+
+
+class DesignRow(StorageRecord):
+    """A study in a line."""
+
+    kind = "designs"
+
+    loop: str
+    reference: str
+
+
+class DesignList(ApiResponse):
+    """Studies, the newest last."""
+
+    designs: list[DesignRow]
+
+
+class DesignDetail(DesignRow):
+    """A study before deployment."""
+
+    study: JsonObject

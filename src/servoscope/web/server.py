@@ -1,0 +1,180 @@
+"""Serves the application: opens its files, listens, and stops in order."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import sys
+import threading
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from servoscope.core.errors import ConfigError
+from servoscope.core.messages import message, render
+from servoscope.core.workers import ProcessLimits
+from servoscope.service.access import Sessions, Users, WebSettings
+from servoscope.service.access.allowed_hosts import split_address
+from servoscope.service.config import ServiceFile
+from servoscope.service.store import Store
+from servoscope.web.app import create_app
+from servoscope.web.connections import ConnectionTable, LimitedProtocol
+from servoscope.web.dependencies import Context, SingleSignOn
+from servoscope.web.event_hub import EventHub
+from servoscope.web.jobs.queue import JobQueue
+from servoscope.web.storage import FileStorage
+from servoscope.web.upload_storage import UploadStorage
+
+STORE_PATIENCE = 5.0  # s
+STOPS_WITHIN_S = 5
+BACKLOG = 1024
+SEND_BUFFER = 1 << 17  # bytes of each connection; Linux takes them twice
+MAX_CONNECTIONS = 4000
+FILES_ASIDE = 200  # that are open beside connections: store, uploads, jobs
+HANDSHAKE_S = 10.0  # within which TLS has to be agreed on
+
+
+class WebServer(uvicorn.Server):
+    """Ends the streams of events before it waits for requests to end."""
+
+    def __init__(self, config: uvicorn.Config, hub: EventHub) -> None:
+        super().__init__(config)
+        self._hub = hub
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen."""
+        if self.config.is_ssl:  # uvicorn has no setting for it, and a minute of asyncio's own is long
+            loop = asyncio.get_running_loop()
+            setattr(loop, "create_server", partial(loop.create_server, ssl_handshake_timeout=HANDSHAKE_S))  # noqa: B010
+        await super().startup(sockets)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop."""
+        self._hub.close()
+        await super().shutdown(sockets)
+
+
+def run_server(
+    settings: WebSettings, store: Store, config: ServiceFile | None, folder: Path, *, with_parent: bool
+) -> None:
+    """Serve until stopped by a signal; the store is closed at the end.
+
+    Paths in the settings are relative to `folder`. `with_parent`: stop when stdin ends, which the service that
+    started the server holds. Raises ServoscopeError if the address or a file is not available.
+    """
+    users = Users(folder / settings.users) if settings.users is not None and settings.password_login else None
+    if users is not None and not users.all():
+        file = folder / str(settings.users)
+        what = "has no users" if file.exists() else "no such file"
+        raise ConfigError(f"{file}: {what}, add one: servoscope users add NAME --users {file}")
+    hub, storage = EventHub(store), FileStorage(folder / settings.folder)
+    context = Context(
+        settings=settings,
+        store=store,
+        config=config,
+        storage=storage,
+        uploads=UploadStorage(storage),
+        event_hub=hub,
+        jobs=JobQueue(ProcessLimits(settings.job_s, settings.job_memory_mb)),
+        users=users,
+        sessions=Sessions(settings.session_hours * 3600.0),
+        single_sign_on=_create_single_sign_on(settings, folder),
+    )
+    tls = {}
+    if settings.certificate is not None and settings.key is not None:
+        tls = {"ssl_certfile": folder / settings.certificate, "ssl_keyfile": folder / settings.key}
+        for path in tls.values():
+            if not path.is_file():
+                raise ConfigError(f"{path}: no such file, see [web] certificate and key")
+    listening = _bind_socket(settings.listen)
+    try:
+        server = WebServer(_uvicorn_config(context, tls), hub)
+        if with_parent:
+            threading.Thread(target=_stop_with_parent, args=(server,), daemon=True).start()
+        _print_address(settings, listening)
+        server.run([listening])
+    finally:
+        listening.close()
+        store.close()
+
+
+def _create_single_sign_on(settings: WebSettings, folder: Path) -> SingleSignOn | None:
+    """Return the client of the provider; None: there is none. Raises ConfigError if extra or secret are missing."""
+    if settings.oidc is None:
+        return None
+    from servoscope.web.oidc_client import OidcClient  # late: it needs an extra
+
+    return SingleSignOn(OidcClient(settings.oidc, settings.oidc.load_secret(folder)))
+
+
+def _uvicorn_config(context: Context, tls: dict[str, Any]) -> uvicorn.Config:
+    settings = context.settings
+    table = ConnectionTable(_available_connections(), settings.connections_per_address, settings.proxies)
+    protocol: Any = partial(LimitedProtocol, table)  # uvicorn calls it as it calls a class
+    return uvicorn.Config(
+        create_app(context),
+        http=protocol,
+        ws="none",  # there are no web sockets here
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=bool(settings.proxies),  # whoever else connects could write them
+        forwarded_allow_ips=list(settings.proxies),
+        timeout_graceful_shutdown=STOPS_WITHIN_S,
+        h11_max_incomplete_event_size=65536,
+        lifespan="on",
+        **tls,
+    )
+
+
+def _available_connections() -> int:
+    """Return how many connections there may be, with as many open files as the system allows."""
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_CONNECTIONS + FILES_ASIDE
+    if 0 <= soft < wanted:
+        soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    return MAX_CONNECTIONS if soft < 0 else max(1, min(MAX_CONNECTIONS, soft - FILES_ASIDE))
+
+
+def _bind_socket(address: str) -> socket.socket:
+    host, port = split_address(address)
+    try:
+        family, *_, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listening = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            # what the kernel holds cannot be replaced by newer events: a slow reader is behind by no more than that
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            listening.bind(where)
+            listening.listen(BACKLOG)  # clients may come as soon as the address is printed
+        except BaseException:
+            listening.close()
+            raise
+    except (OSError, OverflowError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ConfigError(f"[web] listen: {address} cannot be had ({why}), choose another address") from None
+    return listening
+
+
+def _print_address(settings: WebSettings, listening: socket.socket) -> None:
+    """Print the address, and whether there is a login, on stderr."""
+    host, port = listening.getsockname()[:2]
+    name = f"[{host}]" if ":" in host else host
+    scheme = "https" if settings.secure else "http"
+    login = message("web.login" if settings.login else "web.no_login")
+    lines = [message("web.address", address=f"{scheme}://{name}:{port}/", login=login)]
+    if settings.login and not settings.secure:
+        lines.append(message("web.no_tls"))
+    print(*map(render, lines), sep="\n", file=sys.stderr, flush=True)
+
+
+def _stop_with_parent(server: uvicorn.Server) -> None:
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    server.should_exit = True
