@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from servoscope.broker import BrokerSettings, reach
-from servoscope.live.block import Block, Resume
-from servoscope.live.checkpoint import Counted
-from servoscope.live.mqtt import payload
-from servoscope.live.mqtt.publishing import Publisher, PublishSettings
-from servoscope.live.mqtt.source import MqttSettings, MqttSource
-from servoscope.live.numbering import place
-from servoscope.live.service import Service
+from servoscope.service.checkpoint import StreamPosition
+from servoscope.service.mqtt import payload
+from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
+from servoscope.service.mqtt.replay_client import ReplayClient, ReplayClientSettings
+from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
+from servoscope.service.service import Service
+from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.continuity import check_continuity
 
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
-LOOP = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+LOOP = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
 
 
 def until(holds: Callable[[], Any], seconds: float = 300.0) -> Any:
@@ -46,22 +46,26 @@ class Taker:
 
     port: int
     assets: frozenset[str] = frozenset({"press"})
-    kept: dict[str, tuple[Counted, list[tuple[int, int]]]] = field(default_factory=dict)  # what a store would hold
+    kept: dict[str, tuple[StreamPosition, list[tuple[int, int]]]] = field(
+        default_factory=dict
+    )  # what a store would hold
 
     def start(self) -> MqttSource:
-        settings = MqttSettings(kind="mqtt", host="127.0.0.1", port=self.port, client="hall")
+        settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=self.port, client="hall")
         self.source = MqttSource(settings, self.assets, Path(), "hall")
-        self.source.open({asset: Resume(one.sequence, BEGAN, one.stream) for asset, (one, _) in self.kept.items()})
+        self.source.open(
+            {asset: ResumePosition(one.sequence, BEGAN, one.stream) for asset, (one, _) in self.kept.items()}
+        )
         self._now, self._taken = dict(self.kept), dict.fromkeys(self.assets, 0)
-        until(lambda: self.source.up)
+        until(lambda: self.source.connected)
         time.sleep(0.1)  # the broker has the subscription by then
         return self.source
 
     def turn(self, *, commit: bool = True) -> None:
         for one in self.source.poll(1000):
             counted, order = self._now.get(one.asset, (None, []))
-            found = place(counted, one)
-            before = counted or Counted(BEGAN, BEGAN)
+            found = check_continuity(counted, one)
+            before = counted or StreamPosition(BEGAN, BEGAN)
             if found is None:
                 counted = replace(before, repeated=before.repeated + 1)
             else:
@@ -89,7 +93,7 @@ class Sender:
     """A publisher that sends what it is told, and keeps nothing."""
 
     def __init__(self, port: int) -> None:
-        self.client = reach(BrokerSettings(host="127.0.0.1", port=port), Path(), "")
+        self.client = create_mqtt_client(BrokerSettings(host="127.0.0.1", port=port), Path(), "")
         self.heard: dict[str, Any] = {}
         self.client.on_message = lambda *words: self.heard.update({words[-1].topic: json.loads(words[-1].payload)})
         self.client.connect("127.0.0.1", port)
@@ -97,7 +101,7 @@ class Sender:
 
     def send(self, *messages: bytes | Block, asset: str = "press") -> None:
         for one in messages:
-            message = payload.to_json(one) if isinstance(one, Block) else one
+            message = payload.encode_json(one) if isinstance(one, Block) else one
             self.client.publish(f"servoscope/v1/data/{asset}", message, qos=1).wait_for_publish(30.0)
 
     def close(self) -> None:
@@ -105,7 +109,7 @@ class Sender:
         self.client.loop_stop()
 
 
-def publisher(folder: Path, port: int, *, speed: float = 0.0, files: str = "press.csv", more: str = "") -> Publisher:
+def publisher(folder: Path, port: int, *, speed: float = 0.0, files: str = "press.csv", more: str = "") -> ReplayClient:
     """Return a publisher of a recording in a folder, in blocks of half a second."""
     path = folder / "publish.toml"
     path.write_text(
@@ -113,7 +117,7 @@ def publisher(folder: Path, port: int, *, speed: float = 0.0, files: str = "pres
         f'[broker]\nhost = "127.0.0.1"\nport = {port}\n{more}\n'
         f'[assets.press]\nloop = "{LOOP}"\nfiles = ["{files}"]\n'
     )
-    return Publisher(PublishSettings.load(path))
+    return ReplayClient(ReplayClientSettings.load(path))
 
 
 class Running:
@@ -121,7 +125,7 @@ class Running:
 
     error: Exception | None = None
 
-    def __init__(self, one: Service | Publisher) -> None:
+    def __init__(self, one: Service | ReplayClient) -> None:
         self.one = one
         self._thread = threading.Thread(target=self._run)
         self._thread.start()

@@ -63,18 +63,18 @@ def carry(warm: Path) -> None:
 
     Its process id is printed when it is about to take its first block.
     """
-    from servoscope.live import logs
-    from servoscope.live.assembling import assemble
-    from servoscope.live.config import Config
-    from servoscope.live.service import Service
+    from servoscope.service import log
+    from servoscope.service.build import build_components
+    from servoscope.service.config import ServiceFile
+    from servoscope.service.service import Service
 
-    logs.set_up("error")
-    Service(Config.load(warm), assemble(Config.load(warm))).run()
+    log.set_up_logging("error")
+    Service(ServiceFile.load(warm), build_components(ServiceFile.load(warm))).run()
     for line in sys.stdin:
         child = os.fork()
         if not child:
-            settings = Config.load(line.strip())
-            service = Service(settings, assemble(settings))
+            settings = ServiceFile.load(line.strip())
+            service = Service(settings, build_components(settings))
             print("runs", os.getpid(), flush=True)
             service.run()
             os._exit(0)

@@ -30,8 +30,8 @@ def run(*words: object, input: str | None = None) -> Run:
 
 def prepared(folder: Path) -> Path:
     """Put loop.toml, healthy.csv, suspect.csv and baseline.json into a folder, by the commands themselves."""
-    demo.prepare(folder)
-    for step in demo.steps(folder)[:3]:
+    demo.write_loop_file(folder)
+    for step in demo.demo_steps(folder)[:3]:
         assert run(*step.arguments).code == 0
     return folder
 

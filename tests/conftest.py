@@ -5,7 +5,6 @@ REQUIRE_ALL=1 turns every skipped test into a failed one, so that a run meant to
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -24,21 +23,8 @@ hypothesis.settings.register_profile("servoscope", derandomize=True, deadline=No
 hypothesis.settings.load_profile("servoscope")
 
 
-def _share_compiled_code() -> None:
-    """Give numba one cache per state of the compiled sources, for all workers and subprocesses.
-
-    Numba's own check looks at the file of a function alone: after an edit to a function that it calls in
-    another file, the old machine code would run.
-    """
-    digest = hashlib.sha256()
-    for path in sorted((PROJECT / "src").rglob("*.py")):
-        text = path.read_bytes()
-        if b"numba" in text:
-            digest.update(text)
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(PROJECT / ".cache" / "numba" / digest.hexdigest()[:16]))
-
-
-_share_compiled_code()
+# one cache of compiled kernels for all workers and subprocesses
+os.environ.setdefault("NUMBA_CACHE_DIR", str(PROJECT / ".cache" / "numba"))
 
 
 @pytest.hookimpl(wrapper=True)

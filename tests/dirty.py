@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from servoscope.errors import RecordingError
-from servoscope.recording import Defect, Recording, clean
+from servoscope.core.errors import RecordingError
+from servoscope.signals import Defect, Recording, clean
 
 Signals = dict[str, npt.NDArray[np.float64]]
 RATE = 100.0

@@ -7,15 +7,14 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
-from servoscope import writers
-from servoscope.baseline import Baseline
-from servoscope.learning import nominal
-from servoscope.live.config import Config
-from servoscope.loop import Loop
-from servoscope.recording import Recording
+from servoscope.detection.baseline import Baseline
+from servoscope.learning.learn import nominal_baseline
+from servoscope.models.loop import Loop
+from servoscope.service.config import ServiceFile
+from servoscope.signals import Recording, writers
 from servoscope.simulation import FaultEvent, reference, simulate
 
-LOOP = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+LOOP = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
 LEAK = FaultEvent.parse("C_ie=1.2@30")
 
 # What has to be the same whatever has happened to the process: all rows, and all that the next block depends on.
@@ -31,7 +30,7 @@ RESULTS = {
 @functools.cache
 def baseline() -> Baseline:
     """Return what healthy looks like, from the rig's nominal parameters."""
-    return nominal(Loop.load(LOOP))
+    return nominal_baseline(Loop.load(LOOP))
 
 
 @functools.cache
@@ -45,8 +44,8 @@ def files(folder: Path) -> None:
     """Put baseline.json, healthy.csv and leaky.csv into a folder."""
     folder.mkdir(exist_ok=True)
     baseline().save(folder / "baseline.json")
-    writers.write(folder / "healthy.csv", recorded(1))
-    writers.write(folder / "leaky.csv", recorded(2, LEAK))
+    writers.write_recording(folder / "healthy.csv", recorded(1))
+    writers.write_recording(folder / "leaky.csv", recorded(2, LEAK))
 
 
 def hall(folder: Path, name: str, *, speed: float = 0.0, store: str = "", more: str = "") -> Path:
@@ -85,7 +84,7 @@ def hall(folder: Path, name: str, *, speed: float = 0.0, store: str = "", more: 
 
 def asked(config: Path, query: str) -> list[Any]:
     """Return what a query finds in the SQLite store of a service file."""
-    found = Config.load(config)
+    found = ServiceFile.load(config)
     connection = sqlite3.connect(found.folder / found.store.url, timeout=10.0)
     try:
         return connection.execute(query).fetchall()

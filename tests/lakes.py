@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from servoscope.loop import Loop
-from servoscope.recording import Recording
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
 from servoscope.simulation import FaultEvent, reference, simulate
 
-LOOP = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+LOOP = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
 DAYS = ("2026-11-01", "2026-11-02")
 ILL, CORRUPT, GARBAGE = "P1", "P2", "P3"
 

@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from servoscope.errors import ServoscopeError
-from servoscope.loop import Loop
-from servoscope.readers import read
-from servoscope.recording import Recording
-
-FloatArray = npt.NDArray[np.float64]
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import ServoscopeError
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
+from servoscope.signals.readers import read
 
 
 def signals(samples: int = 300) -> dict[str, FloatArray]:

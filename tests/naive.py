@@ -73,11 +73,8 @@ def akf(
 def iv_akf(
     theta: Array, P: Array, P_d: Array, R: float, eta: float, phi: Array, z: Array, memory: float, past: list[Any]
 ) -> tuple[Array, Array, Array]:
-    """Take one step of the instrumental-variable AKF, skipped where the instrument points away."""
-    if phi @ P @ z < 0.0 or phi @ P_d @ z < 0.0:
-        return theta, P, np.zeros_like(theta)
-    K = P @ z / (R + phi @ P @ z)
-    new = P - np.outer(K, phi @ P) + np.outer(P_d @ z, phi @ P_d) / (R + phi @ P_d @ z)
+    """Take one step of the instrumental-variable AKF: the AKF's gain and covariance with z, its residual with phi."""
+    _, new, K = akf(theta, P, P_d, R, eta, z, z, memory, past)
     return theta + K * (eta - phi @ theta), new, K
 
 

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from servoscope import report
-from servoscope.diagnosis import (
+from servoscope.detection.result import (
     Candidate,
     Diagnosis,
-    FoundFault,
-    Parameter,
+    DiagnosisWarning,
+    FaultEstimate,
+    FinalCoefficient,
     ResponsePoint,
     Trace,
-    Warning,
 )
-from servoscope.ifrf import Response
-from servoscope.loop import Loop
-from servoscope.recording import Recording
+from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
 
 PROVENANCE = {"baseline": "healthy.json", "hash": "0123456789abcdef", "threshold": "46.2"}
 VOID = {"meta", "br", "path", "use", "circle", "link", "img"}
@@ -67,7 +67,7 @@ def make_recording(N: int = 6000, seed: int = 0, name: str = "suspect.csv") -> R
         restart[[N // 2, 3 * N // 4]] = True
     r = 0.03 * np.sin(t)
     u, noise = rng.normal(0.0, 0.1, N), rng.normal(0.0, 1e-3, N)
-    return Recording(name, t, r, u, r + noise, 100.0, restart, np.zeros(N, dtype=np.int32))
+    return Recording(t, r, u, r + noise, restart, name=name, sample_rate=100.0, run=np.zeros(N, dtype=np.int32))
 
 
 def make_trace(K: int = 600, n: int = 4, F: int = 3, seed: int = 1, names: tuple[str, ...] | None = None) -> Trace:
@@ -79,9 +79,9 @@ def make_trace(K: int = 600, n: int = 4, F: int = 3, seed: int = 1, names: tuple
     covariance = np.einsum("kn,nm->knm", (0.01 * expected) ** 2, np.eye(n))
     E = np.exp(1j * rng.uniform(0.0, 6.0, (F, n)))
 
-    def of(theta: Any) -> Response:
+    def of(theta: Any) -> FrequencyResponse:
         spread = np.tile(1e-4 * np.array([[2.0, 0.5], [0.5, 1.0]]), (K, F, 1, 1))
-        return Response(np.arange(1.0, F + 1.0), theta @ E.T, spread)
+        return FrequencyResponse(np.arange(1.0, F + 1.0), theta @ E.T, spread)
 
     return Trace(
         t=t,
@@ -100,14 +100,14 @@ def make_trace(K: int = 600, n: int = 4, F: int = 3, seed: int = 1, names: tuple
 
 
 def make_diagnosis(verdict: str = "fault", **changes: Any) -> Diagnosis:
-    leakage = FoundFault(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.19, 1.21))
+    leakage = FaultEstimate(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.19, 1.21))
     values: dict[str, Any] = {
         "recording": "suspect.csv",
         "samples": 6000,
         "duration_s": 60.37,
         "verdict": verdict,
         "summary": "What the summary says.",
-        "parameters": {"theta_0": Parameter(value=0.3129, std=0.0023, nominal=0.2590)},
+        "parameters": {"theta_0": FinalCoefficient(value=0.3129, std=0.0023, nominal=0.2590)},
         "ifrf": (
             ResponsePoint(
                 frequency_hz=1.0,
@@ -119,7 +119,9 @@ def make_diagnosis(verdict: str = "fault", **changes: Any) -> Diagnosis:
                 nominal_imag=1.6587,
             ),
         ),
-        "warnings": (Warning(kind="gap", from_s=20.0, to_s=20.37, count=37, message="gap of 37 rows, not bridged"),),
+        "warnings": (
+            DiagnosisWarning(kind="gap", from_s=20.0, to_s=20.37, count=37, message="gap of 37 rows, not bridged"),
+        ),
     }
     if verdict == "fault":
         values |= {
@@ -136,4 +138,6 @@ def make_diagnosis(verdict: str = "fault", **changes: Any) -> Diagnosis:
 
 
 def read(diagnosis: Diagnosis, loop: Loop, trace: Trace | None = None, recording: Recording | None = None) -> Reader:
-    return Reader(report.page(diagnosis, trace or make_trace(), recording or make_recording(), loop, PROVENANCE))
+    return Reader(
+        report.render_diagnosis_page(diagnosis, trace or make_trace(), recording or make_recording(), loop, PROVENANCE)
+    )

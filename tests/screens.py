@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 import halls
-from servoscope import writers
-from servoscope.learning import learn
-from servoscope.loop import Loop
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.signals import writers
 from servoscope.simulation import FaultEvent
 
 SOURCES = str(Path(__file__).parents[1] / "src")
@@ -57,18 +57,18 @@ def browser() -> str | None:
 
 def recordings(folder: Path) -> None:
     """Put what the hall replays into a folder: healthy, two faults that begin and that stand, a sensor that sticks."""
-    learn(Loop.load(halls.LOOP), [halls.recorded(7, seconds=120.0)]).save(folder / "baseline.json")
+    learn_baseline(Loop.load(halls.LOOP), [halls.recorded(7, seconds=120.0)]).save(folder / "baseline.json")
     for seed, name in enumerate(HEALTHY, start=1):
-        writers.write(folder / f"{name}.csv", halls.recorded(seed))
+        writers.write_recording(folder / f"{name}.csv", halls.recorded(seed))
     for name, event in {
         "leaky": "C_ie=1.2@20",
         "leaking": "C_ie=1.2@0",
         "weak": "p_s=0.9@35",
         "weakened": "p_s=0.9@0",
     }.items():
-        writers.write(folder / f"{name}.csv", halls.recorded(2, FaultEvent.parse(event)))
+        writers.write_recording(folder / f"{name}.csv", halls.recorded(2, FaultEvent.parse(event)))
     healthy = halls.recorded(1)
-    writers.write(folder / "stuck.csv", replace(healthy, y=np.where(healthy.t < 3.0, healthy.y, 0.01)))
+    writers.write_recording(folder / "stuck.csv", replace(healthy, y=np.where(healthy.t < 3.0, healthy.y, 0.01)))
 
 
 def hall(folder: Path, *, speed: float = SPEED) -> Path:

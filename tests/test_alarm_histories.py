@@ -11,28 +11,28 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from servoscope.alarms import (
+from servoscope.core.errors import AlarmError
+from servoscope.service.alarms import (
     COMMANDS,
     PRIORITIES,
     AlarmDefinition,
     AlarmState,
-    Command,
-    Event,
+    AlarmTransition,
+    AssetSnapshot,
     FloodSettings,
     FloodState,
+    LifecycleEvent,
+    LifecycleState,
+    OperatorCommand,
     Priority,
-    Snapshot,
-    State,
-    Transition,
-    announce,
-    pass_time,
-    start,
-    step,
+    advance_flood,
+    initial_alarm_state,
+    notify_transition,
+    step_alarm,
 )
-from servoscope.alarms.states import WAITING
-from servoscope.errors import AlarmError
+from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
 
-PUT_AWAY = (State.SHELVED, State.SUPPRESSED, State.OUT_OF_SERVICE)
+PUT_AWAY = (LifecycleState.SHELVED, LifecycleState.SUPPRESSED, LifecycleState.OUT_OF_SERVICE)
 VERDICTS = st.sampled_from(["healthy", "fault", "undetermined"])
 SECONDS = st.integers(0, 12).map(float)
 
@@ -44,9 +44,9 @@ class AlarmLife(RuleBasedStateMachine):
         super().__init__()
         self.now = 1000.0
         self.definition = AlarmDefinition(source="verdict", on_delay_s=5.0, off_delay_s=7.0, suppressed_when=("clock",))
-        self.alarm = self.twin = start("a", "fault", self.now)
-        self.told: list[Transition] = []
-        self.twins: list[Transition] = []
+        self.alarm = self.twin = initial_alarm_state("a", "fault", self.now)
+        self.told: list[AlarmTransition] = []
+        self.twins: list[AlarmTransition] = []
         self.seen: list[tuple[float, str]] = []
 
     @precondition(lambda self: not self.told)
@@ -57,33 +57,33 @@ class AlarmLife(RuleBasedStateMachine):
     @rule(verdict=VERDICTS, suppressed=st.booleans(), later=SECONDS)
     def observe(self, verdict: str, suppressed: bool, later: float) -> None:
         self.now += later
-        seen = Snapshot(verdict, ("clock",) if suppressed else ())
+        seen = AssetSnapshot(verdict, ("clock",) if suppressed else ())
         self.seen.append((self.now, verdict))
         self._do(seen)
 
     @rule(event=st.sampled_from(COMMANDS), later=SECONDS, hold=st.integers(1, 30))
-    def command(self, event: Event, later: float, hold: int) -> None:
+    def command(self, event: LifecycleEvent, later: float, hold: int) -> None:
         self.now += later
-        self._do(Command(event, "ann", until=self.now + hold if event is Event.SHELVE else None))
+        self._do(OperatorCommand(event, "ann", until=self.now + hold if event is LifecycleEvent.SHELVE else None))
 
     @rule(later=SECONDS)
     def pass_time(self, later: float) -> None:
         self.now += later
-        self.alarm, transitions = step(self.definition, self.alarm, None, self.now)
+        self.alarm, transitions = step_alarm(self.definition, self.alarm, None, self.now)
         self.told += transitions
 
     @rule()
     def save_and_load(self) -> None:
         self.alarm = AlarmState.from_dict(json.loads(json.dumps(self.alarm.to_dict())))
 
-    def _do(self, given: Snapshot | Command) -> None:
+    def _do(self, given: AssetSnapshot | OperatorCommand) -> None:
         try:
-            self.alarm, transitions = step(self.definition, self.alarm, given, self.now)
+            self.alarm, transitions = step_alarm(self.definition, self.alarm, given, self.now)
         except AlarmError:
             with pytest.raises(AlarmError):
-                step(self.definition, self.twin, given, self.now)
+                step_alarm(self.definition, self.twin, given, self.now)
             return
-        self.twin, twins = step(self.definition, self.twin, given, self.now)
+        self.twin, twins = step_alarm(self.definition, self.twin, given, self.now)
         self.told += transitions
         self.twins += twins
         assert (self.alarm, self.told) == (self.twin, self.twins)
@@ -92,18 +92,20 @@ class AlarmLife(RuleBasedStateMachine):
     def state_and_flags_agree(self) -> None:
         one = self.alarm
         if one.state not in PUT_AWAY:
-            assert one.active == (one.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED))
+            assert one.active == (one.state in (LifecycleState.UNACKNOWLEDGED, LifecycleState.ACKNOWLEDGED))
             assert not one.suppressed
-        assert one.state is not State.SUPPRESSED or one.suppressed
-        assert (one.shelved_until is not None) == (one.state is State.SHELVED)
+        assert one.state is not LifecycleState.SUPPRESSED or one.suppressed
+        assert (one.shelved_until is not None) == (one.state is LifecycleState.SHELVED)
         assert one.shelved_until is None or one.shelved_until > one.at
-        assert one.state not in (State.LATCHED_UNACKNOWLEDGED, State.LATCHED_ACKNOWLEDGED) or one.latched
-        assert not (one.state is State.NORMAL and one.latched)
+        assert (
+            one.state not in (LifecycleState.LATCHED_UNACKNOWLEDGED, LifecycleState.LATCHED_ACKNOWLEDGED) or one.latched
+        )
+        assert not (one.state is LifecycleState.NORMAL and one.latched)
 
     @invariant()
     def history_is_a_chain(self) -> None:
         assert [one.sequence for one in self.told] == list(range(1, self.alarm.sequence + 1))
-        states = [State.NORMAL, *(one.after for one in self.told)]
+        states = [LifecycleState.NORMAL, *(one.after for one in self.told)]
         assert [one.before for one in self.told] == states[:-1]
         assert self.alarm.state is states[-1]
         times = [one.time for one in self.told]
@@ -113,10 +115,10 @@ class AlarmLife(RuleBasedStateMachine):
     @invariant()
     def nothing_that_waits_for_an_operator_goes_by_itself(self) -> None:
         for one in self.told:
-            if one.before in WAITING and one.after not in (*WAITING, *PUT_AWAY):
-                assert (one.event, one.who) == (Event.ACKNOWLEDGE, "ann")
-            if one.before is State.LATCHED_ACKNOWLEDGED and one.after is State.NORMAL:
-                assert (one.event, one.who) == (Event.RESET, "ann")
+            if one.before in UNACKNOWLEDGED_STATES and one.after not in (*UNACKNOWLEDGED_STATES, *PUT_AWAY):
+                assert (one.event, one.who) == (LifecycleEvent.ACKNOWLEDGE, "ann")
+            if one.before is LifecycleState.LATCHED_ACKNOWLEDGED and one.after is LifecycleState.NORMAL:
+                assert (one.event, one.who) == (LifecycleEvent.RESET, "ann")
 
     @invariant()
     def the_condition_behind_the_delays_is_what_a_slow_version_says(self) -> None:
@@ -149,23 +151,33 @@ class Flood(RuleBasedStateMachine):
     @rule(which=st.integers(0, 5), later=st.integers(0, 6))
     def occur(self, which: int, later: int) -> None:
         self.now += later
-        self._take(which, State.NORMAL, State.UNACKNOWLEDGED, Event.OCCUR, PRIORITIES[which % 4])
+        self._take(
+            which, LifecycleState.NORMAL, LifecycleState.UNACKNOWLEDGED, LifecycleEvent.OCCUR, PRIORITIES[which % 4]
+        )
         self._slowly()
         self.new.append(self.now)
         self.slow = self.slow or self._recent() > self.settings.limit
 
     @rule(which=st.integers(0, 5))
     def acknowledge(self, which: int) -> None:
-        self._take(which, State.UNACKNOWLEDGED, State.ACKNOWLEDGED, Event.ACKNOWLEDGE, PRIORITIES[which % 4])
+        self._take(
+            which,
+            LifecycleState.UNACKNOWLEDGED,
+            LifecycleState.ACKNOWLEDGED,
+            LifecycleEvent.ACKNOWLEDGE,
+            PRIORITIES[which % 4],
+        )
 
     @rule(which=st.integers(0, 5))
     def clear(self, which: int) -> None:
-        self._take(which, State.UNACKNOWLEDGED, State.RETURNED, Event.CLEAR, PRIORITIES[which % 4])
+        self._take(
+            which, LifecycleState.UNACKNOWLEDGED, LifecycleState.RETURNED, LifecycleEvent.CLEAR, PRIORITIES[which % 4]
+        )
 
     @rule(later=st.integers(0, 25))
     def wait(self, later: int) -> None:
         self.now += later
-        self.flood, notices = pass_time(self.settings, self.flood, self.now)
+        self.flood, notices = advance_flood(self.settings, self.flood, self.now)
         self.told_late += sum(one.counted for one in notices if one.kind == "held")
         self._slowly()
 
@@ -173,11 +185,13 @@ class Flood(RuleBasedStateMachine):
     def save_and_load(self) -> None:
         self.flood = FloodState.from_dict(json.loads(json.dumps(self.flood.to_dict())))
 
-    def _take(self, which: int, before: State, after: State, event: Event, priority: Priority) -> None:
+    def _take(
+        self, which: int, before: LifecycleState, after: LifecycleState, event: LifecycleEvent, priority: Priority
+    ) -> None:
         self.sequence += 1
-        one = Transition(self.now, f"asset {which}", "fault", self.sequence, before, after, event, "", "system")
+        one = AlarmTransition(self.now, f"asset {which}", "fault", self.sequence, before, after, event, "", "system")
         held = {h.transition.asset: h.count for h in self.flood.held}
-        self.flood, notices = announce(self.settings, self.flood, one, priority)
+        self.flood, notices = notify_transition(self.settings, self.flood, one, priority)
         late = sum(n.counted for n in notices if n.kind == "held")
         self.told_late += late
         self.told += sum(n.kind == "alarm" for n in notices)
@@ -212,18 +226,28 @@ TestFlood = Flood.TestCase
 def test_a_flood_holds_low_priorities_and_tells_them_at_its_end() -> None:
     flood, kinds = FloodState(), []
     for k in range(14):
-        one = Transition(
-            float(k), f"asset {k}", "fault", 1, State.NORMAL, State.UNACKNOWLEDGED, Event.OCCUR, "", "system"
+        one = AlarmTransition(
+            float(k),
+            f"asset {k}",
+            "fault",
+            1,
+            LifecycleState.NORMAL,
+            LifecycleState.UNACKNOWLEDGED,
+            LifecycleEvent.OCCUR,
+            "",
+            "system",
         )
-        flood, notices = announce(FloodSettings(), flood, one, "critical" if k == 12 else "low")
+        flood, notices = notify_transition(FloodSettings(), flood, one, "critical" if k == 12 else "low")
         kinds += [notice.kind for notice in notices]
     assert kinds == ["alarm"] * 10 + ["flood_begins", "alarm"]
-    gone = replace(one, time=20.0, sequence=2, before=one.after, after=State.RETURNED, event=Event.CLEAR)
-    flood, notices = announce(FloodSettings(), flood, gone, "low")
+    gone = replace(
+        one, time=20.0, sequence=2, before=one.after, after=LifecycleState.RETURNED, event=LifecycleEvent.CLEAR
+    )
+    flood, notices = notify_transition(FloodSettings(), flood, gone, "low")
     assert notices == ()
-    flood, notices = pass_time(FloodSettings(), flood, 608.5)
+    flood, notices = advance_flood(FloodSettings(), flood, 608.5)
     assert notices == ()
-    flood, notices = pass_time(FloodSettings(), flood, 609.0)
+    flood, notices = advance_flood(FloodSettings(), flood, 609.0)
     assert [(n.kind, n.counted, n.peak) for n in notices] == [("flood_ends", 14, 14), *[("held", 1, 0)] * 3]
     assert [n.transition.asset for n in notices if n.transition] == ["asset 10", "asset 11", "asset 13"]
     assert notices[-1].transition == gone
@@ -233,8 +257,8 @@ def test_a_flood_holds_low_priorities_and_tells_them_at_its_end() -> None:
 def test_a_flood_is_counted_whatever_the_order_that_assets_tell_it_in() -> None:
     flood, kinds = FloodState(), []
     for k in (9, 3, 8, 0, 1, 7, 2, 6, 5, 4, 10):
-        states = State.NORMAL, State.UNACKNOWLEDGED
-        one = Transition(50.0 * k, f"asset {k}", "fault", 1, *states, Event.OCCUR, "", "system")
-        flood, notices = announce(FloodSettings(), flood, one, "low")
+        states = LifecycleState.NORMAL, LifecycleState.UNACKNOWLEDGED
+        one = AlarmTransition(50.0 * k, f"asset {k}", "fault", 1, *states, LifecycleEvent.OCCUR, "", "system")
+        flood, notices = notify_transition(FloodSettings(), flood, one, "low")
         kinds += [notice.kind for notice in notices]
     assert kinds == ["alarm"] * 10 + ["flood_begins"]

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-import ast
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from servoscope import compiled
-from servoscope.arithmetic import dot, fma, larger, lower, root, smaller, where
-from servoscope.compiled import filled, kernel, sources, traced, turning
-from servoscope.linear import Linear
-from servoscope.straight import advance, coefficients, pattern
+from servoscope.core.jit import (
+    dot,
+    fma,
+    kernel,
+    make_transpose,
+    maximum,
+    minimum,
+    specialise,
+    sqrt,
+    trace_function,
+    tril_index,
+    where,
+)
+from servoscope.estimation.kernel.sparse_lti import advance_system, pack_coefficients, sparsity_pattern
+from servoscope.models.lti import LinearSystem
 
 LANES = 16
 
@@ -22,7 +30,7 @@ def mixed(x: Any, y: Any) -> None:
     """Use every operation once; y becomes functions of x."""
     a, b, c = x[0], x[1], x[2]
     y[0] = fma(a, b, c) + 2.0 * a - b / (1.0 + abs(c))
-    y[1] = larger(a, smaller(b, 0.5)) - root(abs(a) + 1.0)
+    y[1] = maximum(a, minimum(b, 0.5)) - sqrt(abs(a) + 1.0)
     y[2] = where(a > b, where(c <= 0.0, where(a >= 0.0, where(b < 1.0, 1.0, 2.0), -1.0), c), 1.0 / (abs(b) + 0.1))
     y[3] = dot([a, b, c], [c, -a, b])
 
@@ -41,7 +49,7 @@ def test_code_does_to_lanes_what_python_does_to_numbers(kind: Any) -> None:
     found = []
     for width in (1, 8, 16):
         y = np.zeros((4, LANES), dtype=kind)
-        kernel(filled(apply, {"_part": traced(mixed, width)}, f"{width}"), heap=False)(x, y, width)
+        kernel(specialise(apply, {"_part": trace_function(mixed, width)}, f"{width}"), heap=False)(x, y, width)
         found.append(y)
     assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2])
     for a in range(LANES):
@@ -52,7 +60,7 @@ def test_code_does_to_lanes_what_python_does_to_numbers(kind: Any) -> None:
         )
 
 
-def running(s: Any, x: Any, i: Any) -> None:
+def add_up(s: Any, x: Any, i: Any) -> None:
     """Add sample i to a sum, and to that sum's sum."""
     s[0] = s[0] + x[i]
     s[2] = s[2] + s[0] * s[1]
@@ -68,7 +76,9 @@ def test_a_loop_leaves_what_its_steps_would(width: int) -> None:
     """Rows that it keeps in registers are read before it and stored behind it; a loop of no steps changes nothing."""
     rng = np.random.default_rng(0)
     x, s = rng.standard_normal((5, LANES)), rng.standard_normal((3, LANES))
-    run = kernel(filled(run_over, {"_part": traced(running, width, kept=("s",))}, f"kept {width}"), heap=False)
+    run = kernel(
+        specialise(run_over, {"_part": trace_function(add_up, width, kept=("s",))}, f"kept {width}"), heap=False
+    )
     expected = s.copy()
     for begin, end in ((1, 4), (2, 2), (4, 5)):
         for i in range(begin, end):
@@ -80,65 +90,34 @@ def test_a_loop_leaves_what_its_steps_would(width: int) -> None:
 
 @pytest.mark.parametrize("kinds", [("f8", "f8"), ("f8", "f4"), ("f4", "f8"), ("f4", "f4")])
 @pytest.mark.parametrize("width", [8, 16])
-def test_a_square_is_turned_and_rounded(width: int, kinds: tuple[str, str]) -> None:
+def test_a_square_is_transposed_and_rounded(width: int, kinds: tuple[str, str]) -> None:
     x = np.random.default_rng(0).standard_normal((20, 30)).astype(kinds[0])
     y = np.zeros((30, 40), dtype=kinds[1])
 
-    def turn(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> None:
+    def transpose(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> None:
         _part(x, 3, 5, y, 7, 11)
 
-    kernel(filled(turn, {"_part": turning(width)}, f"{width}"), heap=False)(x, y)
+    kernel(specialise(transpose, {"_part": make_transpose(width)}, f"{width}"), heap=False)(x, y)
     expected = np.zeros_like(y)
     expected[7 : 7 + width, 11 : 11 + width] = x[3 : 3 + width, 5 : 5 + width].T
     assert np.array_equal(y, expected)
 
 
 def test_a_symmetric_matrix_is_stored_once() -> None:
-    assert sorted({lower(i, j) for i in range(4) for j in range(4)}) == list(range(10))
-    assert lower(1, 3) == lower(3, 1)
+    assert sorted({tril_index(i, j) for i in range(4) for j in range(4)}) == list(range(10))
+    assert tril_index(1, 3) == tril_index(3, 1)
 
 
 def test_straight_line_code_leaves_out_zeros_and_nothing_else() -> None:
     rng = np.random.default_rng(1)
     A, B, C, D = (rng.standard_normal(s) * (rng.random(s) < 0.5) for s in ((5, 5), (5, 2), (3, 5), (3, 2)))
-    system = Linear(0.4 * A, B, C, D)
-    found = pattern([system])
-    assert len(coefficients(found, system)) == sum(np.count_nonzero(x) for x in (A, B, C, D))
+    system = LinearSystem(0.4 * A, B, C, D)
+    found = sparsity_pattern([system])
+    assert len(pack_coefficients(found, system)) == sum(np.count_nonzero(x) for x in (A, B, C, D))
     x, w = rng.standard_normal(5), rng.standard_normal((20, 2))
     state = dict(enumerate(x.tolist()))
     for w_k in w:
-        v = advance(found, coefficients(found, system).tolist(), 0, state, 0, w_k.tolist())
+        v = advance_system(found, pack_coefficients(found, system).tolist(), 0, state, 0, w_k.tolist())
         assert v == pytest.approx((system.C @ x + system.D @ w_k).tolist())
         x = system.A @ x + system.B @ w_k
     assert list(state.values()) == pytest.approx(x.tolist())
-
-
-class TestCache:
-    def test_it_knows_every_file_that_kernels_are_made_of(self) -> None:
-        """Whatever imports what makes kernels is part of the key."""
-        package = Path(compiled.__file__).parent
-        for path in package.rglob("*.py"):
-            imports = [
-                ast.unparse(node) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)
-            ]
-            if any(line.startswith(("from servoscope.compiled", "from servoscope.arithmetic")) for line in imports):
-                text = path.read_bytes()
-                assert b"servoscope.compiled" in text or b"servoscope.arithmetic" in text
-        assert len(sources()) == 12
-
-    def test_without_a_folder_it_compiles_for_this_process(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        import numba
-
-        plain = numba.njit
-
-        def nowhere(**options: Any) -> Any:
-            if options.get("cache"):
-                raise RuntimeError("cannot cache function: no locator available")
-            return plain(**options)
-
-        monkeypatch.setattr(compiled.numba, "njit", nowhere)
-
-        def twice(x: float) -> float:
-            return 2.0 * x
-
-        assert kernel(twice)(3.0) == 6.0

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope.errors import LoopError, SimulationError
-from servoscope.loop import Loop
-from servoscope.simulation import FaultEvent, reference, response, simulate
+from servoscope.core.errors import LoopError, SimulationError
+from servoscope.models.loop import Loop
+from servoscope.simulation import FaultEvent, reference, simulate, simulate_response
 
 AXIS: dict[str, Any] = {
     "kind": "polynomial",
@@ -55,10 +55,10 @@ class TestAxis:
         proportional = {"kind": "pi", "k_p": 2000.0, "k_i": 0.0}
         loop = make(rig, plant=AXIS, controller=proportional, sample_rate=1000.0)
         # 20.4 N hold 2000 N/m x 8.6 mm and the offset of 3.2 N; not 8.7 mm.
-        assert np.all(response(loop, np.full(500, 0.0085))[1] == 0.0)
-        assert response(loop, np.full(500, 0.0087))[1][-1] > 0.0
+        assert np.all(simulate_response(loop, np.full(500, 0.0085))[1] == 0.0)
+        assert simulate_response(loop, np.full(500, 0.0087))[1][-1] > 0.0
         # It comes to rest, away from the reference, and stays there.
-        y = response(loop, np.full(8000, 0.05))[1]
+        y = simulate_response(loop, np.full(8000, 0.05))[1]
         assert np.all(y[-1000:] == y[-1])
         assert 0.0 < abs(y[-1] - 0.05) < 0.0119
 
@@ -69,7 +69,7 @@ class TestAxis:
         controller = {"kind": "pi", "k_p": 2000.0, "k_i": 50.0}
         r = reference("profile", 4.0, 1000.0)
         exact, stepped = (
-            response(make(rig, plant=plant, controller=controller, sample_rate=1000.0, delay=0.0022), r)[1]
+            simulate_response(make(rig, plant=plant, controller=controller, sample_rate=1000.0, delay=0.0022), r)[1]
             for plant in (linear, coulomb)
         )
         assert stepped == pytest.approx(exact, abs=1e-9)
@@ -82,7 +82,7 @@ class TestAxis:
             "coefficients": {"viscous_friction": 10.0, "coulomb_friction": 2.0},
         }
         loop = make(rig, plant=plant, controller={"kind": "pi", "k_p": 50.0, "k_i": 0.0})
-        u, y = response(loop, np.full(3000, 1.0))
+        u, y = simulate_response(loop, np.full(3000, 1.0))
         assert y[-1] == pytest.approx(1.0 - 2.0 / 50.0, abs=1e-3)
         assert np.diff(y)[:20] == pytest.approx((u[:20] - 2.0) / 10.0 * 0.01, rel=1e-9)
 
@@ -91,7 +91,7 @@ class TestAxis:
         plant = AXIS | {"input_gain": 2.0, "coefficients": doubled}
         scaled = make(rig, plant=plant, controller=axis.to_dict()["controller"], sample_rate=1000.0)
         r = reference("profile", 2.0, 1000.0)
-        assert response(scaled, r)[1] == pytest.approx(response(axis, r)[1], rel=1e-9, abs=1e-15)
+        assert simulate_response(scaled, r)[1] == pytest.approx(simulate_response(axis, r)[1], rel=1e-9, abs=1e-15)
 
     def test_a_fault_by_the_name_of_its_coefficient(self, axis: Loop) -> None:
         _, truth = simulate(axis, np.zeros(200), faults=[FaultEvent("inertia", 1.3, 0.1)])

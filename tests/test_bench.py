@@ -7,7 +7,7 @@ import json
 import pytest
 
 from commands import run
-from servoscope.bench import Measured, interleaved
+from servoscope.research.bench import JobTiming, time_interleaved
 
 FIGURES = (
     "log, NumPy",
@@ -40,6 +40,7 @@ FACTS = (
 )
 
 
+@pytest.mark.slow
 def test_a_small_run_finds_every_figure_and_peers_that_agree() -> None:
     done = run("bench", "--repeats", 1, "--share", 0.01, "--json")
     assert done.code == 0, done.err
@@ -66,6 +67,6 @@ def test_what_makes_no_sense_is_refused(option: str, value: str, why: str) -> No
 
 def test_jobs_take_turns() -> None:
     turns: list[str] = []
-    found = interleaved({name: lambda name=name: turns.append(name) for name in "ab"}, 3)  # type: ignore[misc]
+    found = time_interleaved({name: lambda name=name: turns.append(name) for name in "ab"}, 3)  # type: ignore[misc]
     assert "".join(turns) == "abababab"  # once uncounted, then three times
-    assert all(isinstance(each, Measured) and each.low <= each.median <= each.high for each in found.values())
+    assert all(isinstance(each, JobTiming) and each.low <= each.median <= each.high for each in found.values())

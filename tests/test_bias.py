@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope.inverse import nominal_theta
-from servoscope.loop import Loop
-from servoscope.pipeline import Pipeline
-from servoscope.readers import read
-from servoscope.simulation import reference, response
-from servoscope.tuning import fit, least_squares
+from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.tuning import fit_tuning, least_squares
+from servoscope.models.loop import Loop
+from servoscope.signals.readers import read
+from servoscope.simulation import reference, simulate_response
 
 FREQUENCIES = (1.0, 10.0, 20.0)
 H = np.array([0.257754 + 1.657709j, 0.042040 + 16.497358j, -0.611638 + 32.511519j])  # true, at 1, 10, 20 Hz
@@ -34,7 +34,7 @@ def test_noise_free_bias(
 ) -> None:
     loop = Loop.from_dict(rig | {"monitor": {"structure": structure}})
     r = reference(kind, 60.0, 100.0)
-    u, y = response(loop, r)
+    u, y = simulate_response(loop, r)
     restart = np.zeros(len(r), dtype=bool)
     restart[0] = True
     pipeline = Pipeline.of(loop)
@@ -55,7 +55,7 @@ def test_ifrf_of_a_healthy_recording_is_true(rig: dict[str, Any], eha_cases: Pat
         pipeline = Pipeline.of(loop)
         healthy, other = (read(eha_cases / f"multisine_healthy_{i}.csv", loop) for i in (2, 3))
         g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-        tuning = fit(pipeline, [g]).tuning
+        tuning = fit_tuning(pipeline, [g]).tuning
         estimates = pipeline.estimate(tuning, other)
         last = estimates.theta[other.t[estimates.index] >= 50.0].mean(axis=0)
         error[structure] = np.abs(pipeline.bank.E(FREQUENCIES) @ last / H - 1.0)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from servoscope.errors import LoopError, RecordingError
-from servoscope.loop import Columns
-from servoscope.readers.columns import Combination, parse_columns, parse_combination
+from servoscope.core.errors import LoopError, RecordingError
+from servoscope.models.loop import Columns
+from servoscope.signals.readers.columns import LinearCombination, parse_columns, parse_combination
 
 KNOWN = ["set_point", "position_error", "vir", "counts", "x", "motor speed", "log.y", "m[0]", "a-b"]
 
@@ -33,7 +33,7 @@ KNOWN = ["set_point", "position_error", "vir", "counts", "x", "motor speed", "lo
     ],
 )
 def test_linear_combinations_are_understood(text: str, factors: dict[str, float], constant: float) -> None:
-    assert parse_combination(text, KNOWN, "x.csv: [columns] input") == Combination(factors, constant)
+    assert parse_combination(text, KNOWN, "x.csv: [columns] input") == LinearCombination(factors, constant)
 
 
 @pytest.mark.parametrize(

@@ -149,7 +149,7 @@ def test_an_interrupt_is_quiet(made: Path, tmp_path: Path, monkeypatch: pytest.M
     def interrupted(path: Path) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("servoscope.loop.Loop.load", interrupted)
+    monkeypatch.setattr("servoscope.models.loop.Loop.load", interrupted)
     result = run("simulate", made / "loop.toml", "-o", tmp_path / "x.csv")
     assert (result.code, result.out, result.err) == (130, "", "")
 
@@ -160,6 +160,6 @@ def test_a_fault_of_the_program_keeps_its_traceback(
     def broken(path: Path) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("servoscope.loop.Loop.load", broken)
+    monkeypatch.setattr("servoscope.models.loop.Loop.load", broken)
     with pytest.raises(ZeroDivisionError):
         run("simulate", made / "loop.toml", "-o", tmp_path / "x.csv")

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope.fleet.common import SIZES, Prior, causes, individual
-from servoscope.fleet.evidence import Evidence
-from servoscope.fleet.knowledge import known
-from servoscope.scoring import reliability
+from servoscope.fleet.common_cause import SIZES, Evidence, Prior, causes, fault_probability
+from servoscope.fleet.summary import summarise_fleet
+from servoscope.research.scoring import reliability
 
 NAMES = ("p_s", "C_ie", "b_p", "beta")
 
@@ -47,11 +46,11 @@ def test_the_probability_of_a_common_cause_is_right_as_often_as_it_says() -> Non
     rng, prior = np.random.default_rng(1), Prior(common=0.5, fault=0.05)
     said, truth = [], []
     for _ in range(120):
-        common = bool(rng.random() < 0.5)
-        size = prior.size if common else prior.drift
+        common_cause = bool(rng.random() < 0.5)
+        size = prior.size if common_cause else prior.drift
         assets = group(rng, 5, prior, (int(rng.integers(4)), float(size * rng.normal())))
         said.append(causes(assets, one_supply(assets), prior)[0].probability)
-        truth.append(common)
+        truth.append(common_cause)
     told = reliability(np.array(said), np.array(truth), bins=5)
     for claimed, observed, count in zip(told.claimed, told.observed, told.count, strict=True):
         if count:
@@ -70,7 +69,7 @@ def test_forty_pump_faults_of_one_supply_are_one_fault_with_its_size() -> None:
     assert cause.interval[0] < 0.85 < cause.interval[1] and cause.interval[1] - cause.interval[0] < 0.03
     own = dict(zip(cause.members, cause.own, strict=True))
     assert own.pop("a7") > 0.999 and max(own.values()) < 0.2
-    assert individual(assets["a3"], prior) > 0.999  # by itself, each of them looks ill
+    assert fault_probability(assets["a3"], prior) > 0.999  # by itself, each of them looks ill
 
 
 def test_faults_of_their_own_are_no_common_cause() -> None:
@@ -105,7 +104,7 @@ def test_two_members_are_no_group_and_no_evidence_says_nothing() -> None:
     assert causes({"a": nothing, "b": nothing}, {"a": {"s": "1"}, "b": {"s": "1"}}) == []
     three = dict.fromkeys("abc", nothing)
     assert causes(three, {key: {"s": "1"} for key in three})[0].probability == pytest.approx(Prior().common, rel=1e-3)
-    assert individual(nothing) == pytest.approx(Prior().fault)
+    assert fault_probability(nothing) == pytest.approx(Prior().fault)
 
 
 def test_the_quadrature_is_fine_enough_for_the_sharpest_likelihood() -> None:
@@ -113,10 +112,10 @@ def test_the_quadrature_is_fine_enough_for_the_sharpest_likelihood() -> None:
     rng = np.random.default_rng(5)
     assets = group(rng, 40, Prior(fault=0.0), (0, np.log(0.85)), sharp=1e6)
     fine = causes(assets, one_supply(assets))[0]
-    from servoscope.fleet import common
+    from servoscope.fleet import common_cause
 
     half = pytest.MonkeyPatch()
-    half.setattr(common, "SIZES", SIZES[::2])
+    half.setattr(common_cause, "SIZES", SIZES[::2])
     try:
         coarse = causes(assets, one_supply(assets))[0]
     finally:
@@ -136,7 +135,7 @@ def test_what_the_fleet_knows_of_days_names_the_cause_its_begin_and_who_changed(
             entries.append({**entry, "diagnosis": said, "evidence": vars(told)})
     entries.append({"asset": "a6", "day": "3", "status": "failed", "error": "x.parquet: is damaged"})
     groups = {f"a{i}": {"supply": "S1" if i < 3 else "S2"} for i in range(6)}
-    fleet = known(sorted(entries, key=lambda e: (e["asset"], e["day"])), groups, {})
+    fleet = summarise_fleet(sorted(entries, key=lambda e: (e["asset"], e["day"])), groups, {})
     states = {one.asset: (one.before, one.state) for one in fleet.assets}
     assert states["a0"] == ("common cause", "common cause") and states["a5"] == ("healthy", "fault")
     assert states["a4"] == ("healthy", "healthy") and states["a6"] == (None, "failed")

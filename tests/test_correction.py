@@ -10,13 +10,13 @@ import pytest
 from scipy import stats
 
 import naive
-from servoscope.baseline import Baseline
-from servoscope.inverse import nominal_theta
-from servoscope.learning import learn
-from servoscope.loop import Loop
-from servoscope.monitor import examine
-from servoscope.plants import Plant
-from servoscope.recording import Recording
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.models.plants import Plant
+from servoscope.signals import Recording
 from servoscope.simulation import FaultEvent, reference, simulate
 
 FREQUENCIES = (1.0, 10.0, 20.0)
@@ -27,7 +27,7 @@ LATE = slice(-100, None)  # evaluations of the last 10 s
 
 @functools.cache
 def loop() -> Loop:
-    return Loop.load(Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml")
+    return Loop.load(Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml")
 
 
 def recorded(seed: int, seconds: float = 60.0, *faults: FaultEvent) -> Recording:
@@ -36,7 +36,7 @@ def recorded(seed: int, seconds: float = 60.0, *faults: FaultEvent) -> Recording
 
 @functools.cache
 def learned(seed: int, seconds: float = 60.0) -> Baseline:
-    return learn(loop(), [recorded(1000 + seed, seconds)])
+    return learn_baseline(loop(), [recorded(1000 + seed, seconds)])
 
 
 def error(H: naive.Array, plant: Plant) -> naive.Array:
@@ -47,6 +47,7 @@ def error(H: naive.Array, plant: Plant) -> naive.Array:
 @pytest.mark.parametrize(
     ("parameter", "ratio"), [("beta", 1.0), ("b_p", 40.0), ("beta", 0.1), ("beta", 0.005)], ids=str
 )
+@pytest.mark.slow
 def test_ifrf_is_that_of_the_actuator(parameter: str, ratio: float) -> None:
     """The mean over the last 10 s and a few seeds, half a minute after the change."""
     plant = loop().plant.with_ratios({parameter: ratio})
@@ -54,7 +55,7 @@ def test_ifrf_is_that_of_the_actuator(parameter: str, ratio: float) -> None:
     told, raw = [], []
     for seed in range(SEEDS):
         baseline, recording = learned(seed), recorded(seed, 60.0, *faults)
-        diagnosis, trace = examine(baseline, recording)
+        diagnosis, trace = diagnose_with_trace(baseline, recording)
         assert diagnosis.verdict == ("fault" if faults else "healthy")
         told.append(trace.ifrf.H[LATE].mean(axis=0))
         pipeline = baseline.pipeline()
@@ -66,12 +67,13 @@ def test_ifrf_is_that_of_the_actuator(parameter: str, ratio: float) -> None:
         assert error(np.mean(raw, axis=0), plant)[2] > 0.1
 
 
+@pytest.mark.slow
 def test_standard_deviations_hold_before_and_after_a_change() -> None:
     """All along a trace whose bias comes from its last evaluation; 18 s are a few memories only, hence the margin."""
     ill = loop().plant.with_ratios({"C_ie": 1.2})
     before, after = [], []
     for seed in range(SEEDS):
-        _, trace = examine(learned(0, 600.0), recorded(300 + seed, 60.0, FaultEvent("C_ie", 1.2, 30.0)))
+        _, trace = diagnose_with_trace(learned(0, 600.0), recorded(300 + seed, 60.0, FaultEvent("C_ie", 1.2, 30.0)))
         std = np.sqrt(np.diagonal(trace.covariance, axis1=1, axis2=2))
         for found, plant, (begins, ends) in ((before, loop().plant, (10.0, 28.0)), (after, ill, (40.0, 58.0))):
             off = (trace.theta - nominal_theta(loop(), plant)) / std
@@ -87,7 +89,7 @@ def test_ellipses_hold_the_truth_in_95_of_100_recordings() -> None:
     truth = np.array([loop().plant.frequency_response(f) for f in FREQUENCIES])
     inside = np.zeros(len(FREQUENCIES), dtype=int)
     for seed in range(count):
-        _, trace = examine(baseline, recorded(200 + seed, 30.0))
+        _, trace = diagnose_with_trace(baseline, recorded(200 + seed, 30.0))
         off = trace.ifrf.H[-1] - truth
         d = np.stack([off.real, off.imag], axis=-1)
         distance = [x @ np.linalg.solve(C, x) for x, C in zip(d, trace.ifrf.covariance[-1], strict=True)]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from servoscope.actions import ActionSettings
-from servoscope.live.delivering import Courier
-from servoscope.store import Batch, Store
+from servoscope.service.actions import ActionSettings
+from servoscope.service.actions.dispatcher import OutboxDispatcher
+from servoscope.service.clock import SteadyClock
+from servoscope.service.store import Batch, Store
 
 
 def test_a_slow_sink_delays_no_other(tmp_path: Path) -> None:
@@ -27,12 +28,12 @@ def test_a_slow_sink_delays_no_other(tmp_path: Path) -> None:
     ]
     store.write(made, "hall", 1)
     argv = {"slow": {"argv": ["sleep", "5"]}, "quick": {"argv": ["true"]}}
-    courier = Courier(store, "hall", ActionSettings.model_validate({"command": argv}))
-    courier.start()
+    dispatcher = OutboxDispatcher(store, "hall", ActionSettings.model_validate({"command": argv}), SteadyClock())
+    dispatcher.start()
     heard, deadline = [], time.monotonic() + 30.0
     while not heard and time.monotonic() < deadline:
         time.sleep(0.05)
-        heard = courier.delivered()
-    courier.stop()
+        heard = dispatcher.take_attempts()
+    dispatcher.stop()
     assert [(one.sink, one.delivered) for one in heard] == [("quick", True)]
     store.close()

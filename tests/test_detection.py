@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,20 +10,19 @@ import pytest
 from scipy import signal, stats
 
 import naive
-from servoscope.detection import (
+from servoscope.detection.chi2_test import (
     SECONDS_PER_YEAR,
+    estimate_onset,
     noncentrality,
-    onset,
     required_noncentrality,
-    statistic,
+    t2_statistic,
     threshold,
     whiten,
 )
-from servoscope.loop import Loop
-from servoscope.pipeline import Pipeline, Tuning
-from servoscope.recording import Recording
+from servoscope.estimation.pipeline import Pipeline, Tuning
+from servoscope.estimation.tuning import fit_tuning
+from servoscope.models.loop import Loop
 from servoscope.simulation import FaultEvent, reference, simulate
-from servoscope.tuning import fit
 
 SCALE = np.array([1.0, 1e-2, 1e-5, 1e-7])
 
@@ -41,7 +41,7 @@ class TestStatistic:
     def test_is_the_plain_inverse(self) -> None:
         C = np.array([covariance(seed) for seed in range(20)])
         theta, expected = np.random.default_rng(2).standard_normal((2, 20, 4)) * SCALE
-        assert statistic(theta, expected, C) == pytest.approx(naive.t_squared(theta, expected, C), rel=1e-6)
+        assert t2_statistic(theta, expected, C) == pytest.approx(naive.t_squared(theta, expected, C), rel=1e-6)
 
     def test_whitens_vectors_and_matrices_alike(self) -> None:
         C = np.array([covariance(seed) for seed in range(3)])
@@ -53,7 +53,7 @@ class TestStatistic:
     def test_gaussian_deviations_are_chi_square(self) -> None:
         C = covariance()
         d = draws(C, 20_000)
-        T2 = statistic(d, 0.0 * d, np.broadcast_to(C, (len(d), 4, 4)))
+        T2 = t2_statistic(d, 0.0 * d, np.broadcast_to(C, (len(d), 4, 4)))
         assert stats.kstest(T2, stats.chi2(4).cdf).pvalue > 0.01
 
 
@@ -70,7 +70,7 @@ class TestThreshold:
         rng = np.random.default_rng(4)
         samples = rng.standard_normal((20_000, m, 4))
         S = np.einsum("kmi,kmj->kij", samples, samples) / m
-        T2 = statistic(rng.standard_normal((20_000, 4)), np.zeros((20_000, 4)), S)
+        T2 = t2_statistic(rng.standard_normal((20_000, 4)), np.zeros((20_000, 4)), S)
         assert (threshold(4, 1.0, 1.0, budget, m) < T2).mean() == pytest.approx(0.01, abs=0.002)
 
     @pytest.mark.parametrize("memory", [5.0, 0.5])
@@ -99,7 +99,7 @@ class TestThreshold:
         C = covariance()
         shift = np.linalg.cholesky(C)[:, 2] * np.sqrt(needed)
         d = draws(C, 20_000) + shift
-        T2 = statistic(d, 0.0 * d, np.broadcast_to(C, (len(d), 4, 4)))
+        T2 = t2_statistic(d, 0.0 * d, np.broadcast_to(C, (len(d), 4, 4)))
         assert (limit < T2).mean() == pytest.approx(0.9, abs=0.01)
 
 
@@ -107,7 +107,7 @@ def tuned(loop: Loop, kind: str, seconds: float = 60.0) -> tuple[Pipeline, Tunin
     pipeline = Pipeline.of(loop)
     healthy, _ = simulate(loop, reference(kind, seconds, 100.0), seed=99)
     g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-    return pipeline, fit(pipeline, [g]).tuning
+    return pipeline, fit_tuning(pipeline, [g]).tuning
 
 
 def test_noncentrality_foretells_the_mean_of_the_statistic(rig: dict[str, Any]) -> None:
@@ -125,7 +125,7 @@ def test_noncentrality_foretells_the_mean_of_the_statistic(rig: dict[str, Any]) 
         e, f = pipeline.estimate(tuning, healthy), pipeline.estimate(tuning, leaking)
         expected = noncentrality(e.S[at], e.Psi[at], Delta[None, :])[:, 0]
         nominal = np.broadcast_to(tuning.theta, e.theta.shape)
-        T2 = [statistic(x.theta[at], nominal[at], x.S[at]) for x in (e, f)]
+        T2 = [t2_statistic(x.theta[at], nominal[at], x.S[at]) for x in (e, f)]
         rises.append((T2[1] - T2[0]) / expected)
     assert expected[0] > 5.0 and np.all(np.diff(expected) > 0.0)
     assert np.mean(rises, axis=0) == pytest.approx(np.ones(3), abs=0.15)
@@ -137,7 +137,7 @@ class TestOnset:
         pipeline, tuning = tuned(loop, kind)
         recording, _ = simulate(loop, reference(kind, 26.0, 100.0), faults=[FaultEvent.parse(fault)], seed=seed)
         e = pipeline.estimate(tuning, recording)
-        T2 = statistic(e.theta, np.broadcast_to(tuning.theta, e.theta.shape), e.S)
+        T2 = t2_statistic(e.theta, np.broadcast_to(tuning.theta, e.theta.shape), e.S)
         alarm = int(np.flatnonzero(threshold(4, 10.0, 5.0, 1.0, 500.0) < T2)[0])
         return pipeline, tuning, recording, e, tuning.theta, e.theta[-1], int(e.index[alarm]), int(e.index[-1])
 
@@ -148,7 +148,7 @@ class TestOnset:
         + [("profile", "C_ie=1.1@12.51"), ("profile", "beta=0.005@12.51"), ("profile", "b_p=10@12.51")],
     )
     def test_finds_the_step(self, rig: dict[str, Any], kind: str, fault: str, seed: int) -> None:
-        found = onset(*self.broken(rig, kind, fault, seed))
+        found = estimate_onset(*self.broken(rig, kind, fault, seed))
         truth = FaultEvent.parse(fault).at_s
         assert found.likely_s == pytest.approx(truth, abs=0.15)
         assert found.low_s <= truth <= found.high_s
@@ -157,13 +157,13 @@ class TestOnset:
         assert found.sample == round(100.0 * found.likely_s)
 
     def test_interval_holds_the_truth_of_a_change_of_high_frequencies(self, rig: dict[str, Any]) -> None:
-        found = [onset(*self.broken(rig, "multisine", "beta=0.1@17.03", seed)) for seed in range(6)]
+        found = [estimate_onset(*self.broken(rig, "multisine", "beta=0.1@17.03", seed)) for seed in range(6)]
         assert np.mean([each.likely_s for each in found]) == pytest.approx(17.03, abs=0.1)
         assert sum(each.low_s <= 17.03 <= each.high_s for each in found) >= 5
 
     def test_a_change_at_rest_may_have_begun_any_time_since(self, rig: dict[str, Any]) -> None:
         """It rests from 15 s to 20 s; noise alone tells little of when friction grew in between."""
-        found = [onset(*self.broken(rig, "profile", "b_p=20@18", seed)) for seed in range(1, 7)]
+        found = [estimate_onset(*self.broken(rig, "profile", "b_p=20@18", seed)) for seed in range(1, 7)]
         assert all(each.low_s <= 18.0 and 19.5 < each.high_s < 20.5 for each in found)
         assert np.median([each.low_s for each in found]) < 17.0
 
@@ -172,9 +172,7 @@ class TestOnset:
         until, last = 450, 600
         cut = recording.restart.copy()
         cut[200] = True  # a gap: its samples do not count
-        recording = Recording(
-            recording.name, recording.t, recording.r, recording.u, recording.y, 100.0, cut, recording.run
-        )
+        recording = replace(recording, restart=cut)
         g = pipeline.regression(recording.r, recording.u, recording.y, cut)
         used = np.flatnonzero(g.ok[: last + 1])
         v, changed = (g.eta - g.phi @ healthy)[used], (g.phi @ (faulty - healthy))[used]
@@ -187,7 +185,7 @@ class TestOnset:
         log_likelihood = np.array([of_used[min(np.searchsorted(used, k), len(used) - 1)] for k in range(until + 1)])
         weight = np.exp(log_likelihood - log_likelihood.max())
         share = np.cumsum(weight) / weight.sum()
-        found = onset(pipeline, tuning, recording, e, healthy, faulty, until, last)
+        found = estimate_onset(pipeline, tuning, recording, e, healthy, faulty, until, last)
         blur = pipeline.bank.wait / 200.0
         assert found.sample == int(np.argmax(log_likelihood))
         assert found.low_s == pytest.approx(np.argmax(share >= 0.025) / 100.0 - blur)
@@ -195,6 +193,6 @@ class TestOnset:
 
     def test_never_leaves_the_recording(self, rig: dict[str, Any]) -> None:
         arguments = self.broken(rig, "multisine", "C_ie=1.4@0", 1)
-        found = onset(*arguments)
+        found = estimate_onset(*arguments)
         assert 0.0 <= found.low_s <= found.likely_s <= found.high_s <= arguments[6] / 100.0
         assert found.low_s == 0.0

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from servoscope.loop import Loop
-from servoscope.plants.eha import EHA
-from servoscope.simulation import reference, response
-from servoscope.simulation.discretise import discretise
+from servoscope.models.discretise import discretise
+from servoscope.models.loop import Loop
+from servoscope.models.plants.eha import EHA
+from servoscope.simulation import reference, simulate_response
 
 Array = npt.NDArray[np.float64]
 
@@ -114,7 +114,7 @@ class TestClosedLoop:
     def test_a_switch_keeps_position_and_speed(self, loop: Loop, ratios: dict[str, float]) -> None:
         assert isinstance(loop.plant, EHA)
         plants = [loop.plant, loop.plant.with_ratios(ratios)]
-        u, y = response(loop, reference("profile", 0.3, 100.0), plants=plants, switch=[0, 15])
+        u, y = simulate_response(loop, reference("profile", 0.3, 100.0), plants=plants, switch=[0, 15])
         assert y == pytest.approx(runge_kutta(plants, u, 100.0, "zoh", 0.0, switch=15), rel=1e-6, abs=1e-10)
 
     @pytest.mark.parametrize("delay", [0.0, 0.004, 0.013])
@@ -123,7 +123,7 @@ class TestClosedLoop:
         loop = make(rig, hold=hold_kind, delay=delay, controller={"kind": "pi", "k_p": 10.0, "k_i": 5.0})
         assert isinstance(loop.plant, EHA)
         r = np.concatenate([[0.0], reference("multisine", 0.3, 100.0)])
-        u, y = response(loop, r)
+        u, y = simulate_response(loop, r)
         e = r - y
         assert u == pytest.approx(10.0 * e + 0.05 * np.cumsum(e), abs=1e-12)
         assert y == pytest.approx(runge_kutta([loop.plant], u, 100.0, hold_kind, delay), rel=1e-6, abs=1e-10)

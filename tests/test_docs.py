@@ -81,13 +81,13 @@ def models_in(annotation: object) -> list[type[BaseModel]]:
 
 def keys_of_loop_file() -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield the words of a section's heading, none for "Top level", and a key in it."""
-    from servoscope import plants
-    from servoscope.loop import Loop
+    from servoscope.models import plants
+    from servoscope.models.loop import Loop
 
     for key, field in Loop.model_fields.items():
         models = models_in(field.annotation)
         if any(issubclass(model, plants.Plant) for model in models):
-            for kind in plants.kinds():
+            for kind in plants.plant_kinds():
                 yield from (((f"[{key}]", kind), inside) for inside in plants.plant_class(kind).model_fields)
         elif models:
             yield from (((f"[{key}]",), inside) for model in models for inside in model.model_fields)
@@ -121,25 +121,31 @@ def test_every_key_of_the_loop_file_is_documented() -> None:
 
 
 def test_every_key_of_the_service_file_is_documented() -> None:
-    from servoscope.live.config import Config
+    from servoscope.service.access.oidc import OidcSettings
+    from servoscope.service.config import ServiceFile
+    from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
 
+    kinds = {"sources": find_kinds(SOURCES), "outlets": find_kinds(PUBLISHERS)}
     elsewhere = ("quality", "alarms", "actions")
     missing = []
-    for key, field in Config.model_fields.items():
-        models = models_in(field.annotation)
-        text = section("service-file.md", rf"\[{key}[].]" if models else "Top level") or ""
+    for key, field in ServiceFile.model_fields.items():
+        models = [each.load() for each in kinds[key].values()] if key in kinds else models_in(field.annotation)
+        text = section("service-file.md", rf"\[{key}(\.NAME)?\]" if models else "Top level") or ""
         inside = [name for model in models for name in model.model_fields] if models else [key]
         if key not in elsewhere:
             missing += [f"{key}: {name}" for name in inside if not has_line(text, name)]
+    text = section("service-file.md", r"\[web\.oidc\]") or ""
+    missing += [f"web.oidc: {name}" for name in OidcSettings.model_fields if not has_line(text, name)]
     assert not missing, f"not in docs/reference/service-file.md: {', '.join(missing)}"
 
 
 def test_every_key_of_alarms_data_quality_and_actions_is_documented() -> None:
-    from servoscope import actions, alarms, quality
+    from servoscope.service import actions, alarms
+    from servoscope.signals import quality
 
     text = (REFERENCE.parent / "alarms.md").read_text() + (REFERENCE.parent / "how-to" / "actions.md").read_text()
     models = [alarms.AlarmDefinition, alarms.FloodSettings, quality.QualitySettings, actions.RetrySettings]
-    models += [actions.WebhookSettings, actions.CommandSettings, actions.ToleranceSettings]
+    models += [actions.WebhookSettings, actions.CommandSettings, actions.FaultToleranceSettings]
     keys = {key for model in models for key in model.model_fields}
     missing = [key for key in sorted(keys) if not re.search(rf"[`\n ]{key}( = [^`\n]*)?[`\n]|`{key}`", text)]
     assert not missing, f"not in docs/alarms.md or docs/how-to/actions.md: {', '.join(missing)}"

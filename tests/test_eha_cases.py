@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope.baseline import Baseline
-from servoscope.diagnosis import Diagnosis, Trace
-from servoscope.learning import learn
-from servoscope.loop import Loop
-from servoscope.monitor import examine
-from servoscope.readers import read
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import Diagnosis, Trace
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.signals.readers import read
 from servoscope.simulation import reference, simulate
 
 LEARNED_ON = {
@@ -30,17 +30,17 @@ WITHIN_S = {"p_s": 1.0, "C_ie": 2.0, "b_p": 2.0, "beta": 2.0}
 @cache
 def _examined(folder: Path, learned_on: str, file: str) -> tuple[Diagnosis, Trace]:
     loop = _loop()
-    return examine(_baseline(folder, learned_on), read(folder / file, loop))
+    return diagnose_with_trace(_baseline(folder, learned_on), read(folder / file, loop))
 
 
 @cache
 def _baseline(folder: Path, file: str) -> Baseline:
-    return learn(_loop(), [read(folder / file, _loop())])
+    return learn_baseline(_loop(), [read(folder / file, _loop())])
 
 
 @cache
 def _loop() -> Loop:
-    return Loop.load(Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml")
+    return Loop.load(Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml")
 
 
 def _cases(truth: dict[str, dict[str, Any]], reference: str) -> list[dict[str, Any]]:
@@ -130,7 +130,7 @@ def test_a_baseline_of_one_reference_serves_another(eha_cases: Path, eha_truth: 
             assert not named or named == set(case["ratios"]), case["file"]
     loop = _loop()
     small, _ = simulate(loop, 0.5 * reference("profile", 60.0, loop.sample_rate), seed=3)
-    assert examine(_baseline(eha_cases, LEARNED_ON["profile"]), small)[0].verdict == "healthy"
+    assert diagnose_with_trace(_baseline(eha_cases, LEARNED_ON["profile"]), small)[0].verdict == "healthy"
 
 
 def test_a_recording_without_motion_is_undetermined_not_healthy(eha_cases: Path) -> None:
@@ -138,6 +138,6 @@ def test_a_recording_without_motion_is_undetermined_not_healthy(eha_cases: Path)
     still, _ = simulate(loop, np.zeros(6000), seed=5)
     short, _ = simulate(loop, reference("profile", 60.0, loop.sample_rate)[:40], seed=5)
     for recording in (still, short):
-        diagnosis, _ = examine(_baseline(eha_cases, LEARNED_ON["profile"]), recording)
+        diagnosis, _ = diagnose_with_trace(_baseline(eha_cases, LEARNED_ON["profile"]), recording)
         assert diagnosis.verdict == "undetermined"
         assert any(warning.kind == "power" for warning in diagnosis.warnings)

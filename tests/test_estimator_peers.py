@@ -15,17 +15,17 @@ from statsmodels.regression.rolling import RollingOLS
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter as StateSpace
 
 import naive
-from servoscope import estimators
-from servoscope.baseline import Baseline
-from servoscope.learning import learn
-from servoscope.loop import Loop
-from servoscope.monitor import examine
-from servoscope.pipeline import Pipeline, Tuning
-from servoscope.readers import read
-from servoscope.recursion import Constants, Recursion
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.estimation import estimators
+from servoscope.estimation.pipeline import Pipeline, Tuning
+from servoscope.estimation.recursion import Recursion, RecursionConstants
+from servoscope.estimation.tuning import fit_tuning
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.signals.readers import read
 from servoscope.simulation import reference, simulate
-from servoscope.tuning import fit
-from test_estimators import ALL, MEMORY, R, Run, n, samples, spd
+from test_estimators import ALL, MEMORY, R, Run, n, samples, share_left, spd
 
 HONEST = [name for name in ALL if not {"covariance", "mean"} & set(estimators.exceptions(name))]
 
@@ -201,37 +201,6 @@ class TestWindup:
         assert grown["dfrls"] > 1e9
 
 
-def share_left(name: str, shape: naive.Array, updates: int) -> naive.Array:
-    """Return what is left of each direction of a change after so many updates, noise-free, P_d tuned as usual."""
-    left = []
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        phi = rng.standard_normal((4 * round(MEMORY), n)) @ shape.T
-        run = Run(name, *[R / MEMORY * np.linalg.inv(shape @ shape.T)] * 2)
-        run.theta[:] = 0.0
-        run.steps(np.zeros(len(phi)), phi, phi)
-        truth = np.linalg.solve(shape.T, np.ones(n))
-        run.steps(phi[:updates] @ truth, phi[:updates], phi[:updates])
-        left.append(shape.T @ (truth - run.theta))
-    return np.asarray(np.mean(left, axis=0))
-
-
-@pytest.mark.parametrize("name", ALL)
-class TestMemory:
-    def test_one_memory_leaves_one_eth(self, name: str) -> None:
-        left = share_left(name, np.eye(n), round(MEMORY))
-        assert left == pytest.approx(0.0 if name == "sliding-window" else np.exp(-1.0), abs=0.03)
-
-    def test_in_weak_directions_too(self, name: str) -> None:
-        """All but plain NLMS, whose weak directions wait forever, forget alike where P_d = (R/N) R_phi^-1."""
-        Q = np.linalg.qr(np.random.default_rng(3).standard_normal((n, n)))[0]
-        left = share_left(name, Q * np.geomspace(1e-3, 1.0, n), round(MEMORY))
-        if name == "nlms":
-            assert left[0] > 0.99
-        else:
-            assert left == pytest.approx(0.0 if name == "sliding-window" else np.exp(-1.0), abs=0.03)
-
-
 def test_kf_with_Q_of_P_d_over_memory_has_the_memory_of_the_akf() -> None:
     for updates in (100, 250, 500, 1000):
         kf, akf = (share_left(name, np.eye(n), updates) for name in ("kf", "akf"))
@@ -242,16 +211,16 @@ Signals = tuple[naive.Array, ...]
 
 
 @cache
-def chain(name: str) -> tuple[Pipeline, Tuning, Constants, Signals]:
+def chain(name: str) -> tuple[Pipeline, Tuning, RecursionConstants, Signals]:
     """Return the recursion of the rig with an estimator, tuned, and a recording with missing values and a gap."""
-    path = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+    path = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
     settings = Loop.load(path).to_dict()
     settings["monitor"] |= {"estimator": name, "memory": 1.0, "evaluation_rate": 100.0}
     loop = Loop.from_dict(settings)
     recording, _ = simulate(loop, reference("multisine", 12.0, 100.0), seed=1)
     pipeline, restart = Pipeline.of(loop), recording.restart.copy()
     g = pipeline.regression(recording.r, recording.u, recording.y, restart)
-    tuning = fit(pipeline, [g]).tuning
+    tuning = fit_tuning(pipeline, [g]).tuning
     r, u, y = recording.r.copy(), 0.9 * recording.u, recording.y.copy()
     u[300], y[301], r[500:510], restart[700] = np.nan, np.nan, np.nan, True
     return (
@@ -277,7 +246,7 @@ class TestInTheRecursion:
             assert out[0, k, 5 : 5 + n] + c.theta == pytest.approx(run.theta, rel=1e-7, abs=1e-9)
         assert 900 < out[0, -1, 0] <= 1200
         size = recursion.slices["extra"]
-        assert size.stop - size.start == estimators.extra(name, n, c.memory)
+        assert size.stop - size.start == estimators.extra_state_size(name, n, c.memory)
 
     def test_a_missing_value_keeps_the_state(self, name: str) -> None:
         _, _, c, signals = chain(name)
@@ -312,22 +281,23 @@ class TestInTheRecursion:
 
 @cache
 def baseline(folder: Path, name: str, file: str) -> Baseline:
-    path = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+    path = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
     settings: dict[str, Any] = Loop.load(path).to_dict()
     settings["monitor"]["estimator"] = name
     loop = Loop.from_dict(settings)
-    return learn(loop, [read(folder / file, loop)])
+    return learn_baseline(loop, [read(folder / file, loop)])
 
 
 @pytest.mark.parametrize("name", ALL)
+@pytest.mark.slow
 def test_verdicts_on_recordings_of_the_rig(name: str, eha_cases: Path) -> None:
     """Under steady excitation every estimator's statistic is good; only an honest one's is after rests, too."""
     learned = baseline(eha_cases, name, "multisine_healthy_2.csv")
-    diagnosis, trace = examine(learned, read(eha_cases / "multisine_healthy_3.csv", learned.loop))
+    diagnosis, trace = diagnose_with_trace(learned, read(eha_cases / "multisine_healthy_3.csv", learned.loop))
     assert diagnosis.verdict == "healthy"
     assert 1.0 < trace.statistic[trace.ready].mean() < 8.0  # four coefficients
     for file, fault, ratio in (("p_sx0.8_10", "pump", 0.8), ("C_iex1.2_11", "leakage", 1.2)):
-        diagnosis, trace = examine(learned, read(eha_cases / f"multisine_{file}.csv", learned.loop))
+        diagnosis, trace = diagnose_with_trace(learned, read(eha_cases / f"multisine_{file}.csv", learned.loop))
         assert diagnosis.verdict == "fault" and diagnosis.detected_at_s == pytest.approx(31.0, abs=1.0)
         assert trace.statistic[trace.t < 30.0].max() < trace.threshold
         if diagnosis.faults or name != "nlms":
@@ -338,5 +308,5 @@ def test_verdicts_on_recordings_of_the_rig(name: str, eha_cases: Path) -> None:
 def test_another_reference_with_rests_is_healthy_for_the_honest(name: str, eha_cases: Path) -> None:
     learned = baseline(eha_cases, name, "profile_healthy_0.csv")
     for file in ("profile_healthy_1.csv", "trapezoid_healthy_4.csv"):
-        diagnosis, _ = examine(learned, read(eha_cases / file, learned.loop))
+        diagnosis, _ = diagnose_with_trace(learned, read(eha_cases / file, learned.loop))
         assert diagnosis.verdict == "healthy", file

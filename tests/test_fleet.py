@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope.baseline import Baseline
-from servoscope.diagnosis import Trace
-from servoscope.errors import BaselineError
-from servoscope.learning import learn
-from servoscope.loop import Loop
-from servoscope.memory import Memory
-from servoscope.monitor import Monitor
-from servoscope.recursion import LANES
+from servoscope.core.errors import BaselineError
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import Trace
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.estimation.kernel.buffers import BufferPool
+from servoscope.estimation.recursion import LANE_COUNT
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
 from servoscope.simulation import FaultEvent, reference, simulate
 
-LOOP = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+LOOP = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
 COLUMNS = ("theta", "covariance", "expected", "statistic", "level", "crossed", "ready")
 
 
@@ -32,7 +32,7 @@ def loop_of(name: str = "rig", **settings: Any) -> Loop:
 @functools.cache
 def learned(kind: str = "multisine", seed: int = 1, estimator: str = "akf") -> Baseline:
     loop = loop_of(monitor={"estimator": estimator})
-    return learn(loop, [simulate(loop, reference(kind, 30.0, 100.0), seed=seed)[0]])
+    return learn_baseline(loop, [simulate(loop, reference(kind, 30.0, 100.0), seed=seed)[0]])
 
 
 @functools.cache
@@ -59,7 +59,7 @@ def same(whole: Trace, asset: int, alone: Trace) -> None:
 
 @pytest.mark.parametrize("own", [False, True], ids=["one baseline", "own baselines"])
 def test_each_asset_of_a_fleet_is_itself_alone_to_the_last_bit(own: bool) -> None:
-    count = LANES["float64"] + 5  # a whole block of lanes, and one that is not full
+    count = LANE_COUNT["float64"] + 5  # a whole block of lanes, and one that is not full
     kinds = [learned(), learned("profile", 2)] if own else [learned()]
     assert {len(b.members) for b in kinds} == ({len(kinds[0].members)} | {len(kinds[-1].members)})
     baselines = [kinds[i % len(kinds)] for i in range(count)]
@@ -79,10 +79,10 @@ def test_each_asset_of_a_fleet_is_itself_alone_to_the_last_bit(own: bool) -> Non
 
 
 def test_many_samples_on_all_cores_are_the_same_as_a_few(monkeypatch: pytest.MonkeyPatch) -> None:
-    from servoscope import recursion
+    from servoscope.estimation import recursion
 
-    monkeypatch.setattr(recursion, "WORTH", 1)
-    r, u, y, restart = signals(LANES["float64"] + 5)
+    monkeypatch.setattr(recursion, "MIN_PARALLEL_SAMPLES", 1)
+    r, u, y, restart = signals(LANE_COUNT["float64"] + 5)
     monitor = Monitor([learned()] * len(r))
     together = monitor.run(monitor.init(), r, u, y, restart)
     monkeypatch.setattr(recursion, "_cores", lambda: 1)
@@ -144,7 +144,7 @@ class TestSingle:
 
 
 def test_memory_is_used_again_only_when_nobody_holds_it() -> None:
-    memory, shape, kind = Memory(), (512, 512), np.dtype(np.float64)
+    memory, shape, kind = BufferPool(), (512, 512), np.dtype(np.float64)
     first = memory.empty(shape, kind)
     first[:] = 1.0
     view = first[3:, ::2].T

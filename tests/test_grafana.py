@@ -13,8 +13,8 @@ from typing import Any
 import sqlalchemy as sa
 from reliability.servers import Postgres
 
-from servoscope.live.metrics import Metrics
-from servoscope.store import Batch, Store
+from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.store import Batch, Store
 
 GRAFANA = Path(__file__).resolve().parents[1] / "grafana"
 DASHBOARD = json.loads((GRAFANA / "dashboards" / "servoscope.json").read_text(encoding="utf-8"))
@@ -35,9 +35,8 @@ def queries() -> list[str]:
 
 def test_every_metric_is_there_and_every_metric_is_shown() -> None:
     writer = SimpleNamespace(unavailable_since=None, waiting=0)
-    config = SimpleNamespace(service=SimpleNamespace(buffer=1))
-    service: Any = SimpleNamespace(assets={}, sources={}, writer=writer, config=config, beat=time.monotonic())
-    text = Metrics(service).text().decode()
+    service: Any = SimpleNamespace(assets={}, sources={}, writer=writer, buffer=1, last_turn=time.monotonic())
+    text = ServiceMetrics(service).render().decode()
     known = {name for name in re.findall(r"^# TYPE (\w+) ", text, re.MULTILINE) if not name.endswith("_created")}
     asked = "\n".join(target["expr"] for target in targets() if "expr" in target)
     used = {re.sub(r"_bucket$", "", name) for name in re.findall(r"servoscope_\w+", asked)}

@@ -7,14 +7,8 @@ from typing import Any
 import pytest
 
 from pages import make_diagnosis, read
-from servoscope.diagnosis import (
-    Candidate,
-    Diagnosis,
-    FoundFault,
-    Mimic,
-    Refit,
-)
-from servoscope.loop import Loop
+from servoscope.detection.result import Candidate, Diagnosis, FaultEstimate, Mimic, RefitSummary
+from servoscope.models.loop import Loop
 
 
 @pytest.fixture
@@ -22,8 +16,8 @@ def loop(rig: dict[str, Any]) -> Loop:
     return Loop.from_dict(rig)
 
 
-LEAK = FoundFault(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.198, 1.202))
-WEAK = FoundFault(name="pump", parameter="p_s", ratio=0.9, interval=(0.898, 0.902))
+LEAK = FaultEstimate(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.198, 1.202))
+WEAK = FaultEstimate(name="pump", parameter="p_s", ratio=0.9, interval=(0.898, 0.902))
 PAIR = Candidate(
     name="pump + leakage",
     probability=0.96,
@@ -34,8 +28,8 @@ PAIR = Candidate(
 NONE = Candidate(name="unknown", probability=0.99)
 
 
-def make_refit(*recursive: Candidate, mimics: tuple[Mimic, ...] = (), misfit: float = 12.5) -> Refit:
-    return Refit(
+def make_refit(*recursive: Candidate, mimics: tuple[Mimic, ...] = (), misfit: float = 12.5) -> RefitSummary:
+    return RefitSummary(
         from_s=0.0, to_s=60.0, over_s=0.0, noise=1.02, misfit=misfit, limit=40.4, recursive=recursive, mimics=mimics
     )
 
@@ -86,7 +80,7 @@ def test_a_pair_has_both_sizes_and_how_they_hang_together(loop: Loop) -> None:
 
 
 def test_pairs_that_are_not_resolved_and_what_would_explain_the_unknown(loop: Loop) -> None:
-    sticky = FoundFault(name="friction", parameter="b_p", ratio=2.0, interval=(1.9, 2.1))
+    sticky = FaultEstimate(name="friction", parameter="b_p", ratio=2.0, interval=(1.9, 2.1))
     other = PAIR.model_copy(update={"name": "leakage + friction", "probability": 0.4, "faults": (LEAK, sticky)})
     both = (PAIR.model_copy(update={"probability": 0.6}), other)
     assert "changed in two ways at once" in read(make_diagnosis(candidates=both, faults=()), loop).text

@@ -10,14 +10,13 @@ from hostile.feeding import fed, markdown
 from hostile.targets import targets
 
 import halls
-from servoscope.alarms import AlarmSettings
-from servoscope.live.asset import Asset, Following
-from servoscope.live.block import Block
-from servoscope.live.checkpoint import pack, unpack
-from servoscope.live.config import DiagnosisSettings
-from servoscope.live.showing import status_of
-from servoscope.monitor import Monitor
-from servoscope.quality import QualitySettings
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.alarms import AlarmSettings
+from servoscope.service.asset import Asset, AssetPolicy
+from servoscope.service.checkpoint import pack_state, unpack_state
+from servoscope.service.config import DiagnosisSettings
+from servoscope.service.sources.block import Block
+from servoscope.signals.quality import QualitySettings
 
 BEGAN, N = 1767225600.0, 50
 LATEST = 253402300799.0
@@ -43,25 +42,25 @@ def hostile() -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def following() -> tuple[Monitor, Following]:
+def following() -> tuple[Monitor, AssetPolicy]:
     alarms = AlarmSettings.model_validate({})
-    how = Following(DiagnosisSettings(window_s=10.0, every_s=20.0), QualitySettings(), alarms, 2.0)
+    how = AssetPolicy(DiagnosisSettings(window_s=10.0, every_s=20.0), QualitySettings(), alarms, 2.0)
     return Monitor(halls.baseline()), how
 
 
 @pytest.mark.parametrize("case", hostile())
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # of 1e300 squared
 @pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
-def test_it_goes_on(case: str, following: tuple[Monitor, Following]) -> None:
+def test_it_goes_on(case: str, following: tuple[Monitor, AssetPolicy]) -> None:
     asset, sound, number = Asset("press", halls.baseline(), *following), halls.recorded(1), 0
 
     def take(*signals: np.ndarray) -> None:
         nonlocal number
-        asset.take(Block("press", number, *signals))
+        asset.process(Block("press", number, *signals))
         number += 1
-        assert asset.progress is not None
-        assert unpack(pack(asset.progress), "press").counted == asset.progress.counted
-        status_of(asset.progress, following[1].alarms.of_asset)
+        assert asset.state is not None
+        assert unpack_state(pack_state(asset.state), "press").position == asset.state.position
+        asset.status(asset.state)
 
     def normal(begin: float, blocks: int) -> None:
         for k in range(blocks):
@@ -71,8 +70,8 @@ def test_it_goes_on(case: str, following: tuple[Monitor, Following]) -> None:
     normal(BEGAN - 30.0, 40)
     take(*hostile()[case])
     normal(BEGAN + 1.0, 60)
-    assert asset.progress is not None
-    assert asset.progress.counted.blocks == 101 and asset.progress.judged.verdict != "fault"
+    assert asset.state is not None
+    assert asset.state.position.blocks == 101 and asset.state.examination.verdict != "fault"
 
 
 @pytest.mark.filterwarnings("ignore")  # of libraries, about broken files

@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 import naive
-from servoscope.errors import LoopError
-from servoscope.inverse import build, closed_loop, instrument_of, nominal_theta, tustin_coefficients
-from servoscope.loop import Loop
-from servoscope.pipeline import Pipeline, Regression
-from servoscope.simulation import reference, response, simulate
+from servoscope.core.errors import LoopError
+from servoscope.estimation.filter_bank import (
+    build_filter_bank,
+    closed_loop_system,
+    instrument_system,
+    nominal_theta,
+    tustin_coefficients,
+)
+from servoscope.estimation.pipeline import Pipeline, Regression
+from servoscope.models.loop import Loop
+from servoscope.simulation import reference, simulate, simulate_response
 
 AXIS = {"kind": "polynomial", "order": 2}
 
@@ -93,6 +99,25 @@ class TestRegressors:
         sign = np.where(v > 1e-9, 1.0, np.where(v < -1e-9, -1.0, 0.0))
         assert close(g.phi[20:, -1], naive.svf(sign, 0, 10.0, 3, 100.0, "foh")[20:], 1e-2)
 
+    @pytest.mark.parametrize("place", [0.0, 0.3, -17.0])
+    @pytest.mark.parametrize("way", [1.0, -1.0])
+    def test_a_reference_that_stands_keeps_the_sign_of_its_last_motion(self, way: float, place: float) -> None:
+        # a move that ends at `place`, then rest for longer than any filter remembers; rounding has no say in the sign
+        plant = AXIS | {"friction": "coulomb", "sign_from": "reference"}
+        loop = Loop.from_dict({"sample_rate": 100.0, "plant": plant, "monitor": {"cutoff": 10.0, "frequencies": [1.0]}})
+        move = place - way * np.maximum(1.0 - np.arange(6000) / 200.0, 0.0)
+        for ulps in range(3):
+            r = move * (1.0 + ulps * 2.0**-52)
+            phi = regression(loop, r, r, r).phi[:, -1]
+            assert close(phi[400:], np.full(5600, way))
+
+    def test_a_reference_that_has_not_moved_has_no_sign(self) -> None:
+        plant = AXIS | {"friction": "coulomb", "sign_from": "reference"}
+        loop = Loop.from_dict({"sample_rate": 100.0, "plant": plant, "monitor": {"cutoff": 10.0, "frequencies": [1.0]}})
+        for place in (0.0, 0.1, 1.7e5, -3e-7):
+            r = np.full(300, place)
+            assert not regression(loop, r, r, r).phi[:, -1].any()
+
     def test_gates(self, rig: dict[str, Any]) -> None:
         """Nothing is used near rest and the dead zone or while the filters settle; u is limited where it was not."""
         speed = np.repeat([0.0, 1.0, 0.0, -1.0], [60, 120, 40, 180])
@@ -118,7 +143,7 @@ class TestInstrument:
         r = reference("multisine", 5.0, 100.0)
         r -= r[0]
         _, u, y = signals(500)
-        _, y_a = response(loop, r)
+        _, y_a = simulate_response(loop, r)
         g = regression(loop, r, u, y)
         for power in range(4):
             assert close(g.z[:, power], naive.svf(y_a, power, 10.0, 4, 100.0, "foh"), 1e-7), power
@@ -135,22 +160,22 @@ class TestInstrument:
         rng = np.random.default_rng(8)
         inputs = np.column_stack([r, 0.1 * rng.standard_normal(len(r)), 0.01 * rng.standard_normal(len(r))])
         from_rest = np.vstack([np.zeros((1, 3)), inputs])
-        u, y = closed_loop(loop, loop.plant).simulate(from_rest)[1:].T
+        u, y = closed_loop_system(loop, loop.plant).simulate(from_rest)[1:].T
         # in straight lines, the two differ in how u came to its first value
         late = slice(0 if hold == "zoh" else 400, None)
         assert close(u[late], recording.u[late], 1e-8)
         assert close(y[late], recording.y[late], 1e-8)
-        y_a = instrument_of(loop).simulate(from_rest[:, :1])[1:, 0]
-        assert close(y_a[late], response(loop, r)[1][late], 1e-8)
+        y_a = instrument_system(loop).simulate(from_rest[:, :1])[1:, 0]
+        assert close(y_a[late], simulate_response(loop, r)[1][late], 1e-8)
 
     def test_needs_a_controller_and_a_stable_loop(self, rig: dict[str, Any]) -> None:
         wild = Loop.from_dict(rig | {"controller": {"kind": "pi", "k_p": 2000.0, "k_i": 5.0}})
         with pytest.raises(LoopError, match="unstable"):
-            closed_loop(wild, wild.plant)
+            closed_loop_system(wild, wild.plant)
         del rig["controller"]
         lonely = Loop.from_dict(rig)
         with pytest.raises(LoopError, match="controller"):
-            closed_loop(lonely, lonely.plant)
+            closed_loop_system(lonely, lonely.plant)
 
 
 class TestTheta:
@@ -160,7 +185,7 @@ class TestTheta:
 
     def test_golden_frequency_response(self, rig: dict[str, Any]) -> None:
         loop = Loop.from_dict(rig)
-        H = build(loop).E([1.0, 10.0, 20.0]) @ nominal_theta(loop)
+        H = build_filter_bank(loop).E([1.0, 10.0, 20.0]) @ nominal_theta(loop)
         golden = np.array([0.257754 + 1.657709j, 0.042040 + 16.497358j, -0.611638 + 32.511519j])
         assert np.abs(H - golden).max() < 1e-6
 
@@ -170,11 +195,11 @@ class TestTheta:
         f = np.array([0.5, 1.0, 10.0, 20.0, 45.0])
         s = 2j * 100.0 * np.tan(np.pi * f / 100.0)
         H = np.polyval(loop.plant.theta()[::-1], s)
-        assert build(loop).E(f) @ nominal_theta(loop) == pytest.approx(H, rel=1e-10)
+        assert build_filter_bank(loop).E(f) @ nominal_theta(loop) == pytest.approx(H, rel=1e-10)
 
     def test_input_gain_and_extras_leave_H_in_units_of_u(self) -> None:
         plant = AXIS | {"friction": "coulomb", "offset": True, "input_gain": 4.0}
-        bank = build(Loop.from_dict({"sample_rate": 100.0, "plant": plant}))
+        bank = build_filter_bank(Loop.from_dict({"sample_rate": 100.0, "plant": plant}))
         theta = np.array([3.0, 5.0, 7.0, 9.0])  # viscous friction, inertia, coulomb friction, offset
         assert bank.names == ("viscous_friction", "inertia", "coulomb_friction", "offset")
         s = 2j * np.pi * 6.0
@@ -185,4 +210,4 @@ class TestTheta:
             {"sample_rate": 100.0, "plant": AXIS | {"friction": "coulomb"}, "monitor": {"structure": "tustin"}}
         )
         with pytest.raises(LoopError, match="structure = 'svf'"):
-            build(loop)
+            build_filter_bank(loop)

@@ -9,10 +9,11 @@ import pytest
 from scipy import integrate
 
 import naive
-from servoscope.diagnosis import UNKNOWN, Candidate
-from servoscope.errors import SimulationError
-from servoscope.isolation import SYSTEMATIC, Signature, curve, isolate, line
-from servoscope.plants import Fault
+from servoscope.core.errors import SimulationError
+from servoscope.detection.result import UNKNOWN, Candidate
+from servoscope.detection.signature import Signature, coefficient_signature, parameter_signature
+from servoscope.isolation.isolate import SYSTEMATIC, isolate
+from servoscope.models.plants import Fault
 
 SCALE = np.array([1.0, 1e-2, 1e-5, 1e-7])  # coefficients have very different sizes
 CORRELATION = np.array([[1.0, 0.3, 0.0, 0.1], [0.3, 1.0, -0.2, 0.0], [0.0, -0.2, 1.0, 0.5], [0.1, 0.0, 0.5, 1.0]])
@@ -32,7 +33,7 @@ def fault(name: str, low: float = 0.2, high: float = 5.0) -> Fault:
 
 
 def three() -> list[Signature]:
-    return [curve(fault(name), bent(d)) for name, d in (("pump", PUMP), ("leak", LEAK), ("rub", RUB))]
+    return [parameter_signature(fault(name), bent(d)) for name, d in (("pump", PUMP), ("leak", LEAK), ("rub", RUB))]
 
 
 def draw(mean: naive.Array, seed: int) -> naive.Array:
@@ -76,7 +77,7 @@ def test_intervals_hold_the_truth_19_times_of_20() -> None:
 def test_probabilities_are_the_integrals_over_the_prior() -> None:
     """Against adaptive quadrature, where two faults fit about equally well."""
     first, second = bent(PUMP), bent(PUMP + np.array([0.0, 0.0, 0.0, 0.15]))
-    signatures = [curve(fault("first"), first), curve(fault("second", 0.5, 2.0), second)]
+    signatures = [parameter_signature(fault("first"), first), parameter_signature(fault("second", 0.5, 2.0), second)]
     d = draw(0.5 * (first(1.1) + second(1.1)), 3)
     size = np.sqrt(np.diag(SIGMA))
 
@@ -103,8 +104,8 @@ def test_interval_is_as_sharp_where_the_grid_misses_the_truth() -> None:
     sigma, ratio = 1e-3, 5.0 ** (3.0 / 16.0)
     rival = 0.75 * along + 0.15 * aside
     pair = [
-        curve(fault("true"), lambda q: along * np.log(q)),
-        curve(fault("rival"), lambda q: rival * np.log(q)),
+        parameter_signature(fault("true"), lambda q: along * np.log(q)),
+        parameter_signature(fault("rival"), lambda q: rival * np.log(q)),
     ]
     widths = []
     for seed in range(10):
@@ -117,7 +118,7 @@ def test_interval_is_as_sharp_where_the_grid_misses_the_truth() -> None:
 
 
 def test_two_curves_that_coincide_are_ambiguous() -> None:
-    twins = [curve(fault("one"), bent(RUB)), curve(fault("other"), bent(RUB)), three()[0]]
+    twins = [parameter_signature(fault("one"), bent(RUB)), parameter_signature(fault("other"), bent(RUB)), three()[0]]
     candidates = isolate(twins, draw(bent(RUB)(1.5), 2), SIGMA)
     check_form(candidates, 4)
     assert {candidates[0].name, candidates[1].name} == {"one", "other"}
@@ -147,19 +148,22 @@ def test_sizes_at_which_the_loop_is_unstable_are_impossible() -> None:
             raise SimulationError("unstable")
         return bent(PUMP)(ratio)
 
-    half = [curve(fault("pump"), shift)]
+    half = [parameter_signature(fault("pump"), shift)]
     candidates = isolate(half, draw(bent(PUMP)(1.9), 1), SIGMA)
     assert candidates[0].name == "pump"
     assert candidates[0].faults[0].ratio == pytest.approx(1.9, rel=0.03)
     assert candidates[0].faults[0].interval[1] <= 2.0 + 1e-9
-    never = [curve(fault("pump"), lambda _: shift(3.0)), *three()[1:]]
+    never = [parameter_signature(fault("pump"), lambda _: shift(3.0)), *three()[1:]]
     assert {c.name for c in isolate(never, draw(bent(LEAK)(1.5), 1), SIGMA)} == {"leak", "rub", UNKNOWN}
 
 
 @pytest.mark.parametrize("change", [-0.5, 0.25, 3.0])
 def test_lines_measure_a_coefficient_in_its_own_size(change: float) -> None:
     theta = SCALE * [2.0, 3.0, 4.0, 5.0]
-    lines = [line(fault(name, 0.1, 10.0), np.where(np.arange(4) == i, theta, 0.0)) for i, name in enumerate("abcd")]
+    lines = [
+        coefficient_signature(fault(name, 0.1, 10.0), np.where(np.arange(4) == i, theta, 0.0))
+        for i, name in enumerate("abcd")
+    ]
     candidates = isolate(lines, draw(change * np.where(np.arange(4) == 2, theta, 0.0), 5), SIGMA)
     assert candidates[0].name == "c" and candidates[0].probability > 0.95
     (found,) = candidates[0].faults

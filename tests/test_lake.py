@@ -19,17 +19,17 @@ import pytest
 import lakes
 from commands import one_line, run
 from servoscope import fleet
-from servoscope.errors import OutputError, RecordingError
-from servoscope.fleet import Plan, following, reading
-from servoscope.fleet.following import Follower, Memory, State
+from servoscope.core.errors import OutputError, RecordingError
+from servoscope.diagnosis.diagnose import diagnose
+from servoscope.fleet import Plan, day_monitor, read
+from servoscope.fleet.day_monitor import DayMonitor, DayState, RowHistory
 from servoscope.fleet.lake import Lake
-from servoscope.fleet.local import local
+from servoscope.fleet.local_engine import local
 from servoscope.fleet.rows import Rows
-from servoscope.fleet.tasks import Examine
-from servoscope.learning import learn
-from servoscope.loop import Columns
-from servoscope.monitor import diagnose
-from servoscope.recording import Recording
+from servoscope.fleet.tasks import ExamineTask
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Columns
+from servoscope.signals import Recording
 
 pytestmark = pytest.mark.xdist_group("lake")  # its fixtures are made once
 
@@ -59,41 +59,41 @@ def rows_of(x: Recording) -> Rows:
     return Rows(np.round(1e6 * x.t).astype(np.int64), x.r, x.u, x.y)
 
 
-def followed(one: Follower, rows: Rows, lengths: list[int]) -> tuple[dict[str, Any], np.ndarray[Any, Any]]:
+def followed(one: DayMonitor, rows: Rows, lengths: list[int]) -> tuple[dict[str, Any], np.ndarray[Any, Any]]:
     """Return state and statistics of a day cut into blocks, the state packed and unpacked between them."""
-    state, history, statistics = one.start(), Memory(), []
+    state, history, statistics = one.start(), RowHistory(), []
     for i, block in enumerate(np.split(np.arange(len(rows)), np.cumsum(lengths))):
         part = rows[block]
         history.add(part)
-        state, found = one.advance(State.unpack(state.pack()), part, history)
+        state, found = one.advance(DayState.unpack(state.pack()), part, history)
         statistics.append(found.statistic)
         if i % 3 == 0:
-            history.forget(one.needed(state))
+            history.drop_until(one.needed_since(state))
     state = one.finish(state, history)
     return {**vars(state), "monitor": state.monitor.tobytes()}, np.concatenate(statistics)
 
 
 def test_a_day_is_the_same_however_it_is_cut_and_its_window_lies_around_the_alarm() -> None:
     healthy, ill = lakes.recorded(1, 0, 15.0), lakes.recorded(1, 1, 30.0, leak=1.5)
-    one = Follower(learn(lakes.loop(), [healthy]), window_s=8.0)
+    one = DayMonitor(learn_baseline(lakes.loop(), [healthy]), window_s=8.0)
     rows = rows_of(ill)
-    rows = Rows.joined([rows[:700], rows[720:1000], rows[999:]])  # a gap, and a row twice
+    rows = Rows.concatenate([rows[:700], rows[720:1000], rows[999:]])  # a gap, and a row twice
     whole, statistics = followed(one, rows, [])
     for seed in (1, 2):
         lengths = np.random.default_rng(seed).integers(0, 300, 20).tolist()
         again, other = followed(one, rows, lengths)
         assert again == whole and np.array_equal(statistics, other)
     assert whole["gaps"] == 1 and whole["repeats"] == 1 and whole["samples"] == 2980
-    said = whole["said"]["diagnosis"]
+    said = whole["result"]["diagnosis"]
     assert 15.0 < whole["alarm_us"] * 1e-6 < 17.0 and said["duration_s"] == pytest.approx(8.0)
     assert said["faults"][0]["name"] == "leakage" and said["onset_s"][1] == pytest.approx(15.0, abs=0.1)
 
 
 def test_a_day_shorter_than_the_window_is_diagnosed_as_the_recording_that_it_is() -> None:
-    baseline, day = learn(lakes.loop(), [lakes.recorded(1, 0, 15.0)]), lakes.recorded(1, 1, 15.0)
-    state, _ = followed(Follower(baseline), rows_of(day), [])
+    baseline, day = learn_baseline(lakes.loop(), [lakes.recorded(1, 0, 15.0)]), lakes.recorded(1, 1, 15.0)
+    state, _ = followed(DayMonitor(baseline), rows_of(day), [])
     alone = json.loads(diagnose(baseline, day).model_dump_json(exclude={"recording"}))
-    assert state["said"]["diagnosis"] == alone
+    assert state["result"]["diagnosis"] == alone
 
 
 def test_rows_come_in_the_order_of_time_from_files_and_row_groups_in_any_order(lake: Path, tmp_path: Path) -> None:
@@ -103,8 +103,8 @@ def test_rows_come_in_the_order_of_time_from_files_and_row_groups_in_any_order(l
     lakes.write(tmp_path / "a.parquet", table.slice(100, 200), 70)
     lakes.write(tmp_path / "c.parquet", late, 30)
     files = [str(tmp_path / f"{name}.parquet") for name in "abc"]
-    blocks = list(reading.blocks(files, Columns()))
-    found = Rows.joined(blocks)
+    blocks = list(read.read_blocks(files, Columns()))
+    found = Rows.concatenate(blocks)
     assert len(blocks) > 5 and np.array_equal(found.y, table.column("y").to_numpy())
     assert np.array_equal(found.t_us, table.column("t").cast("int64").to_numpy())
     assert np.array_equal(Rows.unpack(found.pack()).u, found.u)
@@ -117,7 +117,7 @@ def test_a_lake_is_found_by_its_folders_or_in_a_table(lake: Path, tmp_path: Path
     assert Lake.open(f"file://{lake}").items[0].files[0] == f"file://{found.items[0].files[0]}"
     values = lakes.table_of(lakes.recorded(0, 0, 1.0), 0).set_column(0, "t", pa.array(np.arange(100) / 100.0))
     pacsv.write_csv(values, tmp_path / "one.csv")
-    (rows,) = reading.blocks([str(tmp_path / "one.csv")], Columns())
+    (rows,) = read.read_blocks([str(tmp_path / "one.csv")], Columns())
     assert rows.t_us.tolist() == list(range(0, 1_000_000, 10_000))
     table = tmp_path / "files.csv"
     table.write_text(f"asset,file,site\nP0,{found.items[0].files[0]},north\nP9,gone.csv,\n")
@@ -149,7 +149,7 @@ def test_a_fleet_says_who_is_ill_and_what_could_not_be_examined(done: tuple[Plan
 
 
 def test_the_budget_of_false_alarms_is_shared(done: tuple[Plan, fleet.Fleet]) -> None:
-    from servoscope.baseline import Baseline
+    from servoscope.detection.baseline import Baseline
 
     plan, _ = done
     own = Baseline.load(plan.output / "baselines" / "A.json")
@@ -198,7 +198,7 @@ def test_after_a_kill_nothing_is_lost_and_nothing_counted_twice(done: tuple[Plan
     assert entries(tmp_path) == entries(plan.output)
 
 
-class Killer(Examine):
+class Killer(ExamineTask):
     """An item whose reading takes its process with it, as a want of memory does."""
 
     def run(self) -> dict[str, Any]:
@@ -226,4 +226,4 @@ def test_the_command_runs_a_fleet(done: tuple[Plan, fleet.Fleet], lake: Path) ->
 def test_following_knows_its_default_window_everywhere() -> None:
     from servoscope.cli.fleet import WINDOW
 
-    assert WINDOW == following.WINDOW
+    assert WINDOW == day_monitor.WINDOW

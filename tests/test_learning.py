@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope.baseline import Baseline
-from servoscope.errors import BaselineError, NotEnoughError, RecordingError
-from servoscope.learning import learn, nominal
-from servoscope.loop import Loop
-from servoscope.monitor import diagnose
-from servoscope.recording import Recording
+from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.diagnose import diagnose
+from servoscope.learning.learn import learn_baseline, nominal_baseline
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
 from servoscope.simulation import FaultEvent, reference, simulate
 
 
@@ -30,20 +30,21 @@ def record() -> Callable[..., Recording]:
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory, record: Callable[..., Recording]) -> Path:
-    loop = Loop.load(Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml")
+    loop = Loop.load(Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml")
     path = tmp_path_factory.mktemp("baseline") / "b.json"
-    learn(loop, [record(loop)]).save(path)
+    learn_baseline(loop, [record(loop)]).save(path)
     return path
 
 
 def test_finds_noise_and_healthy_parameters(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
     aged = loop.model_copy(update={"plant": loop.plant.with_ratios({"p_s": 0.8, "C_ie": 1.5})})
-    baseline = learn(loop, [record(aged)])  # the loop file is wrong by as much: the recording knows better
+    baseline = learn_baseline(loop, [record(aged)])  # the loop file is wrong: the recording knows better
     assert baseline.noise is not None
     assert baseline.noise.y_std == pytest.approx(np.sqrt(1e-7), rel=0.1)
-    assert baseline.ratios["p_s"] == pytest.approx(0.8, rel=0.01)
-    assert baseline.ratios["C_ie"] == pytest.approx(1.5, rel=0.01)
+    # whether it aged in two parameters or the file is wrong in all, the coefficients do not say; they are known
+    assert baseline.theta[:2] == pytest.approx(aged.plant.theta()[:2], rel=0.002)
+    assert any("contradict the parameters in [plant]" in str(note) for note in baseline.notes)
     worse = record(aged, seed=2, faults=[FaultEvent("C_ie", 1.2, 30.0)])
     (fault,) = diagnose(baseline, worse).faults
     assert fault.ratio == pytest.approx(1.2, rel=0.01)
@@ -52,8 +53,8 @@ def test_finds_noise_and_healthy_parameters(rig: dict[str, Any], record: Callabl
 def test_scatter_between_recordings_counts(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
     colder = loop.model_copy(update={"plant": loop.plant.with_ratios({"C_ie": 1.03})})
-    same = learn(loop, [record(loop, seed=1), record(loop, seed=2)])
-    mixed = learn(loop, [record(loop, seed=1), record(colder, seed=2)])
+    same = learn_baseline(loop, [record(loop, seed=1), record(loop, seed=2)])
+    mixed = learn_baseline(loop, [record(loop, seed=1), record(colder, seed=2)])
     assert mixed.covariance[0][0] > 10.0 * same.covariance[0][0]
     by_parameter = {p.parameter: p.change for p in mixed.promises}
     assert by_parameter["C_ie"] is not None and by_parameter["C_ie"] > 0.05
@@ -61,9 +62,9 @@ def test_scatter_between_recordings_counts(rig: dict[str, Any], record: Callable
 
 def test_more_data_promise_more(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
-    short, long = (learn(loop, [record(loop, seconds=seconds)]) for seconds in (30.0, 120.0))
-    assert any("short" in note for note in short.notes)
-    assert np.all(np.diag(short.cov()) > np.diag(long.cov()))
+    short, long = (learn_baseline(loop, [record(loop, seconds=seconds)]) for seconds in (30.0, 120.0))
+    assert any("short" in str(note) for note in short.notes)
+    assert np.all(np.diag(short.covariance_array()) > np.diag(long.covariance_array()))
     few, many = ({p.parameter: p.change for p in baseline.promises} for baseline in (short, long))
     for parameter in ("b_p", "beta"):
         assert few[parameter] > many[parameter]
@@ -76,43 +77,43 @@ def test_refuses_recordings_out_of_step(rig: dict[str, Any], record: Callable[..
     loop = Loop.from_dict(rig)
     late = record(Loop.from_dict(rig | {"delay": 0.01}))
     with pytest.raises(RecordingError, match=r"delay = 0\.01"):
-        learn(loop, [late])
-    told = learn(Loop.from_dict(rig | {"delay": 0.01}), [late])
+        learn_baseline(loop, [late])
+    told = learn_baseline(Loop.from_dict(rig | {"delay": 0.01}), [late])
     assert told.delay_s == pytest.approx(0.01, abs=0.001)
 
 
 def test_refuses_what_excites_nothing(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
     with pytest.raises(NotEnoughError, match="usable samples"):
-        learn(loop, [record(loop).part(0.0, 0.9)])
+        learn_baseline(loop, [record(loop).part(0.0, 0.9)])
     with pytest.raises(NotEnoughError, match="at least one"):
-        learn(loop, [])
+        learn_baseline(loop, [])
 
 
 def test_suggests_a_model_error_where_the_model_is_wrong(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
     bent = record(loop)
     bent = replace(bent, u=bent.u * (1.0 + 2.0 * np.abs(bent.u)))  # a valve that saturates
-    baseline = learn(loop, [bent])
+    baseline = learn_baseline(loop, [bent])
     assert baseline.suggested_model_error > 0.001
-    assert learn(loop, [record(loop)]).suggested_model_error < 0.001
+    assert learn_baseline(loop, [record(loop)]).suggested_model_error < 0.001
 
 
 def test_a_useless_instrument_is_replaced_and_told(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig | {"monitor": {"estimator": "iv-akf"}})
     good = record(loop, kind="multisine")
-    assert learn(loop, [good]).loop.monitor.estimator == "iv-akf"
+    assert learn_baseline(loop, [good]).loop.monitor.estimator == "iv-akf"
     shuffled = replace(good, r=np.roll(good.r, 333))  # an r that u and y know nothing of
-    baseline = learn(loop, [shuffled])
+    baseline = learn_baseline(loop, [shuffled])
     assert baseline.loop.monitor.estimator == "akf"
-    assert any("instrument is too weak" in note for note in baseline.notes)
+    assert any("instrument is too weak" in str(note) for note in baseline.notes)
 
 
 def test_an_instrument_that_fails_later_is_replaced_and_told(
     rig: dict[str, Any], record: Callable[..., Recording]
 ) -> None:
     loop = Loop.from_dict(rig | {"monitor": {"estimator": "iv-akf"}})
-    baseline = learn(loop, [record(loop, kind="multisine")])
+    baseline = learn_baseline(loop, [record(loop, kind="multisine")])
     other = record(loop, kind="multisine", seed=2)
     diagnosis = diagnose(baseline, replace(other, r=-other.r))
     assert any(warning.kind == "instrument" and "akf" in warning.message for warning in diagnosis.warnings)
@@ -123,23 +124,23 @@ def test_a_noisier_sensor_is_told_and_not_taken_for_a_fault(
 ) -> None:
     """The noise in the regressors moves theta; without its growth in the expectation it looks like contamination."""
     loop = Loop.from_dict(rig)
-    baseline = learn(loop, [record(loop)])
+    baseline = learn_baseline(loop, [record(loop)])
     for seed in (2, 3):
         diagnosis = diagnose(baseline, record(loop, seed=seed, noise_y_std=3.0 * np.sqrt(1e-7)))
         assert diagnosis.verdict == "healthy"
         (told,) = [warning for warning in diagnosis.warnings if warning.kind == "noise"]
         # of the power over a memory a low quantile counts, so the factor comes out a few per cent low, and scatters
-        assert float(told.message.split()[0]) == pytest.approx(2.9, rel=0.06)
+        assert told.description.values["factor"] == pytest.approx(2.9, rel=0.06)
 
 
 def test_an_input_at_its_limits_says_nothing(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
-    baseline = learn(loop, [record(loop)])
+    baseline = learn_baseline(loop, [record(loop)])
     stuck = Loop.from_dict(rig | {"input_limits": [-1e-3, 1e-3]})
     pinned = record(loop)
     pinned = replace(pinned, u=np.clip(pinned.u, -1e-3, 1e-3))
     with pytest.raises(NotEnoughError, match="at a limit"):
-        learn(stuck, [pinned])
+        learn_baseline(stuck, [pinned])
     limited = baseline.model_copy(update={"loop_settings": stuck.to_dict()})
     assert diagnose(limited, pinned).verdict != "healthy"
 
@@ -156,13 +157,13 @@ def test_polynomial_with_nominal_values_needs_no_learning(record: Callable[..., 
             "controller": {"kind": "pi", "k_p": 300.0, "k_i": 0.0},
         }
     )
-    baseline = nominal(axis)
+    baseline = nominal_baseline(axis)
     assert baseline.theta == pytest.approx((50.0, 2.0), rel=0.2)  # with the bias of this noise in it
 
 
 def test_nominal_baseline_finds_faults_without_learning(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
-    baseline = nominal(loop)
+    baseline = nominal_baseline(loop)
     assert diagnose(baseline, record(loop, kind="multisine", seed=3)).verdict == "healthy"
     (fault,) = diagnose(baseline, record(loop, seed=4, faults=[FaultEvent("p_s", 1.4, 20.0)])).faults
     assert fault.name == "pump"
@@ -209,13 +210,15 @@ def test_a_blink_of_a_recording_is_undetermined(
     rig: dict[str, Any], record: Callable[..., Recording], seconds: float
 ) -> None:
     loop = Loop.from_dict(rig)
-    assert diagnose(learn(loop, [record(loop)]), record(loop, seconds=seconds, seed=2)).verdict == "undetermined"
+    assert (
+        diagnose(learn_baseline(loop, [record(loop)]), record(loop, seconds=seconds, seed=2)).verdict == "undetermined"
+    )
 
 
 def test_a_slowly_ringing_loop_keeps_its_noise_apart(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     """The closed loop's poles, not the filters', say how long the noise is remembered."""
     loop = Loop.from_dict(rig | {"delay": 0.013})
-    baseline = learn(loop, [record(loop)])
+    baseline = learn_baseline(loop, [record(loop)])
     assert baseline.noise is not None and baseline.members
     assert baseline.noise.u_std == pytest.approx(1e-4, rel=0.6)
     assert baseline.noise.y_std == pytest.approx(np.sqrt(1e-7), rel=0.05)
@@ -226,21 +229,21 @@ def test_a_loop_that_is_held_at_rest_can_be_simulated_too(
     rig: dict[str, Any], record: Callable[..., Recording]
 ) -> None:
     loop = Loop.from_dict(rig | {"monitor": {"update_when": "moving", "rest_speed": 0.005}})
-    baseline = learn(loop, [record(loop, kind="profile")])
+    baseline = learn_baseline(loop, [record(loop, kind="profile")])
     assert diagnose(baseline, record(loop, kind="profile", seed=4)).verdict == "healthy"
 
 
 def test_silence_is_no_obstacle(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
     quiet = {"noise_u_std": 0.0, "noise_y_std": 0.0}
-    assert diagnose(learn(loop, [record(loop, **quiet)]), record(loop, seed=5, **quiet)).verdict == "healthy"
+    assert diagnose(learn_baseline(loop, [record(loop, **quiet)]), record(loop, seed=5, **quiet)).verdict == "healthy"
 
 
 def test_one_recording_too_short_among_others_is_refused(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
     loop = Loop.from_dict(rig)
     short = replace(record(loop, seconds=0.3, seed=2), name="short.csv")
     with pytest.raises(NotEnoughError, match=r"^short\.csv: only \d+ usable samples of at least 80 "):
-        learn(loop, [record(loop), short])
+        learn_baseline(loop, [record(loop), short])
 
 
 def test_a_rehearsal_is_as_long_as_the_memory_asks(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
@@ -248,5 +251,5 @@ def test_a_rehearsal_is_as_long_as_the_memory_asks(rig: dict[str, Any], record: 
     shares = []
     for memory in (5.0, 20.0):
         loop = Loop.from_dict(rig | {"monitor": {"memory": memory}})
-        shares.append(learn(loop, [record(loop, seconds=240.0)]).rehearsed.statistic)
+        shares.append(learn_baseline(loop, [record(loop, seconds=240.0)]).rehearsed.statistic)
     assert shares[1] == pytest.approx(shares[0], rel=0.5)

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 import naive
-from servoscope.linear import Linear, autocovariances, sampled, settling, stack, state_variable_filter, taps
+from servoscope.models.lti import (
+    LinearSystem,
+    autocovariances,
+    block_diagonal,
+    sample_system,
+    settling_samples,
+    state_variable_filter,
+    tapped_delay_line,
+)
 
 RATE = 100.0
 HOLDS: tuple[Literal["zoh", "foh"], ...] = ("zoh", "foh")
@@ -25,22 +33,22 @@ class TestSampled:
         self, hold: Literal["zoh", "foh"], delay: float
     ) -> None:
         w = noise(120)
-        ours = sampled(state_variable_filter(10.0, 4), RATE, hold, delay).simulate(w[:, None])
+        ours = sample_system(state_variable_filter(10.0, 4), RATE, hold, delay).simulate(w[:, None])
         for power in range(4):
             theirs = naive.svf(w, power, 10.0, 4, RATE, hold, delay, steps=100)
             assert np.abs(ours[:, power] - theirs).max() < 1e-9 * np.abs(theirs).max(), power
 
     @pytest.mark.parametrize("hold", HOLDS)
     def test_starts_at_rest_at_the_first_input(self, hold: Literal["zoh", "foh"]) -> None:
-        system = sampled(state_variable_filter(10.0, 4), RATE, hold, 0.0137)
+        system = sample_system(state_variable_filter(10.0, 4), RATE, hold, 0.0137)
         out = system.simulate(np.full((50, 1), 3.0))
         assert out == pytest.approx(np.tile([3.0, 0.0, 0.0, 0.0], (50, 1)), abs=1e-4)  # s^3 F is of size 1e5
 
 
 class TestAlgebra:
-    def systems(self) -> tuple[Linear, Linear]:
-        first = sampled(state_variable_filter(5.0, 2), RATE, "zoh").output(np.array([[1.0, 0.02]]))
-        return first, sampled(state_variable_filter(20.0, 3), RATE, "foh").output(np.eye(1, 3))
+    def systems(self) -> tuple[LinearSystem, LinearSystem]:
+        first = sample_system(state_variable_filter(5.0, 2), RATE, "zoh").output(np.array([[1.0, 0.02]]))
+        return first, sample_system(state_variable_filter(20.0, 3), RATE, "foh").output(np.eye(1, 3))
 
     def test_series_is_one_after_the_other(self) -> None:
         first, second = self.systems()
@@ -51,11 +59,11 @@ class TestAlgebra:
     def test_stack_shares_nothing(self) -> None:
         first, second = self.systems()
         w = np.column_stack([noise(80, 1), noise(80, 2)])
-        both = stack([first, second]).simulate(w)
+        both = block_diagonal([first, second]).simulate(w)
         assert both == pytest.approx(np.hstack([first.simulate(w[:, :1]), second.simulate(w[:, 1:])]), abs=1e-12)
 
     def test_inputs_and_outputs_are_mixed_before_and_after(self) -> None:
-        both = stack(self.systems())
+        both = block_diagonal(self.systems())
         before, after = np.array([[1.0, -2.0, 0.5], [0.0, 3.0, 1.0]]), np.array([[2.0, 0.1]])
         w = np.column_stack([noise(80, seed) for seed in range(3)])
         mixed = both.input(before).output(after).simulate(w)
@@ -63,28 +71,28 @@ class TestAlgebra:
 
     def test_steady_state_stands_still(self) -> None:
         first, second = self.systems()
-        both = stack([first, second, taps(np.ones(4))])
+        both = block_diagonal([first, second, tapped_delay_line(np.ones(4))])
         x = both.steady @ np.array([1.0, -2.0, 0.5])
         assert both.A @ x + both.B @ np.array([1.0, -2.0, 0.5]) == pytest.approx(x, rel=1e-10, abs=1e-12)
 
     def test_taps_are_a_convolution(self) -> None:
         w, weights = noise(40), np.array([[1.0, 3.0, 3.0, 1.0], [0.0, 0.0, 2.0, 0.0]])
-        out = taps(weights).simulate(w[:, None])
+        out = tapped_delay_line(weights).simulate(w[:, None])
         padded = np.concatenate([np.full(3, w[0]), w])
         for row, column in zip(weights, out.T, strict=True):
             assert column == pytest.approx(np.convolve(padded, row)[3 : 3 + len(w)], abs=1e-12)
 
     def test_a_single_tap_is_a_gain_without_state(self) -> None:
         w = noise(5)[:, None]
-        assert taps(np.array([2.5])).simulate(w) == pytest.approx(2.5 * w)
+        assert tapped_delay_line(np.array([2.5])).simulate(w) == pytest.approx(2.5 * w)
 
 
 class TestAutocovariances:
     @pytest.mark.parametrize("stride", [1, 3])
     def test_are_those_of_the_impulse_responses(self, stride: int) -> None:
         """E[v(k + lag) v(k)'] under white inputs is the sum over the past of the responses' products."""
-        first = sampled(state_variable_filter(5.0, 2), RATE, "zoh")
-        system = stack([first, sampled(state_variable_filter(20.0, 2), RATE, "foh")])
+        first = sample_system(state_variable_filter(5.0, 2), RATE, "zoh")
+        system = block_diagonal([first, sample_system(state_variable_filter(20.0, 2), RATE, "foh")])
         mix = np.array([[1.0, 0.02, 0.0, 0.0], [0.3, 0.0, 1.0, 1e-3]])
         system = system.output(mix)
         pulse = np.zeros((2000, 2, 2))
@@ -99,7 +107,7 @@ class TestAutocovariances:
             assert ours[lag] == pytest.approx(theirs, rel=1e-8, abs=1e-10), lag
 
     def test_of_a_gain(self) -> None:
-        gain = taps(np.array([2.0]))
+        gain = tapped_delay_line(np.array([2.0]))
         assert autocovariances(gain, 2)[:, 0, 0] == pytest.approx([4.0, 0.0, 0.0])
 
 
@@ -116,5 +124,5 @@ class TestStateVariableFilter:
     def test_settling_is_the_first_sample_after_which_a_step_is_over(self, cutoff: float, order: int) -> None:
         w = np.concatenate([[0.0], np.ones(400)])
         left = np.abs(naive.svf(w, 0, cutoff, order, RATE, "zoh") - 1.0)[1:]  # left[i]: i samples after the step
-        count = settling(cutoff, order, 1.0 / RATE)
+        count = settling_samples(cutoff, order, 1.0 / RATE)
         assert left[count] <= 1e-3 < left[count - 1]

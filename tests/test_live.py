@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,26 +14,34 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import halls
-from servoscope.alarms import AlarmSettings, Command, Event, State
-from servoscope.errors import AlarmError, ConfigError, RecordingError, StateError
-from servoscope.live import checkpoint
-from servoscope.live.arrival import arrive
-from servoscope.live.assembling import rehearse
-from servoscope.live.asset import Asset, Following
-from servoscope.live.block import Block, Resume
-from servoscope.live.config import Config, DiagnosisSettings
-from servoscope.live.examining import Examined, Told, diagnose_in_full
-from servoscope.live.judging import Judged, Window, ask_in_full, judge
-from servoscope.live.replay import Replay, ReplaySettings, Tape
-from servoscope.live.thinning import Thinned, thin
-from servoscope.monitor import Monitor
-from servoscope.quality import QualitySettings
-from servoscope.recording import Recording
+from servoscope.core.errors import AlarmError, ConfigError, RecordingError, StateError
+from servoscope.core.messages import text_message
+from servoscope.detection.result import Verdict
+from servoscope.diagnosis.follower import DiagnosisSchedule
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.service import checkpoint
+from servoscope.service.alarms import AlarmSettings, LifecycleEvent, LifecycleState, OperatorCommand
+from servoscope.service.asset import Asset, AssetPolicy
+from servoscope.service.build import check_service_file
+from servoscope.service.config import DiagnosisSettings, ServiceFile
+from servoscope.service.examination import StoredDiagnosis, diagnose_blocks
+from servoscope.service.examination_schedule import (
+    ExaminationState,
+    PendingDiagnosis,
+    schedule_full_diagnosis,
+    update_examination,
+)
+from servoscope.service.residual_history import HistoryState, update_history
+from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.replay import ReplaySettings, ReplaySource, ReplayStream
+from servoscope.service.store.queries import format_time
+from servoscope.signals import Recording
+from servoscope.signals.quality import QualitySettings
+from servoscope.signals.timebase import Timebase
 from servoscope.simulation import FaultEvent
-from servoscope.store.history import dated
 
 BEGAN = 1.7e9
-HOW = Following(
+HOW = AssetPolicy(
     DiagnosisSettings(window_s=40.0, every_s=100.0),
     QualitySettings(),
     AlarmSettings.model_validate({}),
@@ -40,16 +49,16 @@ HOW = Following(
 )
 
 
-def tape(samples: int = 50, *, repeat: bool = False) -> Tape:
-    return Tape((halls.recorded(1), halls.recorded(2, halls.LEAK)), samples, repeat)
+def tape(samples: int = 50, *, repeat: bool = False) -> ReplayStream:
+    return ReplayStream((halls.recorded(1), halls.recorded(2, halls.LEAK)), samples, repeat)
 
 
-def asset(how: Following = HOW) -> Asset:
+def asset(how: AssetPolicy = HOW) -> Asset:
     return Asset("press", halls.baseline(), Monitor(halls.baseline()), how)
 
 
 def blocks(recording: Recording, samples: int = 50) -> list[Block]:
-    one = Tape((recording,), samples, repeat=False)
+    one = ReplayStream((recording,), samples, repeat=False)
     found = (one.block("press", k, BEGAN) for k in range(math.ceil(recording.samples / samples)))
     return [block for block in found if block is not None]
 
@@ -74,21 +83,21 @@ class TestReplay:
         halls.files(tmp_path)
         loop = halls.baseline().loop
         settings = ReplaySettings(kind="replay", speed=0.0, block=1.0)
-        source = Replay(settings, {name: ((tmp_path / "healthy.csv",), loop) for name in ("a", "b")})
-        source.open({"a": Resume(9, BEGAN), "b": Resume(11, BEGAN)})
+        source = ReplaySource(settings, {name: ((tmp_path / "healthy.csv",), loop) for name in ("a", "b")})
+        source.open({"a": ResumePosition(9, BEGAN), "b": ResumePosition(11, BEGAN)})
         order = [(block.asset, block.sequence) for block in source.poll(5)]
         assert order == [("a", 10), ("a", 11), ("a", 12), ("b", 12), ("a", 13)]
         while source.poll(50):
             pass
-        assert math.isinf(source.waits)
+        assert math.isinf(source.next_block_s)
 
     def test_it_keeps_time(self, tmp_path: Path) -> None:
         halls.files(tmp_path)
         settings = ReplaySettings(kind="replay", speed=2.0, block=30.0)
-        source = Replay(settings, {"a": ((tmp_path / "healthy.csv",), halls.baseline().loop)})
+        source = ReplaySource(settings, {"a": ((tmp_path / "healthy.csv",), halls.baseline().loop)})
         source.open({})
         assert source.poll(1) == []
-        assert 14.0 < source.waits < 15.0  # a block of 30 s, twice as fast as it was recorded
+        assert 14.0 < source.next_block_s < 15.0  # a block of 30 s, twice as fast as it was recorded
 
 
 @pytest.mark.parametrize(
@@ -104,9 +113,9 @@ class TestReplay:
     ],
 )
 def test_what_of_a_block_counts(t: list[float], used: list[int], restart: list[int]) -> None:
-    found = arrive(np.array(t), 0.99, 0.01)
-    assert found.used.tolist() == [bool(x) for x in used]
-    assert found.restart.tolist() == [bool(x) for x in restart]
+    found = Timebase(0.01).order_block(np.array(t), 0.99)
+    assert found.rows.tolist() == [row for row, x in enumerate(used) if x]
+    assert found.restart.tolist() == [bool(x) for x, y in zip(restart, used, strict=True) if y]
     assert found.t == [x for x, yes in zip(t, used, strict=True) if yes][-1]
 
 
@@ -115,48 +124,52 @@ def packed() -> bytes:
     """A checkpoint of an asset behind 45 s."""
     followed = asset()
     for block in blocks(halls.recorded(1))[:90]:
-        followed.take(block)
-    assert followed.progress is not None
-    return checkpoint.pack(followed.progress)
+        followed.process(block)
+    assert followed.state is not None
+    return checkpoint.pack_state(followed.state)
 
 
 class TestCheckpoint:
     def test_it_is_turned_back_whole(self, packed: bytes) -> None:
-        assert checkpoint.pack(checkpoint.unpack(packed, "press")) == packed
+        assert checkpoint.pack_state(checkpoint.unpack_state(packed, "press")) == packed
 
     @given(where=st.floats(0.0, 1.0, exclude_max=True), bit=st.integers(0, 7))
     def test_one_bit_is_enough_to_refuse_it(self, packed: bytes, where: float, bit: int) -> None:
         torn = bytearray(packed)
         torn[int(where * len(torn))] ^= 1 << bit
         with pytest.raises(StateError, match=r"press: its saved state is .*run --anew press"):
-            checkpoint.unpack(bytes(torn), "press")
+            checkpoint.unpack_state(bytes(torn), "press")
 
     @given(share=st.floats(0.0, 1.0, exclude_max=True))
     def test_so_is_a_torn_one(self, packed: bytes, share: float) -> None:
         with pytest.raises(StateError, match="torn: restore the store from a copy"):
-            checkpoint.unpack(packed[: int(share * len(packed))], "press")
+            checkpoint.unpack_state(packed[: int(share * len(packed))], "press")
 
     def test_another_version_is_named(self, packed: bytes) -> None:
         other = packed[:16] + (checkpoint.VERSION + 1).to_bytes(2, "little") + packed[18:]
         with pytest.raises(
             StateError, match=r"is of version 2, this servoscope reads 1: use the version that wrote it"
         ):
-            checkpoint.unpack(other, "press")
+            checkpoint.unpack_state(other, "press")
 
     def test_another_baseline_is_refused(self, packed: bytes) -> None:
-        other = replace(checkpoint.unpack(packed, "press"), baseline="0123")
+        other = replace(checkpoint.unpack_state(packed, "press"), baseline="0123")
         with pytest.raises(StateError, match=r"belongs to another baseline .* run --anew press"):
             asset().resume(other, [])
 
 
-class TestJudging:
-    settings = DiagnosisSettings(window_s=40.0, every_s=100.0)
+def result(verdict: Verdict, onset: float | None = None, **values: Any) -> StoredDiagnosis:
+    return StoredDiagnosis(verdict=verdict, headline=text_message("words"), onset=onset, **values)
 
-    def course(self, exceeded: list[bool], verdict: str = "healthy") -> list[int]:
+
+class TestJudging:
+    settings, schedule = DiagnosisSettings(window_s=40.0, every_s=100.0), DiagnosisSchedule(40.0, 10.0)
+
+    def course(self, exceeded: list[bool], verdict: Verdict = "healthy") -> list[int]:
         """Return at which seconds there was an examination that says the verdict."""
-        state, looked = Judged(due=1e9, verdict="healthy"), []
+        state, looked = ExaminationState(due=1e9, verdict="healthy"), []
         for t, above in enumerate(exceeded):
-            state, found = judge(state, self.settings, float(t), above, lambda: Examined(verdict, ""))  # type: ignore[arg-type]
+            state, found = update_examination(state, self.settings, float(t), above, lambda: result(verdict))
             looked += [t] if found else []
         return looked
 
@@ -167,32 +180,38 @@ class TestJudging:
         assert self.course([False] * 5 + [True] * 50, "fault") == [5]
 
     def test_the_beginning_of_a_fault_stays_what_it_was_first_seen_to_be(self) -> None:
-        first, _ = judge(Judged(due=0.0), self.settings, 10.0, True, lambda: Examined("fault", "x", onset=8.0))
-        later, _ = judge(
-            replace(first, due=20.0), self.settings, 20.0, True, lambda: Examined("fault", "x", onset=15.0)
+        first, _ = update_examination(
+            ExaminationState(due=0.0), self.settings, 10.0, True, lambda: result("fault", 8.0)
         )
-        over, _ = judge(replace(later, due=30.0), self.settings, 30.0, False, lambda: Examined("healthy", "fine"))
+        later, _ = update_examination(
+            replace(first, due=20.0), self.settings, 20.0, True, lambda: result("fault", 15.0)
+        )
+        over, _ = update_examination(replace(later, due=30.0), self.settings, 30.0, False, lambda: result("healthy"))
         assert (first.onset, later.onset, over.onset) == (8.0, 8.0, None)
 
     def test_a_fault_that_stands_is_diagnosed_again_each_time_it_is_twice_as_old(self) -> None:
-        state, asked = Judged(due=0.0, verdict="healthy"), []
+        state, asked = ExaminationState(due=0.0, verdict="healthy"), []
         for t in range(10, 2000):
-            state, found = judge(state, self.settings, float(t), True, lambda: Examined("fault", "x", onset=8.0))
-            state, in_full = ask_in_full(state, 40.0, float(t)) if found else (state, False)
+            state, found = update_examination(state, self.settings, float(t), True, lambda: result("fault", 8.0))
+            state, in_full = schedule_full_diagnosis(state, self.schedule, float(t)) if found else (state, False)
             asked += [t] if in_full else []
         assert asked[0] == 10 and asked[1] >= 50  # with the window full of it
         assert all(2 * (a - 10) <= b - 10 <= 2 * (a - 10) + 150 for a, b in pairwise(asked[1:])) and len(asked) == 6
-        assert ask_in_full(replace(state, again=1e9, since=0.0), 40.0, 1e6)[1] is False
-        late, in_full = ask_in_full(replace(state, since=0.0), 40.0, 1e6)
+        assert schedule_full_diagnosis(replace(state, again=1e9, since=0.0), self.schedule, 1e6)[1] is False
+        late, in_full = schedule_full_diagnosis(replace(state, since=0.0), self.schedule, 1e6)
         assert in_full and late.again == 1e6 + 86400.0
 
     def test_quiet_assets_are_looked_at_now_and_then(self) -> None:
-        state, found = judge(Judged(due=50.0), self.settings, 51.0, False, lambda: Examined("healthy", "fine"))
+        state, found = update_examination(
+            ExaminationState(due=50.0), self.settings, 51.0, False, lambda: result("healthy")
+        )
         assert found is not None and (state.verdict, state.since, state.due) == ("healthy", 51.0, 200.0)
 
     def test_after_a_deviation_the_window_has_to_pass(self) -> None:
-        gone = Examined("undetermined", "gone", recovering=True)
-        state, _ = judge(Judged(due=1e9, verdict="fault"), self.settings, 10.0, False, lambda: gone)
+        gone = result("undetermined", recovering=True)
+        state, _ = update_examination(
+            ExaminationState(due=1e9, verdict="fault"), self.settings, 10.0, False, lambda: gone
+        )
         assert state.due == 50.0
 
 
@@ -200,10 +219,10 @@ def test_stored_residuals_do_not_depend_on_how_the_blocks_are_cut() -> None:
     monitor, recording = Monitor(halls.baseline()), halls.recorded(2, halls.LEAK)
 
     def rows(cuts: list[int]) -> list[dict[str, object]]:
-        state, found, thinned = monitor.init(), [], Thinned()
+        state, found, thinned = monitor.init(), [], HistoryState()
         for a, b in pairwise([0, *cuts, 6000]):
             state, trace = monitor.run(state, recording.r[a:b], recording.u[a:b], recording.y[a:b])
-            thinned, more = thin(thinned, trace, BEGAN + trace.t, 2.5)
+            thinned, more = update_history(thinned, trace, BEGAN + trace.t, 2.5)
             found += more
         return found
 
@@ -219,19 +238,19 @@ class TestAsset:
     def test_a_block_counts_once(self) -> None:
         one, other, cut = asset(), asset(), blocks(halls.recorded(1))[:20]
         for block in cut:
-            one.take(block)
-            other.take(block)
-            assert other.take(block).rows == []
-        assert one.progress is not None and other.progress is not None
-        assert other.progress.counted == replace(one.progress.counted, repeated=20)
-        assert (other.progress.monitor == one.progress.monitor).all()
+            one.process(block)
+            other.process(block)
+            assert other.process(block).rows == []
+        assert one.state is not None and other.state is not None
+        assert other.state.position == replace(one.state.position, repeated=20)
+        assert (other.state.monitor == one.state.monitor).all()
 
     def test_a_block_that_is_missing_is_told(self) -> None:
         followed, cut = asset(), blocks(halls.recorded(1))[:20]
-        told = [row for block in (*cut[:8], *cut[11:]) for row in followed.take(block).rows if row.table == "audit"]
+        told = [row for block in (*cut[:8], *cut[11:]) for row in followed.process(block).rows if row.table == "audit"]
         (lost,) = told
         assert lost.values["document"] == {"blocks": 3, "after": [0, 7], "before": [0, 11]}
-        assert followed.progress is not None and followed.progress.counted.lost == 3
+        assert followed.state is not None and followed.state.position.lost == 3
 
     def test_what_is_no_block_is_refused(self) -> None:
         followed, block = asset(), blocks(halls.recorded(1))[0]
@@ -242,37 +261,37 @@ class TestAsset:
             replace(block, t=np.full(50, math.nan)),
         ):
             with pytest.raises(RecordingError, match="press: block 0: t, r, u, y must have one length"):
-                followed.take(wrong)
-        assert followed.progress is None
+                followed.process(wrong)
+        assert followed.state is None
 
     def test_a_clock_that_is_set_back_keeps_neither_samples_nor_verdicts_waiting(self) -> None:
         followed = asset()
         for k, block in enumerate(blocks(halls.recorded(1, seconds=600.0))):
-            followed.take(replace(block, t=block.t - (3600.0 if k >= 200 else 0.0)))
-        assert followed.progress is not None
+            followed.process(replace(block, t=block.t - (3600.0 if k >= 200 else 0.0)))
+        assert followed.state is not None
         assert len(followed._window) <= 2 * 40 / 0.5 + 1
-        assert followed.progress.judged.examined is not None
-        assert followed.progress.judged.examined < BEGAN - 3000.0
+        assert followed.state.examination.examined is not None
+        assert followed.state.examination.examined < BEGAN - 3000.0
 
     def test_what_is_no_number_does_no_harm(self) -> None:
         followed, cut = asset(), blocks(halls.recorded(1))[:40]
         for k, block in enumerate(cut):
             y = np.where(np.arange(50) % 7 == k % 7, [math.inf, math.nan] * 25, block.y)
-            followed.take(replace(block, y=y) if 10 < k < 20 else block)
-        assert followed.progress is not None
-        checkpoint.unpack(checkpoint.pack(followed.progress), "press")
-        assert math.isfinite(followed.progress.shown["statistic"])
+            followed.process(replace(block, y=y) if 10 < k < 20 else block)
+        assert followed.state is not None
+        checkpoint.unpack_state(checkpoint.pack_state(followed.state), "press")
+        assert math.isfinite(followed.state.evaluation.statistic or math.nan)
 
     def test_silence_is_an_alarm_and_no_verdict(self) -> None:
         followed = asset()
         for block in blocks(halls.recorded(1)):
-            followed.take(block)
-        assert followed.progress is not None
-        assert followed.status(followed.progress)["verdict"] == "healthy"
-        told = [one for quiet in range(1, 40) for one in followed.tick(float(quiet)).transitions]
-        status = followed.status(followed.progress)
+            followed.process(block)
+        assert followed.state is not None
+        assert followed.status(followed.state).to_json()["verdict"] == "healthy"
+        told = [one for quiet in range(1, 40) for one in followed.advance_time(float(quiet)).transitions]
+        status = followed.status(followed.state).to_json()
         assert status["verdict"] == "undetermined" and "silent" in status["quality"]
-        (alarm,) = [one for one in told if one.after is State.UNACKNOWLEDGED]
+        (alarm,) = [one for one in told if one.after is LifecycleState.UNACKNOWLEDGED]
         assert (alarm.alarm, alarm.cause) == ("data_quality", "no data come")
         assert status["summary"] == "Undetermined: no data come."
         assert status["ne107"] == "failure"
@@ -280,47 +299,47 @@ class TestAsset:
     def test_a_fault_is_alarmed_and_then_diagnosed_in_full(self) -> None:
         followed, transitions = asset(), []
         for block in blocks(halls.recorded(2, halls.LEAK))[:90]:
-            transitions += followed.take(block).transitions
+            transitions += followed.process(block).transitions
         (alarm,) = transitions
         assert alarm.alarm == "fault" and BEGAN + 30.0 < alarm.time < BEGAN + 33.0
-        ((window, seen),) = followed.wanted()
+        ((window, seen),) = followed.due_diagnoses()
         assert window.until == alarm.time + 10.0 and seen[-1].t[-1] >= window.until - 0.02
-        assert followed.wanted(ended=True) == [(window, seen)]
+        assert followed.due_diagnoses(ended=True) == [(window, seen)]
         with pytest.raises(AlarmError, match="reset means nothing there"):
-            followed.obey("fault", Command(Event.RESET, "ann"))
-        (done,) = followed.obey("fault", Command(Event.ACKNOWLEDGE, "ann", "seen")).transitions
-        assert (done.after, done.who, done.cause) == (State.ACKNOWLEDGED, "ann", "seen")
+            followed.execute("fault", OperatorCommand(LifecycleEvent.RESET, "ann"))
+        (done,) = followed.execute("fault", OperatorCommand(LifecycleEvent.ACKNOWLEDGE, "ann", "seen")).transitions
+        assert (done.after, done.who, done.cause) == (LifecycleState.ACKNOWLEDGED, "ann", "seen")
         with pytest.raises(AlarmError, match=r"press: has no alarm 'falt', did you mean 'fault'\?"):
-            followed.obey("falt", Command(Event.ACKNOWLEDGE, "ann"))
+            followed.execute("falt", OperatorCommand(LifecycleEvent.ACKNOWLEDGE, "ann"))
 
     def test_a_fault_that_grows_is_diagnosed_in_full_again(self) -> None:
         followed, told, onsets = asset(), list[tuple[float, bool, float]](), list[float]()
         grown = FaultEvent.parse("C_ie=1.6@200")
         for block in blocks(halls.recorded(3, halls.LEAK, grown, seconds=400.0)):
-            followed.take(block)
-            for window, seen in followed.wanted():
-                said = diagnose_in_full(followed.baseline, "press", seen)
+            followed.process(block)
+            for window, seen in followed.due_diagnoses():
+                said = diagnose_blocks(followed.baseline, "press", seen)
                 (fault,) = said.document["faults"]
                 told.append((window.until - BEGAN, followed.is_news(window, said), fault["ratio"]))
-                (row,) = followed.told(window, said).rows
+                (row,) = followed.apply_diagnosis(window, said).rows
                 onsets.append(row.values["onset"])
-                assert f"since {dated(onsets[0])} UTC" in row.values["summary"]
+                assert f"since {format_time(onsets[0])} UTC" in row.values["summary"]
         assert [news for _, news, _ in told] == [True, False, False]  # the same fault: nobody is told once more
         assert [size for *_, size in told] == pytest.approx([1.2, 1.2, 1.6], abs=0.01)
-        assert followed.progress is not None
-        status = followed.status(followed.progress)
+        assert followed.state is not None
+        status = followed.status(followed.state).to_json()
         (fault,) = status["faults"]
         assert status["summary"] == status["alarms"]["fault"]["cause"] and "leakage. C_ie is 1.6" in status["summary"]
-        assert fault["ratio"] == told[-1][2] and followed.progress.judged.onset == onsets[0]
+        assert fault["ratio"] == told[-1][2] and followed.state.examination.onset == onsets[0]
         assert onsets == [onsets[0]] * 3 and onsets[0] == pytest.approx(BEGAN + 30.0, abs=0.5)
-        other = Told("fault", "Fault: pump.", None, {"faults": [{"name": "pump", "ratio": 0.9}]})
-        nothing = Told("fault", "Fault, unknown.", None, {"faults": []})
-        late = Window(99, 0, BEGAN + 400.0, "full")
+        other = result("fault", document={"faults": [{"name": "pump", "ratio": 0.9}]})
+        nothing = result("fault", document={"faults": []})
+        late = PendingDiagnosis(99, 0, BEGAN + 400.0, "full")
         assert followed.is_news(late, other) and not followed.is_news(late, nothing)
         # once it has gone the alarm still says what it was
         for block in blocks(halls.recorded(1, seconds=120.0)):
-            followed.take(replace(block, sequence=block.sequence + 1000, t=block.t + 401.0))
-        status = followed.status(followed.progress)
+            followed.process(replace(block, sequence=block.sequence + 1000, t=block.t + 401.0))
+        status = followed.status(followed.state).to_json()
         assert status["verdict"] == "healthy" and status["summary"].startswith("Healthy")
         assert status["alarms"]["fault"]["state"] == "latched_unacknowledged"
         assert "leakage. C_ie is 1.6" in status["alarms"]["fault"]["cause"]
@@ -333,9 +352,17 @@ class TestConfig:
             ("speed =", "sped =", "[sources] line.sped: unknown key, did you mean 'speed'?"),
             ("window_s = 40.0", "window_s = 0", "[diagnosis] window_s: 0 must be at least 0.001"),
             ('source = "line"', 'source = "lime"', "there is no source 'lime', only line"),
-            ('kind = "replay"', 'kind = "mqt"', "[sources] line.kind: 'mqt' is not one of 'replay', 'mqtt', 'opcua'"),
-            ('kind = "replay"', "", "[sources] line.kind: missing, add it"),
-            ('kind = "replay"', 'kind = "mqtt"', "[sources] line.speed: unknown key, choose from host, port"),
+            (
+                'kind = "replay"',
+                'kind = "mqt"',
+                "[sources] line.kind: 'mqt' is unknown, choose from mqtt, opcua, replay",
+            ),
+            ('kind = "replay"', "", "[sources] line.kind: missing, choose from mqtt, opcua, replay"),
+            (
+                'kind = "replay"',
+                'kind = "mqtt"',
+                "[sources] line.speed: unknown key, choose from kind, network, ca_file",
+            ),
             ('name = "hall"', 'name = "press"', "'press' is an asset's name too"),
             ("[store]", "[stor]", "stor: unknown key, did you mean 'store'?"),
             (
@@ -359,15 +386,15 @@ class TestConfig:
         assert old in text
         path.write_text(text.replace(old, new, 1))
         with pytest.raises(ConfigError) as caught:
-            Config.load(path)
+            ServiceFile.load(path)
         assert said in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
     def test_a_missing_baseline_says_whose(self, tmp_path: Path) -> None:
         with pytest.raises(
             ConfigError, match=r"^\[assets\] press.baseline: .*baseline.json: no such file; make a basel"
         ):
-            rehearse(Config.load(halls.hall(tmp_path, "bare")))
+            check_service_file(ServiceFile.load(halls.hall(tmp_path, "bare")))
 
     def test_a_missing_file_says_so(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="no such file"):
-            Config.load(tmp_path / "none.toml")
+            ServiceFile.load(tmp_path / "none.toml")

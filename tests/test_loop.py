@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from servoscope.errors import LoopError, ServoscopeError
-from servoscope.loop import DEFAULT_FREQUENCIES, Columns, Loop, MonitorSettings
+from servoscope.core.errors import LoopError, ServoscopeError
+from servoscope.models.loop import DEFAULT_FREQUENCIES, Columns, Loop, MonitorSettings
 
 RIG = """
 name = "reference rig"

@@ -14,11 +14,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from commands import run
-from servoscope import readers
-from servoscope.errors import RecordingError
-from servoscope.loop import Columns
-from servoscope.readers import measurements
-from servoscope.readers.proposing import propose
+from servoscope.core.errors import RecordingError
+from servoscope.models.loop import Columns
+from servoscope.signals import readers
+from servoscope.signals.readers import mdf_tdms
+from servoscope.signals.readers.formats import open_file
+from servoscope.signals.readers.guess_columns import guess_columns, guess_mapping
 
 N, RATE = 5000, 100.0
 T = np.arange(N) / RATE
@@ -60,7 +61,7 @@ def test_a_recording_is_read_piece_by_piece(
 ) -> None:
     path = tmp_path / f"log{suffix}"
     write(path)
-    monkeypatch.setattr(measurements, "ROWS", 700)
+    monkeypatch.setattr(mdf_tdms, "CHUNK_ROWS", 700)
     found = readers.read(path, columns=COLUMNS)
     assert found.sample_rate == pytest.approx(RATE) and np.allclose(found.t, T, atol=1e-9)
     for letter, name, factor in (("r", "SetPoint", 1.0), ("u", "ValveCurrent", 0.5), ("y", "Pos", 1.0)):
@@ -75,10 +76,10 @@ def test_memory_does_not_grow_with_the_file(
 ) -> None:
     path = tmp_path / f"log{suffix}"
     write(path, 200)  # a million rows, 24 MB and more
-    monkeypatch.setattr(measurements, "ROWS", 10_000)
-    opened = readers.opening.open_file(path)
+    monkeypatch.setattr(mdf_tdms, "CHUNK_ROWS", 10_000)
+    opened = open_file(path)
     tracemalloc.start()
-    rows = sum(table.rows for table in opened.pieces([*SIGNALS, "time"]))
+    rows = sum(table.rows for table in opened.iter_chunks([*SIGNALS, "time"]))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert rows == 200 * N and peak < 10e6
@@ -109,11 +110,21 @@ def test_inspect_lists_channels_and_proposes(tmp_path: Path, suffix: str, write:
         (["t", "r", "u", "y"], {"t": "t", "r": "r", "u": "u", "y": "y"}),
         (["Zeit", "Soll", "Stell", "Ist"], {"t": "Zeit", "r": "Soll", "u": "Stell", "y": "Ist"}),
         (["a", "pos_ref", "motor torque", "pos"], {"r": "pos_ref", "u": "motor torque", "y": "pos"}),
+        (["Time", "Target", "Command", "Position"], {"t": "Time", "r": "Target", "u": "Command", "y": "Position"}),
+        (["Time", "Command", "Current", "Position"], {"t": "Time", "r": "Command", "u": "Current", "y": "Position"}),
+        (["time", "qg", "vir", "qm"], {"t": "time", "r": "qg", "u": "vir", "y": "qm"}),
+        (["timestamp", "ref_speed", "cmd", "speed"], {"t": "timestamp", "r": "ref_speed", "u": "cmd", "y": "speed"}),
+        (["pos_cmd", "torque", "pos"], {"r": "pos_cmd", "u": "torque", "y": "pos"}),
         (["a", "b"], {}),
     ],
 )  # fmt: skip
-def test_names_speak_for_themselves_or_not(names: list[str], proposed: dict[str, str]) -> None:
-    assert propose(names) == proposed
+def test_columns_are_guessed_by_their_names_on_the_command_line_and_on_the_page(
+    names: list[str], proposed: dict[str, str]
+) -> None:
+    assert guess_columns(names) == proposed
+    mapping = guess_mapping(names)
+    fields = {"t": "time", "r": "reference", "u": "input", "y": "output"}
+    assert {letter: mapping[field] for letter, field in fields.items() if mapping[field] is not None} == proposed
 
 
 @KINDS

@@ -16,14 +16,13 @@ from reliability.servers import Mosquitto, mosquitto
 import halls
 from brokers import BEGAN, Running, Sender, Taker, block, publisher, until
 from halls import RESULTS, asked
-from servoscope import writers
-from servoscope.errors import ConfigError, SourceError
-from servoscope.live.assembling import assemble
-from servoscope.live.config import Config
-from servoscope.live.mqtt import payload
-from servoscope.live.mqtt.source import MqttSettings, MqttSource
-from servoscope.live.service import Service
-from servoscope.recording import clean
+from servoscope.core.errors import ConfigError, SourceError
+from servoscope.service.build import build_components
+from servoscope.service.config import ServiceFile
+from servoscope.service.mqtt import payload
+from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
+from servoscope.service.service import Service
+from servoscope.signals import clean, writers
 
 MISSING = "Mosquitto is not on this machine: scripts/install-test-servers installs it"
 STREAM = round(BEGAN * 1e6)
@@ -53,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("plant")
     t = 0.01 * np.arange(6000)
     signals = np.random.default_rng(5).normal(size=(3, t.size))
-    writers.write(made / "press.csv", clean(t, *signals, name="press", sample_rate=100.0))
+    writers.write_recording(made / "press.csv", clean(t, *signals, name="press", sample_rate=100.0))
     return made
 
 
@@ -81,7 +80,7 @@ def test_what_is_published_counts_once_whoever_is_killed(folder: Path, broker: M
 def test_a_stream_that_began_before_another_is_refused(folder: Path, broker: Mosquitto, sender: Sender) -> None:
     taker = Taker(broker.port)
     taker.start()
-    sender.send(payload.encode(block(0, stream=STREAM + 1), oldest=0))
+    sender.send(payload.encode_binary(block(0, stream=STREAM + 1), oldest=0))
     taker.until(lambda: taker.kept)
     taker.die()
     with pytest.raises(SourceError, match=r"press: the service has a stream that began at 2026-.*: give a later start"):
@@ -106,11 +105,11 @@ def test_a_block_that_its_sender_keeps_waits_for_those_before_it(broker: Mosquit
     source = taker.start()
     blocks = [block(k, stream=5) for k in range(6)]
     for k, oldest in ((0, 0), (2, 0), (1, 0), (2, 0), (5, 4), (4, 4)):  # 3 is gone for good, its sender says
-        sender.send(payload.encode(blocks[k], oldest))
+        sender.send(payload.encode_binary(blocks[k], oldest))
     taker.until(lambda: taker.kept and taker.kept["press"][0].sequence == 4)
     counted, order = taker.kept["press"]
     assert [sequence for _, sequence in order] == [0, 1, 2, 4] and (counted.lost, counted.repeated) == (1, 0)
-    assert [(one.kind, one.number) for one in source.refused()] == [("ahead", 2)]
+    assert [(one.kind, one.count) for one in source.rejections.take()] == [("ahead", 2)]
     sender.client.subscribe("servoscope/v1/ack/press")
     assert until(lambda: sender.heard) == {"servoscope/v1/ack/press": {"stream": 5, "sequence": 4}}
     taker.die()
@@ -136,14 +135,14 @@ def test_the_broker_is_answered_only_when_results_are_stored(broker: Mosquitto, 
 def test_what_is_no_block_is_refused_and_named(broker: Mosquitto, sender: Sender) -> None:
     taker = Taker(broker.port)
     source = taker.start()
-    binary = payload.encode(block(1))
+    binary = payload.encode_binary(block(1))
     sender.send(b"", b"\0" * 100, b"[" * 10_000, binary[:-1], binary + b"0", binary[:-1] + bytes([binary[-1] ^ 1]))
     sender.send(b"SVSB\x02" + binary[5:], b'{"version": 1}', bytes(2**20 + 1))
     sender.send(block(1), asset="nobody")
     sender.send(block(1))
     taker.until(lambda: taker.kept)
     expected = {"not a block": 3, "truncated": 1, "oversized": 2, "checksum": 1, "version": 1, "wrong type": 1}
-    found = {(one.asset, one.kind): one.number for one in source.refused()}
+    found = {(one.asset, one.kind): one.count for one in source.rejections.take()}
     assert found == {("press", kind): count for kind, count in expected.items()} | {("", "unknown asset"): 1}
     taker.die()
 
@@ -164,14 +163,16 @@ def test_tls_and_password(tmp_path: Path) -> None:
 
     def source(**keys: object) -> MqttSource:
         given = {"tls": True, "ca_file": "ca.pem", "user": "hall", "password_file": "password", **keys}
-        settings = MqttSettings.model_validate({"kind": "mqtt", "host": "127.0.0.1", "port": server.port, **given})
+        settings = MqttSourceSettings.model_validate(
+            {"kind": "mqtt", "host": "127.0.0.1", "port": server.port, **given}
+        )
         return MqttSource(settings, frozenset({"press"}), tmp_path, "hall")
 
     try:
         for keys, trouble in (({}, ""), ({"user": "guest"}, "Not authorized"), ({"ca_file": None}, "self-signed")):
             one = source(**keys)
             one.open({})
-            until(lambda one=one, trouble=trouble: trouble in one._trouble if trouble else one.up)
+            until(lambda one=one, trouble=trouble: trouble in one._trouble if trouble else one.connected)
             one.close()
         with pytest.raises(ConfigError, match=r"nowhere: the password cannot be read \(No such file"):
             source(password_file="nowhere")
@@ -187,7 +188,7 @@ def test_through_the_whole_service_and_back(tmp_path: Path, broker: Mosquitto, s
     """Results are those of a replay of the same file, and are told to the broker."""
     sender.client.subscribe([("servoscope/v1/status/+", 1), ("plant/alarms", 1)])
     halls.baseline().save(tmp_path / "baseline.json")
-    writers.write(tmp_path / "press.csv", halls.recorded(2, halls.LEAK))
+    writers.write_recording(tmp_path / "press.csv", halls.recorded(2, halls.LEAK))
     address = f'host = "127.0.0.1"\nport = {broker.port}'
     common = (
         'name = "hall"\n[service]\nlisten = ""\nlog = "error"\n[store]\nurl = "{name}.sqlite"\nresidual_every_s = 2.0\n'
@@ -201,7 +202,7 @@ def test_through_the_whole_service_and_back(tmp_path: Path, broker: Mosquitto, s
         f'[outlets.plant]\nkind = "mqtt"\n{address}\n'
         f'[actions.mqtt.scada]\nalarms = ["fault"]\ntopic = "plant/alarms"\n[actions.mqtt.scada.broker]\n{address}\n'
     )
-    service = Running(Service(Config.load(subscribed), assemble(Config.load(subscribed))))
+    service = Running(Service(ServiceFile.load(subscribed), build_components(ServiceFile.load(subscribed))))
     Running(publisher(tmp_path, broker.port)).end()
     sender.send(b"no block")
     status = until(lambda: (one := sender.heard.get("servoscope/v1/status/press")) and one["faults"] and one)
@@ -211,12 +212,12 @@ def test_through_the_whole_service_and_back(tmp_path: Path, broker: Mosquitto, s
     alarm = until(lambda: sender.heard.get("plant/alarms"))
     assert (alarm["asset"], alarm["alarm"], alarm["after"]) == ("press", "fault", "unacknowledged") and alarm["key"]
     refused = 'servoscope_refused_total{asset="press",kind="not a block",source="line"} 1.0'
-    until(lambda: refused in service.one.metrics.text().decode())
-    assert 'servoscope_source_up{source="line"} 1.0' in service.one.metrics.text().decode()
+    until(lambda: refused in service.one.metrics.render().decode())
+    assert 'servoscope_source_up{source="line"} 1.0' in service.one.metrics.render().decode()
     service.end(stop=True)
     (refused,) = asked(subscribed, "SELECT document FROM audit WHERE what = 'refused'")
     assert json.loads(refused[0])["kind"] == "not a block"
-    Service(Config.load(replayed), assemble(Config.load(replayed))).run()
+    Service(ServiceFile.load(replayed), build_components(ServiceFile.load(replayed))).run()
     for table, query in RESULTS.items():
         if table != "states":  # where the stream's name stands
             found = asked(subscribed, query)

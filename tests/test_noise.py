@@ -11,14 +11,23 @@ from hypothesis import strategies as st
 from scipy import linalg, signal
 
 import naive
-from servoscope.inverse import FilterBank, nominal_theta
-from servoscope.linear import Linear, autocovariances
-from servoscope.loop import Loop
-from servoscope.noise import AR_ORDER, Coloured, Noise, autocovariance, coloured, residual_of, white_noises, yule_walker
-from servoscope.pipeline import Pipeline
-from servoscope.tuning import white_enough
+from servoscope.estimation.filter_bank import FilterBank, nominal_theta
+from servoscope.estimation.noise_model import (
+    AR_ORDER,
+    ArmaNoise,
+    WhiteNoise,
+    arma_from_white_noise,
+    fit_white_noise,
+    residual_system,
+    sample_autocovariance,
+    yule_walker,
+)
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.tuning import prefers_white_noise
+from servoscope.models.loop import Loop
+from servoscope.models.lti import LinearSystem, autocovariances
 
-PAPER = Noise(u_std=1e-4, y_std=float(np.sqrt(1e-7)))
+PAPER = WhiteNoise(u_std=1e-4, y_std=float(np.sqrt(1e-7)))
 AXIS = {"kind": "polynomial", "order": 2, "coefficients": {"viscous_friction": 200.0, "inertia": 90.0}}
 
 
@@ -28,12 +37,14 @@ def built(rig: dict[str, Any], ratios: dict[str, float], **monitor: Any) -> tupl
     return Pipeline.of(loop).bank, nominal_theta(loop, loop.plant.with_ratios(ratios))
 
 
-def loud(bank: FilterBank, theta: naive.Array, noise: Noise) -> Linear:
+def loud(bank: FilterBank, theta: naive.Array, noise: WhiteNoise) -> LinearSystem:
     """Return unit white noises -> v."""
-    return residual_of(bank, theta).input(np.diag([noise.u_std, noise.y_std]))
+    return residual_system(bank, theta).input(np.diag([noise.u_std, noise.y_std]))
 
 
-def drawn(bank: FilterBank, theta: naive.Array, noise: Noise, samples: int, seed: int, stride: int = 1) -> naive.Array:
+def drawn(
+    bank: FilterBank, theta: naive.Array, noise: WhiteNoise, samples: int, seed: int, stride: int = 1
+) -> naive.Array:
     """Return v as SciPy passes white noises through the bank, at every update, without the start."""
     system, settled = loud(bank, theta, noise), 500
     w = np.random.default_rng(seed).standard_normal((settled + samples * stride, 2))
@@ -64,16 +75,16 @@ class TestFactorisation:
         ratios = {"C_ie": 10.0**leak, "beta": 10.0**oil, "b_p": 10.0**friction}
         bank, theta = built(rig | {"hold": hold, "delay": delay}, ratios, cutoff=cutoff)
         # where zeros are all but lost behind others, roots are known less well: 6e-8 was the worst of 1500 draws
-        self.agrees(bank, theta, Noise(10.0**u_std * PAPER.u_std, 10.0**y_std * PAPER.y_std), stride, 1e-7)
+        self.agrees(bank, theta, WhiteNoise(10.0**u_std * PAPER.u_std, 10.0**y_std * PAPER.y_std), stride, 1e-7)
 
     @pytest.mark.parametrize("stride", [1, 2, 5])
     @pytest.mark.parametrize("louder", [0.01, 1.0, 10.0])
     def test_is_exact_on_the_rig(self, rig: dict[str, Any], louder: float, stride: int) -> None:
         bank, theta = built(rig, {})
-        self.agrees(bank, theta, Noise(louder * PAPER.u_std, PAPER.y_std), stride, 1e-9)
+        self.agrees(bank, theta, WhiteNoise(louder * PAPER.u_std, PAPER.y_std), stride, 1e-9)
 
-    def agrees(self, bank: FilterBank, theta: naive.Array, noise: Noise, stride: int, tolerance: float) -> None:
-        model = coloured(bank, theta, noise, stride)
+    def agrees(self, bank: FilterBank, theta: naive.Array, noise: WhiteNoise, stride: int, tolerance: float) -> None:
+        model = arma_from_white_noise(bank, theta, noise, stride)
         of_bank = autocovariances(loud(bank, theta, noise), 60, stride)[:, 0, 0]
         assert np.abs(model.autocovariance(60) - of_bank).max() < tolerance * of_bank[0]
         # invertible, or whitening would run away
@@ -82,7 +93,7 @@ class TestFactorisation:
 
     def test_heads_are_those_of_the_state_space_form(self, rig: dict[str, Any]) -> None:
         """E v(k)v(k-j) and E v(k)e(k-j), from which the covariance of theta_hat grows."""
-        model = coloured(*built(rig, {}), PAPER, 1)
+        model = arma_from_white_noise(*built(rig, {}), PAPER, 1)
         p, q = len(model.a), len(model.b)
         noise = naive.Spread(1, model.a, model.b, model.variance)
         assert noise.stationary[0, :p] == pytest.approx(model.gamma, rel=1e-8)
@@ -91,7 +102,7 @@ class TestFactorisation:
     @pytest.mark.parametrize("structure", ["tustin", "tustin-held"])
     def test_a_regression_without_poles_is_a_moving_average(self, rig: dict[str, Any], structure: str) -> None:
         bank, theta = built(rig, {}, structure=structure)
-        model = coloured(bank, theta, PAPER, 1)
+        model = arma_from_white_noise(bank, theta, PAPER, 1)
         of_bank = autocovariances(loud(bank, theta, PAPER), 20)[:, 0, 0]
         assert np.abs(model.autocovariance(20) - of_bank).max() < 1e-9 * of_bank[0]
         assert not np.any(model.a)
@@ -105,21 +116,24 @@ class TestWhitening:
     ) -> None:
         bank, theta = built(rig, ratios)
         v = drawn(bank, theta, PAPER, 20_000, 1, stride)
-        white_within(coloured(bank, theta, PAPER, stride).whiten(v)[500:])
+        white_within(arma_from_white_noise(bank, theta, PAPER, stride).whiten(v)[500:])
 
     def test_an_autoregression_of_ten_is_not_white_where_the_notch_is(self, rig: dict[str, Any]) -> None:
         """So that the test above can fail: no short autoregression draws the notch at low frequencies."""
         bank, theta = built(rig, {})
         v = drawn(bank, theta, PAPER, 60_000, 1)
         power = {}
-        for name, model in (("arma", coloured(bank, theta, PAPER, 1)), ("ar", yule_walker(autocovariance([v], 10)))):
+        for name, model in (
+            ("arma", arma_from_white_noise(bank, theta, PAPER, 1)),
+            ("ar", yule_walker(sample_autocovariance([v], 10))),
+        ):
             f, S = signal.welch(model.whiten(v)[500:], fs=100.0, nperseg=4096)
             power[name] = float(S[(f > 0.05) & (f < 0.5)].mean() * 50.0)  # 1 for white noise
         assert power["arma"] == pytest.approx(1.0, abs=0.25)
         assert power["ar"] < 0.5
 
     def test_is_undone_by_shaping(self, rig: dict[str, Any]) -> None:
-        model = coloured(*built(rig, {}), PAPER, 1)
+        model = arma_from_white_noise(*built(rig, {}), PAPER, 1)
         x = np.random.default_rng(3).standard_normal((400, 2))
         assert model.shape(model.whiten(x)) == pytest.approx(x, rel=1e-9, abs=1e-9)
 
@@ -127,7 +141,7 @@ class TestWhitening:
 def test_yule_walker_and_sample_autocovariance_are_the_textbook() -> None:
     a = np.array([1.2, -0.5])
     v = signal.lfilter([1.0], [1.0, -1.2, 0.5], np.random.default_rng(0).standard_normal(50_000))
-    gamma = autocovariance([v[:20_000], v[20_000:]], 2)
+    gamma = sample_autocovariance([v[:20_000], v[20_000:]], 2)
     assert gamma[1] == pytest.approx((v[1:20_000] @ v[:19_999] + v[20_001:] @ v[20_000:-1]) / 50_000, rel=1e-12)
     model = yule_walker(gamma)
     assert model.a == pytest.approx(linalg.solve(linalg.toeplitz(gamma[:2]), gamma[1:]), rel=1e-6)
@@ -136,7 +150,7 @@ def test_yule_walker_and_sample_autocovariance_are_the_textbook() -> None:
     assert coloured_is_autoregressive(model)
 
 
-def coloured_is_autoregressive(model: Coloured) -> bool:
+def coloured_is_autoregressive(model: ArmaNoise) -> bool:
     """Check that the autocovariance goes on as v(k) = a' v_past does."""
     gamma = model.autocovariance(12)
     return bool(np.allclose(gamma[3:], model.a[0] * gamma[2:-1] + model.a[1] * gamma[1:-2], rtol=1e-12))
@@ -149,8 +163,8 @@ class TestWhittle:
         truth = np.array([u * PAPER.u_std, y * PAPER.y_std])
         fits = []
         for seed in range(12):
-            v = drawn(bank, theta, Noise(*truth), 6000 // stride, seed, stride)
-            found = white_noises(residual_of(bank, theta), [v[: len(v) // 3], v[len(v) // 3 :]], stride)
+            v = drawn(bank, theta, WhiteNoise(*truth), 6000 // stride, seed, stride)
+            found = fit_white_noise(residual_system(bank, theta), [v[: len(v) // 3], v[len(v) // 3 :]], stride)
             fits.append([found.noise.u_std, found.noise.y_std])
             assert found.loudest.u_std >= found.noise.u_std and found.loudest.y_std >= found.noise.y_std
         relative = np.array(fits) / truth
@@ -166,5 +180,5 @@ class TestWhittle:
         hum = np.sqrt(2.0) * white.std() * np.sin(2.0 * np.pi * 12.0 * np.arange(6000) / 100.0)
         red = signal.lfilter([1.0], [1.0, -0.5], white)
         for v, said in ((white, True), (white + hum, False), (red, False)):
-            noises = white_noises(residual_of(bank, theta), [v], 1)
-            assert white_enough([v], noises, yule_walker(autocovariance([v], AR_ORDER))) is said
+            noises = fit_white_noise(residual_system(bank, theta), [v], 1)
+            assert prefers_white_noise([v], noises, yule_walker(sample_autocovariance([v], AR_ORDER))) is said

@@ -22,13 +22,13 @@ from reliability.servers import Cable
 
 from brokers import BEGAN, until
 from opcua_plant import NODES
-from servoscope.errors import ConfigError, MessageError
-from servoscope.live.block import Block, Resume
-from servoscope.live.opcua.aligning import Aligner
-from servoscope.live.opcua.following import block_of, history, single
-from servoscope.live.opcua.outlet import OpcuaOutlet, OpcuaOutletSettings
-from servoscope.live.opcua.settings import Nodes, OpcuaSettings
-from servoscope.live.opcua.source import OpcuaSource
+from servoscope.core.errors import ConfigError, MessageError
+from servoscope.service.opcua.resample import Resampler
+from servoscope.service.opcua.server import OpcuaServer, OpcuaServerSettings
+from servoscope.service.opcua.settings import OpcuaNodes
+from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
+from servoscope.service.opcua.subscriptions import parse_block, parse_value, read_history
+from servoscope.service.sources.block import Block, ResumePosition
 
 RATE = 20.0
 # asyncua leaves sockets of connections that were cut to the garbage collector
@@ -45,43 +45,41 @@ def test_values_that_change_now_and_then_are_held_on_one_clock(data: st.DataObje
     t = BEGAN + 0.01 * (np.arange(n) + jitter)
     told = np.diff(truth, axis=1, prepend=math.nan) != 0.0
     told[2] = True  # one signal has a value at every sample: the clock
-    aligner, found = Aligner(3, 0.01), []
-    aligner.cut(0.0)
+    aligner, found = Resampler(3, 0.01), []
+    aligner.restart(0.0)
     for k in range(n):
         for signal in data.draw(st.permutations(range(3))):
             if told[signal, k]:
                 aligner.add(signal, t[k], truth[signal, k])
         if data.draw(st.booleans()):
-            found.append(aligner.take(-math.inf))
-    found.append(aligner.take(t[-1] + 0.009))
+            found.append(aligner.take_samples(-math.inf))
+    found.append(aligner.take_samples(t[-1] + 0.009))
     assert np.array_equal(np.concatenate([one.t for one in found]), t)
     assert np.array_equal(np.concatenate([one.values for one in found], axis=1), truth)
     assert not aligner.late and not any(one.gaps for one in found)
 
 
 def test_a_constant_signal_goes_on_while_the_server_lives_and_a_gap_is_a_gap() -> None:
-    aligner = Aligner(2, 0.1)
-    aligner.cut(BEGAN)
+    aligner = Resampler(2, 0.1)
+    aligner.restart(BEGAN)
     aligner.add(0, BEGAN - 50.0, 1.0)  # what holds since long
     aligner.add(1, BEGAN + 1.0, 2.0)
-    first = aligner.take(BEGAN + 2.0)
+    first = aligner.take_samples(BEGAN + 2.0)
     assert np.allclose(first.t, BEGAN + 1.0 + 0.1 * np.arange(10)) and (first.values == [[1.0], [2.0]]).all()
     aligner.add(1, BEGAN + 1.5, 9.0)
-    assert not aligner.take(BEGAN + 1.9).t.size and aligner.late == 1
+    assert not aligner.take_samples(BEGAN + 1.9).t.size and aligner.late == 1
     aligner.add(1, BEGAN + 1.95, 7.0)  # heard last, and part of no sample yet: nobody knows how long it held
-    aligner.cut(BEGAN + 5.0)
+    aligner.restart(BEGAN + 5.0)
     aligner.add(0, BEGAN + 4.0, 3.0)
     aligner.add(1, BEGAN + 4.2, 4.0)  # before the subscription: they tell what holds
-    second = aligner.take(BEGAN + 5.3)
+    second = aligner.take_samples(BEGAN + 5.3)
     assert second.t[0] == BEGAN + 5.0 and (second.values[:, 0] == [3.0, 4.0]).all()
-    assert [(gap.begins, gap.ends, gap.samples) for gap in second.gaps] == [
-        (pytest.approx(BEGAN + 1.9), BEGAN + 5.0, 30)
-    ]
+    assert [(gap.start, gap.end, gap.samples) for gap in second.gaps] == [(pytest.approx(BEGAN + 1.9), BEGAN + 5.0, 30)]
     aligner.add(1, 250e9, 5.0)  # a clock that was set to the year 9892 costs no memory
-    assert aligner.take(251e9).t.size <= 20
+    assert aligner.take_samples(251e9).t.size <= 20
     for k in range(4):
         aligner.add(1, BEGAN + 6.0 + 0.1 * k, float(k))  # and when it is set back, samples go on
-    assert aligner.take(BEGAN).values[1].tolist() == [0.0, 1.0, 2.0]
+    assert aligner.take_samples(BEGAN).values[1].tolist() == [0.0, 1.0, 2.0]
 
 
 VALUES = st.one_of(
@@ -101,7 +99,7 @@ def test_whatever_a_node_holds(value: object, stamp: datetime | None, bad: bool)
     given_ = SimpleNamespace(
         Value=SimpleNamespace(Value=value), SourceTimestamp=stamp, ServerTimestamp=None, StatusCode=status
     )
-    for decode in (single, lambda one: block_of("press", one)):
+    for decode in (parse_value, lambda one: parse_block("press", one)):
         try:
             found = decode(given_)
         except MessageError as error:
@@ -154,17 +152,17 @@ def plant(request: pytest.FixtureRequest) -> Iterator[Plant]:
 class Following:
     """A source and what came of it."""
 
-    def __init__(self, plant: Plant, nodes: Nodes, resume: dict[str, Resume] | None = None) -> None:
+    def __init__(self, plant: Plant, nodes: OpcuaNodes, resume: dict[str, ResumePosition] | None = None) -> None:
         given_ = {"kind": "opcua", "url": f"opc.tcp://127.0.0.1:{plant.port}/plant", "block": 0.25, "heartbeat_s": 3.0}
-        self.source = OpcuaSource(OpcuaSettings.model_validate(given_), {"press": (nodes, RATE)}, Path())
+        self.source = OpcuaSource(OpcuaSourceSettings.model_validate(given_), {"press": (nodes, RATE)}, Path())
         self.source.open(resume or {})
         self.began, self.blocks = plant.began, list[Block]()
         self.refused: dict[str, int] = {}
 
     def look(self) -> int:
         self.blocks += self.source.poll(1000)
-        for one in self.source.refused():
-            self.refused[one.kind] = self.refused.get(one.kind, 0) + one.number
+        for one in self.source.rejections.take():
+            self.refused[one.kind] = self.refused.get(one.kind, 0) + one.count
         return len(self.blocks)
 
     def more(self, blocks: int) -> None:
@@ -180,7 +178,7 @@ class Following:
         return k
 
 
-SCALARS = Nodes(r=NODES["r"], u=NODES["u"], y=NODES["y"])
+SCALARS = OpcuaNodes(r=NODES["r"], u=NODES["u"], y=NODES["y"])
 
 
 @pytest.mark.parametrize("plant", ["history"], indirect=True)
@@ -200,7 +198,7 @@ def test_a_cable_that_was_pulled_costs_nothing_where_there_is_history(plant: Pla
         last, ends = next(
             (block, end) for block, end in zip(one.blocks[::-1], k[::-5], strict=True) if (end + 1) % 3 == held
         )
-        again = Following(plant, SCALARS, {"press": Resume(last.sequence, 0.0, 0, float(last.t[-1]))})
+        again = Following(plant, SCALARS, {"press": ResumePosition(last.sequence, 0.0, 0, float(last.t[-1]))})
         again.more(3)
         again.source.close()
         assert again.samples()[0] == ends + 1 and again.blocks[0].sequence == last.sequence + 1
@@ -224,7 +222,7 @@ def test_a_server_that_was_killed_leaves_a_gap_that_is_counted(plant: Plant) -> 
 
 @pytest.mark.parametrize("plant", ["history"], indirect=True)
 def test_arrays_come_as_they_are_written(plant: Plant) -> None:
-    one = Following(plant, Nodes(block=NODES["block"]))
+    one = Following(plant, OpcuaNodes(block=NODES["block"]))
     one.more(3)
     plant.pulled.set()
     time.sleep(5.0)
@@ -243,7 +241,7 @@ def test_a_server_in_trouble_is_asked_again_and_one_without_history_is_not() -> 
             raise error
 
         client = SimpleNamespace(get_node=lambda _: SimpleNamespace(read_raw_history=read))
-        return asyncio.run(history(client, "i=1", 0.0, 1.0))
+        return asyncio.run(read_history(client, "i=1", 0.0, 1.0))
 
     assert answer(uaerrors.BadHistoryOperationUnsupported()) is None
     with pytest.raises(uaerrors.BadTimeout):
@@ -256,9 +254,9 @@ def test_settings_that_cannot_work_are_told() -> None:
         ({"r": "i=1", "u": "i=2", "y": "i=3", "block": "i=4"}, "give block, or r, u and y"),
     ):
         with pytest.raises(ValueError, match=why):
-            Nodes.model_validate(wrong)
+            OpcuaNodes.model_validate(wrong)
     with pytest.raises(ValueError, match="belong together"):
-        OpcuaSettings.model_validate({"kind": "opcua", "url": "opc.tcp://plc", "cert_file": "a.der"})
+        OpcuaSourceSettings.model_validate({"kind": "opcua", "url": "opc.tcp://plc", "cert_file": "a.der"})
 
 
 def certificate(folder: Path, name: str, uri: str) -> dict[str, str]:
@@ -279,20 +277,20 @@ def test_verdicts_are_offered_signed_and_encrypted(tmp_path: Path) -> None:
     server = certificate(tmp_path, "server", "urn:servoscope")
     client = certificate(tmp_path, "client", "urn:servoscope:client")
     port = free_port()
-    outlet = OpcuaOutlet(OpcuaOutletSettings(kind="opcua", listen=f"127.0.0.1:{port}", **server), tmp_path)
+    outlet = OpcuaServer(OpcuaServerSettings(kind="opcua", listen=f"127.0.0.1:{port}", **server), tmp_path)
     outlet.open({"press": {**STATUS, "verdict": "healthy"}, "hall": {"service": True}})
-    outlet.tell({"press": STATUS})
+    outlet.publish({"press": STATUS})
     url = f"opc.tcp://127.0.0.1:{port}/servoscope"
-    nodes = Nodes(r="ns=2;s=press.T2", u="ns=2;s=press.Level", y="ns=2;s=press.Ratio")
+    nodes = OpcuaNodes(r="ns=2;s=press.T2", u="ns=2;s=press.Level", y="ns=2;s=press.Ratio")
 
     def source(**keys: str) -> OpcuaSource:
-        made = OpcuaSettings.model_validate({"kind": "opcua", "url": url, **keys})
+        made = OpcuaSourceSettings.model_validate({"kind": "opcua", "url": url, **keys})
         return OpcuaSource(made, {"press": (nodes, 1.0)}, tmp_path)
 
     async def read() -> dict[str, Any]:
-        from servoscope.live.opcua.settings import reach
+        from servoscope.service.opcua.source import create_opcua_client
 
-        async with await reach(source(**client).settings, None, tmp_path) as one:
+        async with await create_opcua_client(source(**client).settings, None, tmp_path) as one:
             names = ("Verdict", "Fault", "Ratio", "T2", "NE107", "Since")
             return {name: await one.get_node(f"ns=2;s=press.{name}").read_value() for name in names}
 
@@ -303,8 +301,8 @@ def test_verdicts_are_offered_signed_and_encrypted(tmp_path: Path) -> None:
         secure, open_ = source(**client), source()
         for one in (secure, open_):
             one.open({})
-        until(lambda: secure.up and open_._trouble)  # who does not encrypt is not let in
-        assert not open_.up
+        until(lambda: secure.connected and open_._trouble)  # who does not encrypt is not let in
+        assert not open_.connected
         for one in (secure, open_):
             one.close()
         with pytest.raises(ConfigError, match=r"nowhere: no such file"):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from servoscope.errors import OutputError
-from servoscope.output import atomic_write
+from servoscope.core.errors import OutputError
+from servoscope.core.files import atomic_write
 
 
 def test_where_nothing_can_be_written_is_told_in_one_line(tmp_path: Path) -> None:

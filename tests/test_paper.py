@@ -13,10 +13,11 @@ import pytest
 from typer.testing import CliRunner
 
 from servoscope.cli import app
-from servoscope.paper import (
+from servoscope.models.plants.eha import EHA
+from servoscope.research.paper import (
     claims,
     drawings,
-    measures,
+    jobs,
     metrics,
     reproduction,
     sensitivity,
@@ -25,21 +26,35 @@ from servoscope.paper import (
     tracking,
     windup,
 )
-from servoscope.paper.conditions import FREQUENCIES, PAPER, TABLE_2, TRACKED, Case, default_loop, paper_loop, rig
-from servoscope.paper.measures import Job
-from servoscope.paper.method import Evaluator, FaultManager, Finding, ResidualGenerator, nominal_signatures
-from servoscope.paper.numbers import Numbers
-from servoscope.plants.eha import EHA
+from servoscope.research.paper.conditions import (
+    FREQUENCIES,
+    PAPER,
+    TABLE_2,
+    TRACKING_CASE,
+    FaultCase,
+    default_loop,
+    paper_loop,
+    rig_loop,
+)
+from servoscope.research.paper.jobs import SeedJob
+from servoscope.research.paper.method import (
+    Evaluator,
+    EvaluatorResult,
+    FaultManager,
+    ResidualGenerator,
+    nominal_signatures,
+)
+from servoscope.research.paper.quartiles import MetricQuartiles
 from servoscope.simulation import reference, simulate
 
-REDUCED = [Job(part, 1) for part in ("profile", "table", "tracking", "windup", "tolerance", "physics")]
+REDUCED = [SeedJob(part, 1) for part in ("profile", "table", "tracking", "windup", "tolerance", "physics")]
 
 
 @functools.cache
 def reduced() -> reproduction.Reproduction:
     """One seed, one operating condition, and the diagnosis of this project's default left out."""
-    found = measures.gather([(job, measures.work(job)) for job in REDUCED])
-    return reproduction.Reproduction((1,), found, tuple(claims.claims(found)))
+    found = jobs.merge_metrics([(job, jobs.run_job(job)) for job in REDUCED])
+    return reproduction.Reproduction((1,), found, tuple(claims.evaluate_claims(found)))
 
 
 def number(name: str) -> float:
@@ -47,21 +62,22 @@ def number(name: str) -> float:
 
 
 def plant() -> EHA:
-    found = rig().plant
+    found = rig_loop().plant
     assert isinstance(found, EHA)
     return found
 
 
 def test_sensitivities_agree_with_finite_differences() -> None:
     f = np.geomspace(0.1, 40.0, 7)
-    assert sensitivity.of_H(plant(), f) == pytest.approx(
-        sensitivity.by_differences(plant(), f, inverse=True), rel=1e-7, abs=1e-9
+    assert sensitivity.sensitivity_of_H(plant(), f) == pytest.approx(
+        sensitivity.numerical_sensitivity(plant(), f, inverse=True), rel=1e-7, abs=1e-9
     )
-    assert sensitivity.of_G(plant(), f) == pytest.approx(
-        sensitivity.by_differences(plant(), f, inverse=False), rel=1e-7, abs=1e-9
+    assert sensitivity.sensitivity_of_G(plant(), f) == pytest.approx(
+        sensitivity.numerical_sensitivity(plant(), f, inverse=False), rel=1e-7, abs=1e-9
     )
 
 
+@pytest.mark.slow
 def test_G_and_H_tell_parameters_apart_equally_well_at_any_one_frequency() -> None:
     assert number("sensitivity.angle_difference") == 0.0
     assert number("sensitivity.b_p-beta.1") < 1.0 < 60.0 < number("sensitivity.b_p-beta.20")
@@ -69,8 +85,8 @@ def test_G_and_H_tell_parameters_apart_equally_well_at_any_one_frequency() -> No
 
 def test_the_papers_regression_is_equation_4() -> None:
     loop = paper_loop()
-    healthy = PAPER.record(loop, 1)
-    made = ResidualGenerator.of(loop, healthy)
+    healthy = PAPER.simulate(loop, 1)
+    made = ResidualGenerator.from_loop(loop, healthy)
     g = made.pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
     u_a = made.pipeline.input(healthy.r, healthy.u, healthy.restart)
     k = 3000
@@ -84,8 +100,8 @@ def test_the_papers_regression_is_equation_4() -> None:
 
 def test_table_2_and_its_closed_loops() -> None:
     assert len(TABLE_2) == 16 and str(TABLE_2[0]) == "p_s x0.6" and TABLE_2[-1].fault == "contamination"
-    assert all(poles[-1] < 1.0 for poles in table.stability().values())
-    assert len(table.stability()) == 17
+    assert all(poles[-1] < 1.0 for poles in table.pole_magnitudes().values())
+    assert len(table.pole_magnitudes()) == 17
 
 
 def test_coefficients_of_variation() -> None:
@@ -97,28 +113,30 @@ def test_coefficients_of_variation() -> None:
 def test_rise_and_separation() -> None:
     t = np.arange(10.0)
     H = np.where(t < 6.0, 1.0 + 1.0j, 2.0 + 2.0j)
-    assert metrics.rise(t, H, 4.0, 1.0 + 1.0j, 2.0 + 2.0j) == 2.0
-    assert np.isnan(metrics.rise(t, H, 4.0, 1.0 + 1.0j, 9.0 + 9.0j))
+    assert metrics.rise_time(t, H, 4.0, 1.0 + 1.0j, 2.0 + 2.0j) == 2.0
+    assert np.isnan(metrics.rise_time(t, H, 4.0, 1.0 + 1.0j, 9.0 + 9.0j))
     rng = np.random.default_rng(1)
     cloud = rng.standard_normal(4000) + 1j * rng.standard_normal(4000)
     assert metrics.separation(cloud, cloud[::-1] + 3.0 + 4.0j) == pytest.approx(5.0, rel=0.05)
-    angle, apart = metrics.clouds([cloud + 100.0], [cloud + 100.0j], 0.0)
+    angle, apart = metrics.compare_clouds([cloud + 100.0], [cloud + 100.0j], 0.0)
     assert angle == pytest.approx(90.0, abs=1.0) and apart == pytest.approx(141.0, rel=0.05)
 
 
 def test_curves_are_compared_where_both_have_been() -> None:
     fast, slow = [1.0, 2.0, 4.0], [2.0, 4.0, 8.0]
-    assert metrics.at_equal_rise(fast, [4.0, 2.0, 1.0], slow, [4.0, 2.0, 1.0]) == pytest.approx(0.5)
-    assert np.isnan(metrics.at_equal_rise([1.0, 2.0], [1.0, 1.0], [3.0, 4.0], [1.0, 1.0]))
+    assert metrics.ratio_at_equal_rise(fast, [4.0, 2.0, 1.0], slow, [4.0, 2.0, 1.0]) == pytest.approx(0.5)
+    assert np.isnan(metrics.ratio_at_equal_rise([1.0, 2.0], [1.0, 1.0], [3.0, 4.0], [1.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_windup_of_four_estimators() -> None:
     assert number("windup.dark.akf") == number("windup.dark.dfrls") == 1.0
     assert number("windup.rest.akf") < 1.05 < 5.0 < number("windup.rest.kf") < number("windup.rest.rls")
-    assert windup.in_the_dark("kf", 1000, 1000.0) == pytest.approx(2.0, rel=1e-3)
-    assert windup.in_the_dark("rls", 1000, 1000.0) == pytest.approx(np.e, rel=1e-3)
+    assert windup.covariance_without_excitation("kf", 1000, 1000.0) == pytest.approx(2.0, rel=1e-3)
+    assert windup.covariance_without_excitation("rls", 1000, 1000.0) == pytest.approx(np.e, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_equation_12_contracts_along_excited_directions_only() -> None:
     assert number("eq12.motion.60.largest") < 1e-3 and number("eq12.motion.60.smallest") > -1e-3
     assert number("eq12.dark.60.largest") == pytest.approx(number("eq12.dark.60.smallest")) == pytest.approx(1.0)
@@ -131,6 +149,7 @@ def test_the_bias_comes_from_the_held_input() -> None:
     assert [number(f"noise_free.svf.{f:g}") for f in FREQUENCIES] == pytest.approx([1e-4, 0.0026, 0.0098], abs=5e-4)
 
 
+@pytest.mark.slow
 def test_the_traces_follow_the_fault() -> None:
     for method in tracking.METHODS:
         assert number(f"{method}.before") < 0.07
@@ -150,8 +169,10 @@ def test_evaluator_detects_isolates_and_leaves_healthy_alone() -> None:
     # bias widens its thresholds and turns its residuals; without it the same evaluator does better
     assert 3.0 <= number("paper.named") < number("unbiased.named") <= number("unbiased.detected") <= 16.0
     assert number("labelled.named") >= 14.0 > number("labelled.unseen")
-    found = table.residuals("default", 1)
-    finding = Evaluator.of(default_loop(), found.healthy).evaluate(found.cases[TABLE_2.index(Case("p_s", 0.6))])
+    found = table.table_2_residuals("default", 1)
+    finding = Evaluator.from_healthy(default_loop(), found.healthy).evaluate(
+        found.cases[TABLE_2.index(FaultCase("p_s", 0.6))]
+    )
     assert finding.fault == "pump" and finding.ratio == pytest.approx(0.6, rel=0.05)
     assert finding.detected_at_s is not None and 30.0 < finding.detected_at_s < 35.0
 
@@ -162,15 +183,17 @@ def test_nominal_signatures_pass_through_every_case() -> None:
     for case in TABLE_2:
         ill = loop.plant.with_ratios({case.parameter: case.ratio})
         assert isinstance(ill, EHA)
-        fault, ratio = evaluator.nearest(ill.frequency_response(FREQUENCIES) - plant().frequency_response(FREQUENCIES))
+        fault, ratio = evaluator.nearest_signature(
+            ill.frequency_response(FREQUENCIES) - plant().frequency_response(FREQUENCIES)
+        )
         assert (fault, ratio) == (case.fault, pytest.approx(case.ratio, rel=0.1))
 
 
 def test_fault_manager() -> None:
     decide = FaultManager().decide
-    assert decide(Finding(None, None, None)) == "run on"
-    assert decide(Finding(31.0, "pump", 0.6)) == "reconfigure"
-    assert decide(Finding(31.0, "leakage", 1.2)) == "alarm"
+    assert decide(EvaluatorResult(None, None, None)) == "run on"
+    assert decide(EvaluatorResult(31.0, "pump", 0.6)) == "reconfigure"
+    assert decide(EvaluatorResult(31.0, "leakage", 1.2)) == "alarm"
 
 
 def test_rescheduled_gains_make_up_for_the_pump_and_help_against_soft_oil() -> None:
@@ -180,9 +203,9 @@ def test_rescheduled_gains_make_up_for_the_pump_and_help_against_soft_oil() -> N
 
 
 def test_the_plain_simulation_agrees_with_the_compiled_one() -> None:
-    loop = rig()
-    recording, _ = simulate(loop, reference("profile", 60.0, 100.0), faults=[TRACKED.event], seed=3)
-    assert tolerance.run(loop, TRACKED, 3).y == pytest.approx(recording.y, abs=1e-12)
+    loop = rig_loop()
+    recording, _ = simulate(loop, reference("profile", 60.0, 100.0), faults=[TRACKING_CASE.event], seed=3)
+    assert tolerance.simulate_gain_change(loop, TRACKING_CASE, 3).y == pytest.approx(recording.y, abs=1e-12)
 
 
 def test_claims_have_numbers_and_verdicts() -> None:
@@ -196,9 +219,9 @@ def test_claims_have_numbers_and_verdicts() -> None:
 
 
 def test_numbers_in_words() -> None:
-    numbers = Numbers({"x": [0.1, 0.2, 0.3, 0.4, 0.5], "same": [2.0, 2.0], "never": [np.nan]})
-    assert numbers.say("x") == "0.3 [0.2, 0.4]" and numbers.percent("x") == "30 % [20, 40]"
-    assert numbers.say("same") == "2" and numbers.say("never") == numbers.say("unknown") == "never"
+    numbers = MetricQuartiles({"x": [0.1, 0.2, 0.3, 0.4, 0.5], "same": [2.0, 2.0], "never": [np.nan]})
+    assert numbers.text("x") == "0.3 [0.2, 0.4]" and numbers.percent("x") == "30 % [20, 40]"
+    assert numbers.text("same") == "2" and numbers.text("never") == numbers.text("unknown") == "never"
 
 
 def test_the_reproduction_writes_every_figure_twice_and_the_claims(
@@ -206,10 +229,10 @@ def test_the_reproduction_writes_every_figure_twice_and_the_claims(
 ) -> None:
     monkeypatch.setattr(reproduction, "SUFFIXES", (".svg",))  # PNG is the same picture once more
     found = reduced()
-    drawn = [name for name, _ in reproduction.drawings(found)]
-    assert len(drawn) == reproduction.DRAWINGS and {f"figure-{i}" for i in (1, 2, 3, 4)} <= set(drawn)
+    drawn = [name for name, _ in reproduction.list_figures(found)]
+    assert len(drawn) == reproduction.FIGURE_COUNT and {f"figure-{i}" for i in (1, 2, 3, 4)} <= set(drawn)
     assert all(f"figure-{i}-{version}" in drawn for i in (5, 6, 7, 8) for version in ("paper", "default"))
-    written = reproduction.write(found, tmp_path)
+    written = reproduction.write_reproduction(found, tmp_path)
     assert all(path.stat().st_size > 1000 for path in written)
     for name in drawn:
         ET.fromstring((tmp_path / f"{name}.svg").read_text(encoding="utf-8"))
@@ -221,8 +244,8 @@ def test_the_reproduction_writes_every_figure_twice_and_the_claims(
 
 
 def test_jobs_are_shared_between_processes() -> None:
-    work = [Job("physics", 1), Job("physics", 2)]
-    assert dict(reproduction.results(work, 2)) == dict(reproduction.results(work, 1))
+    work = [SeedJob("physics", 1), SeedJob("physics", 2)]
+    assert dict(reproduction.run_jobs(work, 2)) == dict(reproduction.run_jobs(work, 1))
 
 
 class TestCommand:
@@ -234,8 +257,8 @@ class TestCommand:
             told(f"{len(seeds)} seeds")
             return reduced()
 
-        monkeypatch.setattr(reproduction, "run", run)
-        monkeypatch.setattr(reproduction, "drawings", lambda found: iter([("figure-1", drawings.figure_1)]))
+        monkeypatch.setattr(reproduction, "run_reproduction", run)
+        monkeypatch.setattr(reproduction, "list_figures", lambda found: iter([("figure-1", drawings.figure_1)]))
 
     def test_writes_a_folder_and_prints_the_verdicts(self, tmp_path: Path) -> None:
         said = CliRunner().invoke(app, ["reproduce", "-o", str(tmp_path / "new" / "folder")])

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servoscope.errors import MessageError
-from servoscope.live.block import Block
-from servoscope.live.mqtt import payload, topics
+from servoscope.core.errors import MessageError
+from servoscope.service.mqtt import payload, topics
+from servoscope.service.sources.block import Block
 
 T0 = 1767225600.0
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
@@ -26,22 +26,24 @@ def blocks(draw: st.DrawFn) -> Block:
     signals = np.array(draw(st.lists(NUMBERS, min_size=3 * n, max_size=3 * n))).reshape(3, n)
     t = T0 + 0.01 * np.arange(n)
     if draw(st.booleans()):
-        t = np.array(draw(st.lists(st.floats(0.0, payload.LATEST, exclude_max=True), min_size=n, max_size=n)))
-    whole = st.integers(0, payload.LARGEST)
+        t = np.array(draw(st.lists(st.floats(0.0, payload.MAX_TIME_S, exclude_max=True), min_size=n, max_size=n)))
+    whole = st.integers(0, payload.MAX_COUNT)
     return Block("press", draw(whole), t, *signals, stream=draw(whole))
 
 
-@given(blocks(), st.none() | st.integers(0, payload.LARGEST))
+@given(blocks(), st.none() | st.integers(0, payload.MAX_COUNT))
 def test_a_block_comes_back_bit_by_bit(block: Block, oldest: int | None) -> None:
-    found, kept = payload.decode("press", payload.encode(block, oldest))
+    found, kept = payload.decode_block("press", payload.encode_binary(block, oldest))
     assert np.array_equal(found.signals.view(np.int64), block.signals.view(np.int64))
-    assert (found.stream, found.sequence, found.kept, kept) == (
+    assert (found.stream, found.sequence, found.retained, kept) == (
         block.stream,
         block.sequence,
         oldest is not None,
         oldest,
     )
-    text, kept = payload.decode("press", payload.to_json(block, oldest))  # JSON has no infinity: it is missing as well
+    text, kept = payload.decode_block(
+        "press", payload.encode_json(block, oldest)
+    )  # JSON has no infinity: it is missing as well
     expected = np.where(np.isfinite(block.signals), block.signals, np.nan)
     assert np.array_equal(text.signals, expected, equal_nan=True) and kept == oldest
 
@@ -49,11 +51,11 @@ def test_a_block_comes_back_bit_by_bit(block: Block, oldest: int | None) -> None
 def taken(message: bytes) -> None:
     """Decode: a block whose times and numbers can be used, or the project's own error with a line that says why."""
     try:
-        block = payload.decode("press", message).block
+        block = payload.decode_block("press", message).block
     except MessageError as error:
         assert error.kind and str(error) and "\n" not in str(error)
         return
-    assert block.t.size and ((block.t >= 0.0) & (block.t < payload.LATEST)).all()
+    assert block.t.size and ((block.t >= 0.0) & (block.t < payload.MAX_TIME_S)).all()
     assert {x.size for x in (block.r, block.u, block.y)} == {block.t.size}
     assert 0 <= block.sequence < 2**63 and 0 <= block.stream < 2**63
 
@@ -72,7 +74,7 @@ def test_any_bytes(message: bytes) -> None:
 @given(blocks(), st.data())
 @settings(max_examples=300)
 def test_a_damaged_block_whose_checksum_fits(block: Block, data: st.DataObject) -> None:
-    message = bytearray(payload.encode(block))
+    message = bytearray(payload.encode_binary(block))
     for _ in range(data.draw(st.integers(1, 8))):
         message[data.draw(st.integers(4, len(message) - 1))] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(0, len(message)))
@@ -87,7 +89,7 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
     max_leaves=8,
 )
-KEY = st.sampled_from(sorted(payload.KEYS))
+KEY = st.sampled_from(sorted(payload.JSON_KEYS))
 
 
 @given(st.dictionaries(KEY, JSON), st.dictionaries(KEY, st.just([1.0, 2.0])), st.booleans())
@@ -100,17 +102,17 @@ def test_any_json(changed: dict[str, object], more: dict[str, object], version: 
 @given(st.binary(max_size=60) | JSON.map(lambda x: json.dumps(x).encode()))
 def test_any_acknowledgement(message: bytes) -> None:
     try:
-        stream, sequence = topics.ack_of(message)
+        stream, sequence = topics.decode_ack(message)
     except MessageError:
         return
     assert min(stream, sequence) >= -1
 
 
 def test_what_is_announced_takes_no_memory() -> None:
-    head = payload.HEAD.pack(payload.MAGIC, 1, 0, 0, 2**32 - 1, 0) + payload.REST.pack(0, 0, 0, T0, 0.01)
+    head = payload.HEADER.pack(payload.MAGIC, 1, 0, 0, 2**32 - 1, 0) + payload.BODY_HEADER.pack(0, 0, 0, T0, 0.01)
     tracemalloc.start()
     with pytest.raises(MessageError, match="56 bytes, 4294967295 samples need 103079215136"):
-        payload.decode("press", head)
+        payload.decode_block("press", head)
     assert tracemalloc.get_traced_memory()[1] < 100_000
     tracemalloc.stop()
 
@@ -119,8 +121,8 @@ def test_the_binary_form_is_the_documented_one() -> None:
     """Written by hand, as somebody with another language would."""
     body = struct.pack("<QQQdd", 5, 7, 6, T0, 0.5) + struct.pack("<6f", 1, 2, 3, 4, 5, float("nan"))
     message = b"SVSB" + bytes([1, 1 | 4, 0, 0]) + struct.pack("<II", 2, zlib.crc32(body)) + body
-    block, oldest = payload.decode("press", message, 3.0)
-    assert (block.stream, block.sequence, oldest, block.due) == (5, 7, 6, 3.0)
+    block, oldest = payload.decode_block("press", message, 3.0)
+    assert (block.stream, block.sequence, oldest, block.completed_at) == (5, 7, 6, 3.0)
     assert block.t.tolist() == [T0, T0 + 0.5] and block.r.tolist() == [1.0, 2.0] and block.u.tolist() == [3.0, 4.0]
     assert block.y[0] == 5.0 and np.isnan(block.y[1])
 
@@ -144,5 +146,5 @@ def test_the_binary_form_is_the_documented_one() -> None:
 )
 def test_each_case_has_its_name(text: str, kind: str) -> None:
     with pytest.raises(MessageError) as error:
-        payload.decode("press", text.encode())
+        payload.decode_block("press", text.encode())
     assert error.value.kind == kind

@@ -11,26 +11,26 @@ import pytest
 
 from dirty import RATE, cleaned, signals
 from logs import lines, written
-from servoscope import spool
-from servoscope.baseline import Baseline
-from servoscope.diagnosis import Diagnosis, Trace
-from servoscope.errors import RecordingError
-from servoscope.examination import Examination
-from servoscope.loop import Columns, Loop
-from servoscope.monitor import diagnose, examine
-from servoscope.points import learn
-from servoscope.readers import csvtext, opening, read
-from servoscope.recording import Recording
+from servoscope.core import outofcore
+from servoscope.core.errors import RecordingError
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import Diagnosis, Trace
+from servoscope.diagnosis.diagnose import diagnose, diagnose_with_trace
+from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.operating_points import learn
+from servoscope.models.loop import Columns, Loop
+from servoscope.signals import Recording
+from servoscope.signals.readers import csv, parquet, read
+from servoscope.signals.writers import write_recording
 from servoscope.simulation import FaultEvent, reference, simulate
-from servoscope.writers import write
 
 
 def cut(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
     """Work on so many rows at a time, and keep every column of more than a kilobyte in a file."""
-    monkeypatch.setattr(spool, "ROWS", rows)
-    monkeypatch.setattr(spool, "LARGE", 1024)
-    monkeypatch.setattr(opening, "ROWS", rows)
-    monkeypatch.setattr(csvtext, "PIECE", 10 * rows)
+    monkeypatch.setattr(outofcore, "CHUNK_ROWS", rows)
+    monkeypatch.setattr(outofcore, "SPILL_BYTES", 1024)
+    monkeypatch.setattr(parquet, "CHUNK_ROWS", rows)
+    monkeypatch.setattr(csv, "CHUNK_BYTES", 10 * rows)
 
 
 def bits(recording: Recording) -> list[Any]:
@@ -39,7 +39,7 @@ def bits(recording: Recording) -> list[Any]:
 
 @functools.cache
 def rig() -> Loop:
-    return Loop.load(Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml")
+    return Loop.load(Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml")
 
 
 @functools.cache
@@ -56,14 +56,16 @@ def learned() -> Baseline:
 class TestColumns:
     def test_a_long_column_lies_in_a_file_and_keeps_its_values(self, monkeypatch: pytest.MonkeyPatch) -> None:
         cut(monkeypatch, 100)
-        column, growing = spool.empty((1000,)), spool.Growing()
-        for rows in spool.pieces(0, 1000, column):
+        column, growing = outofcore.empty((1000,)), outofcore.GrowableArray()
+        for rows in outofcore.iter_chunks(0, 1000, column):
             column[rows] = np.arange(rows.start, rows.stop)
             growing.append(column[rows].copy())
         assert not column.flags.owndata
         assert np.array_equal(column, np.arange(1000.0))
-        assert np.array_equal(growing.whole(), column)
-        assert np.array_equal(spool.without(column, np.array([0, 99, 100, 999])), np.delete(column, [0, 99, 100, 999]))
+        assert np.array_equal(growing.to_array(), column)
+        assert np.array_equal(
+            outofcore.drop_rows(column, np.array([0, 99, 100, 999])), np.delete(column, [0, 99, 100, 999])
+        )
 
 
 class TestCleaning:
@@ -112,7 +114,7 @@ class TestReading:
     @pytest.mark.parametrize("rows", [7, 100])
     def test_files(self, suffix: str, rows: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         path = tmp_path / f"x{suffix}"
-        write(path, recorded(20.0))
+        write_recording(path, recorded(20.0))
         whole = read(path, rig())
         cut(monkeypatch, rows)
         assert bits(read(path, rig())) == bits(whole)
@@ -138,20 +140,21 @@ class TestReading:
 class TestExamination:
     @pytest.mark.parametrize("faults", [(), (FaultEvent("C_ie", 1.3, 30.0),)], ids=["healthy", "fault"])
     def test_a_diagnosis_and_its_trace(self, faults: tuple[FaultEvent, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-        whole = told(*examine(learned(), recorded(60.0, *faults)))
+        whole = told(*diagnose_with_trace(learned(), recorded(60.0, *faults)))
         for rows in (999, 4000):
             cut(monkeypatch, rows)
-            assert told(*examine(learned(), recorded(60.0, *faults))) == whole
+            assert told(*diagnose_with_trace(learned(), recorded(60.0, *faults))) == whole
 
     def test_what_is_forgotten_does_not_count(self) -> None:
         """Ten minutes: the evaluation at the end is explained by the last four of them, to the same numbers."""
-        x = Examination.of(learned(), recorded(600.0, FaultEvent("C_ie", 1.3, 520.0)))
+        x = Examination.from_recording(learned(), recorded(600.0, FaultEvent("C_ie", 1.3, 520.0)))
         ill, since = rig().plant.with_ratios({"C_ie": 1.3}), 52_000
         last = slice(x.evaluations - 1, x.evaluations)
-        assert x.recalled(last.start) > 35_000
-        near, whole = x.path(last, ill, since), x.path(slice(0, last.stop), ill, since)[-1:]
+        assert x.memory_start(last.start) > 35_000
+        near, whole = x.expected_path(last, ill, since), x.expected_path(slice(0, last.stop), ill, since)[-1:]
         np.testing.assert_allclose(near, whole, rtol=1e-8)
-        np.testing.assert_allclose(x.spread(last, ill), x.spread(slice(0, last.stop), ill)[-1:], rtol=1e-6)
+        near, whole = x.covariance_under(last, ill), x.covariance_under(slice(0, last.stop), ill)[-1:]
+        np.testing.assert_allclose(near, whole, rtol=1e-6)
 
     def test_a_fault_long_ago_is_found_as_one_just_now(self) -> None:
         """What was healthy long before it, or has been ill long since, changes neither its size nor its onset."""

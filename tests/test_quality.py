@@ -8,18 +8,26 @@ from typing import NamedTuple
 
 import hypothesis.strategies as st
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 
-from servoscope.alarms import Snapshot, condition
-from servoscope.alarms.definitions import AlarmSettings
-from servoscope.errors import RecordingError, StateError
-from servoscope.loop import Loop
-from servoscope.quality import KINDS, Finding, QualitySettings, examine, init, judged, listen, standing, tick
-from servoscope.readers import read
-
-FloatArray = npt.NDArray[np.float64]
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import RecordingError, StateError
+from servoscope.models.loop import Loop
+from servoscope.service.alarms import AssetSnapshot, evaluate_condition
+from servoscope.service.alarms.settings import AlarmSettings
+from servoscope.signals.quality import (
+    KINDS,
+    QualityFinding,
+    QualitySettings,
+    active_findings,
+    check_block,
+    init_state,
+    limit_verdict,
+    restart_silence,
+    tick,
+)
+from servoscope.signals.readers import read
 
 EPOCH = 1.7e9  # s: a time stamp of our days, whose last digit is 2.4e-7 s
 LIMITS = QualitySettings().limits(100.0)
@@ -46,7 +54,7 @@ def axis(noise: float = 1e-3, step: float = 0.0, n: int = 6000, seed: int = 1) -
 
 
 def found(block: Block, limits: object = LIMITS) -> list[tuple[str, bool]]:
-    _, findings = examine(limits, init(), *block)  # type: ignore[arg-type]
+    _, findings = check_block(limits, init_state(), *block)  # type: ignore[arg-type]
     return [(one.kind, one.begins) for one in findings]
 
 
@@ -125,7 +133,7 @@ def without(block: Block, start: int, stop: int) -> Block:
 
 def test_missing_samples_are_a_gap_until_a_window_is_whole_again() -> None:
     block = without(axis(), 2500, 2540)
-    _, findings = examine(LIMITS, init(), *block)
+    _, findings = check_block(LIMITS, init_state(), *block)
     begin, end = findings[1:]
     assert (begin.kind, begin.begins, begin.time) == ("gap", True, EPOCH + 25.40)
     assert begin.value == pytest.approx(40 / 1040)
@@ -140,32 +148,32 @@ def test_missing_samples_are_a_gap_until_a_window_is_whole_again() -> None:
 def test_a_clock_that_is_set_is_found_until_a_window_is_whole_again(jump: float) -> None:
     block = axis()
     block.t[2500:] += jump
-    _, findings = examine(LIMITS, init(), *block)
+    _, findings = check_block(LIMITS, init_state(), *block)
     assert [(one.kind, one.begins) for one in findings] == [*SOUND, ("clock", True), ("clock", False)]
     assert findings[1].value == pytest.approx(jump + 0.01, abs=1e-6)
 
 
 def test_a_long_step_of_the_stamps_is_a_gap_if_the_silence_was_heard() -> None:
     block = axis()
-    state, _ = examine(LIMITS, init(), *(signal[:2000] for signal in block))
+    state, _ = check_block(LIMITS, init_state(), *(signal[:2000] for signal in block))
     state, _ = tick(LIMITS, state, 100.0)
     state, findings = tick(LIMITS, state, 110.5)
-    assert findings == (Finding("silent", True, 110.5, 10.5, 10.0),)
-    assert list(standing(state)) == ["silent"]
-    state, findings = examine(LIMITS, state, *(signal[4000:] for signal in block))
+    assert findings == (QualityFinding("silent", True, 110.5, 10.5, 10.0),)
+    assert list(active_findings(state)) == ["silent"]
+    state, findings = check_block(LIMITS, state, *(signal[4000:] for signal in block))
     assert [one.kind for one in findings if one.begins] == ["gap"]
     state, findings = tick(LIMITS, state, 120.0)
-    assert findings == (Finding("silent", False, 120.0, 0.0, 10.0),)
+    assert findings == (QualityFinding("silent", False, 120.0, 0.0, 10.0),)
 
 
 def test_silence_before_the_first_sample_is_silence_and_that_of_the_service_is_not() -> None:
-    state, findings = tick(LIMITS, init(), 50.0)
+    state, findings = tick(LIMITS, init_state(), 50.0)
     state, findings = tick(LIMITS, state, 61.0)
     assert [one.kind for one in findings] == ["silent"]
     block = axis()
-    state, _ = examine(LIMITS, init(), *block)
+    state, _ = check_block(LIMITS, init_state(), *block)
     state, _ = tick(LIMITS, state, 50.0)
-    assert tick(LIMITS, listen(state, 900.0), 901.0)[1] == ()
+    assert tick(LIMITS, restart_silence(state, 900.0), 901.0)[1] == ()
 
 
 def test_jitter_and_a_wrong_sample_rate_are_found() -> None:
@@ -178,7 +186,7 @@ def test_jitter_and_a_wrong_sample_rate_are_found() -> None:
     slight = block._replace(t=block.t + rng.uniform(-0.0005, 0.0005, 6000))
     assert found(slight) == SOUND
     slow = block._replace(t=EPOCH + 1.003 * (block.t - EPOCH))
-    _, findings = examine(LIMITS, init(), *slow)
+    _, findings = check_block(LIMITS, init_state(), *slow)
     assert findings[0].kind == "rate"
     assert findings[0].value == pytest.approx(1 / 1.003 - 1, abs=1e-6)
     assert found(block._replace(t=EPOCH + 1.001 * (block.t - EPOCH))) == SOUND
@@ -200,11 +208,11 @@ def damaged() -> Block:
 @given(cuts=st.lists(st.integers(0, 8800), max_size=12))
 def test_cutting_the_stream_anywhere_changes_nothing(cuts: list[int]) -> None:
     block = damaged()
-    whole, expected = examine(LIMITS, init(), *block)
+    whole, expected = check_block(LIMITS, init_state(), *block)
     assert {one.kind for one in expected if one.begins} == {"gap", "frozen_y", "frozen_u", "clock", "jitter"}
-    state, findings = init(), []
+    state, findings = init_state(), []
     for part in zip(*(np.split(signal, sorted(cuts)) for signal in block), strict=True):
-        state, told = examine(LIMITS, state, *part)
+        state, told = check_block(LIMITS, state, *part)
         findings += told
         state = np.array(json.loads(json.dumps(state.tolist(), allow_nan=False)))
     assert tuple(findings) == expected
@@ -213,54 +221,56 @@ def test_cutting_the_stream_anywhere_changes_nothing(cuts: list[int]) -> None:
 
 def test_sample_by_sample_is_the_same_too_and_the_old_state_stays_valid() -> None:
     block = Block(*(signal[:1500] for signal in damaged()))
-    begin = init()
-    whole, expected = examine(LIMITS, begin, *block)
+    begin = init_state()
+    whole, expected = check_block(LIMITS, begin, *block)
     state, findings = begin, []
     for k in range(1500):
-        state, told = examine(LIMITS, state, *(signal[k : k + 1] for signal in block))
+        state, told = check_block(LIMITS, state, *(signal[k : k + 1] for signal in block))
         findings += told
     assert tuple(findings) == expected
     assert np.array_equal(state, whole)
-    assert np.array_equal(begin, init())
+    assert np.array_equal(begin, init_state())
 
 
 def test_more_findings_than_fit_at_a_time_are_all_told() -> None:
     block = axis()
     block.t[1::2] -= 100.0
-    assert sum(one.kind == "clock" for one in examine(LIMITS, init(), *block)[1]) == 5999
+    assert sum(one.kind == "clock" for one in check_block(LIMITS, init_state(), *block)[1]) == 5999
 
 
 def test_nothing_is_healthy_by_default() -> None:
-    assert list(standing(init())) == ["waiting"]
-    assert judged("healthy", standing(init())) == "undetermined"
-    state, _ = examine(LIMITS, init(), *(signal[:900] for signal in axis()))
-    assert judged("healthy", standing(state)) == "undetermined"
-    state, _ = examine(LIMITS, init(), *axis())
-    assert judged("healthy", standing(state)) == "healthy"
-    assert [kind for kind in KINDS if judged("healthy", [kind]) != "undetermined"] == []
-    assert [kind for kind in KINDS if judged("fault", [kind]) == "fault"] == ["gap"]
+    assert list(active_findings(init_state())) == ["waiting"]
+    assert limit_verdict("healthy", active_findings(init_state())) == "undetermined"
+    state, _ = check_block(LIMITS, init_state(), *(signal[:900] for signal in axis()))
+    assert limit_verdict("healthy", active_findings(state)) == "undetermined"
+    state, _ = check_block(LIMITS, init_state(), *axis())
+    assert limit_verdict("healthy", active_findings(state)) == "healthy"
+    assert [kind for kind in KINDS if limit_verdict("healthy", [kind]) != "undetermined"] == []
+    assert [kind for kind in KINDS if limit_verdict("fault", [kind]) == "fault"] == ["gap"]
 
 
 def test_a_stream_without_a_single_good_step_stays_unknown() -> None:
     block = axis()._replace(t=np.full(6000, np.nan))
-    state, _ = examine(LIMITS, init(), *block)
-    assert {"waiting", "gap"} == set(standing(state))
+    state, _ = check_block(LIMITS, init_state(), *block)
+    assert {"waiting", "gap"} == set(active_findings(state))
 
 
 def test_every_finding_alarms_and_says_what_it_is() -> None:
-    quality = AlarmSettings().of_asset["data_quality"]
+    quality = AlarmSettings().asset_alarms["data_quality"]
     for kind in KINDS:
-        assert condition(quality, False, Snapshot(quality=(kind,))) == ("unknown" if kind == "waiting" else "abnormal")
-        message = Finding(kind, True, 0.0, 0.25, 5.0).message
+        assert evaluate_condition(quality, False, AssetSnapshot(quality=(kind,))) == (
+            "unknown" if kind == "waiting" else "abnormal"
+        )
+        message = QualityFinding(kind, True, 0.0, 0.25, 5.0).message
         assert message and "{" not in message
 
 
 def test_blocks_that_do_not_fit_and_states_of_another_version_are_refused() -> None:
     with pytest.raises(RecordingError, match="same shape"):
-        examine(LIMITS, init(), [0.0], [0.0, 1.0], [0.0], [0.0])
-    old = init()
+        check_block(LIMITS, init_state(), [0.0], [0.0, 1.0], [0.0], [0.0])
+    old = init_state()
     old[0] = 99.0
-    for state in (old, init()[:-1]):
+    for state in (old, init_state()[:-1]):
         with pytest.raises(StateError, match="another version"):
             tick(LIMITS, state, 0.0)
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from logs import as_expected, lines, refusal, signals, written
-from servoscope.errors import LoopError, RecordingError
-from servoscope.loop import Columns, Loop
-from servoscope.readers import channels, read, read_parts
-from servoscope.recording import Recording
+from servoscope.core.errors import LoopError, RecordingError
+from servoscope.models.loop import Columns, Loop
+from servoscope.signals import Recording
+from servoscope.signals.readers import list_channels, read, read_parts
 
 CRANFIELD = Columns(
     time="time",
@@ -151,7 +151,7 @@ def test_limits_of_the_loop_count_saturation(tmp_path: Path, rig: dict[str, Any]
 
 def test_channels_are_listed_with_their_ranges(tmp_path: Path) -> None:
     path = written(tmp_path, lines(note=["a"] * 300, flag=[1, 0] * 150))
-    found = {info.name: info for info in channels(path)}
+    found = {info.name: info for info in list_channels(path)}
     assert list(found) == ["t", "r", "u", "y", "note", "flag"]
     assert (found["t"].min, found["t"].max) == (0.0, 2.99)
     assert np.isnan(found["note"].min)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dirty import RATE, cleaned, only, refusal, signals, without
-from servoscope.errors import NotEnoughError, RecordingError
+from servoscope.core.errors import NotEnoughError, RecordingError
 
 
 def test_a_sound_log_stays_as_it_is() -> None:

@@ -13,17 +13,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import naive
-from servoscope.baseline import Baseline
-from servoscope.diagnosis import Trace
-from servoscope.errors import BaselineError, RecordingError
-from servoscope.learning import learn
-from servoscope.loop import Loop
-from servoscope.monitor import Monitor
-from servoscope.pipeline import Estimates, Pipeline, Tuning
-from servoscope.recording import Recording
-from servoscope.recursion import Recursion, View
-from servoscope.simulation import reference, response, simulate
-from servoscope.tuning import fit
+from servoscope.core.errors import BaselineError, RecordingError
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.result import Trace
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.estimation.pipeline import Estimates, Pipeline, Tuning
+from servoscope.estimation.recursion import EvaluationConstants, Recursion
+from servoscope.estimation.tuning import fit_tuning
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
+from servoscope.simulation import reference, simulate, simulate_response
 
 Signals = tuple[naive.Array, naive.Array, naive.Array, npt.NDArray[np.bool_]]
 AXIS = {"kind": "polynomial", "order": 2, "coefficients": {"viscous_friction": 200.0, "inertia": 90.0}}
@@ -36,14 +36,16 @@ def recorded(loop: Loop, kind: str, seconds: float, seed: int) -> Recording:
 def tuned(loop: Loop, kind: str) -> Tuning:
     pipeline, healthy = Pipeline.of(loop), recorded(loop, kind, 20.0, 1)
     g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-    return fit(pipeline, [g]).tuning
+    return fit_tuning(pipeline, [g]).tuning
 
 
 def estimate(pipeline: Pipeline, tuning: Tuning, signals: Signals) -> Estimates:
     r, u, y, restart = signals
     N = len(r)
     t = np.arange(N) / pipeline.loop.sample_rate
-    recording = Recording("x", t, r, u, y, pipeline.loop.sample_rate, restart, np.zeros(N, dtype=np.int32))
+    recording = Recording(
+        t, r, u, y, restart, name="x", sample_rate=pipeline.loop.sample_rate, run=np.zeros(N, dtype=np.int32)
+    )
     return pipeline.estimate(tuning, recording)
 
 
@@ -73,7 +75,7 @@ def slow(pipeline: Pipeline, tuning: Tuning, signals: Signals) -> naive.Chain:
         eta[part] = naive.svf(u[part], 0, cutoff, order, rate, loop.hold)
         y_a = y[part]
         if loop.monitor.estimator == "iv-akf":
-            y_a = r[begin] + response(loop, r[part] - r[begin])[1]
+            y_a = r[begin] + simulate_response(loop, r[part] - r[begin])[1]
         for i, power in enumerate(loop.plant.powers):
             phi[part, i] = naive.svf(y[part], power, cutoff, order, rate, "foh") / tuning.scale[i]
             z[part, i] = naive.svf(y_a, power, cutoff, order, rate, "foh") / tuning.scale[i]
@@ -169,7 +171,7 @@ class TestGaps:
         assert np.array_equal(g.eta[200:], fresh.eta) and np.array_equal(g.phi[200:], fresh.phi)
 
 
-NOWHERE = View(np.eye(4), np.zeros(4), np.zeros((2, 4)), 100.0)  # of no baseline, at one frequency
+NOWHERE = EvaluationConstants(np.eye(4), np.zeros(4), np.zeros((2, 4)), 100.0)  # of no baseline, at one frequency
 
 _LEARNED: dict[int, Baseline] = {}
 
@@ -177,7 +179,7 @@ _LEARNED: dict[int, Baseline] = {}
 def learned(rig: dict[str, Any], seed: int) -> Baseline:
     if seed not in _LEARNED:
         loop = Loop.from_dict(rig)
-        _LEARNED[seed] = learn(loop, [recorded(loop, "multisine", 20.0, seed)])
+        _LEARNED[seed] = learn_baseline(loop, [recorded(loop, "multisine", 20.0, seed)])
     return _LEARNED[seed]
 
 

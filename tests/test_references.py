@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoscope.errors import SimulationError
+from servoscope.core.errors import SimulationError
 from servoscope.simulation import reference
 
 

@@ -14,15 +14,10 @@ import pytest
 
 from pages import PROVENANCE, Reader, make_diagnosis, make_recording, make_trace, read
 from servoscope import report
-from servoscope.diagnosis import (
-    Candidate,
-    FoundFault,
-    Parameter,
-    Warning,
-)
-from servoscope.errors import OutputError
-from servoscope.loop import Loop
-from servoscope.report import canvas, figures
+from servoscope.core.errors import OutputError
+from servoscope.detection.result import Candidate, DiagnosisWarning, FaultEstimate, FinalCoefficient
+from servoscope.models.loop import Loop
+from servoscope.report import diagnosis_figures, plotting
 
 
 @pytest.fixture
@@ -61,7 +56,7 @@ def test_the_page_is_one_well_formed_document_with_four_pictures(loop: Loop) -> 
 
 
 def test_nothing_comes_from_outside(loop: Loop) -> None:
-    content = report.page(make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
+    content = report.render_diagnosis_page(make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
     assert not re.search(r"(?i)https?:|//\w|@import|url\((?!#)|javascript:", content)
     page = Reader(content)
     assert not {tag for tag, _ in page.tags} & {"script", "link", "iframe", "img", "object", "embed", "base"}
@@ -86,7 +81,7 @@ AXIS: dict[str, Any] = {"sample_rate": 100.0, "plant": {"kind": "polynomial", "o
 
 @pytest.mark.parametrize(("ratio", "words"), [(1.3, "More u for the same motion"), (0.8, "Less u for the same motion")])
 def test_the_input_gain_is_told_in_words_and_once(ratio: float, words: str) -> None:
-    gain = FoundFault(name="input_gain", parameter="input_gain", ratio=ratio, interval=(ratio - 0.01, ratio + 0.01))
+    gain = FaultEstimate(name="input_gain", parameter="input_gain", ratio=ratio, interval=(ratio - 0.01, ratio + 0.01))
     both = (
         Candidate(name="input_gain", probability=0.9996, faults=(gain,)),
         Candidate(name="inertia", probability=1e-4),
@@ -112,9 +107,9 @@ def test_what_is_no_percentage_has_a_unit(loop: Loop) -> None:
 
 def test_the_axes_give_way_to_a_path_but_not_to_a_wild_value() -> None:
     values = np.concatenate([np.linspace(0.0, 1.0, 200), [1.8]])
-    assert canvas.robust_range(values)[1] < 1.2
-    assert canvas.robust_range(values, room=2.5)[1] > 1.8
-    assert canvas.robust_range(np.append(values, 50.0), room=2.5)[1] < 5.0
+    assert plotting.robust_range(values)[1] < 1.2
+    assert plotting.robust_range(values, room=2.5)[1] > 1.8
+    assert plotting.robust_range(np.append(values, 50.0), room=2.5)[1] < 5.0
 
 
 def test_an_open_question_is_told_as_one(loop: Loop) -> None:
@@ -136,7 +131,7 @@ def test_numbers_warnings_settings_and_provenance_are_there(loop: Loop) -> None:
         assert f"{key} {value}" in page.text
     for words in (
         "[plant]",
-        "C_ie 6 × 10−12",
+        "C_ie 6 × 10⁻¹²",
         "[monitor]",
         "false_alarms_per_year 1",
         "frequencies 1, 10, 20",
@@ -146,18 +141,18 @@ def test_numbers_warnings_settings_and_provenance_are_there(loop: Loop) -> None:
 
 def test_hostile_names_stay_text(loop: Loop) -> None:
     evil = "<script>alert('x')</script>\"&$x$"
-    fault = FoundFault(name=evil, parameter=evil, ratio=-1.5, interval=(-2.0, float("nan")))
+    fault = FaultEstimate(name=evil, parameter=evil, ratio=-1.5, interval=(-2.0, float("nan")))
     diagnosis = make_diagnosis(
         recording=evil + "\udc80",
         summary=evil,
         faults=(fault,),
         candidates=(Candidate(name=evil, probability=1.0, faults=(fault,)),),
-        parameters={evil: Parameter(value=float("nan"), std=0.0, nominal=0.0)},
-        warnings=(Warning(kind=evil, from_s=0.0, to_s=0.0, count=1, message=evil),),
+        parameters={evil: FinalCoefficient(value=float("nan"), std=0.0, nominal=0.0)},
+        warnings=(DiagnosisWarning(kind=evil, from_s=0.0, to_s=0.0, count=1, message=evil),),
     )
     loop = loop.model_copy(update={"name": evil})
     trace = make_trace(names=(evil, "a$b", "c_d", "$"))
-    content = report.page(diagnosis, trace, make_recording(name=evil), loop, {evil: evil})
+    content = report.render_diagnosis_page(diagnosis, trace, make_recording(name=evil), loop, {evil: evil})
     page = Reader(content)
     assert not [tag for tag, _ in page.tags if tag == "script"] and "<script" not in content.lower()
     assert page.text.count("alert('x')") >= 8 and not page.wrong
@@ -176,10 +171,10 @@ def test_short_traces_are_drawn(loop: Loop, K: int, verdict: str) -> None:
 @pytest.mark.parametrize("n", [1, 3, 8])
 def test_any_number_of_coefficients_and_frequencies_is_drawn(n: int, F: int) -> None:
     trace, diagnosis = make_trace(n=n, F=F), make_diagnosis()
-    panels = len([ax for ax in figures.ifrf(trace, diagnosis).axes if ax.axison])
-    rows = len([ax for ax in figures.coefficients(trace, diagnosis).axes if ax.axison])
+    panels = len([ax for ax in diagnosis_figures.plot_ifrf(trace, diagnosis).axes if ax.axison])
+    rows = len([ax for ax in diagnosis_figures.plot_coefficients(trace, diagnosis).axes if ax.axison])
     assert (panels, rows) == (F, n)
-    assert "8 Hz" in canvas.svg(figures.ifrf(trace), "x") or F < 8
+    assert "8 Hz" in plotting.render_svg(diagnosis_figures.plot_ifrf(trace), "x") or F < 8
 
 
 @pytest.mark.parametrize("unready", ["ready", "theta", "expected", "covariance", "some"])
@@ -196,15 +191,15 @@ def test_what_is_not_a_number_does_not_stop_a_picture(unready: str) -> None:
         H = np.full_like(trace.ifrf.H, np.nan)
         broken = dataclasses.replace(trace.ifrf, H=H, covariance=np.full_like(trace.ifrf.covariance, np.nan))
         trace = dataclasses.replace(trace, **{unready: nan}, ifrf=broken, ifrf_expected=broken)
-    for draw in (figures.statistic, figures.coefficients, figures.ifrf):
-        assert "<svg" in canvas.svg(draw(trace, make_diagnosis()), "x")
+    for draw in (diagnosis_figures.plot_statistic, diagnosis_figures.plot_coefficients, diagnosis_figures.plot_ifrf):
+        assert "<svg" in plotting.render_svg(draw(trace, make_diagnosis()), "x")
 
 
 def test_a_coefficient_that_should_be_zero_is_drawn_in_its_own_units() -> None:
     trace = make_trace()
     expected = trace.expected.copy()
     expected[:, 1] = 0.0
-    axes = figures.coefficients(dataclasses.replace(trace, expected=expected)).axes
+    axes = diagnosis_figures.plot_coefficients(dataclasses.replace(trace, expected=expected)).axes
     assert [ax.get_ylabel() for ax in axes] == [
         "deviation [%]",
         "deviation",
@@ -215,9 +210,9 @@ def test_a_coefficient_that_should_be_zero_is_drawn_in_its_own_units() -> None:
 
 def test_long_recordings_are_drawn_fast_and_small(loop: Loop, tmp_path: Path) -> None:
     recording, trace, diagnosis = make_recording(1_000_000), make_trace(100_000), make_diagnosis()
-    report.write(tmp_path / "warm.html", diagnosis, make_trace(10), make_recording(50), loop, {})
+    report.write_diagnosis_page(tmp_path / "warm.html", diagnosis, make_trace(10), make_recording(50), loop, {})
     begin = time.perf_counter()
-    report.write(tmp_path / "long.html", diagnosis, trace, recording, loop, PROVENANCE)
+    report.write_diagnosis_page(tmp_path / "long.html", diagnosis, trace, recording, loop, PROVENANCE)
     assert time.perf_counter() - begin < 8.0  # about one and a half alone on a machine
     assert (tmp_path / "long.html").stat().st_size < 3_000_000
 
@@ -230,25 +225,28 @@ def test_the_envelope_keeps_every_peak_and_every_gap() -> None:
     restart[[0, 30_000]] = True
     t[30_000:] += 50.0
     x[70_000:72_000] = np.nan
-    at, value = canvas.envelope(t, x, restart)
+    at, value = plotting.envelope(t, x, restart)
     assert len(at) == len(value) <= 3 * 1200 + 1
     assert np.nanmax(value) == 99.0 and np.nanmin(value) == np.nanmin(x)
     assert np.isnan(value[(at >= 350.0) & (at < 350.5)]).any() and np.isnan(value[(at > 752.0) & (at < 768.0)]).all()
     assert (np.diff(at) >= 0.0).all()
-    short = canvas.envelope(t[:5], x[:5], np.array([True, False, True, False, False]))[1]
+    short = plotting.envelope(t[:5], x[:5], np.array([True, False, True, False, False]))[1]
     np.testing.assert_array_equal(short, [x[0], x[1], np.nan, x[2], x[3], x[4]])
 
 
 def test_many_gaps_are_joined_where_they_cannot_be_told_apart() -> None:
     t = np.linspace(0.0, 1000.0, 100_001)
     low = np.arange(0.0, 900.0, 0.1)
-    assert len(canvas.spans_on(t, low, low + 0.05)) == 1
-    assert len(canvas.spans_on(t, low[:40], low[:40] + 0.05)) == 40
-    assert canvas.spans_on(t, low[:0], low[:0]) == []
+    assert len(plotting.visible_spans(t, low, low + 0.05)) == 1
+    assert len(plotting.visible_spans(t, low[:40], low[:40] + 0.05)) == 40
+    assert plotting.visible_spans(t, low[:0], low[:0]) == []
 
 
 def test_the_same_diagnosis_gives_the_same_page(loop: Loop) -> None:
-    pages = {report.page(make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE) for _ in range(2)}
+    pages = {
+        report.render_diagnosis_page(make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
+        for _ in range(2)
+    }
     assert len(pages) == 1
 
 
@@ -256,17 +254,17 @@ def test_pictures_do_not_change_the_users_matplotlib() -> None:
     import matplotlib
 
     before = dict(matplotlib.rcParams)
-    canvas.svg(figures.statistic(make_trace()), "x")
+    plotting.render_svg(diagnosis_figures.plot_statistic(make_trace()), "x")
     assert dict(matplotlib.rcParams) == before
 
 
 @pytest.mark.parametrize("ending", ["svg", "png", "pdf"])
 def test_a_picture_is_saved(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"x.{ending}"
-    canvas.save(figures.signals(make_recording(), make_diagnosis(), units=("m", "A")), path)
+    plotting.save_figure(diagnosis_figures.plot_signals(make_recording(), make_diagnosis(), units=("m", "A")), path)
     assert path.read_bytes()[:5] in (b"<?xml", b"\x89PNG\r", b"%PDF-")
     with pytest.raises(OutputError, match=r"x\.bmp: a figure is written as"):
-        canvas.save(figures.statistic(make_trace()), tmp_path / "x.bmp")
+        plotting.save_figure(diagnosis_figures.plot_statistic(make_trace()), tmp_path / "x.bmp")
 
 
 def test_writing_is_all_or_nothing(loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,9 +278,9 @@ def test_writing_is_all_or_nothing(loop: Loop, tmp_path: Path, monkeypatch: pyte
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full_disk)
         with pytest.raises(OutputError) as caught:
-            report.write(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
+            report.write_diagnosis_page(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
     assert str(caught.value) == f"{path}: cannot be written (No space left on device)"
     assert path.read_text() == "before" and [each.name for each in tmp_path.iterdir()] == ["r.html"]
-    report.write(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
+    report.write_diagnosis_page(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
     assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert path.stat().st_mode & 0o777 == 0o640 and len(list(tmp_path.iterdir())) == 1

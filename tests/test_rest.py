@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servoscope.baseline import Baseline
-from servoscope.errors import LoopError
-from servoscope.learning import learn
-from servoscope.loop import Loop
-from servoscope.monitor import diagnose
-from servoscope.recording import Recording
+from servoscope.core.errors import LoopError
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.diagnose import diagnose
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
 
 RATE = 500.0
 AXIS = {
@@ -33,12 +33,12 @@ def _record(seconds: float, seed: int, rest: bool = False) -> Recording:
         y, u = np.zeros(len(t)), 1.5 + 0.3 * rng.standard_normal(len(t))
     y = y + 1e-6 * rng.standard_normal(len(t))
     first = np.arange(len(t)) == 0
-    return Recording("axis", t, y, u, y, RATE, first, np.zeros(len(t), dtype=np.int32))
+    return Recording(t, y, u, y, first, name="axis", sample_rate=RATE, run=np.zeros(len(t), dtype=np.int32))
 
 
 @pytest.fixture(scope="module")
 def baseline() -> Baseline:
-    return learn(Loop.from_dict(AXIS), [_record(60.0, 1)])
+    return learn_baseline(Loop.from_dict(AXIS), [_record(60.0, 1)])
 
 
 def test_a_still_log_is_undetermined(baseline: Baseline) -> None:
@@ -67,7 +67,9 @@ def test_rest_after_motion_keeps_the_verdict_and_is_told(baseline: Baseline) -> 
 
 def test_a_reversal_is_no_rest(baseline: Baseline) -> None:
     used = baseline.pipeline().estimate(baseline.tuning, _record(30.0, 5)).updates[-1]
-    held = learn(Loop.from_dict(AXIS | {"monitor": {"cutoff": 10.0, "update_when": "always"}}), [_record(60.0, 1)])
+    held = learn_baseline(
+        Loop.from_dict(AXIS | {"monitor": {"cutoff": 10.0, "update_when": "always"}}), [_record(60.0, 1)]
+    )
     assert used == held.pipeline().estimate(held.tuning, _record(30.0, 5)).updates[-1]
 
 

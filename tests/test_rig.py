@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from commands import run
-from servoscope.errors import SimulationError
-from servoscope.loop import Loop
-from servoscope.recording import Recording
+from servoscope.core.errors import SimulationError
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
 from servoscope.simulation import FaultEvent, Rig, RigTruth, reference, simulate, simulate_rig
 
 IDEAL = Rig.ideal()
@@ -152,7 +152,7 @@ def test_what_cannot_be_simulated_is_refused(loop: Loop, rig: dict[str, Any]) ->
 
 
 def test_on_the_command_line(tmp_path: Path, project: Path) -> None:
-    file = project / "src" / "servoscope" / "examples" / "reference-rig.toml"
+    file = project / "src" / "servoscope" / "simulation" / "reference-rig.toml"
     said = run("simulate", file, "-o", tmp_path / "x.csv", "--rig", "nonlinear", "--duration", 2, "--json")
     assert said.code == 0, said.err
     assert json.loads(said.out)["rig"] == "nonlinear"

@@ -11,24 +11,25 @@ import pytest
 from scipy import signal
 
 import naive
-from servoscope.baseline import Baseline
-from servoscope.cusum import LAGS, whitening
-from servoscope.detection import SECONDS_PER_YEAR, delayed
-from servoscope.inverse import nominal_theta
-from servoscope.learning import learn
-from servoscope.loop import Loop
-from servoscope.monitor import Monitor, examine
-from servoscope.noise import Noise
-from servoscope.pipeline import Estimates, Pipeline
-from servoscope.recording import Recording
-from servoscope.rehearsal import rehearse
-from servoscope.sequential import Member, members, watch
-from servoscope.signatures import Expectation, colour_of, course
-from servoscope.simulation import FaultEvent, reference, response, simulate
-from servoscope.tuning import fit
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.chi2_test import SECONDS_PER_YEAR, apply_alarm_delays
+from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, choose_cusum_hypotheses
+from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model
+from servoscope.detection.threshold_calibration import calibrate_thresholds
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.estimation.kernel.cusum import LAGS, whitening_filter
+from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.estimation.pipeline import Estimates, Pipeline
+from servoscope.estimation.tuning import fit_tuning
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
+from servoscope.simulation import FaultEvent, reference, simulate, simulate_response
 
-NOISE = Noise(u_std=1e-4, y_std=float(np.sqrt(1e-7)))
-LOOP = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+NOISE = WhiteNoise(u_std=1e-4, y_std=float(np.sqrt(1e-7)))
+LOOP = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
 
 
 def loop_of(**monitor: Any) -> Loop:
@@ -45,12 +46,12 @@ def recorded(loop: Loop, seed: int, seconds: float = 60.0, kind: str = "multisin
 def learned(kind: str = "multisine", seed: int = 1) -> Baseline:
     """Return a baseline of one healthy minute with a budget of one false alarm a year."""
     loop = loop_of(false_alarms_per_year=1.0)
-    return learn(loop, [recorded(loop, seed, kind=kind)])
+    return learn_baseline(loop, [recorded(loop, seed, kind=kind)])
 
 
 def estimates(baseline: Baseline, recording: Recording) -> Estimates:
     pipeline = baseline.pipeline()
-    return pipeline.estimate(baseline.tuning, recording, baseline.watch(pipeline))
+    return pipeline.estimate(baseline.tuning, recording, baseline.cusum_constants(pipeline))
 
 
 class TestKernel:
@@ -60,7 +61,7 @@ class TestKernel:
         hold = nominal_theta(loop, loop.plant)[0]
         for begin, end in naive.stretches(r, u, y, recording.restart):
             part, first = slice(begin, end), recording.r[begin]
-            moved = response(loop, r[part] - first)
+            moved = simulate_response(loop, r[part] - first)
             u[part], y[part] = hold * first + moved[0], first + moved[1]
         g = pipeline.regression(r, u, y, recording.restart)
         return g.eta, g.phi
@@ -71,7 +72,7 @@ class TestKernel:
         loop = Loop.from_dict(rig | {"sample_rate": rate, "monitor": {"cutoff": cutoff}})
         pipeline, n = Pipeline.of(loop), 4
         g = pipeline.regression(*(getattr(recorded(loop, 1, 20.0), x) for x in ("r", "u", "y", "restart")))
-        tuning = fit(pipeline, [g]).tuning
+        tuning = fit_tuning(pipeline, [g]).tuning
         # leaks, is repaired, leaks again; values are missing and a gap cuts in
         faults = [FaultEvent("C_ie", ratio, at) for ratio, at in ((1.5, 4.0), (1.0, 8.0), (0.7, 14.0))]
         recording = recorded(loop, 2, 20.0, "multisine", *faults)
@@ -82,8 +83,8 @@ class TestKernel:
         step -= nominal_theta(loop, loop.plant)
         late = 1e-3 * step[:, -1:] * rng.standard_normal((3, LAGS))
         changes, limits = np.hstack([step, late]), np.array([20.0, 35.0, 15.0])
-        chosen = [Member("C_ie", 1.0, tuple(change), 1.0, 0.0) for change in changes.tolist()]
-        test = watch(pipeline, loop.plant, NOISE, tuning.scale, chosen, 1e-6)
+        chosen = [CusumHypothesis("C_ie", 1.0, tuple(change), 1.0, 0.0) for change in changes.tolist()]
+        test = build_cusum_constants(pipeline, loop.plant, NOISE, tuning.scale, chosen, 1e-6)
         assert test is not None
         ours = pipeline.estimate(tuning, recording, test._replace(limits=limits))
 
@@ -91,7 +92,7 @@ class TestKernel:
         g = pipeline.regression(r, u, y, restart)
         eta, phi = self.shadow(pipeline, recording)
         v = g.eta - eta - (g.phi - phi) @ nominal_theta(loop, loop.plant)
-        model = colour_of(pipeline, loop.plant, NOISE)
+        model = residual_noise_model(pipeline, loop.plant, NOISE)
         numerator, denominator = np.concatenate([[1.0], -model.a]), np.concatenate([[1.0], model.b])
         slowest = np.abs(np.roots(denominator)).max()
         warm = int(np.log(0.05) / np.log(slowest)) + max(len(numerator), len(denominator))
@@ -108,7 +109,7 @@ class TestKernel:
         level, crossed = naive.cusums(e, psi, counts, changes, limits, pipeline.every, len(r))
         turn = (np.arange(len(r)) + 1) % pipeline.stride == 0
         assert np.array_equal(g.ok, ok & turn)
-        assert whitening(model)[3] == warm
+        assert whitening_filter(model)[3] == warm
         assert level.max() == 2.0 and len(np.unique(crossed)) >= 3  # it alarms, falls silent, and alarms again
         assert ours.level == pytest.approx(level, rel=1e-6, abs=1e-6)
         assert np.array_equal(ours.crossed, crossed)
@@ -137,7 +138,7 @@ class TestKernel:
         recording.restart[2000] = True
         e = estimates(baseline, recording)
         pipeline = baseline.pipeline()
-        test = baseline.watch(pipeline)
+        test = baseline.cusum_constants(pipeline)
         assert test is not None and baseline.members
         silent = (e.index >= 2000) & (e.index < 2000 + pipeline.bank.wait + test.warm)
         before = e.level[np.flatnonzero(silent)[0] - 1]
@@ -178,7 +179,7 @@ class TestAlarms:
     def test_the_alarm_of_a_diagnosis_is_the_first_of_both_tests(self) -> None:
         baseline = learned()
         recording = recorded(baseline.loop, 6, 45.0, "multisine", FaultEvent("C_ie", 1.2, 30.0))
-        diagnosis, trace = examine(baseline, recording)
+        diagnosis, trace = diagnose_with_trace(baseline, recording)
         first = int(np.argmax(trace.exceeded))
         assert diagnosis.detected_at_s == pytest.approx(float(trace.crossed[first]))
         assert np.array_equal(
@@ -192,15 +193,15 @@ class TestAlarms:
         loop, per_hour, hours = loop_of(), 60.0, 4
         pipeline, plant = Pipeline.of(loop), loop.plant
         healthy = recorded(loop, 1, kind=kind)
-        tuning = fit(pipeline, [pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)]).tuning
-        expectation = Expectation(pipeline, tuning, NOISE, course(healthy))
-        chosen = members(expectation, plant, NOISE, np.zeros((len(plant.parameters),) * 2))
-        budget = per_hour / 3600.0 * SECONDS_PER_YEAR / rehearse(expectation, plant, NOISE, chosen).cusum
-        test = watch(pipeline, plant, NOISE, tuning.scale, chosen, budget)
+        tuning = fit_tuning(pipeline, [pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)]).tuning
+        expectation = Expectation(pipeline, tuning, NOISE, reference_path(healthy))
+        chosen = choose_cusum_hypotheses(expectation, plant, NOISE, np.zeros((len(plant.parameters),) * 2))
+        budget = per_hour / 3600.0 * SECONDS_PER_YEAR / calibrate_thresholds(expectation, plant, NOISE, chosen).cusum
+        test = build_cusum_constants(pipeline, plant, NOISE, tuning.scale, chosen, budget)
         count = 0
         for hour in range(hours):
             level = pipeline.estimate(tuning, recorded(loop, 50 + hour, 3600.0, kind), test).level
-            alarm = delayed(level >= 1.0, *pipeline.delays)
+            alarm = apply_alarm_delays(level >= 1.0, *pipeline.delays)
             count += int(np.sum(alarm[1:] & ~alarm[:-1]))
         assert 0.5 < count / (per_hour * hours) < 2.0, count
 
@@ -209,8 +210,8 @@ class TestAlarms:
         budget = 0.2
         heights = []
         for drift in (0.0, 0.001, 0.003):
-            h = Member("C_ie", 1.1, (1.0,), 1e8, drift).limit(budget)
+            h = CusumHypothesis("C_ie", 1.1, (1.0,), 1e8, drift).limit(budget)
             assert 1e8 * np.exp(-h + 2.0 * h**2 * drift) == pytest.approx(budget, rel=1e-9)
             heights.append(h)
         assert np.all(np.diff(heights) > 0.0)
-        assert Member("C_ie", 1.1, (1.0,), 1e8, 0.1).limit(budget) == np.inf
+        assert CusumHypothesis("C_ie", 1.1, (1.0,), 1e8, 0.1).limit(budget) == np.inf

@@ -25,11 +25,11 @@ from reliability.servers import Postgres
 import halls
 from carrying import Carrier
 from halls import RESULTS, asked, hall
-from servoscope.errors import StoreError
-from servoscope.live.assembling import assemble
-from servoscope.live.config import Config
-from servoscope.live.service import Service
-from servoscope.live.serving import serve
+from servoscope.core.errors import StoreError
+from servoscope.service.build import build_components
+from servoscope.service.config import ServiceFile
+from servoscope.service.health import serve_health
+from servoscope.service.service import Service
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def service_of(config: Path) -> Service:
-    settings = Config.load(config)
-    return Service(settings, assemble(settings))
+    settings = ServiceFile.load(config)
+    return Service(settings, build_components(settings))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_an_uninterrupted_run_says_what_is_there(whole: dict[str, list[object]],
     full, again = [row for row in diagnoses if row[1] == "full"]
     assert full[0] == "press" and full[2] == "fault" and "leakage" in full[3]
     assert again[0] == "press" and "unknown" in again[3]  # the leak ends in its window
-    began = Config.load(config).sources["line"].start
+    began = ServiceFile.load(config).sources["line"].start
     assert began is not None and full[4] - began.timestamp() == pytest.approx(60.02 + 30.0, abs=0.6)
     (alarm,) = asked(config, "SELECT asset, alarm, t FROM transitions WHERE after = 'unacknowledged'")
     assert alarm[:2] == ("press", "fault") and 0.0 < alarm[2] - full[4] < 3.0
@@ -117,14 +117,14 @@ def test_a_locked_database_is_waited_for_within_bounds(folder: Path, whole: dict
         time.sleep(0.01)
     with sqlite3.connect(folder / "locked.sqlite", isolation_level=None) as other:
         other.execute("BEGIN IMMEDIATE")
-        while service.ready == "":
+        while service.unready_reason == "":
             time.sleep(0.01)
         time.sleep(1.5)  # three times as long as the buffer lasts
         assert service.writer.waiting == 40  # and not one more: the source has to wait
-        assert "40 blocks wait" in service.ready
+        assert "40 blocks wait" in service.unready_reason
         other.execute("ROLLBACK")
     running.join(60.0)
-    assert not running.is_alive() and service.ready == ""
+    assert not running.is_alive() and service.unready_reason == ""
     results = {name: asked(config, query) for name, query in RESULTS.items()}
     results["transitions"] = [row for row in results["transitions"] if row[0] != "hall"]
     assert results == whole
@@ -140,6 +140,7 @@ def worked(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_waited_for(folder: Path, whole: dict[str, list[object]], carrier: Carrier) -> None:
     config = hall(folder, "full", speed=60.0)
     process = carrier.start(config)
@@ -160,6 +161,7 @@ def test_a_full_disk_is_waited_for(folder: Path, whole: dict[str, list[object]],
     assert asked(config, "SELECT 1 FROM audit WHERE what = 'store was unavailable'")
 
 
+@pytest.mark.slow
 def test_postgresql_killed_and_crashed_says_the_same(
     folder: Path, whole: dict[str, list[object]], carrier: Carrier, postgres: Postgres
 ) -> None:
@@ -190,11 +192,11 @@ def plain(cell: object) -> object:
 
 
 def test_one_store_has_one_writer(folder: Path) -> None:
-    first = assemble(Config.load(hall(folder, "claimed")))
+    first = build_components(ServiceFile.load(hall(folder, "claimed")))
     with pytest.raises(StoreError, match="another servoscope run writes to it, stop it first"):
-        assemble(Config.load(folder / "claimed.toml"))
+        build_components(ServiceFile.load(folder / "claimed.toml"))
     first.store.close()
-    assemble(Config.load(folder / "claimed.toml")).store.close()
+    build_components(ServiceFile.load(folder / "claimed.toml")).store.close()
 
 
 def test_a_webhook_is_told_once_and_after_a_restart(folder: Path) -> None:
@@ -237,7 +239,7 @@ def test_a_webhook_is_told_once_and_after_a_restart(folder: Path) -> None:
 
 def test_health_and_metrics(folder: Path) -> None:
     service = service_of(hall(folder, "served", speed=50.0))
-    server = serve(service, "127.0.0.1:0")
+    server = serve_health(service, "127.0.0.1:0")
     running = threading.Thread(target=service.run)
     running.start()
     try:

@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 
 import naive
-from servoscope.detection import statistic
-from servoscope.loop import Loop
-from servoscope.pipeline import Pipeline, Regression, Tuning
-from servoscope.recording import clean
-from servoscope.signatures import Expectation, Noise, course, solve_scaled
+from servoscope.detection.chi2_test import t2_statistic
+from servoscope.detection.expectation import Expectation, WhiteNoise, reference_path
+from servoscope.estimation.pipeline import Pipeline, Regression, Tuning
+from servoscope.estimation.tuning import fit_tuning, least_squares
+from servoscope.models.loop import Loop
+from servoscope.models.lti import solve_scaled
+from servoscope.signals import clean
 from servoscope.simulation import FaultEvent, reference, simulate
-from servoscope.simulation.closed_loop import NOISE_U_STD, NOISE_Y_STD
-from servoscope.tuning import fit, least_squares
+from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 
 SEEDS = 60
-NOISE = Noise(u_std=NOISE_U_STD, y_std=NOISE_Y_STD)
+NOISE = WhiteNoise(u_std=NOISE_U_STD, y_std=NOISE_Y_STD)
 LATE = slice(150, None, 50)  # evaluations 5 s apart, after the start is forgotten
 
 
@@ -32,7 +33,7 @@ class Ensemble(NamedTuple):
 
 def ensemble(loop: Loop, kind: str, faults: list[FaultEvent], louder: float = 1.0, seeds: int = SEEDS) -> Ensemble:
     pipeline = Pipeline.of(loop)
-    noise = Noise(u_std=louder * NOISE.u_std, y_std=louder * NOISE.y_std)
+    noise = WhiteNoise(u_std=louder * NOISE.u_std, y_std=louder * NOISE.y_std)
 
     def recorded(seconds: float, seed: int, faults: list[FaultEvent]) -> Any:
         r = reference(kind, seconds, loop.sample_rate)
@@ -40,19 +41,19 @@ def ensemble(loop: Loop, kind: str, faults: list[FaultEvent], louder: float = 1.
 
     healthy = recorded(300.0, 999, [])
     g = pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-    tuning = fit(pipeline, [g]).tuning
+    tuning = fit_tuning(pipeline, [g]).tuning
     recordings = [recorded(60.0, seed, faults) for seed in range(seeds)]
     estimates = [pipeline.estimate(tuning, recording) for recording in recordings]
-    expectation = Expectation(pipeline, tuning, noise, course(recordings[0]))
+    expectation = Expectation(pipeline, tuning, noise, reference_path(recordings[0]))
     return Ensemble(np.array([e.theta for e in estimates]), np.array([e.S for e in estimates]), expectation)
 
 
 def expected(run: Ensemble, fault: FaultEvent | None) -> naive.Array:
     plant, start = run.expectation.pipeline.loop.plant, run.expectation.tuning.theta
     if fault is None:
-        return run.expectation.path(start, plant)
+        return run.expectation.mean_path(start, plant)
     ill = plant.with_ratios({fault.parameter: fault.ratio})
-    return run.expectation.path(start, plant, ill, round(100 * fault.at_s))
+    return run.expectation.mean_path(start, plant, ill, round(100 * fault.at_s))
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,7 @@ def test_covariance_is_that_of_the_ensemble(rig: dict[str, Any], kind: str) -> N
     d = run.theta[:, LATE] - run.theta[:, LATE].mean(axis=0)
     claimed = np.sqrt(np.diagonal(S, axis1=-2, axis2=-1).mean(axis=0))
     ratio = (np.sqrt((d**2).mean(axis=0)) / claimed).mean(axis=0)
-    T2 = np.mean([statistic(one, 0.0 * one, its) for one, its in zip(d, S, strict=True)])
+    T2 = np.mean([t2_statistic(one, 0.0 * one, its) for one, its in zip(d, S, strict=True)])
     assert ratio[1:] == pytest.approx(np.ones(3), abs=0.2)
     # the slowest direction is claimed worse than it is: a short autoregression knows little of slow noise
     assert 0.25 < ratio[0] < 1.1
@@ -99,36 +100,36 @@ class TestExpectation:
         pipeline = Pipeline.of(loop)
         recording, _ = simulate(loop, reference("profile", 40.0, 100.0), seed=1)
         g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
-        tuning = fit(pipeline, [g]).tuning
-        return Expectation(pipeline, tuning, NOISE, course(recording)), g, tuning
+        tuning = fit_tuning(pipeline, [g]).tuning
+        return Expectation(pipeline, tuning, NOISE, reference_path(recording)), g, tuning
 
     def test_batch_is_where_least_squares_ends(self, built: tuple[Expectation, Regression, Tuning]) -> None:
         expectation, *_ = built
         pipeline, loop = expectation.pipeline, expectation.pipeline.loop
         estimates = []
         for seed in range(SEEDS):
-            recording, _ = simulate(loop, expectation.course.r, seed=seed)
+            recording, _ = simulate(loop, expectation.reference.r, seed=seed)
             estimates.append(
                 least_squares(pipeline.regression(recording.r, recording.u, recording.y, recording.restart))
             )
         error = np.std(estimates, axis=0, ddof=1) / np.sqrt(SEEDS)
-        assert np.abs((np.mean(estimates, axis=0) - expectation.batch(loop.plant)) / error).max() < 3.5
+        assert np.abs((np.mean(estimates, axis=0) - expectation.batch_estimate(loop.plant)) / error).max() < 3.5
 
     def test_healthy_keeps_what_the_model_leaves_unexplained(
         self, built: tuple[Expectation, Regression, Tuning]
     ) -> None:
         expectation, _, tuning = built
         plant = expectation.pipeline.loop.plant
-        model = expectation.batch(plant)
-        path = expectation.path(model, plant)
-        assert expectation.healthy(plant, model) == pytest.approx(path + (tuning.theta - model), rel=1e-12)
+        model = expectation.batch_estimate(plant)
+        path = expectation.mean_path(model, plant)
+        assert expectation.healthy_path(plant, model) == pytest.approx(path + (tuning.theta - model), rel=1e-12)
 
     def test_a_shorter_look_is_the_beginning(self, built: tuple[Expectation, Regression, Tuning]) -> None:
         expectation, _, tuning = built
         plant = expectation.pipeline.loop.plant
         ill = plant.with_ratios({"C_ie": 1.2})
-        whole = expectation.path(tuning.theta, plant, ill, 1000)
-        part = expectation.first(15.0).path(tuning.theta, plant, ill, 1000)
+        whole = expectation.mean_path(tuning.theta, plant, ill, 1000)
+        part = expectation.truncate(15.0).mean_path(tuning.theta, plant, ill, 1000)
         assert np.array_equal(part, whole[:150])
 
 
@@ -136,8 +137,8 @@ def test_course_puts_gaps_back(rig: dict[str, Any]) -> None:
     r = reference("multisine", 10.0, 100.0)
     kept = np.delete(np.arange(1000), np.r_[100, 300:350])
     recording = clean(kept / 100.0, r[kept], r[kept], r[kept], sample_rate=100.0)
-    back = course(recording)
-    assert np.array_equal(back.kept, kept)
+    back = reference_path(recording)
+    assert np.array_equal(back.recorded_index, kept)
     assert np.array_equal(back.r[kept], r[kept])
     assert len(back.r) == 1000
     assert back.r[100] == pytest.approx((r[99] + r[101]) / 2.0)

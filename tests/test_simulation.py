@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from servoscope.errors import SimulationError
-from servoscope.loop import Loop
-from servoscope.simulation import FaultEvent, closed_loop_poles, reference, response, simulate
-from servoscope.simulation.faults import schedule
+from servoscope.core.errors import SimulationError
+from servoscope.models.loop import Loop
+from servoscope.simulation import FaultEvent, closed_loop_poles, reference, simulate, simulate_response
+from servoscope.simulation.faults import schedule_plants
 
 Array = npt.NDArray[np.float64]
 TABLE_2 = [
@@ -46,7 +46,7 @@ class TestAgainstRecordings:
                 continue
             _, r, u, y = load(eha_cases / name)
             plants = [loop.plant] + ([loop.plant.with_ratios(case["ratios"])] if case["ratios"] else [])
-            u_free, y_free = response(loop, r, plants=plants, switch=[0, 3000][: len(plants)])
+            u_free, y_free = simulate_response(loop, r, plants=plants, switch=[0, 3000][: len(plants)])
             for part in (slice(0, 3000), slice(3000, 6000)):
                 assert 3.6e-4 < np.std(y[part] - y_free[part]) < 4.4e-4, name
                 assert abs(np.mean(y[part] - y_free[part])) < 4e-5, name
@@ -54,7 +54,7 @@ class TestAgainstRecordings:
 
     def test_simulated_noise_is_that_of_the_recordings(self, loop: Loop, eha_cases: Path) -> None:
         _, r, u, y = load(eha_cases / "profile_healthy_0.csv")
-        u_free, y_free = response(loop, r)
+        u_free, y_free = simulate_response(loop, r)
         recording, truth = simulate(loop, r, seed=3)
         assert np.std(recording.y - y_free) == pytest.approx(np.std(y - y_free), rel=0.05)
         assert np.std(recording.u - u_free) == pytest.approx(np.std(u - u_free), rel=0.05)
@@ -78,7 +78,7 @@ class TestStability:
     def test_poles_rule_the_decay(self, rig: dict[str, Any], change: dict[str, Any]) -> None:
         loop = make(rig, controller={"kind": "pi", "k_p": 10.0, "k_i": 0.1}, **change)
         # After an impulse in r only the closed loop's own modes are left; its poles annihilate them.
-        y = response(loop, np.eye(1, 400)[0])[1]
+        y = simulate_response(loop, np.eye(1, 400)[0])[1]
         characteristic = np.real(np.poly(closed_loop_poles(loop)))
         left = np.convolve(y, characteristic, mode="valid")[12:]
         assert np.abs(left).max() < 1e-9 * np.abs(y).max()
@@ -96,21 +96,21 @@ class TestStability:
 
     def test_no_controller(self, rig: dict[str, Any]) -> None:
         loop = make({key: value for key, value in rig.items() if key != "controller"})
-        for ask in (closed_loop_poles, lambda loop: response(loop, np.zeros(9))):
+        for ask in (closed_loop_poles, lambda loop: simulate_response(loop, np.zeros(9))):
             with pytest.raises(SimulationError, match="controller"):
                 ask(loop)
 
 
 class TestResponse:
     def test_steady_state(self, loop: Loop) -> None:
-        u, y = response(loop, np.full(6000, 0.02))
+        u, y = simulate_response(loop, np.full(6000, 0.02))
         assert y[-1] == pytest.approx(0.02, rel=1e-5)
         assert u[-1] == pytest.approx(0.02 * loop.plant.theta()[0], rel=1e-3)
 
     def test_is_the_simulation_without_noise(self, loop: Loop) -> None:
         r = reference("multisine", 10.0, 100.0)
         faulty = loop.plant.with_ratios({"C_ie": 1.3})
-        u, y = response(loop, r, plants=[loop.plant, faulty], switch=[0, 400])
+        u, y = simulate_response(loop, r, plants=[loop.plant, faulty], switch=[0, 400])
         faults = [FaultEvent("C_ie", 1.3, 4.0)]
         recording, truth = simulate(loop, r, faults=faults, noise_u_std=0.0, noise_y_std=0.0)
         assert np.array_equal(recording.u, u)
@@ -119,28 +119,28 @@ class TestResponse:
     @pytest.mark.parametrize("switch", [(1,), (0, 5), ()])
     def test_switches_that_do_not_fit(self, loop: Loop, switch: tuple[int, ...]) -> None:
         with pytest.raises(SimulationError, match="switch"):
-            response(loop, np.zeros(9), plants=[loop.plant], switch=switch)
+            simulate_response(loop, np.zeros(9), plants=[loop.plant], switch=switch)
 
     @pytest.mark.parametrize("r", [[], [[1.0, 2.0]], [1.0, np.nan]])
     def test_references_that_do_not_fit(self, loop: Loop, r: Any) -> None:
         with pytest.raises(SimulationError, match="reference"):
-            response(loop, r)
+            simulate_response(loop, r)
 
     def test_delay_of_whole_samples_shifts_the_plant(self, rig: dict[str, Any]) -> None:
         r = np.eye(1, 50)[0]
         slow = {"kind": "pi", "k_p": 5.0, "k_i": 0.0}
-        prompt, late = (response(make(rig, controller=slow, delay=d), r) for d in (0.0, 0.03))
+        prompt, late = (simulate_response(make(rig, controller=slow, delay=d), r) for d in (0.0, 0.03))
         # Until the first feedback the delayed loop does the same, three samples later.
         assert np.all(late[1][:4] == 0.0)
         assert late[1][4] == pytest.approx(prompt[1][1], rel=1e-9)
 
     def test_fast(self, loop: Loop) -> None:
         r = reference("multisine", 60.0, 100.0)
-        response(loop, r)
+        simulate_response(loop, r)
         best = np.inf
         for _ in range(20):
             start = time.perf_counter()
-            response(loop, r)
+            simulate_response(loop, r)
             best = min(best, time.perf_counter() - start)
         assert best < 3e-3  # about 0.4 ms, discretisation included; the margin is for loaded machines
 
@@ -178,8 +178,8 @@ class TestSimulate:
 
     def test_a_later_event_takes_over(self, loop: Loop) -> None:
         events = [FaultEvent("C_ie", 4.0, 1.0, ramp_s=2.0), FaultEvent("C_ie", 1.0, 2.0)]
-        plan = schedule(loop.plant, events, 400, 100.0)
-        ratio = plan.ratios["C_ie"][plan.which]
+        plan = schedule_plants(loop.plant, events, 400, 100.0)
+        ratio = plan.ratios["C_ie"][plan.plant_index]
         assert ratio[199] == pytest.approx(2.0, rel=0.05)
         assert ratio[200:] == pytest.approx(1.0)
 
@@ -229,3 +229,12 @@ def test_the_room_is_light() -> None:
     heavy = "{'numba', 'scipy.signal', 'scipy.linalg', 'pyarrow'}"
     code = f"import sys, servoscope.simulation; sys.exit(bool({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_loop_without_integrator_and_with_a_delay_has_the_poles_of_a_slow_integrator(rig: dict[str, Any]) -> None:
+    p_only, slow = (
+        np.sort_complex(closed_loop_poles(make(rig, delay=0.013, controller={"kind": "pi", "k_p": 2.0, "k_i": k_i})))
+        for k_i in (0.0, 1e-9)
+    )
+    rest = np.delete(slow, int(np.argmin(np.abs(slow - 1.0))))
+    np.testing.assert_allclose(p_only, rest, atol=1e-4)

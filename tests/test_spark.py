@@ -25,15 +25,15 @@ import sqlalchemy as sa
 
 import lakes
 from servoscope import fleet
-from servoscope.errors import ServoscopeError
+from servoscope.core.errors import ServoscopeError
 from servoscope.fleet import Plan, sinks, streaming
 from servoscope.fleet import spark as engines
 from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.lake import Lake
-from servoscope.fleet.local import local
-from servoscope.fleet.tasks import Examine
-from servoscope.store import Store
-from servoscope.store.tables import diagnoses
+from servoscope.fleet.local_engine import local
+from servoscope.fleet.tasks import ExamineTask
+from servoscope.service.store import Store
+from servoscope.service.store.tables import diagnoses
 
 # one session for all of them, so one process of the test runner
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("spark")]
@@ -100,11 +100,11 @@ def set_batches(session: Any, rows: int) -> None:
         session.conf.set(key, str(rows))
 
 
-class Fragile(Examine):
+class Fragile(ExamineTask):
     """An item that takes its worker with it: P1 always, P2 once, as a lost executor does."""
 
     def run(self) -> dict[str, Any]:
-        marker = Path(self.why)
+        marker = Path(self.baseline_error)
         if self.item.asset == lakes.ILL or (self.item.asset == lakes.CORRUPT and not marker.exists()):
             marker.touch()
             os._exit(1)
@@ -133,9 +133,11 @@ def test_a_lost_executor_costs_a_second_try_and_one_that_is_always_lost_costs_it
 def test_a_data_frame_keyed_by_asset_finds_what_one_machine_finds(session: Any, plan: Plan, batch: int) -> None:
     set_batches(session, batch)
     some = [
-        str(path) for asset in ("P0", "P1", "P3") for path in Path(plan.lake.where).rglob(f"asset={asset}/*/*.parquet")
+        str(path)
+        for asset in ("P0", "P1", "P3")
+        for path in Path(plan.lake.location).rglob(f"asset={asset}/*/*.parquet")
     ]
-    rows = session.read.option("basePath", plan.lake.where).parquet(*some).drop("day").repartition(3)
+    rows = session.read.option("basePath", plan.lake.location).parquet(*some).drop("day").repartition(3)
     found = engines.diagnose(rows, plan.output / "baselines", by="supply", assets=4).collect()
     entries = {(row.asset, row.day): json.loads(row.result) for row in found}
     assert entries == without_files(journal(plan.output), "P0", "P1", "P3")
@@ -161,11 +163,11 @@ def the_next_day(folder: Path) -> None:
 
 
 def followed(session: Any, plan: Plan, folder: Path, output: Path, store: str | None = None) -> None:
-    frame = sinks.files(session, str(folder), lakes.loop().columns)
+    frame = sinks.file_stream(session, str(folder), lakes.loop().columns)
     stream = streaming.follow(frame, plan.output / "baselines", assets=4, by="supply")
     for left in (2, 1, 0):
         try:
-            return sinks.wait(sinks.start(stream, output, every_s=None, store=store))
+            return sinks.wait_for_stream(sinks.start(stream, output, every_s=None, store=store))
         except ServoscopeError as error:
             # Spark gives a new Python ten seconds to start; on a busy machine that may take another try
             if "failed to connect back" not in str(error) or not left:
@@ -173,7 +175,7 @@ def followed(session: Any, plan: Plan, folder: Path, output: Path, store: str | 
 
 
 def items_of(session: Any, output: Path) -> dict[tuple[str, str], dict[str, Any]]:
-    rows = sinks.results(session, output).where("kind = 'item'").select("result").collect()
+    rows = sinks.read_results(session, output).where("kind = 'item'").select("result").collect()
     entries = [json.loads(row.result) for row in rows]
     assert len(entries) == len({(entry["asset"], entry["day"]) for entry in entries})  # none twice
     return {(entry["asset"], entry["day"]): entry for entry in entries}
@@ -185,18 +187,21 @@ def test_a_stream_finds_what_one_machine_finds_and_writes_the_same_traces(
     set_batches(session, 10_000)
     for day in (0, 1):
         for asset in ("P0", "P1", "P3"):
-            put(tmp_path / "in", str(day), asset, day_of(Path(plan.lake.where), asset, day), day)
+            put(tmp_path / "in", str(day), asset, day_of(Path(plan.lake.location), asset, day), day)
     the_next_day(tmp_path / "in")
     store = str(tmp_path / "history.db")
     followed(session, plan, tmp_path / "in", tmp_path / "out", store)
     wanted = without_files(journal(plan.output), "P0", "P1", "P3")
     assert items_of(session, tmp_path / "out") == wanted
     stored = {
-        (row["asset"], row["document"]["day"]): row["document"] for row in Store.open(store).rows(sa.select(diagnoses))
+        (row["asset"], row["document"]["day"]): row["document"] for row in Store.open(store).fetch(sa.select(diagnoses))
     }
     assert stored == wanted
     rows = (
-        sinks.results(session, tmp_path / "out").where("kind = 'trace' and asset = 'P1'").orderBy("time_us").collect()
+        sinks.read_results(session, tmp_path / "out")
+        .where("kind = 'trace' and asset = 'P1'")
+        .orderBy("time_us")
+        .collect()
     )
     whole = [pq.read_table(path, partitioning=None) for path in sorted(plan.output.glob("traces/asset=P1/*/*.parquet"))]
     trace = pa.concat_tables(whole)
@@ -207,14 +212,14 @@ def test_a_stream_finds_what_one_machine_finds_and_writes_the_same_traces(
 
 def test_tiny_batches_of_one_row_in_any_order_change_nothing(session: Any, plan: Plan, tmp_path: Path) -> None:
     set_batches(session, 1)
-    day = day_of(Path(plan.lake.where), "P0", 0).slice(0, 240)
+    day = day_of(Path(plan.lake.location), "P0", 0).slice(0, 240)
     mixed = day.take(np.random.default_rng(3).permutation(day.num_rows))
     for i in range(2):
         put(tmp_path / "in", str(i), "P0", mixed.slice(120 * i, 120), 0)
     the_next_day(tmp_path / "in")
     followed(session, plan, tmp_path / "in", tmp_path / "out")
     lakes.write(tmp_path / "lake" / "asset=P0" / f"day={lakes.DAYS[0]}" / "a.parquet", day)
-    alone = Examine(
+    alone = ExamineTask(
         Lake.open(str(tmp_path / "lake")).items[0], str(plan.output / "baselines" / "A.json"), "", 4, None, 120.0, None
     )
     wanted = {key: value for key, value in alone.run().items() if key != "stamp"}
@@ -225,7 +230,7 @@ def test_tiny_batches_of_one_row_in_any_order_change_nothing(session: Any, plan:
 def test_a_killed_driver_goes_on_from_its_checkpoint_and_late_rows_are_counted(
     session: Any, plan: Plan, tmp_path: Path
 ) -> None:
-    first = {asset: day_of(Path(plan.lake.where), asset, 0) for asset in ("P0", "P1")}
+    first = {asset: day_of(Path(plan.lake.location), asset, 0) for asset in ("P0", "P1")}
     for i, (asset, begin, end) in enumerate((("P0", 0, 700), ("P1", 0, 700), ("P0", 700, 1200), ("P1", 700, 1200))):
         put(tmp_path / "in", f"0-{i}", asset, first[asset].slice(begin, end - begin), i)
     words = [
@@ -268,13 +273,13 @@ def test_a_killed_driver_goes_on_from_its_checkpoint_and_late_rows_are_counted(
     set_batches(session, 10_000)
     session.conf.set("spark.sql.shuffle.partitions", "3")  # the checkpoint's number stays
     for asset in ("P0", "P1"):
-        put(tmp_path / "in", "1", asset, day_of(Path(plan.lake.where), asset, 1), 50)
+        put(tmp_path / "in", "1", asset, day_of(Path(plan.lake.location), asset, 1), 50)
     followed(session, plan, tmp_path / "in", tmp_path / "out")
     put(tmp_path / "in", "late", "P1", first["P1"].slice(100, 30), 98)
     the_next_day(tmp_path / "in")
     followed(session, plan, tmp_path / "in", tmp_path / "out")
     assert items_of(session, tmp_path / "out") == without_files(journal(plan.output), "P0", "P1")
-    known = sinks.report(session, tmp_path / "out", {}, "in")
+    known = sinks.write_stream_report(session, tmp_path / "out", {}, "in")
     assert (
         known.late == {"P1": 30}
         and "30 rows came after the watermark" in (tmp_path / "out" / "report.html").read_text()
@@ -283,12 +288,12 @@ def test_a_killed_driver_goes_on_from_its_checkpoint_and_late_rows_are_counted(
 
 
 def test_baselines_travel_as_text_or_stay_in_their_folder(plan: Plan) -> None:
-    from servoscope.baseline import Baseline
-    from servoscope.errors import BaselineError
+    from servoscope.core.errors import BaselineError
+    from servoscope.detection.baseline import Baseline
 
     own = Baseline.load(plan.output / "baselines" / "A.json")
     limit = own.shared(4).limit
     for source in (own, {"A": own}, plan.output / "baselines", plan.output / "baselines" / "A.json"):
-        assert Baselines.of(source, 4, 60.0).follower("A").baseline.limit == limit
+        assert Baselines.from_source(source, 4, 60.0).day_monitor("A").baseline.limit == limit
     with pytest.raises(BaselineError, match="none is called B"):
-        Baselines.of({"A": own}, 4, 60.0).follower("B")
+        Baselines.from_source({"A": own}, 4, 60.0).day_monitor("B")

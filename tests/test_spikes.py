@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dirty import RATE, cleaned, only, signals
-from servoscope.recording.spikes import find_spikes, steps_in
+from servoscope.signals.spikes import find_spikes, follows_reference_step
 
 
 @pytest.mark.parametrize("channel", "ruy")
@@ -46,7 +46,7 @@ def test_several_spikes_do_not_hide_each_other_nor_what_is_between() -> None:
 
 def test_the_kick_of_u_at_a_step_of_r_is_no_spike() -> None:
     data = signals()
-    assert steps_in(data["r"], np.zeros(2000, dtype=np.int32), np.array([200, 400])).all()
+    assert follows_reference_step(data["r"], np.zeros(2000, dtype=np.int32), np.array([200, 400])).all()
     data["u"][[200, 400]] += 50.0 * float(np.ptp(data["u"]))
     assert cleaned(data).defects == ()
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
@@ -15,17 +17,19 @@ import pyarrow.parquet as pq
 import pytest
 import sqlalchemy as sa
 from reliability.servers import Postgres
+from rich.console import Console
 
 import halls
 from commands import one_line, run
-from servoscope.errors import StoreError, StoreUnavailable
-from servoscope.live.assembling import assemble
-from servoscope.live.config import Config
-from servoscope.live.rows import Row
-from servoscope.live.service import Service
-from servoscope.live.writing import Writer
-from servoscope.store import Batch, Store, schema, tables
-from servoscope.store.history import coarse, dated, history
+from servoscope.cli.render.history import row_table
+from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.service.build import build_components
+from servoscope.service.config import ServiceFile
+from servoscope.service.records import TableRow
+from servoscope.service.service import Service
+from servoscope.service.store import Batch, Store, schema, tables
+from servoscope.service.store.queries import format_time, query_downsampled, query_history
+from servoscope.service.writer import StoreWriter
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -36,7 +40,7 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
     server: Postgres = request.getfixturevalue("postgres")
     yield server.url
     engine = sa.create_engine(server.url.replace("postgresql", "postgresql+psycopg"))
-    tables.TABLES.drop_all(engine)
+    tables.METADATA.drop_all(engine)
     engine.dispose()
 
 
@@ -62,7 +66,7 @@ def test_a_batch_is_written_whole_or_not_at_all(store: Store) -> None:
     store.write(batch(residual(1, 0.0), residual(2, 1.0)), "hall", 1)
     with pytest.raises(StoreError):
         store.write(batch(residual(3, 2.0), residual(2, 1.0)), "hall", 2)  # number 2 is there already
-    assert [row["number"] for row in history(store, "residuals")] == [1, 2]
+    assert [row["number"] for row in query_history(store, "residuals")] == [1, 2]
     assert store.last_commit("hall") == 1 and store.last_commit("another") == 0
 
 
@@ -92,39 +96,39 @@ class Forgetful(Store):
         super().write(batch, owner, commit)
         self.cut += 1
         if self.cut == 1:
-            raise StoreUnavailable("the connection is lost")
+            raise StoreUnavailableError("the connection is lost")
 
 
 def test_a_commit_whose_end_was_not_heard_is_not_made_twice(url: str) -> None:
     store = Forgetful.open(url, write=True)
-    writer = Writer(store, "hall", 10)
-    writer.add("press", [Row("residuals", {k: v for k, v in residual(1, 0.0).items() if k != "asset"})])
-    with pytest.raises(StoreUnavailable):
+    writer = StoreWriter(store, "hall", 10)
+    writer.add("press", [TableRow("residuals", {k: v for k, v in residual(1, 0.0).items() if k != "asset"})])
+    with pytest.raises(StoreUnavailableError):
         writer.write()
     assert not writer.empty and writer.unavailable_since is not None
     while writer.write() is None:
         time.sleep(0.01)
     assert writer.empty and writer.unavailable_since is None
-    assert len(history(store, "residuals")) == 1 and store.last_commit("hall") == 1
+    assert len(query_history(store, "residuals")) == 1 and store.last_commit("hall") == 1
     store.close()
 
 
 def test_a_checkpoint_replaces_the_one_before_and_old_samples_go(store: Store) -> None:
     for sequence in range(3):
-        made = Batch(keep={"press": sequence - 1})
+        made = Batch(first_needed={"press": sequence - 1})
         made.rows["recent"] = [{"asset": "press", "sequence": sequence, "samples": bytes([sequence])}]
         row = {"asset": "press", "sequence": sequence, "state": b"x", "status": {"verdict": "healthy"}, "at": 1.0}
         made.checkpoints["press"] = row
         store.write(made, "hall", sequence + 1)
     assert store.statuses()["press"]["sequence"] == 2
-    assert store.recent("press") == [(1, b"\1"), (2, b"\2")]
+    assert store.recent_samples("press") == [(1, b"\1"), (2, b"\2")]
 
 
 def test_residuals_are_kept_for_as_long_as_said(store: Store) -> None:
     store.write(batch(*(residual(k, float(k)) for k in range(10))), "hall", 1)
     store.write(batch(residual(1, 0.0, "lift")), "hall", 2)
-    assert store.forget("residuals", {"press": 7.0}) == 7
-    assert [(row["asset"], row["number"]) for row in history(store, "residuals")] == [
+    assert store.delete_before("residuals", {"press": 7.0}) == 7
+    assert [(row["asset"], row["number"]) for row in query_history(store, "residuals")] == [
         ("lift", 1),
         ("press", 7),
         ("press", 8),
@@ -145,7 +149,7 @@ def test_older_tables_are_migrated_and_newer_ones_refused(url: str, monkeypatch:
         Store.open(url)
     Store.open(url, write=True).close()
     again = Store.open(url)
-    assert again.rows(sa.select(sa.column("note")).select_from(tables.residuals)) == [{"note": "old"}]
+    assert again.fetch(sa.select(sa.column("note")).select_from(tables.residuals)) == [{"note": "old"}]
     again.close()
     monkeypatch.setattr(schema, "MIGRATIONS", [])
     with pytest.raises(StoreError, match=r"of version 2, this servoscope knows up to 1: install a newer one"):
@@ -165,7 +169,7 @@ def test_a_migration_that_fails_leaves_all_as_it_was(url: str, monkeypatch: pyte
     monkeypatch.setattr(schema, "MIGRATIONS", [])
     store = Store.open(url)
     with pytest.raises(StoreError, match="note"):
-        store.rows(sa.select(sa.column("note")).select_from(tables.residuals))
+        store.fetch(sa.select(sa.column("note")).select_from(tables.residuals))
     store.close()
 
 
@@ -193,7 +197,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_time_that_no_calendar_has_is_a_number() -> None:
-    assert dated(0.0) == "1970-01-01 00:00:00" and dated(3e11) == "300000000000 s"
+    assert format_time(0.0) == "1970-01-01 00:00:00" and format_time(3e11) == "300000000000 s"
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +206,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("history")
     halls.files(folder)
     config = halls.hall(folder, "hall")
-    Service(Config.load(config), assemble(Config.load(config))).run()
+    Service(ServiceFile.load(config), build_components(ServiceFile.load(config))).run()
     return config
 
 
@@ -255,7 +259,7 @@ class TestCommands:
         # a service that goes on: the same history with more to replay
         text = hall.read_text().replace("speed = 0.0", "speed = 1.0")
         hall.write_text(text.replace('kind = "replay"', 'kind = "replay"\nrepeat = true'))
-        service = Service(Config.load(hall), assemble(Config.load(hall)))
+        service = Service(ServiceFile.load(hall), build_components(ServiceFile.load(hall)))
         running = threading.Thread(target=service.run)
         running.start()
         try:
@@ -266,7 +270,7 @@ class TestCommands:
             assert run("alarms", "shelve", hall, "press", "fault", "--for", "8h").code == 0
             (shelved,) = json.loads(run("alarms", "list", hall, "--json").out)
             assert shelved["state"] == "shelved" and shelved["until"] - shelved["since"] == 8 * 3600.0
-            assert dated(shelved["until"]) in run("alarms", "list", hall).out
+            assert format_time(shelved["until"]) in run("alarms", "list", hall).out
             one_line(run("alarms", "ack", hall, "press", "falt"), "has no alarm 'falt', did you mean 'fault'?")
         finally:
             service.stop()
@@ -278,11 +282,19 @@ class TestCommands:
         assert told[0] == ("ann", "acknowledge", "done") and told[1][2] == "refused:"
 
 
+def test_the_audit_of_a_login_is_told() -> None:
+    row = {"at": 0.0, "who": "vera", "document": {"from": "192.0.2.1", "until": 60.0}}
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(row_table([row], ("at", "who", "document")))
+    said = console.export_text()
+    assert "from: 192.0.2.1" in said and "until: 1970-01-01 00:01:00" in said
+
+
 @pytest.mark.parametrize("url", ["postgresql"], indirect=True)
 def test_postgresql_clears_samples_away_by_their_number(store: Store) -> None:
     """By default it waits for a fifth of what the table held: 50 GB after a day of 200 assets and many crashes."""
     kept = sa.text("SELECT reloptions FROM pg_class WHERE oid = 'recent'::regclass").columns(sa.column("reloptions"))
-    (row,) = store.rows(sa.select(kept.subquery()))
+    (row,) = store.fetch(sa.select(kept.subquery()))
     assert "autovacuum_vacuum_threshold=1000" in row["reloptions"]
 
 
@@ -294,18 +306,18 @@ def test_a_long_history_is_thinned_by_the_database_to_what_was_largest(store: St
             {**row, "statistic": float(number == 555), "residual": [[1.0, number, 0.0, 1.0]]}
         )
     store.write(batch, "hall", 1)
-    rows, count = coarse(store, "press", (100.0, 1100.0), 10)
+    rows, count = query_downsampled(store, "press", (100.0, 1100.0), 10)
     assert count == 1000 and [row["rows"] for row in rows] == [100] * 10
     assert rows[5]["t"] == 655.0 and rows[5]["statistic"] == 1.0 and rows[5]["residual"] == [[1.0, 555, 0.0, 1.0]]
     assert all(row["level"] == 0.6 for row in rows)
-    rows, count = coarse(store, "press", (100.0, 110.0), 1000)
+    rows, count = query_downsampled(store, "press", (100.0, 110.0), 1000)
     assert count == len(rows) == 10 and [row["t"] for row in rows] == [100.0 + k for k in range(10)]
-    assert coarse(store, "lift", (0.0, 1e9), 10) == ([], 0)
+    assert query_downsampled(store, "lift", (0.0, 1e9), 10) == ([], 0)
 
 
 def test_what_others_change_is_told_in_the_audit(store: Store) -> None:
-    store.note("vera", "", "baseline saved", {"baseline": "mine"})
-    (row,) = history(store, "audit")
+    store.add_audit("vera", "", "baseline saved", {"baseline": "mine"})
+    (row,) = query_history(store, "audit")
     assert (row["who"], row["asset"], row["what"], row["document"]) == (
         "vera",
         "",
@@ -313,3 +325,14 @@ def test_what_others_change_is_told_in_the_audit(store: Store) -> None:
         {"baseline": "mine"},
     )
     assert abs(row["at"] - time.time()) < 60.0
+
+
+def test_a_writer_waits_for_another_that_prepares_the_file(tmp_path: Path) -> None:
+    """Service and pages begin at the same moment; SQLite refuses one of them at once."""
+    other = sqlite3.connect(tmp_path / "history.sqlite", check_same_thread=False)
+    other.execute("PRAGMA journal_mode = DELETE")
+    other.execute("BEGIN EXCLUSIVE")
+    timer = threading.Timer(1.0, lambda: (other.rollback(), other.close()))
+    timer.start()
+    Store.open("history.sqlite", tmp_path, write=True).close()
+    timer.join()

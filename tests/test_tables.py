@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from logs import as_expected, lines, mat5, mat73, parquet, refusal, signals, written
-from servoscope.errors import NotEnoughError
-from servoscope.loop import Columns
-from servoscope.readers import channels, read
+from servoscope.core.errors import NotEnoughError
+from servoscope.models.loop import Columns
+from servoscope.signals.readers import list_channels, read
 
 # Kinds of text
 
@@ -35,7 +35,7 @@ def test_the_name_is_the_files(tmp_path: Path) -> None:
 
 def test_a_file_without_a_header_has_numbered_columns(tmp_path: Path) -> None:
     path = written(tmp_path, lines(header=False))
-    assert [info.name for info in channels(path)] == ["c0", "c1", "c2", "c3"]
+    assert [info.name for info in list_channels(path)] == ["c0", "c1", "c2", "c3"]
     as_expected(read(path, columns=Columns(time="c0", reference="c1", input="c2", output="c3")))
     assert "no column 'r'; say where the signals stand: --columns 't=..., r=..., u=..., y=...'" in refusal(path)
     assert refusal(path).endswith("or [columns] in the loop file; the file has c0, c1, c2, c3")
@@ -250,7 +250,7 @@ def test_mat_with_structs_matrices_and_scalars(tmp_path: Path) -> None:
     data = signals()
     both = np.column_stack([data["r"], data["u"]])
     path = mat5(tmp_path, {"t": data["t"], "log": {"motor": {"y": data["y"]}}, "both": both, "gain": 3.0, "who": "me"})
-    assert [info.name for info in channels(path)] == ["t", "log.motor.y", "both[0]", "both[1]"]
+    assert [info.name for info in list_channels(path)] == ["t", "log.motor.y", "both[0]", "both[1]"]
     as_expected(read(path, columns=Columns(reference="both[0]", input="1*both[1]", output="log.motor.y")))
     assert "'gain' has 1 values, the channels have 300" in refusal(path, columns=Columns(reference="gain"))
 

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from servoscope import estimators
-from servoscope.baseline import Baseline
-from servoscope.errors import LoopError, NotEnoughError
-from servoscope.learning import learn
-from servoscope.loop import Loop
-from servoscope.monitor import Monitor, diagnose
-from servoscope.paper.conditions import rig as reference_rig
-from servoscope.pipeline import Pipeline
-from servoscope.recording import Recording
+from servoscope.core.errors import LoopError, NotEnoughError
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.diagnose import diagnose
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.estimation import estimators
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.two_stage import StageOneRunner, basis_functions, basis_settling_samples, tune_stage_one
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.research.paper.conditions import rig_loop as reference_rig
+from servoscope.signals import Recording
 from servoscope.simulation import FaultEvent, reference, simulate
-from servoscope.twostage import Stage, functions, settling, tune
 
 SILENT = {"noise_u_std": 0.0, "noise_y_std": 0.0}
 
@@ -31,12 +33,12 @@ def recorded(loop: Loop, seed: int, seconds: float = 60.0, kind: str = "profile"
 
 
 def u_a(loop: Loop, healthy: Recording, recording: Recording) -> np.ndarray[Any, np.dtype[np.float64]]:
-    stage = Stage(loop, tune(loop, [healthy]))
+    stage = StageOneRunner(loop, tune_stage_one(loop, [healthy]))
     return stage.run(stage.start(), recording.r, recording.u, recording.restart)
 
 
 def test_laguerre_functions_are_orthonormal_and_what_their_definition_says(rig: dict[str, Any]) -> None:
-    system = functions(loop_of(rig, stage_one="laguerre", stage_one_length=5, stage_one_pole=0.7))
+    system = basis_functions(loop_of(rig, stage_one="laguerre", stage_one_length=5, stage_one_pole=0.7))
     impulse = np.zeros((400, 1))
     impulse[1] = 1.0
     l = system.simulate(impulse)[1:]
@@ -51,10 +53,10 @@ def test_laguerre_functions_are_orthonormal_and_what_their_definition_says(rig: 
 
 
 def test_fir_functions_are_the_last_samples_of_r_and_forget_after_them(rig: dict[str, Any]) -> None:
-    system = functions(loop_of(rig, stage_one_length=4))
+    system = basis_functions(loop_of(rig, stage_one_length=4))
     r = np.arange(10.0)[:, None]
     assert system.simulate(r)[5].tolist() == [5.0, 4.0, 3.0, 2.0]
-    assert settling(system) == 3
+    assert basis_settling_samples(system) == 3
 
 
 @pytest.mark.parametrize("settings", [{}, {"stage_one": "laguerre"}], ids=["fir", "laguerre"])
@@ -69,17 +71,17 @@ def test_u_a_follows_the_noise_free_input(rig: dict[str, Any], settings: Any, fa
 
 def test_the_noise_of_a_sample_has_no_share_in_its_own_u_a(rig: dict[str, Any]) -> None:
     loop, healthy = loop_of(rig, stage_one_length=10), recorded(loop_of(rig), 1, 20.0)
-    changed = Recording(**{**vars(healthy), "u": np.where(np.arange(2000) == 1000, 99.0, healthy.u)})
+    changed = replace(healthy, u=np.where(np.arange(2000) == 1000, 99.0, healthy.u))
     first, second = u_a(loop, healthy, healthy), u_a(loop, healthy, changed)
     same = first == second
     assert same[20:1001].all() and not same[1001]
 
 
-@pytest.mark.parametrize("name", [name for name in estimators.names() if name != "sliding-window"])
+@pytest.mark.parametrize("name", [name for name in estimators.estimator_names() if name != "sliding-window"])
 def test_every_estimator_runs_stage_one_and_blocks_change_nothing(rig: dict[str, Any], name: str) -> None:
     loop = loop_of(rig, estimator=name, stage_one="laguerre", stage_one_length=6)
     healthy = recorded(loop, 1, 30.0)
-    stage = Stage(loop, tune(loop, [healthy]))
+    stage = StageOneRunner(loop, tune_stage_one(loop, [healthy]))
     r, u, restart = healthy.r.copy(), healthy.u.copy(), healthy.restart.copy()
     u[700], restart[1500] = np.nan, True
     whole_state, split_state = stage.start(), stage.start()
@@ -96,14 +98,14 @@ def test_a_gap_silences_u_a_until_the_functions_have_forgotten_it(rig: dict[str,
     loop, healthy = loop_of(rig, stage_one_length=10), recorded(loop_of(rig), 1, 20.0)
     u = healthy.u.copy()
     u[500] = np.nan
-    gone = np.flatnonzero(~np.isfinite(u_a(loop, healthy, Recording(**{**vars(healthy), "u": u}))))
+    gone = np.flatnonzero(~np.isfinite(u_a(loop, healthy, replace(healthy, u=u))))
     assert gone.tolist() == [*range(9), *range(500, 510)]
 
 
 @pytest.fixture(scope="module")
 def baseline() -> Baseline:
     loop = reference_rig(two_stage="adaptive", stage_one="laguerre")
-    return learn(loop, [recorded(loop, 1)])
+    return learn_baseline(loop, [recorded(loop, 1)])
 
 
 class TestMonitor:
@@ -126,6 +128,7 @@ class TestMonitor:
         raw = baseline.pipeline().estimate(baseline.tuning, recording).theta
         assert trace.theta == pytest.approx(raw - baseline.bias, rel=1e-12, abs=1e-12)
 
+    @pytest.mark.slow
     def test_a_fleet_is_its_assets(self, baseline: Baseline) -> None:
         recordings = [recorded(baseline.loop, seed, 20.0) for seed in (2, 3)]
         fleet = Monitor([baseline, baseline])
@@ -154,8 +157,8 @@ def test_what_cannot_be_is_refused(rig: dict[str, Any]) -> None:
     with pytest.raises(LoopError, match="learn a baseline"):
         Pipeline.of(loop)
     with pytest.raises(NotEnoughError, match="stage_one_length"):
-        tune(loop, [recorded(loop, 1, 1.0)])
-    still = Recording(**{**vars(recorded(loop, 1, 10.0)), "r": np.zeros(1000)})
+        tune_stage_one(loop, [recorded(loop, 1, 1.0)])
+    still = replace(recorded(loop, 1, 10.0), r=np.zeros(1000))
     with pytest.raises(NotEnoughError, match="reference is zero"):
-        tune(loop, [still])
-    assert tune(Loop.from_dict(rig), [still]) is None
+        tune_stage_one(loop, [still])
+    assert tune_stage_one(Loop.from_dict(rig), [still]) is None

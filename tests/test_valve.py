@@ -10,15 +10,16 @@ import numpy.typing as npt
 import pytest
 
 from servoscope import learn
-from servoscope.errors import LoopError, SimulationError
-from servoscope.linear import sampled, state_variable_filter
-from servoscope.loop import Loop
-from servoscope.monitor import Monitor, diagnose
-from servoscope.pipeline import Pipeline
-from servoscope.recording import Recording
-from servoscope.simulation import FaultEvent, reference, response, simulate, simulate_rig
-from servoscope.tuning import least_squares
-from servoscope.valve import Valve
+from servoscope.core.errors import LoopError, SimulationError
+from servoscope.diagnosis.diagnose import diagnose
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.tuning import least_squares
+from servoscope.estimation.valve import ValveLaw
+from servoscope.models.loop import Loop
+from servoscope.models.lti import sample_system, state_variable_filter
+from servoscope.signals import Recording
+from servoscope.simulation import FaultEvent, reference, simulate, simulate_response, simulate_rig
 
 SILENT = {"noise_u_std": 0.0, "noise_y_std": 0.0}
 Array = npt.NDArray[np.float64]
@@ -34,7 +35,9 @@ def naive(loop: Loop, u: Array, y: Array) -> Array:
     late = math.floor(loop.delay * loop.sample_rate + 1e-9)
     plant = loop.plant
     derivatives = (
-        sampled(state_variable_filter(20.0, 3), loop.sample_rate, "foh").output(np.eye(3)[1:]).simulate(y[:, None])
+        sample_system(state_variable_filter(20.0, 3), loop.sample_rate, "foh")
+        .output(np.eye(3)[1:])
+        .simulate(y[:, None])
     )
     p_L = (plant.k_p * y + derivatives @ [plant.b_p, plant.m_p]) / plant.A_p
     before = np.concatenate([np.full(late, u[0]), u])[: len(u)]
@@ -45,7 +48,7 @@ def naive(loop: Loop, u: Array, y: Array) -> Array:
 def test_it_is_u_times_the_root_of_the_pressure_left(rig: dict[str, Any], delay: float) -> None:
     loop = loop_of(rig, delay=delay)
     recording, _ = simulate(loop_of(rig), reference("multisine", 5.0, 100.0), seed=1)
-    valve = Valve(loop)
+    valve = ValveLaw(loop)
     flow = valve.run(valve.start(), recording.u, recording.y, recording.restart)
     assert flow == pytest.approx(naive(loop, recording.u, recording.y), rel=1e-12)
 
@@ -55,7 +58,7 @@ def test_a_missing_sample_is_missing_and_what_follows_starts_anew(rig: dict[str,
     recording, _ = simulate(loop, reference("multisine", 5.0, 100.0), seed=1)
     u, y = recording.u.copy(), recording.y.copy()
     u[200], y[201], y[202] = np.nan, np.nan, 1e200
-    valve = Valve(loop)
+    valve = ValveLaw(loop)
     flow = valve.run(valve.start(), u, y, recording.restart)
     assert np.flatnonzero(np.isnan(flow)).tolist() == [200, 201, 202]
     assert flow[203:] == pytest.approx(naive(loop, u[203:], y[203:]), rel=1e-12)
@@ -73,9 +76,9 @@ def test_before_the_limiter_u_is_limited_first(rig: dict[str, Any]) -> None:
 
 def test_small_motions_do_not_know_the_law(rig: dict[str, Any]) -> None:
     r = reference("multisine", 10.0, 100.0)
-    linear = response(loop_of(rig, "linear"), r)
+    linear = simulate_response(loop_of(rig, "linear"), r)
     for size, far in ((1.0, True), (1e-3, False)):
-        curved = [signal / size for signal in response(loop_of(rig), size * r)]
+        curved = [signal / size for signal in simulate_response(loop_of(rig), size * r)]
         off = [np.abs(a - b).max() / np.abs(b).max() for a, b in zip(curved, linear, strict=True)]
         assert bool(max(off) > 0.04) is far
         assert far or max(off) < 1e-3
@@ -86,7 +89,7 @@ def test_its_inverse_does_not_move_with_the_amplitude(rig: dict[str, Any]) -> No
 
     def real_part(law: str, amplitude: float) -> float:
         loop = loop_of(rig, law)
-        u, y = response(loop_of(rig), amplitude * reference("multisine", 20.0, 100.0))
+        u, y = simulate_response(loop_of(rig), amplitude * reference("multisine", 20.0, 100.0))
         r = restart = np.zeros(len(u))
         pipeline = Pipeline.of(loop)
         theta = least_squares(pipeline.regression(r, u, y, restart.astype(bool)))
@@ -105,6 +108,7 @@ def followed(monitor: Monitor, recording: Recording, cuts: list[int]) -> tuple[A
     return state, np.concatenate(thetas)
 
 
+@pytest.mark.slow
 def test_blocks_and_single_samples_leave_the_same_bits(rig: dict[str, Any]) -> None:
     loop = loop_of(rig, delay=0.0128)
     recording, _ = simulate(loop, reference("multisine", 30.0, 100.0), seed=1)
@@ -132,6 +136,7 @@ def test_what_does_not_go_together_is_refused(rig: dict[str, Any]) -> None:
         simulate(loop_of(rig, hold="foh"), np.zeros(9))
 
 
+@pytest.mark.slow
 def test_on_a_rig_with_friction_valve_and_warm_oil_it_sizes_a_leak_and_stands_a_smaller_motion(
     rig: dict[str, Any],
 ) -> None:

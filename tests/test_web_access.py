@@ -19,11 +19,11 @@ import halls
 from browsing import Served, login, upload
 from commands import run
 from halls import hall
-from servoscope.access import Attempts, Hosts, Sessions, Users, WebSettings
-from servoscope.errors import AccessError, ConfigError
-from servoscope.live.assembling import assemble
-from servoscope.live.config import Config
-from servoscope.live.service import Service
+from servoscope.core.errors import AccessError, ConfigError
+from servoscope.service.access import AllowedHosts, LoginThrottle, Sessions, Users, WebSettings
+from servoscope.service.build import build_components
+from servoscope.service.config import ServiceFile
+from servoscope.service.service import Service
 
 pytestmark = pytest.mark.xdist_group("access")
 
@@ -36,8 +36,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store that a service has left, and a file of users."""
     made = tmp_path_factory.mktemp("access")
     halls.files(made)
-    config = Config.load(hall(made, "done"))
-    Service(config, assemble(config)).run()
+    config = ServiceFile.load(hall(made, "done"))
+    Service(config, build_components(config)).run()
     users = Users(made / "users.json")
     for name, role in ROLES.items():
         users.add(name, role, PASSWORDS[name])  # type: ignore[arg-type]
@@ -68,6 +68,8 @@ def test_without_login_nothing_is_told(server: Served, path: str) -> None:
         assert said.status_code == 401 and said.headers["content-type"] == "application/problem+json"
         assert client.get("/session").json() | {"version": ""} == {
             "login_required": True,
+            "password_login": True,
+            "single_sign_on": None,
             "user": None,
             "role": None,
             "csrf": None,
@@ -243,18 +245,18 @@ def test_browsers_are_told_nothing_that_they_only_complain_of(folder: Path, list
 
 class TestHosts:
     def test_a_numeric_address_cannot_be_rebound(self) -> None:
-        everywhere = Hosts.of("0.0.0.0:8080", ["monitor.example"])
+        everywhere = AllowedHosts.of("0.0.0.0:8080", ["monitor.example"])
         assert everywhere.known("192.0.2.7:8080") and everywhere.known("[2001:db8::1]:8080")
         assert everywhere.known("monitor.example") and not everywhere.known("evil.example")
-        assert not Hosts.of("127.0.0.1:8080", []).known("192.0.2.7:8080")
+        assert not AllowedHosts.of("127.0.0.1:8080", []).known("192.0.2.7:8080")
 
     @pytest.mark.parametrize("origin", ["", "null", "http://", "ftp://localhost", "http://localhost:x", "localhost"])
     def test_what_is_no_origin_is_foreign(self, origin: str) -> None:
-        assert not Hosts.same(origin, "localhost", "http")
+        assert not AllowedHosts.same(origin, "localhost", "http")
 
     def test_default_ports_may_be_left_out(self) -> None:
-        assert Hosts.same("http://localhost:80", "localhost", "http")
-        assert not Hosts.same("http://localhost:8080", "localhost", "http")
+        assert AllowedHosts.same("http://localhost:80", "localhost", "http")
+        assert not AllowedHosts.same("http://localhost:8080", "localhost", "http")
 
 
 class TestUsers:
@@ -329,7 +331,7 @@ class TestSettings:
     def test_the_section_is_part_of_the_service_file(self, tmp_path: Path) -> None:
         path = hall(tmp_path, "x", more='[web]\nlisten = "0.0.0.0:80"\n')
         with pytest.raises(ConfigError, match="web: users: missing"):
-            Config.load(path)
+            ServiceFile.load(path)
 
 
 def test_sessions_end_and_attempts_are_forgotten() -> None:
@@ -337,9 +339,11 @@ def test_sessions_end_and_attempts_are_forgotten() -> None:
     secret, session = sessions.begin("vera", "s", 0.0)
     assert sessions.find(secret, 9.9) == session and sessions.find(secret, 10.0) is None
     assert sessions.find("another", 1.0) is None and sessions.find(None, 1.0) is None
-    attempts = Attempts(2, 60.0)
-    attempts.fail("a", 0.0)
-    assert attempts.wait("a", 1.0) == 0.0
-    attempts.fail("a", 10.0)
+    attempts = LoginThrottle(2, 60.0)
+    attempts.reserve(["a"], 0.0)
+    attempts.settle(["a"], 0.0, failed=True)
+    assert attempts.reserve(["a"], 10.0) == 0.0
+    assert attempts.reserve(["b", "a"], 10.0) > 0.0 == attempts.wait("b", 10.0)  # the other is being checked
+    attempts.settle(["a"], 10.0, failed=True)
     assert attempts.wait("a", 20.0) == 40.0 and attempts.wait("b", 20.0) == 0.0
     assert attempts.wait("a", 61.0) == 0.0

@@ -9,43 +9,47 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from servoscope.errors import RecordingError
-from servoscope.store import Batch, Store
-from servoscope.web.guessing import mapping
-from servoscope.web.hub import Hub
-from servoscope.web.jobs import Limits, carry_out
-from servoscope.web.signals import chosen
+from servoscope.core.workers import ProcessLimits, WorkerError
+from servoscope.service.store import Batch, Store
+from servoscope.signals.readers.guess_columns import guess_mapping
+from servoscope.web.downsample import downsample_indices
+from servoscope.web.event_hub import EventHub
+from servoscope.web.jobs.queue import run_task
+from servoscope.web.schemas.requests import DesignRequest, LoopRef
 
 
 def test_work_that_takes_too_long_is_ended(tmp_path: Path) -> None:
-    study = {"loop": {"example": "reference-rig"}, "files": [], "columns": None, "out": str(tmp_path)}
-    with pytest.raises(RecordingError, match="more than 1 s of processor time"):
-        asyncio.run(carry_out("design", study, tmp_path, Limits(1.0, 3000.0), lambda _: None))
+    request = DesignRequest(loop=LoopRef(example="reference-rig"))
+    arguments = request, request.loop, [], str(tmp_path)
+    with pytest.raises(WorkerError, match="more than 1 s of processor time"):
+        asyncio.run(run_task("study_design", arguments, tmp_path, ProcessLimits(1.0, 3000.0)))
 
 
 def test_a_reader_that_is_late_hears_the_newest_state_and_no_backlog(tmp_path: Path) -> None:
     store = Store.open("x.sqlite", tmp_path, write=True)
     status = {"verdict": "healthy", "summary": "", "since": 0.0, "onset": None, "examined": None, "ne107": "good"}
-    status |= {"reasons": [], "quality": [], "alarms": {}}
+    status |= {"reasons": [], "quality": {}, "alarms": {}}
 
-    async def look(hub: Hub, commit: int, *assets: str) -> None:
+    async def change(hub: EventHub, commit: int, *assets: str) -> None:
         batch = Batch()
         for asset in assets:
-            said = {**status, "counted": {"t": float(commit), "rows": 0}}
+            said = {**status, "counted": {"began": 0.0, "t": float(commit), "rows": 0}}
             row = {"asset": asset, "sequence": commit, "state": b"", "status": said, "at": float(commit)}
             batch.checkpoints[asset] = row
         store.write(batch, "hall", commit)
-        await hub.look()
+        await hub.poll()
 
     async def story() -> None:
-        hub = Hub(store)
-        await look(hub, 1, "press", "lift")
+        hub = EventHub(store)
+        await change(hub, 1, "press", "lift")
         first = hub.tick
         for commit in range(2, 50):
-            await look(hub, commit, "press")
-        (late,) = [json.loads(line[6:]) for line in hub.since(first).decode().splitlines() if line.startswith("data: ")]
+            await change(hub, commit, "press")
+        (late,) = [
+            json.loads(line[6:]) for line in hub.events_since(first).decode().splitlines() if line.startswith("data: ")
+        ]
         assert [(row["asset"], row["t"]) for row in late["assets"]] == [("press", 49.0)]
-        assert hub.since(hub.tick) == b"" and len(hub.since(-1)) > 2 * len(hub.since(first)) * 0.8
+        assert hub.events_since(hub.tick) == b"" and len(hub.events_since(-1)) > 2 * len(hub.events_since(first)) * 0.8
 
     asyncio.run(story())
     store.close()
@@ -54,11 +58,11 @@ def test_a_reader_that_is_late_hears_the_newest_state_and_no_backlog(tmp_path: P
 def test_thinning_keeps_order_and_extremes() -> None:
     rng = np.random.default_rng(1)
     signals = rng.normal(size=10_000), np.where(rng.random(10_000) < 0.1, np.nan, rng.normal(size=10_000))
-    at = chosen(signals, 400)
+    at = downsample_indices(signals, 400)
     assert np.all(np.diff(at) > 0) and at.size <= 402 and at[0] == 0 and at[-1] == 9999
     for one in signals:
         assert np.nanmax(one[at]) == np.nanmax(one) and np.nanmin(one[at]) == np.nanmin(one)
-    assert chosen(signals, 20_000).size == 10_000
+    assert downsample_indices(signals, 20_000).size == 10_000
 
 
 @pytest.mark.parametrize(
@@ -74,6 +78,6 @@ def test_thinning_keeps_order_and_extremes() -> None:
     ],
 )
 def test_columns_are_guessed_by_their_names(names: list[str], found: tuple[str | None, ...]) -> None:
-    said = mapping([{"name": name} for name in names])
+    said = guess_mapping(names)
     assert tuple(said[key] for key in ("time", "reference", "input", "output")) == found
     assert said["time_unit"] == ("ms" if "ms" in names[0] else "s")
