@@ -20,13 +20,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from servoscope import fleet
-from servoscope.baseline import Baseline
+from servoscope.detection.baseline import Baseline
 from servoscope.fleet import Lake, Plan
-from servoscope.learning import learn
-from servoscope.loop import Loop
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
 from servoscope.simulation import reference, simulate
 
-RIG = Path(__file__).parents[1] / "src/servoscope/examples/reference-rig.toml"
+RIG = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
 DAYS = ("2026-11-01", "2026-11-02")
 
 
@@ -54,7 +54,7 @@ def make(folder: Path, assets: int, minutes: float, rate: float) -> int:
             pq.write_table(pa.table({"t": t, "r": x.r, "u": x.u, "y": y}), path, row_group_size=100_000)
     file = folder / "baseline.json"
     if not file.exists():
-        learn(loop, [simulate(loop, r[: int(30 * rate)], seed=2)[0]]).save(file)
+        learn_baseline(loop, [simulate(loop, r[: int(30 * rate)], seed=2)[0]]).save(file)
     return rows
 
 
@@ -140,12 +140,12 @@ def on_spark(folder: Path, lake: str, rows: int, cores: int, window: float, plan
     found = spark.diagnose(session.read.parquet(lake), baseline, assets=len(Lake.open(lake).assets), window_s=window)
     measured(f"{at}, DataFrame", rows, found.collect, descendants)
     shutil.rmtree(folder / "stream", ignore_errors=True)
-    stream = sinks.files(session, lake, baseline.loop.columns)
+    stream = sinks.file_stream(session, lake, baseline.loop.columns)
     followed = streaming.follow(stream, baseline, assets=len(Lake.open(lake).assets), window_s=window)
     measured(
         f"{at}, stream",
         rows,
-        lambda: sinks.wait(sinks.start(followed, folder / "stream", every_s=None)),
+        lambda: sinks.wait_for_stream(sinks.start(followed, folder / "stream", every_s=None)),
         descendants,
     )
     session.stop()

@@ -21,9 +21,10 @@ from tables import Table, parser, show
 
 import servoscope as ss
 from servoscope.simulation import reference
-from servoscope.simulation.closed_loop import NOISE_U_STD, NOISE_Y_STD, Simulation
+from servoscope.simulation.closed_loop import LoopSimulation
+from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 
-RIG = Path(str(files("servoscope"))) / "examples" / "reference-rig.toml"
+RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
 PIECE = 600_000  # rows that are simulated and written at a time
 WIDER = 1.2  # of the leakage, from the middle of the recording on
 
@@ -33,7 +34,7 @@ def written(folder: Path, rows: int, fault: bool) -> list[Path]:
     loop = ss.Loop.load(RIG)
     minute = reference("profile", 60.0, loop.sample_rate)
     plants = [loop.plant, loop.plant.with_ratios({"C_ie": WIDER})]
-    simulation, rng = Simulation(loop, plants), np.random.default_rng(5)
+    simulation, rng = LoopSimulation(loop, plants), np.random.default_rng(5)
     schema = pa.schema([(name, pa.float64()) for name in ("t", "r", "u", "y")])
     paths = [folder / "long.parquet", folder / "long.csv"]
     with pq.ParquetWriter(paths[0], schema) as columns, csv.CSVWriter(str(paths[1]), schema) as text:

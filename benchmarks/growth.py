@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from tables import machine, parser
 
-from servoscope.bench import interleaved, limits
-from servoscope.chain import TILE, Chain
-from servoscope.linear import sampled, stack, state_variable_filter
-from servoscope.readout import Readout
-from servoscope.recursion import Constants, Recursion, View
-from servoscope.twostage import Stage, StageOne
+from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
+from servoscope.estimation.kernel.sample_steps import TILE, SampleSteps
+from servoscope.estimation.recursion import EvaluationConstants, Recursion, RecursionConstants
+from servoscope.estimation.two_stage import StageOneRunner, StageOneTuning
+from servoscope.models.lti import block_diagonal, sample_system, state_variable_filter
+from servoscope.research.bench import limits, time_interleaved
 
 RATE = 100.0
 REPEATS = 9
@@ -41,17 +41,17 @@ class Tally(float):
         return Tally(-float(self))
 
 
-def constants(n: int = 4, frequencies: int = 3) -> Constants:
+def constants(n: int = 4, frequencies: int = 3) -> RecursionConstants:
     """Return the recursion of a loop of n coefficients behind a state-variable filter of order n."""
     svf = state_variable_filter(10.0, n)
-    bank = stack([sampled(svf, RATE, "zoh").output(np.eye(1, n)), sampled(svf, RATE, "foh")])
+    bank = block_diagonal([sample_system(svf, RATE, "zoh").output(np.eye(1, n)), sample_system(svf, RATE, "foh")])
     route = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     system = type(bank)(bank.A, bank.B @ route, bank.C / np.abs(bank.C).max(axis=1)[:, None], bank.D @ route)
-    velocity = sampled(state_variable_filter(25.0, 2), RATE, "foh").output(np.array([[0.0, 1.0]]))
+    velocity = sample_system(state_variable_filter(25.0, 2), RATE, "foh").output(np.array([[0.0, 1.0]]))
     rng = np.random.default_rng(0)
-    view = View(np.eye(n), np.zeros(n), rng.standard_normal((2 * frequencies, n)), RATE)
+    view = EvaluationConstants(np.eye(n), np.zeros(n), rng.standard_normal((2 * frequencies, n)), RATE)
     one, a = np.eye(n), np.array([0.5, 0.1, 0.05, 0.01])
-    return Constants(
+    return RecursionConstants(
         estimator="akf", steady=True, bank=system, velocity=velocity, v_of_r=False, codes=(),
         limits=(-np.inf, np.inf), deadzone=(np.inf, -np.inf), sign_speed=0.0, rest_speed=0.0, still_speed=0.0,
         only_moving=False, wait=20, stride=1, every=10, scale=np.ones(n), basis=one, theta=np.zeros(n),
@@ -59,28 +59,28 @@ def constants(n: int = 4, frequencies: int = 3) -> Constants:
     )  # fmt: skip
 
 
-def operations(c: Constants) -> float:
+def operations(c: RecursionConstants) -> float:
     """Return how many additions and multiplications one sample takes, its share of an evaluation included."""
     recursion = Recursion([c])
-    chain = Chain(recursion._plan, lambda R, phi: [x * (1.0 / (R + sum(p * p for p in phi))) for x in phi])
+    steps = SampleSteps(recursion._spec, lambda R, phi: [x * (1.0 / (R + sum(p * p for p in phi))) for x in phi])
     row = [Tally(x) for x in recursion._table[0]]
     s, h = ([Tally(0.1)] * size for size in (recursion.sizes.floats, 8))
-    v, said, q = ([Tally(1.0)] * size for size in (recursion.sizes.rows, 1, recursion.sizes.row))
+    v, status, q = ([Tally(1.0)] * size for size in (recursion.sizes.rows, 1, recursion.sizes.row))
     tile = [Tally(0.1)] * (4 * TILE)
     Tally.done = 0
-    chain.advance(row, s, h, said, v, [], tile, 0, True)
-    chain.learn(row, s, h, v, [], [])
+    steps.advance_filters(row, s, h, status, v, [], tile, 0, True)
+    steps.update_estimate(row, s, h, v, [], [])
     each, Tally.done = Tally.done, 0
     for i in range(recursion.sizes.floats):
         s[i] = Tally(1.0 + i % 3)
-    readout = Readout(recursion._plan)
-    readout.evaluate(row, s, h, q)
+    evaluation = EvaluationSteps(recursion._spec)
+    evaluation.write_evaluation(row, s, h, q)
     for f in range(recursion.sizes.frequencies):
-        readout.respond(row, s, f, q)
+        evaluation.write_response(row, s, f, q)
     return each + Tally.done / c.every
 
 
-def moved(c: Constants, samples: int) -> float:
+def moved(c: RecursionConstants, samples: int) -> float:
     """Return how many bytes one sample reads and writes, its share of an evaluation and of the state included.
 
     What is written is read before, by the processor, to fill the cache's lines.
@@ -89,7 +89,7 @@ def moved(c: Constants, samples: int) -> float:
     return 8.0 * (3 + 2 * recursion.sizes.row / c.every + 3 * recursion.size / samples)
 
 
-def fleet(c: Constants, assets: int, samples: int) -> tuple[Callable[[], object], int]:
+def fleet(c: RecursionConstants, assets: int, samples: int) -> tuple[Callable[[], object], int]:
     """Return a job of one core over a fleet, and its samples."""
     recursion = Recursion([c] * assets)
     signals = np.random.default_rng(1).standard_normal((3, assets, samples))
@@ -99,11 +99,11 @@ def fleet(c: Constants, assets: int, samples: int) -> tuple[Callable[[], object]
 
 def fir(n: int) -> tuple[Callable[[], object], int]:
     """Return a job of stage 1 with n taps, and its samples."""
-    from servoscope.bench.running import rig
+    from servoscope.research.bench.benchmarks import benchmark_loop
 
-    loop = rig(two_stage="adaptive", stage_one_length=n)
+    loop = benchmark_loop(two_stage="adaptive", stage_one_length=n)
     P_d = np.eye(n) * 1e-3
-    stage = Stage(loop, StageOne((0.1,) * n, tuple(tuple(row) for row in P_d.tolist()), 1.0))
+    stage = StageOneRunner(loop, StageOneTuning((0.1,) * n, tuple(tuple(row) for row in P_d.tolist()), 1.0))
     r, u = np.random.default_rng(1).standard_normal((2, 20_000))
     restart = np.zeros(20_000, dtype=np.bool_)
     return lambda: stage.run(stage.start(), r, u, restart), 20_000
@@ -114,7 +114,7 @@ def main() -> None:
     command = parser(__doc__)
     command.add_argument("-o", "--output", type=Path, help="also draw it")
     given = command.parse_args()
-    from servoscope import recursion
+    from servoscope.estimation import recursion
 
     recursion._cores = lambda: 1
     taps = "taps of stage 1 (FIR), one log"
@@ -123,8 +123,8 @@ def main() -> None:
         "coefficients": {n: (constants(n), 1024, 100) for n in range(2, 9)},
         "frequencies": {F: (constants(4, F), 1024, 100) for F in (1, 3, 10, 30, 100)},
     }
-    burn, count = limits.multiply_adds(200_000)
-    copy, copied = limits.copying()
+    burn, count = limits.multiply_add_job(200_000)
+    copy, copied = limits.copy_job()
     jobs: dict[str, Callable[[], object]] = {"fma": burn, "copy": copy}
     samples, least, bytes_ = {}, {}, {}
     for sweep, points in loops.items():
@@ -134,7 +134,7 @@ def main() -> None:
     for n in (8, 16, 40, 64, 128):
         jobs[f"{taps}={n}"], samples[taps, n] = fir(n)
         least[taps, n], bytes_[taps, n] = n * n + 4 * n, 3 * 8.0
-    found = interleaved(jobs, REPEATS)
+    found = time_interleaved(jobs, REPEATS)
     per_fma, per_byte = 1e9 * found["fma"].processor / count, 1e9 * found["copy"].processor / copied
     result: dict[str, Any] = {
         "machine": machine(),

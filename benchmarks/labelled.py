@@ -8,14 +8,14 @@ Healthy runs 1 to 5 of each load make the baseline; no labelled run is judged wi
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from tables import Table, parser, show
+from tables import Table, parse_with_data, parser, show
 
 import servoscope as ss
-from servoscope.errors import NotEnoughError
-from servoscope.scoring import accuracy, confusion
+from servoscope.core.errors import NotEnoughError
+from servoscope.research.scoring import accuracy, confusion
 
 ROOT = Path(__file__).resolve().parent.parent
 LOADS = ("20", "40", "-40")
@@ -148,14 +148,30 @@ def tables(data: Path) -> Iterator[Table]:
     )
 
 
+def values(found: Mapping[str, Table]) -> dict[str, str]:
+    """Return the figures that stand alone in sentences of documents."""
+
+    def total(rows: Iterable[Sequence[str]], *heads: str) -> int:
+        return sum(int(row[2 + SAID.index(head)] or 0) for row in rows for head in heads)
+
+    halves = [row for row in found["half of the runs"].rows if row[1] in FILES]
+    dry_20 = [row for row in halves if row[:2] == ("20", "dry")]
+    strangers = found["the other fault never seen"].rows
+    seen = sum(total([row], *SAID[:-1]) for row in strangers)
+    other = sum(total([row], next(kind for kind in FILES if kind != row[1])) for row in strangers)
+    return {
+        "detected": str(total(halves, *SAID[:-1])),
+        "named": str(total(halves, *SAID[:3])),
+        "dry-20.wrong-first": f"{total(dry_20, 'open, wrong one first')} of {total(dry_20, *SAID)}",
+        "stranger.named": f"{other} of {seen}",
+    }
+
+
 def main() -> None:
     """Run the command line of this process."""
-    command = parser(__doc__)
-    command.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
-    given = command.parse_args()
-    if not (given.data / "real" / "cranfield").is_dir():
-        command.error(f"{given.data}: no recordings there; name their folder with --data")
-    show(tables(given.data), given.json)
+    given = parse_with_data(parser(__doc__), "real/cranfield")
+    found = list(tables(given.data))
+    show(found, given.json, values({table.title.partition(": ")[2]: table for table in found}))
 
 
 if __name__ == "__main__":

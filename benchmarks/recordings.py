@@ -15,13 +15,14 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 
-from tables import Table, parser, show
+from recording_values import values
+from tables import Table, parse_with_data, parser, show
 
 import servoscope as ss
-from servoscope.monitor import examine
+from servoscope.diagnosis.diagnose import diagnose_with_trace
 
 ROOT = Path(__file__).resolve().parent.parent
-RIG = Path(str(files("servoscope"))) / "examples" / "reference-rig.toml"
+RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
 AUTHORS = {"inertia": 95.1089, "viscous_friction": 203.5034, "coulomb_friction": 20.3935, "offset": -3.1648}
 
 
@@ -38,7 +39,7 @@ class Judged:
     def of(cls, baseline: ss.Baseline, recording: ss.Recording) -> Judged:
         """Diagnose a recording."""
         start = time.perf_counter()
-        diagnosis, trace = examine(baseline, recording)
+        diagnosis, trace = diagnose_with_trace(baseline, recording)
         seconds = time.perf_counter() - start
         top = max((float(T2) for T2 in trace.statistic[trace.ready]), default=0.0)
         return cls(diagnosis, top, baseline.limit, seconds)
@@ -105,7 +106,7 @@ def emps(data: Path) -> Iterator[Table]:
     settings["plant"]["friction"] = "directional"
     directional = ss.Loop.from_dict(settings)
     baseline, refined = ss.learn(loop, [whole]), ss.learn(directional, [whole])
-    sigma = baseline.cov().diagonal() ** 0.5
+    sigma = baseline.covariance_array().diagonal() ** 0.5
     rows = []
     for name, value, std in zip(baseline.names, baseline.theta, sigma, strict=True):
         off = f"{100.0 * (value / AUTHORS[name] - 1.0):+.2f} %"
@@ -145,7 +146,7 @@ def injected(data: Path) -> Iterator[Table]:
     ):
         baseline = ss.learn(loop, healthy)
         for name in ("inertia", "viscous_friction", "input_gain"):
-            changed, at = _changed(judged, baseline, name)
+            changed, at = change_u(judged, baseline, name)
             said = Judged.of(baseline, changed)
             d = said.diagnosis
             late = "" if d.detected_at_s is None else f"{d.detected_at_s - at:.1f} s"
@@ -240,7 +241,7 @@ def cranfield(data: Path) -> Iterator[Table]:
     )
 
 
-def _changed(recording: ss.Recording, baseline: ss.Baseline, name: str) -> tuple[ss.Recording, float]:
+def change_u(recording: ss.Recording, baseline: ss.Baseline, name: str) -> tuple[ss.Recording, float]:
     """Return the recording with a change from half-way on, and when that is [s]."""
     from scipy.signal import savgol_filter
 
@@ -268,13 +269,10 @@ def _ratio(judged: Judged) -> str:
 
 def main() -> None:
     """Run the command line of this process."""
-    command = parser(__doc__)
-    command.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
-    given = command.parse_args()
-    if not (given.data / "eha_cases").is_dir():
-        command.error(f"{given.data}: no recordings there; name their folder with --data")
+    given = parse_with_data(parser(__doc__), "eha_cases")
     jobs = (reference_rig, emps, pump, qube, injected, cranfield)
-    show((table for job in jobs for table in job(given.data)), given.json)
+    tables = [table for job in jobs for table in job(given.data)]
+    show(tables, given.json, values({table.title: table for table in tables}))
 
 
 if __name__ == "__main__":

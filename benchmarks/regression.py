@@ -10,7 +10,7 @@ import json
 import sys
 from pathlib import Path
 
-from servoscope import bench
+from servoscope.research import bench
 
 STORED = Path(__file__).with_name("ratios.json")
 SLOWER = 1.3  # times as slow, from which it is said
@@ -22,7 +22,7 @@ def main() -> int:
     command.add_argument("--store", action="store_true", help="keep this run's ratios as what to compare with")
     command.add_argument("--repeats", type=int, default=9)
     given = command.parse_args()
-    found = bench.run(given.repeats)
+    found = bench.run_benchmarks(given.repeats)
     peak = found.facts["peak multiply-adds per ns, one core, double"]
     ours = [x for x in found.figures if x.name.startswith(("log", "fleet")) or "servoscope" in x.name]
     ratios = {figure.name: figure.processor * peak for figure in ours}

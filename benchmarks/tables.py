@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -37,11 +37,25 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     return made
 
 
-def show(tables: Iterable[Table], as_json: bool) -> None:
-    """Print tables under the line of the machine."""
+def parse_with_data(command: argparse.ArgumentParser, folder: str) -> argparse.Namespace:
+    """Parse a command line that also knows --data, where `folder` must be; else it ends with a line that says so."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    command.add_argument("--data", type=Path, default=default, help="folder of the recordings")
+    given = command.parse_args()
+    if not (given.data / folder).is_dir():
+        command.error(f"{given.data}: no recordings there; name their folder with --data")
+    return given
+
+
+def show(tables: Iterable[Table], as_json: bool, values: Mapping[str, str] | None = None) -> None:
+    """Print tables under the line of the machine; `values` are figures that stand alone in sentences of documents."""
     made = list(tables)
     if as_json:
-        print(json.dumps({"machine": machine(), "tables": [asdict(table) for table in made]}, indent=1))
+        print(
+            json.dumps(
+                {"machine": machine(), "tables": [asdict(t) for t in made], "values": dict(values or {})}, indent=1
+            )
+        )
     else:
         print("\n".join([f"{machine()}\n", *(table.markdown() for table in made)]), end="")
 

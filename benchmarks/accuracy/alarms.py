@@ -12,8 +12,18 @@ import servoscope as ss
 from accuracy.innovations import innovations
 from accuracy.rig import FAULT_AT, HOURS_PER_YEAR, alarm_times, baseline, loop, record, until_first
 from accuracy.scenario import Numbers, Row, Scenario, Table
-from servoscope.plants import FloatArray
-from servoscope.scoring import DUMMIES, Detections, Detector, alarm_rate, cusum, detections, events, siegmund, two_sided
+from servoscope.core.arrays import FloatArray
+from servoscope.research.scoring import (
+    DUMMIES,
+    Detections,
+    Detector,
+    alarm_rate,
+    cusum,
+    detections,
+    events,
+    siegmund,
+    two_sided,
+)
 from servoscope.simulation import FaultEvent
 
 BUDGETS = (1.0, 0.1)  # false alarms per hour

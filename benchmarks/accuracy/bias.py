@@ -8,8 +8,8 @@ import numpy as np
 
 from accuracy.rig import baseline, loop, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
-from servoscope.monitor import examine
-from servoscope.paper.conditions import TABLE_2, Case
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.research.paper.conditions import TABLE_2, FaultCase
 
 TARGETS = (0.005, 0.01, 0.02)  # relative, at 1, 10 and 20 Hz
 LAST = 50.0  # s, from where the values of a run are averaged
@@ -17,11 +17,11 @@ NOISE = 5.0
 NOISE_TARGET = 1.0 / 3.0  # of the standard deviation of a single evaluation
 
 
-def job(seed: int, kind: str, case: Case | None, noise: float) -> Numbers:
+def job(seed: int, kind: str, case: FaultCase | None, noise: float) -> Numbers:
     """Return H_hat/H_true at each frequency: mean of the last 10 s and last evaluation, real and imaginary parts."""
     learned = baseline(kind, 60.0, seed, noise=noise)
     faults = (case.event,) if case else ()
-    _, trace = examine(learned, record(kind, 60.0, seed, 1, faults, noise))
+    _, trace = diagnose_with_trace(learned, record(kind, 60.0, seed, 1, faults, noise))
     plant = loop().plant.with_ratios({case.parameter: case.ratio} if case else {})
     relative = trace.ifrf.H / plant.frequency_response(trace.ifrf.frequencies)
     found = {"mean": relative[trace.t >= LAST].mean(axis=0), "last": relative[-1]}
@@ -63,7 +63,7 @@ def _std(values: np.ndarray) -> np.ndarray:
     return values.std(axis=0, ddof=1) if len(values) > 1 else np.full(values.shape[1], np.nan)
 
 
-def _scenario(case: Case | None) -> Scenario:
+def _scenario(case: FaultCase | None) -> Scenario:
     id_ = f"bias/{case.parameter}-x{case.ratio:g}" if case else "bias/healthy"
     return Scenario(id_, str(case or "healthy"), 20, job, ("multisine", case, 1.0), errors)
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from accuracy.rig import FAULT_AT, baseline, loop, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
-from servoscope.ifrf import CHI2_95
-from servoscope.monitor import examine
-from servoscope.scoring import share
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.estimation.frequency_response import CHI2_95_2DOF
+from servoscope.research.scoring import share
 from servoscope.simulation import FaultEvent
 
 RUNS = 20  # per baseline
@@ -27,12 +27,12 @@ def job(seed: int, learned_on: str, kind: str, ratios: dict[str, float]) -> Numb
     faults = tuple(FaultEvent(name, ratio, FAULT_AT) for name, ratio in ratios.items())
     learned = baseline(learned_on, 60.0, seed)
     for i in range(RUNS):
-        said, trace = examine(learned, record(kind, 60.0, seed, 1 + i, faults))
+        said, trace = diagnose_with_trace(learned, record(kind, 60.0, seed, 1 + i, faults))
         count["runs"] += 1
         off = trace.ifrf.H[-1] - plant.frequency_response(trace.ifrf.frequencies)
         for name, d, C in zip(FREQUENCIES, off, trace.ifrf.covariance[-1], strict=True):
             parts = np.array([d.real, d.imag])
-            count[name] += int(parts @ np.linalg.solve(C, parts) <= CHI2_95)
+            count[name] += int(parts @ np.linalg.solve(C, parts) <= CHI2_95_2DOF)
         for (name, told), truth in zip(said.parameters.items(), plant.theta(), strict=True):
             count[name] += int(abs(told.value - truth) <= 1.96 * told.std)
         count["alarms"] += int(said.verdict == "fault")

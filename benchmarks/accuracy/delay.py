@@ -11,9 +11,9 @@ import numpy as np
 from accuracy.innovations import information
 from accuracy.rig import FAULT_AT, HOURS_PER_YEAR, alarm_times, baseline, loop, record, until_first
 from accuracy.scenario import Numbers, Row, Scenario, Table
-from servoscope.paper.conditions import WORDS
-from servoscope.plants import FloatArray
-from servoscope.scoring import Detections, detections, needed_information, shortest_delay
+from servoscope.core.arrays import FloatArray
+from servoscope.research.paper.conditions import FAULT_NAMES
+from servoscope.research.scoring import Detections, detections, needed_information, shortest_delay
 from servoscope.simulation import FaultEvent
 
 KIND = "multisine"
@@ -76,7 +76,7 @@ def draw(found: Mapping[str, Sequence[Numbers]], path: Path) -> None:
         size = _size(delays)
         middle, late = (np.array([each.quantile(q) for each in delays.values()]) for q in (0.5, 0.9))
         best = [bounds(FaultEvent(parameter, float(ratio), FAULT_AT))[0] for ratio in delays]
-        axes.plot(size, middle, "o-", color=colour, label=f"{WORDS[parameter]} ({parameter})")
+        axes.plot(size, middle, "o-", color=colour, label=f"{FAULT_NAMES[parameter]} ({parameter})")
         seen = np.isfinite(late)
         axes.vlines(size[seen], middle[seen], late[seen], color=colour, linewidth=1.0)
         axes.plot(size, best, "--", color=colour, linewidth=1.0)
@@ -98,7 +98,7 @@ def _seconds(value: float) -> str:
 def _scenario(parameter: str, ratios: tuple[float, ...], ramp_s: float) -> Scenario:
     words = f"{parameter}, ramp over 10 min to" if ramp_s else parameter
     show = partial(rows, parameter=parameter, ramp_s=ramp_s)
-    id_ = f"delay/{'ramp-' if ramp_s else ''}{WORDS[parameter]}"
+    id_ = f"delay/{'ramp-' if ramp_s else ''}{FAULT_NAMES[parameter]}"
     return Scenario(id_, words, 20, job, (parameter, ratios, ramp_s), show)
 
 

@@ -9,15 +9,15 @@ import numpy as np
 
 import servoscope as ss
 from accuracy.rig import FAULT_AT, baseline, loop
-from servoscope.design import Side, Study, study
-from servoscope.errors import SimulationError
-from servoscope.paper.conditions import SIZES, WORDS
-from servoscope.plants import Fault
+from servoscope.core.errors import SimulationError
+from servoscope.design import DesignStudy, DirectionStudy, study
+from servoscope.models.plants import Fault
+from servoscope.research.paper.conditions import FAULT_NAMES, SIZES
 from servoscope.simulation import FaultEvent, reference
 
 KINDS = ("profile", "multisine", "trapezoid")
 SECONDS = 60.0  # of a recording; faults begin half-way
-PARAMETERS = tuple(WORDS)
+PARAMETERS = tuple(FAULT_NAMES)
 TABLE_2 = {name: (min(sizes), max(sizes)) for name, sizes in SIZES.items()} | {"beta": (0.005, 0.1)}
 RADII = 0.5, 10.0
 USED = 0.9  # of the logarithms of the ratios that a diagnosis looks at: beyond, a size could not be said
@@ -30,13 +30,13 @@ def faults() -> dict[str, Fault]:
 
 
 @functools.cache
-def designed(kind: str) -> Study:
+def designed(kind: str) -> DesignStudy:
     """Return what `servoscope design` says of the rig under a reference, with 30 s after the onset."""
     learned = baseline(kind, SECONDS, 0)
     return study(learned, reference(kind, SECONDS, loop().sample_rate), SECONDS - FAULT_AT)
 
 
-def side(kind: str, parameter: str, up: bool) -> Side:
+def side(kind: str, parameter: str, up: bool) -> DirectionStudy:
     """Return what it says of one direction of a fault."""
     found = next(fault for fault in designed(kind).faults.values() if fault.parameter == parameter)
     return found.up if up else found.down

@@ -6,26 +6,27 @@ import numpy as np
 
 import servoscope as ss
 from accuracy.rig import FAULT_AT, loop
-from servoscope.noise import Noise
-from servoscope.plants import FloatArray, Plant
-from servoscope.refinement.predictor import Bench
-from servoscope.refinement.window import Growth, Window
+from servoscope.core.arrays import FloatArray
+from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.isolation.ml.predictor import PredictorFactory
+from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.models.plants import Plant
 from servoscope.simulation import FaultEvent, reference
-from servoscope.simulation.closed_loop import NOISE_U_STD, NOISE_Y_STD
+from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 
-TRUE = Noise(u_std=NOISE_U_STD, y_std=NOISE_Y_STD)
+TRUE = WhiteNoise(u_std=NOISE_U_STD, y_std=NOISE_Y_STD)
 
 
-def known(recording: ss.Recording, plant: Plant, noise: Noise = TRUE) -> Window:
+def known(recording: ss.Recording, plant: Plant, noise: WhiteNoise = TRUE) -> RefitWindow:
     """Return all of a recording as the refit sees it that knows plant and noise exactly."""
-    bench, nothing = Bench.of(loop(), noise, recording.u), np.zeros((0, 0))
-    return Window(bench, plant, nothing, 0, recording.u, recording.y, recording.restart)
+    bench, nothing = PredictorFactory.from_input(loop(), noise, recording.u), np.zeros((0, 0))
+    return RefitWindow(bench, plant, nothing, (), 0, recording.u, recording.y, recording.restart)
 
 
-def innovations(recording: ss.Recording, plant: Plant, noise: Noise = TRUE) -> FloatArray:
+def innovations(recording: ss.Recording, plant: Plant, noise: WhiteNoise = TRUE) -> FloatArray:
     """Return the innovations of a recording in standard deviations, shape (N,)."""
     window = known(recording, plant, noise)
-    return np.asarray(window.innovations(window.healthy, Growth(0)), dtype=np.float64)
+    return np.asarray(window.innovations(window.healthy, ChangeProfile(0)), dtype=np.float64)
 
 
 def information(fault: FaultEvent, kind: str, seconds: float) -> FloatArray:

@@ -24,12 +24,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tables import Table, parser, show
 
 import servoscope as ss
-from servoscope.errors import RecordingError
-from servoscope.pipeline import Pipeline
+from servoscope.core.errors import RecordingError
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.tuning import least_squares
 from servoscope.simulation import FaultEvent, Rig, RigTruth, reference, simulate_rig
-from servoscope.tuning import least_squares
 
-RIG_FILE = Path(str(files("servoscope"))) / "examples" / "reference-rig.toml"
+RIG_FILE = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
 KINDS = ("profile", "multisine", "trapezoid")
 FAULTS = (("p_s", 0.8), ("C_ie", 1.2), ("b_p", 20.0), ("beta", 0.1))
 FAULT_AT = 30.0  # s

@@ -14,8 +14,8 @@ from accuracy.innovations import known
 from accuracy.rig import FAULT_AT, baseline, loop, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import is_named, is_right, percent, seen, told
-from servoscope.paper.conditions import WORDS
-from servoscope.refinement.window import Growth
+from servoscope.isolation.ml.window import ChangeProfile
+from servoscope.research.paper.conditions import FAULT_NAMES
 from servoscope.simulation import FaultEvent
 
 RUNS = 2  # per baseline and pair
@@ -38,7 +38,7 @@ def job(seed: int, kind: str, runs: int = RUNS) -> Numbers:
 def clear(recording: ss.Recording, faults: Sequence[FaultEvent]) -> float:
     """Return how far from healthy the less clear of two faults is, in standard deviations by the Fisher information."""
     names, x = [fault.parameter for fault in faults], np.log([fault.ratio for fault in faults])
-    J = known(recording, loop().plant).jacobian(x, names, Growth(round(FAULT_AT * loop().sample_rate)))
+    J = known(recording, loop().plant).jacobian(x, names, ChangeProfile(round(FAULT_AT * loop().sample_rate)))
     std = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
     return float(f"{np.min(np.abs(x) / std):.4g}")
 
@@ -47,7 +47,7 @@ def shares(words: str, found: Sequence[Numbers]) -> list[Row]:
     """Show what was named, pair by pair and in all."""
     runs = seen(found)
     rows = []
-    for pair in (*combinations(WORDS.values(), 2), ()):
+    for pair in (*combinations(FAULT_NAMES.values(), 2), ()):
         own = [run for run in runs if set(run["truth"]) == set(pair) or not pair]
         allowed = [run for run in own if run["clear"] >= ALLOWED]
         rest = [run for run in own if run["clear"] < ALLOWED]

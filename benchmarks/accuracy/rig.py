@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 import servoscope as ss
-from servoscope.examination import Examination
-from servoscope.plants import FloatArray
-from servoscope.scoring import events
+from servoscope.core.arrays import FloatArray
+from servoscope.diagnosis.examine import Examination
+from servoscope.research.scoring import events
 from servoscope.simulation import FaultEvent, reference
-from servoscope.simulation.closed_loop import NOISE_U_STD, NOISE_Y_STD
+from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 
 HOURS_PER_YEAR = 8766.0
 FAULT_AT = 30.0  # s
@@ -23,7 +23,7 @@ SEEDS_PER_UNIT = 1000  # more than any unit draws
 @functools.cache
 def loop(per_year: float = 1.0) -> ss.Loop:
     """Return the loop of the reference rig, as its file has it but for the budget of false alarms."""
-    made = ss.Loop.load(Path(str(files("servoscope"))) / "examples" / "reference-rig.toml")
+    made = ss.Loop.load(Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml")
     return made.model_copy(
         update={"monitor": made.monitor.model_copy(update={"false_alarms_per_year": per_year})},
     )
@@ -58,7 +58,7 @@ def alarm_times(learned: ss.Baseline, recording: ss.Recording) -> FloatArray:
 
     One time per excursion: that of the sample where a sequential test passed its limit, or of the evaluation.
     """
-    x = Examination.of(learned, recording)
+    x = Examination.from_recording(learned, recording)
     at = events(x.alarm)
     crossed = np.asarray(x.estimates.crossed[at]).astype(np.int64)
     return np.asarray(recording.t[np.where(crossed > 0, crossed - 1, x.estimates.index[at])])

@@ -28,16 +28,32 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one thread per worker
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: E402
 from tables import machine  # noqa: E402
 
-from accuracy import alarms, bias, confidence, delay, isolation, onset, pairs, sizes, unknown  # noqa: E402
+from accuracy import (  # noqa: E402
+    alarms,
+    bias,
+    confidence,
+    delay,
+    isolation,
+    noisy_output,
+    onset,
+    pairs,
+    second_rig,
+    signal_defects,
+    sizes,
+    smooth,
+    unknown,
+    wrong_file,
+)
 from accuracy.scenario import Numbers, Scenario, Table  # noqa: E402
-from servoscope.output import atomic_write  # noqa: E402
+from servoscope.core.files import atomic_write  # noqa: E402
 
 RESULTS = BENCHMARKS / "accuracy" / "results"
 DOCS = BENCHMARKS.parent / "docs"
 PAGE, IMAGES = DOCS / "accuracy.md", DOCS / "images" / "accuracy"
 TABLES: tuple[Table, ...] = (
     *(*bias.TABLES, *confidence.TABLES, *alarms.TABLES, *delay.TABLES),
-    *(*isolation.TABLES, *unknown.TABLES, *pairs.TABLES, *sizes.TABLES, *onset.TABLES),
+    *(*isolation.TABLES, *unknown.TABLES, *pairs.TABLES, *sizes.TABLES, *onset.TABLES, *smooth.TABLES),
+    *(*second_rig.TABLES, *wrong_file.TABLES, *noisy_output.TABLES, *signal_defects.TABLES),
 )
 SCENARIOS = {scenario.id: scenario for table in TABLES for scenario in table.scenarios}
 
@@ -85,13 +101,18 @@ def path_of(scenario: Scenario) -> Path:
     return RESULTS / f"{scenario.id}.json"
 
 
-def render() -> None:
-    """Write the tables of all results between their markers on the page, and the figures."""
-    results = {
+def stored_results() -> dict[str, Any]:
+    """Return the results that are there, by scenario."""
+    return {
         id_: json.loads(path_of(scenario).read_text(encoding="utf-8"))
         for id_, scenario in SCENARIOS.items()
         if path_of(scenario).is_file()
     }
+
+
+def render() -> None:
+    """Write the tables of all results between their markers on the page, and the figures."""
+    results = stored_results()
     page = PAGE.read_text(encoding="utf-8")
     for table in TABLES:
         begin, end = f"<!-- {table.key} -->", f"<!-- end of {table.key} -->"

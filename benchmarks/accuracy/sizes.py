@@ -10,10 +10,10 @@ import numpy as np
 from accuracy.draws import KINDS, SECONDS
 from accuracy.rig import FAULT_AT, baseline, loop, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
-from servoscope.paper.conditions import WORDS
-from servoscope.refinement import refine
-from servoscope.refinement.columns import deviation
-from servoscope.refinement.window import Growth, Window
+from servoscope.isolation.ml import fit_hypotheses
+from servoscope.isolation.ml.least_squares import last_unknown_std
+from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.research.paper.conditions import FAULT_NAMES
 from servoscope.simulation import FaultEvent
 
 RUNS = 1  # per baseline and fault: the error of the baseline is part of the size's
@@ -38,12 +38,12 @@ def job(seed: int, kind: str, runs: int = RUNS) -> Numbers:
         for j in range(runs):
             recording = record(kind, SECONDS, seed, 1 + runs * i + j, (FaultEvent(name, ratio, FAULT_AT),))
             begin = time.process_time()
-            refined = refine(learned, recording, onset, announced, recording.samples - 1)
+            refined = fit_hypotheses(learned, recording, onset, announced, recording.samples - 1)
             seconds.append(round(time.process_time() - begin, 3))
             own = next(h.fitted for h in refined.hypotheses if h.fitted.names == (name,))
-            window = Window.of(learned, recording, 0, recording.samples)
-            truth = np.append(np.zeros(window.nuisances), np.log(ratio))
-            bound = deviation(window.jacobian(truth, (name,), Growth(onset)))
+            window = RefitWindow.from_recording(learned, recording, 0, recording.samples)
+            truth = np.append(np.zeros(window.nuisance_count), np.log(ratio))
+            bound = last_unknown_std(window.jacobian(truth, (name,), ChangeProfile(onset)))
             errors.append(float(f"{(own.x[0] - np.log(ratio)) / bound:.5g}"))
         found[name] = {"errors": errors, "seconds": seconds}
     return found
@@ -62,7 +62,7 @@ def scatter(words: str, found: Sequence[Numbers]) -> list[Row]:
         rows.append(
             (
                 words,
-                f"{WORDS[name]} x{ratio:g}",
+                f"{FAULT_NAMES[name]} x{ratio:g}",
                 f"{len(errors)}",
                 f"{mark}{worst:.2f}{mark} ± {square.std() / np.sqrt(len(errors)):.2f}",
                 f"{errors.mean():.2f} ± {errors.std() / np.sqrt(len(errors)):.2f}",

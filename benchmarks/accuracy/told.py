@@ -10,48 +10,48 @@ import numpy as np
 
 import servoscope as ss
 from accuracy.rig import FAULT_AT
-from accuracy.scenario import Numbers
-from servoscope.diagnosis import UNKNOWN, Candidate
-from servoscope.examination import Examination
-from servoscope.paper.conditions import WORDS
-from servoscope.refinement import causes
-from servoscope.refit import candidates_of, onset_of, refit
-from servoscope.scoring import share
+from accuracy.scenario import Numbers, Row
+from servoscope.detection.result import UNKNOWN, Candidate
+from servoscope.diagnosis.diagnose import SURE, first_alarm
+from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.ml_refit import refit_candidates, refit_onset, refit_recording
+from servoscope.isolation.ml import find_other_causes
+from servoscope.research.paper.conditions import FAULT_NAMES
+from servoscope.research.scoring import share
 from servoscope.simulation import FaultEvent
-from servoscope.verdict import SURE, alarm_of
 
 LISTED = 6  # candidates that are kept
 
 
 def told(learned: ss.Baseline, recording: ss.Recording, truth: Sequence[FaultEvent], mimics: bool = False) -> Numbers:
     """Judge a recording as `diagnose` does, and keep what can be scored; `mimics` takes longer."""
-    numbers: Numbers = {"truth": {WORDS[event.parameter]: event.ratio for event in truth}}
-    x = Examination.of(learned, recording)
-    alarm = alarm_of(x)
+    numbers: Numbers = {"truth": {FAULT_NAMES[event.parameter]: event.ratio for event in truth}}
+    x = Examination.from_recording(learned, recording)
+    alarm = first_alarm(x)
     if alarm is None:
         return numbers
     begin = time.process_time()
-    refined = refit(x, alarm.since, alarm.announced, int(x.estimates.index[alarm.at]), lambda: None)
+    refined = refit_recording(x, alarm.onset, alarm.sample, int(x.estimates.index[alarm.evaluation]), lambda: None)
     seconds = time.process_time() - begin
     assert refined is not None, "the exact predictor explains the rig's healthy recordings"
-    candidates, onset = candidates_of(refined), onset_of(refined, x)
+    candidates, onset = refit_candidates(refined), refit_onset(refined, x)
     best = candidates[0]
     right = next((c for c in candidates if {f.name for f in c.faults} == set(numbers["truth"])), None)
     numbers |= {
-        "detected": round(float(recording.t[alarm.announced]), 3),
+        "detected": round(float(recording.t[alarm.sample]), 3),
         "said": {each.name: round(each.probability, 6) for each in candidates[:LISTED]},
         "first": best.name,
         "named": best.name != UNKNOWN and best.probability >= SURE,
         "given": right.probability if right else 0.0,
         "sizes": {f.name: [_short(v) for v in (f.ratio, *f.interval)] for f in (right.faults if right else ())},
         "onset": [round(t, 3) for t in (onset.low_s, onset.likely_s, onset.high_s)],
-        "misfit": [_short(v) for v in (refined.goodness.statistic, refined.goodness.limit, refined.louder)],
+        "misfit": [_short(v) for v in (refined.goodness.statistic, refined.goodness.limit, refined.noise_variance)],
         "seconds": round(seconds, 3),
     }
     if right is not None and right.covariance is not None:
         numbers["distance"] = _short(_distance(right, numbers["truth"]))
     if mimics:
-        numbers["mimics"] = {cause.name: _short(cause.value) for cause in causes(refined)}
+        numbers["mimics"] = {cause.name: _short(cause.value) for cause in find_other_causes(refined)}
     return numbers
 
 
@@ -87,3 +87,21 @@ def _distance(candidate: Candidate, truth: dict[str, float]) -> float:
 
 def _short(value: float) -> float:
     return float(f"{value:.6g}")
+
+
+def baseline_rows(words: str, found: Sequence[Numbers], target: float) -> list[Row]:
+    """Show, over several baselines, what was detected and named, and how often the intervals hold."""
+    total, runs = sum(unit["of"] for unit in found), seen(found)
+    good = [run for run in runs if is_right(run)]
+    held = sum(low <= run["truth"][name] <= high for run in good for name, (_, low, high) in run["sizes"].items())
+    return [
+        (
+            words,
+            f"{len(found)}, {total}",
+            f"{sum(bool(unit['runs']) for unit in found)}",
+            f"{sum(unit['sequential'] for unit in found)}",
+            percent(len(runs), total),
+            percent(sum(map(is_named, runs)), total, low=target),
+            percent(held, len(good), low=0.92, high=0.98),
+        )
+    ]

@@ -13,11 +13,11 @@ from accuracy.draws import KINDS, SECONDS
 from accuracy.rig import FAULT_AT, SEEDS_PER_UNIT, baseline, loop
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import percent, seen, told
-from servoscope.diagnosis import UNKNOWN
-from servoscope.plants import FloatArray
+from servoscope.core.arrays import FloatArray
+from servoscope.detection.result import UNKNOWN
+from servoscope.models.discretise import discretise
 from servoscope.simulation import reference
-from servoscope.simulation.closed_loop import NOISE_U_STD, NOISE_Y_STD, noises, recorded
-from servoscope.simulation.discretise import discretise
+from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD, draw_noise, make_recording
 
 RUNS = 10  # per baseline
 UNITS = 5
@@ -79,7 +79,7 @@ def by_hand(
     made = loop()
     assert made.controller is not None, "the rig has a controller"
     plants = [discretise(p.state_space(), made.sample_rate) for p in (made.plant, made.plant.scaled(dict(ratios)))]
-    n_u, n_y = noises(len(r), NOISE_U_STD, NOISE_Y_STD, seed)
+    n_u, n_y = draw_noise(len(r), NOISE_U_STD, NOISE_Y_STD, seed)
     x, u, y = np.zeros(len(plants[0].c)), np.zeros(len(r)), np.zeros(len(r))
     integral, position = 0.0, 0.0
     for k in range(len(r)):
@@ -91,7 +91,7 @@ def by_hand(
         integral += (r[k] - y[k]) / made.sample_rate
         u[k] = made.controller.k_p * (r[k] - y[k]) + made.controller.k_i * integral
         x = plant.A @ x + plant.b_now * (u[k - later if ill else k] + n_u[k])
-    return recorded(made, r, u, y)
+    return make_recording(made, r, u, y)
 
 
 def job(seed: int, what: str, kind: str, runs: int = RUNS) -> Numbers:

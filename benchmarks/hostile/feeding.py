@@ -14,7 +14,7 @@ from typing import Any
 
 from hostile.damage import damaged
 from hostile.targets import Target, targets
-from servoscope.errors import MessageError, ServoscopeError
+from servoscope.core.errors import MessageError, ServoscopeError
 
 __all__ = ["fed", "feed_all", "markdown"]
 

@@ -21,7 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from tables import machine  # noqa: E402
 
 from hostile.feeding import feed_all, markdown  # noqa: E402
-from servoscope.output import atomic_write  # noqa: E402
+from servoscope.core.files import atomic_write  # noqa: E402
 
 RESULTS = BENCHMARKS / "hostile" / "results.json"
 PAGE = BENCHMARKS.parent / "docs" / "reliability.md"

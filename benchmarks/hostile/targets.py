@@ -13,27 +13,26 @@ from typing import Any
 import numpy as np
 
 from hostile.damage import refitted
-from servoscope import readers, writers
-from servoscope.alarms import AlarmSettings
-from servoscope.baseline import Baseline
-from servoscope.errors import MessageError
-from servoscope.learning import nominal
-from servoscope.live.asset import Asset, Following
-from servoscope.live.block import Block
-from servoscope.live.checkpoint import pack, unpack
-from servoscope.live.config import Config, DiagnosisSettings
-from servoscope.live.mqtt import payload, topics
-from servoscope.live.mqtt.publishing import PublishSettings
-from servoscope.live.opcua.following import block_of, single
-from servoscope.loop import Columns, Loop
-from servoscope.monitor import Monitor
-from servoscope.quality import QualitySettings
-from servoscope.recording import Recording
+from servoscope.core.errors import MessageError
+from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.learning.learn import nominal_baseline
+from servoscope.models.loop import Columns, Loop
+from servoscope.service.alarms import AlarmSettings
+from servoscope.service.asset import Asset, AssetPolicy
+from servoscope.service.checkpoint import pack_state, unpack_state
+from servoscope.service.config import DiagnosisSettings, ServiceFile
+from servoscope.service.mqtt import payload, topics
+from servoscope.service.mqtt.replay_client import ReplayClientSettings
+from servoscope.service.opcua.subscriptions import parse_block, parse_value
+from servoscope.service.sources.block import Block
+from servoscope.signals import Recording, readers, writers
+from servoscope.signals.quality import QualitySettings
 from servoscope.simulation import reference, simulate
 
 __all__ = ["Target", "targets"]
 
-LOOP = Path(__file__).parents[2] / "src/servoscope/examples/reference-rig.toml"
+LOOP = Path(__file__).parents[2] / "src/servoscope/simulation/reference-rig.toml"
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
 ROWS = 400
 SERVICE = """
@@ -104,7 +103,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
 
         def feed(data: bytes, _: random.Random, path: Path = path) -> str:
             path.write_bytes(data)
-            readers.channels(path)
+            readers.list_channels(path)
             readers.read(path, columns=Columns(time="time") if path.suffix == ".mf4" else None)
             return "read"
 
@@ -153,11 +152,11 @@ def _tdms(path: Path, columns: dict[str, Any]) -> None:
 
 
 def _settings(folder: Path, loop: Loop) -> list[Target]:
-    nominal(loop).save(folder / "good.json")
+    nominal_baseline(loop).save(folder / "good.json")
     files: tuple[tuple[str, bytes, str, Callable[[Path], object]], ...] = (
         ("loop file", LOOP.read_bytes(), "loop.toml", Loop.load),
-        ("service file", SERVICE.encode(), "service.toml", Config.load),
-        ("file for publish", PUBLISH.encode(), "publish.toml", PublishSettings.load),
+        ("service file", SERVICE.encode(), "service.toml", ServiceFile.load),
+        ("file for publish", PUBLISH.encode(), "publish.toml", ReplayClientSettings.load),
         ("baseline", (folder / "good.json").read_bytes(), "baseline.json", Baseline.load),
     )
     found = []
@@ -183,21 +182,21 @@ def _messages(recording: Recording) -> list[Target]:
     ]
 
     def binary(data: bytes, chance: random.Random) -> str:
-        payload.decode("press", refitted(data, chance))
+        payload.decode_block("press", refitted(data, chance))
         return "read"
 
     def text(data: bytes, _: random.Random) -> str:
-        payload.decode("press", data)
+        payload.decode_block("press", data)
         return "read"
 
     def ack(data: bytes, _: random.Random) -> str:
-        topics.ack_of(data)
+        topics.decode_ack(data)
         return "read"
 
     return [
-        Target("MQTT block, binary", [payload.encode(block, 3) for block in blocks], binary),
-        Target("MQTT block, JSON", [payload.to_json(block, 3) for block in blocks], text),
-        Target("MQTT acknowledgement", [topics.to_ack(5, 7)], ack),
+        Target("MQTT block, binary", [payload.encode_binary(block, 3) for block in blocks], binary),
+        Target("MQTT block, JSON", [payload.encode_json(block, 3) for block in blocks], text),
+        Target("MQTT acknowledgement", [topics.encode_ack(5, 7)], ack),
     ]
 
 
@@ -222,7 +221,7 @@ def _values() -> list[Target]:
         )
 
     def scalar(_: bytes, chance: random.Random) -> str:
-        single(told(chance.choice(CELLS), chance))
+        parse_value(told(chance.choice(CELLS), chance))
         return "read"
 
     def array(_: bytes, chance: random.Random) -> str:
@@ -231,7 +230,7 @@ def _values() -> list[Target]:
         for _ in range(chance.choice((0, 1, 1, 3))):
             cells[chance.randrange(len(cells))] = chance.choice(CELLS)
         cells = cells[: chance.choice((len(cells), len(cells), chance.randrange(len(cells))))]
-        block_of("press", told(cells if chance.random() < 0.95 else chance.choice(CELLS), chance))
+        parse_block("press", told(cells if chance.random() < 0.95 else chance.choice(CELLS), chance))
         return "read"
 
     return [Target("OPC UA value", [], scalar), Target("OPC UA array", [], array)]
@@ -239,8 +238,8 @@ def _values() -> list[Target]:
 
 def _asset(loop: Loop) -> Target:
     """Return an asset, fed with blocks that decoders let through; it must be able to store what it knows after each."""
-    baseline = nominal(loop)
-    how = Following(
+    baseline = nominal_baseline(loop)
+    how = AssetPolicy(
         DiagnosisSettings(window_s=10.0, every_s=60.0), QualitySettings(), AlarmSettings.model_validate({}), 2.0
     )
     asset = Asset("press", baseline, Monitor(baseline), how)
@@ -258,19 +257,19 @@ def _asset(loop: Loop) -> Target:
         elif what == "lost":
             number += chance.choice((1, 5, 10**6, 2**62))
         elif what == "clock":
-            t = np.clip(t + chance.choice((-1e9, -3600.0, -1.0, 1.0, 3600.0, 1e9, 2e11)), 0.0, payload.LATEST - 1.0)
+            t = np.clip(t + chance.choice((-1e9, -3600.0, -1.0, 1.0, 3600.0, 1e9, 2e11)), 0.0, payload.MAX_TIME_S - 1.0)
         elif what == "order":
             t = np.array(chance.sample(t.tolist(), n))
         elif what == "moment":
             t = np.full(n, t[0])
         elif what != "sound":
             signals[:, chance.randrange(n) :] = chance.choice(NUMBERS)
-        block = Block("press", min(number, payload.LARGEST), t, *signals)
-        before = None if asset.progress is None else asset.progress.counted
-        asset.take(block)
-        assert asset.progress is not None
-        unpack(pack(asset.progress), "press")
-        after = asset.progress.counted
+        block = Block("press", min(number, payload.MAX_COUNT), t, *signals)
+        before = None if asset.state is None else asset.state.position
+        asset.process(block)
+        assert asset.state is not None
+        unpack_state(pack_state(asset.state), "press")
+        after = asset.state.position
         if before is not None and after.blocks == before.blocks:
             if after.repeated != before.repeated + 1:
                 raise AssertionError("a block was left out, and not counted as repeated")

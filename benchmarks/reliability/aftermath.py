@@ -11,10 +11,10 @@ import sqlalchemy as sa
 from reliability.checks import NUMBERED, numbers_of, opened
 from reliability.fleet import BLOCK_S, Fleet
 from reliability.plc import BEGAN, tape
-from servoscope.live.checkpoint import unpack
-from servoscope.live.replay import Tape
-from servoscope.store import Store
-from servoscope.store.tables import audit
+from servoscope.service.checkpoint import unpack_state
+from servoscope.service.sources.replay import ReplayStream
+from servoscope.service.store import Store
+from servoscope.service.store.tables import audit
 
 __all__ = ["looked_at"]
 
@@ -43,8 +43,10 @@ def looked_at(fleet: Fleet, config: Path, sent: int, written: Mapping[str, set[i
         doubled += max(0, counted["blocks"] - expected)
         other += counted["digest"] != digest
         repeated += counted["repeated"]
-        numbers = [row["number"] for table in NUMBERED for row in store.rows(numbers_of(table, name))]
-        numbers += [window.number for window in unpack(rows[name]["state"], name).windows]  # still to be diagnosed
+        numbers = [row["number"] for table in NUMBERED for row in store.fetch(numbers_of(table, name))]
+        numbers += [
+            window.number for window in unpack_state(rows[name]["state"], name).pending_diagnoses
+        ]  # still to be diagnosed
         misnumbered += sorted(numbers) != list(range(1, counted["rows"] + 1))
     played = tape(fleet.folder)
     others = {
@@ -57,7 +59,7 @@ def looked_at(fleet: Fleet, config: Path, sent: int, written: Mapping[str, set[i
 
 
 def named(
-    store: Store, played: Tape, sent: Mapping[str, set[int]], rows: Mapping[str, Mapping[str, Any]]
+    store: Store, played: ReplayStream, sent: Mapping[str, set[int]], rows: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, int]:
     """Hold what the audit names as lost against what was sent, up to the last block that was stored.
 
@@ -85,7 +87,7 @@ def named(
 def told_lost(store: Store, asset: str) -> set[int]:
     """Return the numbers of all blocks that the audit names as lost."""
     found: set[int] = set()
-    for row in store.rows(sa.select(audit.c.document).where(audit.c.asset == asset, audit.c.what == "blocks lost")):
+    for row in store.fetch(sa.select(audit.c.document).where(audit.c.asset == asset, audit.c.what == "blocks lost")):
         document = row["document"]
         found.update(range(document["after"][1] + 1, document["before"][1]))
     return found

@@ -35,7 +35,7 @@ from reliability.plain import Plain  # noqa: E402
 from reliability.plc import Plc, names, node  # noqa: E402
 from reliability.run import PAGE, RESULTS, free_port  # noqa: E402
 from reliability.servers import Cable, Mosquitto, mosquitto  # noqa: E402
-from servoscope.output import atomic_write  # noqa: E402
+from servoscope.core.files import atomic_write  # noqa: E402
 
 LONGEST_S = 900.0  # until results are stored again
 AHEAD = 4  # blocks that the publisher keeps per asset

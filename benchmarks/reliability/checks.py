@@ -8,11 +8,11 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from reliability.fleet import Fleet
-from servoscope.live.assembling import assemble
-from servoscope.live.config import Config
-from servoscope.live.service import Service
-from servoscope.store import Store
-from servoscope.store.tables import diagnoses, recent, residuals, transitions
+from servoscope.service.build import build_components
+from servoscope.service.config import ServiceFile
+from servoscope.service.service import Service
+from servoscope.service.store import Store
+from servoscope.service.store.tables import diagnoses, recent, residuals, transitions
 
 __all__ = ["Found", "check"]
 
@@ -58,13 +58,13 @@ def check(fleet: Fleet, config: Path, compared: list[str]) -> Found:
         lost += max(0, blocks - counted["blocks"])
         duplicated += max(0, counted["blocks"] - blocks)
         other += counted["digest"] != digest
-        numbers = sorted(row["number"] for table in NUMBERED for row in store.rows(numbers_of(table, name)))
+        numbers = sorted(row["number"] for table in NUMBERED for row in store.fetch(numbers_of(table, name)))
         rows += len(numbers)
         misnumbered += len(set(range(1, counted["rows"] + 1)).symmetric_difference(numbers))
         misnumbered += len(numbers) - len(set(numbers))
     calm = fleet.config("calm", "calm.sqlite", "", compared, 0.0)
-    settings = Config.load(calm)
-    Service(settings, assemble(settings)).run()
+    settings = ServiceFile.load(calm)
+    Service(settings, build_components(settings)).run()
     again = opened(calm)
     different = sum(results(store, name) != results(again, name) for name in compared)
     for one in (store, again):
@@ -86,8 +86,8 @@ NUMBERED = (residuals, diagnoses, transitions)
 
 def opened(config: Path) -> Store:
     """Open the store of a service file."""
-    settings = Config.load(config)
-    return Store.open(settings.store.url, settings.folder, patience=10.0)
+    settings = ServiceFile.load(config)
+    return Store.open(settings.store.url, settings.folder, lock_timeout_s=10.0)
 
 
 def numbers_of(table: sa.Table, asset: str) -> sa.Select[tuple[int]]:
@@ -98,7 +98,7 @@ def numbers_of(table: sa.Table, asset: str) -> sa.Select[tuple[int]]:
 def results(store: Store, asset: str) -> list[object]:
     """Return all that is stored of an asset."""
     found: list[object] = [
-        store.rows(sa.select(table).where(table.c.asset == asset).order_by(*table.primary_key))
+        store.fetch(sa.select(table).where(table.c.asset == asset).order_by(*table.primary_key))
         for table in (*NUMBERED, recent)
     ]
     row = store.checkpoints([asset])[asset]

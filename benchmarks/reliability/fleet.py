@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from servoscope import writers
-from servoscope.baseline import Baseline
-from servoscope.learning import nominal
-from servoscope.live.replay import Tape
-from servoscope.loop import Loop
-from servoscope.readers import read
+from servoscope.detection.baseline import Baseline
+from servoscope.learning.learn import nominal_baseline
+from servoscope.models.loop import Loop
+from servoscope.service.sources.replay import ReplayStream
+from servoscope.signals import writers
+from servoscope.signals.readers import read
 from servoscope.simulation import FaultEvent, reference, simulate
 
-LOOP = Path(__file__).parents[2] / "src/servoscope/examples/reference-rig.toml"
+LOOP = Path(__file__).parents[2] / "src/servoscope/simulation/reference-rig.toml"
 MINUTES = 10  # of each recording
 LEAKS_AT = 300  # s into the recording with a fault
 BLOCK_S = 30.0  # of a block: of 200 assets, 40 times as fast, 267 come per second
@@ -62,10 +62,10 @@ class Fleet:
         loop = Loop.load(LOOP)
         r = reference("multisine", 60.0 * MINUTES, loop.sample_rate)
         for k in range(HEALTHY):
-            writers.write(self.folder / f"healthy-{k}.csv", simulate(loop, r, seed=k)[0])
+            writers.write_recording(self.folder / f"healthy-{k}.csv", simulate(loop, r, seed=k)[0])
         leak = [FaultEvent.parse(f"C_ie=1.2@{LEAKS_AT}")]
-        writers.write(self.folder / "leaky.csv", simulate(loop, r, faults=leak, seed=HEALTHY)[0])
-        nominal(loop).save(self.folder / "baseline.json")
+        writers.write_recording(self.folder / "leaky.csv", simulate(loop, r, faults=leak, seed=HEALTHY)[0])
+        nominal_baseline(loop).save(self.folder / "baseline.json")
 
     def config(self, name: str, store: str, listen: str, assets: list[str], speed: float) -> Path:
         """Write a service file."""
@@ -98,7 +98,7 @@ class Fleet:
         for name in self.names:
             files = tuple(self.files(name))
             if files not in known:
-                tape = Tape(tuple(recordings[file] for file in files), round(BLOCK_S * loop.sample_rate), False)
+                tape = ReplayStream(tuple(recordings[file] for file in files), round(BLOCK_S * loop.sample_rate), False)
                 blocks = samples = digest = 0
                 while (block := tape.block(name, blocks, began)) is not None:
                     blocks, samples, digest = blocks + 1, samples + block.t.size, block.digest(digest)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from reliability.fleet import BLOCK_S, Fleet
 from reliability.plc import BEGAN, tape
-from servoscope.broker import BrokerSettings, reach
-from servoscope.live.mqtt import payload, topics
+from servoscope.service.mqtt import payload, topics
+from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
 
 __all__ = ["Plain"]
 
@@ -19,7 +19,7 @@ class Plain:
 
     def __init__(self, fleet: Fleet, port: int) -> None:
         self._tape = tape(fleet.folder)
-        self._client = reach(BrokerSettings(host="127.0.0.1", port=port), Path(), "plain")
+        self._client = create_mqtt_client(BrokerSettings(host="127.0.0.1", port=port), Path(), "plain")
         self._client.connect_async("127.0.0.1", port, keepalive=5)
         self._client.loop_start()
         self._over, self._every = threading.Event(), BLOCK_S / fleet.speed
@@ -31,7 +31,7 @@ class Plain:
         while not self._over.wait(self._every):
             block = self._tape.block("plain", self.sent, BEGAN)
             assert block is not None
-            self._client.publish(topics.data("servoscope", "plain"), payload.encode(block), qos=1)
+            self._client.publish(topics.data_topic("servoscope", "plain"), payload.encode_binary(block), qos=1)
             self.sent += 1
 
     def close(self) -> None:

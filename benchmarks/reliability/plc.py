@@ -20,10 +20,10 @@ if __name__ == "__main__":
     sys.path[0] = str(BENCHMARKS)
 
 from reliability.fleet import BLOCK_S, LOOP  # noqa: E402
-from servoscope.live.block import Block  # noqa: E402
-from servoscope.live.replay import Tape  # noqa: E402
-from servoscope.loop import Loop  # noqa: E402
-from servoscope.readers import read  # noqa: E402
+from servoscope.models.loop import Loop  # noqa: E402
+from servoscope.service.sources.block import Block  # noqa: E402
+from servoscope.service.sources.replay import ReplayStream  # noqa: E402
+from servoscope.signals.readers import read  # noqa: E402
 
 __all__ = ["BEGAN", "Plc", "names", "node", "tape"]
 
@@ -41,10 +41,10 @@ def node(name: str) -> str:
     return f"ns=2;s={name}.block"
 
 
-def tape(folder: Path) -> Tape:
+def tape(folder: Path) -> ReplayStream:
     """Return what is measured, over and over."""
     loop = Loop.load(LOOP)
-    return Tape((read(folder / "healthy-0.csv", loop),), round(BLOCK_S * loop.sample_rate), True)
+    return ReplayStream((read(folder / "healthy-0.csv", loop),), round(BLOCK_S * loop.sample_rate), True)
 
 
 class Plc:

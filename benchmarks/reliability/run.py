@@ -35,9 +35,9 @@ from reliability.checks import check  # noqa: E402
 from reliability.fleet import BLOCK_S, Fleet  # noqa: E402
 from reliability.servers import Postgres, programs  # noqa: E402
 from reliability.trial import Disturbance, Measured, Trial, quantile  # noqa: E402
-from servoscope.live import logs  # noqa: E402
-from servoscope.live.metrics import SECONDS  # noqa: E402
-from servoscope.output import atomic_write  # noqa: E402
+from servoscope.core.files import atomic_write  # noqa: E402
+from servoscope.service import log  # noqa: E402
+from servoscope.service.metrics import BUCKETS_S  # noqa: E402
 
 RESULTS = BENCHMARKS / "reliability" / "results"
 PAGE = BENCHMARKS.parent / "docs" / "reliability.md"
@@ -219,7 +219,7 @@ def column(one: dict[str, Any]) -> list[tuple[str, str]]:
         times = [time for name, each in one["recoveries"].items() if name in names for time in each]
         rows.append((words, f"{len(times)}, {max(times):.1f} s" if times else "none"))
     p50, p99 = latency["undisturbed"]["p50"], latency["undisturbed"]["p99"]
-    of = [f"{x:.2g} s" if math.isfinite(x) else f"over {SECONDS[-1]:g} s" for x in (p50, p99)]
+    of = [f"{x:.2g} s" if math.isfinite(x) else f"over {BUCKETS_S[-1]:g} s" for x in (p50, p99)]
     rows.append(("latency undisturbed, p50 and p99", ", ".join(of)))
     rows.append(("memory, growth", f"{memory['late_mb']:.0f} MB, {100.0 * growth:+.1f} % in {memory['over_s']:.0f} s"))
     return rows
@@ -237,7 +237,7 @@ def main() -> None:
     given = command.parse_args()
     if strange := set(given.names) - set(TRIALS):
         command.error(f"{min(strange)}: no such trial, choose from {', '.join(TRIALS)}")
-    logs.set_up("error")
+    log.set_up_logging("error")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # disks are unmounted and servers stopped then
     if given.names or not given.render:
         for name in given.names or TRIALS:

@@ -31,13 +31,13 @@ WARM_S = 5.0
 HEAD = b"event: assets\ndata: "
 STATUS = {
     "verdict": "healthy",
-    "summary": "Healthy: no change that would have shown here (p_s 1.61 %, C_ie 2.29 %, beta 110 %, b_p 112 % on).",
+    "summary": "Healthy: no change found. This recording would have shown changes of p_s by 1.61 % or more.",
     "since": 1.79e9,
     "onset": None,
     "examined": 1.79e9,
     "ne107": "good",
     "reasons": [],
-    "quality": [],
+    "quality": {},
     "alarms": {},
     "awaited": [],
     "level": 0.0,
@@ -63,7 +63,7 @@ STATUS = {
 
 def write(path: str, assets: int, seconds: float, answer: Any) -> None:
     """Write a commit twice a second; the statistic of each asset moves. Answer when each was begun, and made."""
-    from servoscope.store import Batch, Store
+    from servoscope.service.store import Batch, Store
 
     store, rng = Store.open(path, write=True), np.random.default_rng(1)
     begun, state, made = time.monotonic(), b"x" * 8000, {}

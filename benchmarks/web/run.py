@@ -33,7 +33,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from playwright.sync_api import Browser, Page, sync_playwright  # noqa: E402
 from tables import machine  # noqa: E402
 
-from servoscope.output import atomic_write  # noqa: E402
+from servoscope.core.files import atomic_write  # noqa: E402
 from web import store  # noqa: E402
 
 RESULTS = BENCHMARKS / "web" / "results.json"
@@ -55,7 +55,7 @@ EventSource.prototype.addEventListener = function (kind, told) {
   listen.call(this, kind, (event) => { window.heard += kind.startsWith("asset") ? 1 : 0; told(event); });
 };
 """
-SERVE = "import sys, servoscope.web.hub as hub; hub.EVERY_S /= {speed}; from servoscope.cli import main; main()"
+SERVE = "import sys, servoscope.web.event_hub as hub; hub.EVERY_S /= {speed}; from servoscope.cli import main; main()"
 
 
 READ = """

@@ -19,16 +19,16 @@ from typing import Any
 BENCHMARKS = Path(__file__).resolve().parent.parent
 sys.path[0] = str(BENCHMARKS)
 
-from servoscope import writers  # noqa: E402
-from servoscope.learning import nominal  # noqa: E402
-from servoscope.live.assembling import assemble  # noqa: E402
-from servoscope.live.config import Config  # noqa: E402
-from servoscope.live.service import Service  # noqa: E402
-from servoscope.loop import Loop  # noqa: E402
+from servoscope.learning.learn import nominal_baseline  # noqa: E402
+from servoscope.models.loop import Loop  # noqa: E402
+from servoscope.service.build import build_components  # noqa: E402
+from servoscope.service.config import ServiceFile  # noqa: E402
+from servoscope.service.service import Service  # noqa: E402
+from servoscope.service.store import Batch, Store  # noqa: E402
+from servoscope.signals import writers  # noqa: E402
 from servoscope.simulation import FaultEvent, reference, simulate  # noqa: E402
-from servoscope.store import Batch, Store  # noqa: E402
 
-LOOP = BENCHMARKS.parent / "src/servoscope/examples/reference-rig.toml"
+LOOP = BENCHMARKS.parent / "src/servoscope/simulation/reference-rig.toml"
 GROUPS = 8
 FAULTY = 25  # every so-manieth asset has the fault
 FILE = "hall.sqlite"
@@ -38,10 +38,10 @@ def prepare(folder: Path) -> None:
     """Follow a healthy and a faulty asset for two minutes, and keep their statuses."""
     loop = Loop.load(LOOP)
     r = reference("multisine", 120.0, loop.sample_rate)
-    nominal(loop).save(folder / "baseline.json")
-    writers.write(folder / "healthy.csv", simulate(loop, r, seed=1)[0])
+    nominal_baseline(loop).save(folder / "baseline.json")
+    writers.write_recording(folder / "healthy.csv", simulate(loop, r, seed=1)[0])
     leak = [FaultEvent.parse("C_ie=1.2@60")]
-    writers.write(folder / "leaky.csv", simulate(loop, r, faults=leak, seed=2)[0])
+    writers.write_recording(folder / "leaky.csv", simulate(loop, r, faults=leak, seed=2)[0])
     assets = "".join(
         f'[assets.{name}]\nbaseline = "baseline.json"\nsource = "line"\nfiles = ["{name}.csv"]\n'
         for name in ("healthy", "leaky")
@@ -52,8 +52,8 @@ def prepare(folder: Path) -> None:
         f'[sources.line]\nkind = "replay"\nspeed = 0\n{assets}',
         encoding="utf-8",
     )
-    settings = Config.load(config)
-    Service(settings, assemble(settings)).run()
+    settings = ServiceFile.load(config)
+    Service(settings, build_components(settings)).run()
     store = Store.open("two.sqlite", folder)
     found = {name: row["status"] for name, row in store.statuses(["healthy", "leaky"]).items()}
     store.close()

@@ -1,0 +1,1 @@
+"""Benchmarks that anyone can repeat: official protocols and metrics, servoscope beside simple detectors."""

@@ -1,0 +1,105 @@
+"""Cranfield ball screw with seeded faults: servoscope beside three simple detectors, in the same run.
+
+    python benchmarks/public/cranfield.py [--data DIR] [--load 40] [--json]
+
+Per load, each detector learns from healthy runs 1 to 5, or from the odd ones, and judges the other five healthy runs
+and all runs of all faults. Its limit comes from the healthy runs that it learned from. False: healthy runs above the
+limit. Found: faulty runs above it. Rank: faulty runs above the worst healthy one, whatever the limit is.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from tables import Table, parse_with_data, parser, show
+
+import servoscope as ss
+from public.servoscope_detector import OURS, ROOT, servoscope_scores
+from public.simple_detectors import detectors, judge
+
+LOADS = ("20", "40", "-40")
+FAULTS = (
+    "backlash1",
+    "backlash2",
+    "lackLubrication1",
+    "lackLubrication2",
+    "spalling1",
+    "spalling3",
+    "spalling5",
+    "spalling7",
+)
+FOLDS = {"runs 1 to 5": (1, 2, 3, 4, 5), "odd runs": (1, 3, 5, 7, 9)}
+CYCLE_S, CUTOFF_HZ = 12.96, 1.0
+
+
+def runs(data: Path, loop: ss.Loop, name: str, load: str) -> list[ss.Recording]:
+    """Return the runs of a file at a load."""
+    folder = data / "real" / "cranfield"
+    path = next(path for path in (folder / f"{name}.csv", folder / f"{name}.parquet") if path.is_file())
+    return ss.read_parts(path, loop, where={"load": load}, by="run")
+
+
+def main() -> None:
+    """Run the command line of this process."""
+    command = parser(__doc__)
+    command.add_argument("--load", choices=LOADS, action="append", help="only this load [kgf]")
+    given = parse_with_data(command, "real/cranfield")
+    loop, loads = ss.Loop.load(ROOT / "examples" / "cranfield.toml"), given.load or LOADS
+    values: dict[str, str] = {}
+    rows, faults = [], []
+    for fold, chosen in FOLDS.items():
+        counts: dict[str, list[int]] = {}
+        of_fault: dict[tuple[str, str], list[int]] = {}
+        for load in loads:
+            normal = runs(given.data, loop, "normal", load)
+            healthy = [normal[k - 1] for k in chosen]
+            held_out = [run for k, run in enumerate(normal, start=1) if k not in chosen]
+            faulty = [(name, run) for name in FAULTS for run in runs(given.data, loop, name, load)]
+            judged = [*held_out, *(run for _, run in faulty)]
+            scores = {OURS: servoscope_scores(loop, healthy, judged)}
+            scores |= {one.name: judge(one, healthy, judged) for one in detectors(CYCLE_S, CUTOFF_HZ)}
+            for name, (limit, largest) in scores.items():
+                normal_scores, fault_scores = largest[: len(held_out)], largest[len(held_out) :]
+                false = sum(score > limit for score in normal_scores)
+                found = sum(score > limit for score in fault_scores)
+                ranked = sum(score > max(normal_scores) for score in fault_scores)
+                kept = counts.setdefault(name, [0, 0, 0, 0, 0])
+                counts[name] = [
+                    a + b for a, b in zip(kept, (false, len(held_out), found, ranked, len(faulty)), strict=True)
+                ]
+                for (fault, _), score in zip(faulty, fault_scores, strict=True):
+                    both = of_fault.setdefault((fault, name), [0, 0])
+                    both[0], both[1] = both[0] + (score > limit), both[1] + 1
+                if name == OURS and fold == "runs 1 to 5":
+                    values[f"{load}.false"] = f"{false} of {len(held_out)}"
+                    values[f"{load}.worst"] = f"{max(normal_scores) / limit:.2f}"
+                    for fault in FAULTS:
+                        at = [
+                            score > limit for (one, _), score in zip(faulty, fault_scores, strict=True) if one == fault
+                        ]
+                        values[f"{load}.{fault}"] = f"{sum(at)} of {len(at)}"
+        for name, (false, normal_count, found, ranked, faulty_count) in counts.items():
+            rows.append(
+                (fold, name, f"{false} of {normal_count}", f"{found} of {faulty_count}", f"{ranked} of {faulty_count}")
+            )
+        names = list(counts)
+        for fault in FAULTS:
+            faults.append((fold, fault, *("{} of {}".format(*of_fault[fault, name]) for name in names)))
+    heads = ("learned from", "detector", "false", "found", "above the worst healthy run")
+    note = (
+        "Loads of 20, 40 and -40 kgf together, five healthy runs held out at each."
+        if not given.load
+        else (f"At {' and '.join(given.load)} kgf, five healthy runs held out.")
+    )
+    tables = [
+        Table("Cranfield: detectors", note, heads, tuple(rows)),
+        Table("Cranfield: faults", "Faulty runs above the limit.", ("learned from", "fault", *names), tuple(faults)),
+    ]
+    show(tables, given.json, values)
+
+
+if __name__ == "__main__":
+    main()
