@@ -107,6 +107,30 @@ def test_friction_is_never_a_reason_to_refuse() -> None:
     assert delay_s is None and all("cannot" in str(note) or "do not tell" in str(note) for note in notes)
 
 
+def test_a_slower_plant_is_no_delay() -> None:
+    """Nothing known of an axis of order 3, smooth motion: its highest coefficient and a delay are all but the same.
+
+    Least squares found a tenth of the coefficient, which the prior then held, and healthy recordings were refused.
+    """
+    made, told = smooth.machine("axis-3-unknown"), smooth.loop_file("axis-3-unknown")
+    r = smooth.motion("moves and rests", smooth.SECONDS, made.sample_rate, 5)
+    noise = 0.1 * smooth.NOISE_SHARE
+    healthy, _ = simulate(made, r, noise_u_std=0.1 * noise, noise_y_std=noise * float(r.std()), seed=5)
+    assert check_delay(told, [healthy])[0] is None
+
+
+def test_a_delay_that_is_certain_but_rough_is_told_with_its_interval() -> None:
+    """Two samples late under slow moves: there is a delay, of one sample or of three."""
+    loop = smooth.machine("axis-2")
+    late = loop.model_copy(update={"delay": 2.0 / loop.sample_rate})
+    r = smooth.motion("moves", smooth.SECONDS, loop.sample_rate, 3)
+    noise = 0.1 * smooth.NOISE_SHARE
+    recording, _ = simulate(late, r, noise_u_std=0.1 * noise, noise_y_std=noise * float(r.std()), seed=3)
+    delay_s, (note,) = check_delay(loop, [recording])
+    assert delay_s is None and note.key == "learning.delay_rough"
+    assert note.values["low_ms"] < 1e3 * late.delay < note.values["high_ms"]
+
+
 def test_inspect_advises_no_delay_that_noise_fakes() -> None:
     loop = smooth.machine("rig")
     r = smooth.motion("moves", 60.0, loop.sample_rate, 7)

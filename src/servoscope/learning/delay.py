@@ -18,8 +18,9 @@ from servoscope.signals import Recording
 
 TOLERANCE = 0.3  # rad at the filter's cutoff, beyond which a recording is refused: half a sample at f_s = 10 cutoff
 NOTED = 0.06  # rad; an inverse that is too simple moves the estimate a little, so this is only said
-KNOWN = 0.1  # rad; a delay whose standard deviation is larger is not told
+KNOWN = 0.1  # rad; a delay whose standard deviation is larger is not told: setting it might be as wrong as TOLERANCE
 SIGNIFICANT = 0.1  # share of the residual variance below which a regression's delay is not mentioned
+NORMAL_95 = 1.96  # standard deviations, half of a 95 % interval
 WRITTEN = ".4g"  # how a delay is written into the loop file, as the message has it
 
 
@@ -30,7 +31,8 @@ def check_delay(
 
     One sample at 100 Hz that the model does not know costs 63 % at 10 Hz (THEORY section 6), so half of it matters.
     Only the likelihood of y can refuse: least squares with noise in its regressors dates y late, by a sample or more
-    under smooth motion. Where the likelihood cannot be written down, as with friction, nothing is refused.
+    under smooth motion. Where the likelihood cannot be written down, as with friction, nothing is refused; nor where
+    it tells that there is a delay, but not closely enough to set it.
 
     The delay is None where the recordings do not show it; the messages are warnings. `accept` turns a refusal into one.
     """
@@ -44,12 +46,19 @@ def check_delay(
     fit = fit_delay(loop, recording, g)
     if fit is None or not fit.white:
         return _unverified(loop, recording, regression, to_rad)
-    if to_rad * fit.std_s > KNOWN and not fit.significant:
-        return None, [message("learning.delay_unknown")]
+    if to_rad * fit.std_s > KNOWN:
+        return None, [_delay_rough(loop, recording, fit) if fit.significant else message("learning.delay_unknown")]
     off = to_rad * abs(fit.seconds - loop.delay)
     if off < NOTED or not fit.significant:
         return fit.seconds, []
     return fit.seconds, [_out_of_step(loop, recording, fit, off > TOLERANCE and not accept)]
+
+
+def _delay_rough(loop: Loop, recording: Recording, fit: DelayFit) -> Message:
+    """Return the warning about a delay that is certainly another one, without which one: no remedy can be given."""
+    low, high = (1e3 * (fit.seconds + way * NORMAL_95 * fit.std_s) for way in (-1.0, 1.0))
+    values = {"recording": recording.name, "configured_s": loop.delay, "low_ms": max(low, 0.0), "high_ms": high}
+    return message("learning.delay_rough", **values)
 
 
 def _out_of_step(loop: Loop, recording: Recording, fit: DelayFit, refuse: bool) -> Message:

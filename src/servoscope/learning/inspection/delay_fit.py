@@ -28,7 +28,7 @@ from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
 PRIOR = 0.3  # standard deviation of the logarithm of a parameter that the loop file gives
-VAGUE = 1.0  # and of a coefficient that least squares found, noise in its regressors included
+VAGUE = 3.0  # and of a coefficient that least squares found: noise in its regressors may have made it a tenth
 NOISE_PRIOR = 3.0  # of the logarithm of the ratio of the noises
 USUAL = 1e-3  # noise on u, of its standard deviation, at which the search begins
 QUIETEST = 1e-9  # noise on y, of its standard deviation: what is quieter was simulated without any
