@@ -73,7 +73,8 @@ def run(chosen: Sequence[Scenario], share: float, workers: int) -> None:
             for future in as_completed(waiting):
                 found[waiting[future]] = future.result()
                 progress.advance(everything)
-            keep(scenario, share, workers, time.perf_counter() - start, [found[seed] for seed in sorted(found)])
+                # after each unit: what was measured until a run is stopped counts
+                keep(scenario, share, workers, time.perf_counter() - start, [found[seed] for seed in sorted(found)])
 
 
 def keep(scenario: Scenario, share: float, workers: int, seconds: float, found: Sequence[Numbers]) -> None:

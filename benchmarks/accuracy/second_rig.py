@@ -16,6 +16,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.detection.expectation import Expectation, reference_path
 from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.estimation.noise_model import largest_autocorrelation
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.simulation import FaultEvent, reference
 
@@ -92,8 +93,7 @@ def residual(learned: ss.Baseline, recording: ss.Recording) -> FloatArray:
 
 def largest(e: FloatArray) -> float:
     """Return the largest autocorrelation [standard deviations]."""
-    each = [abs(float(e[:-lag] @ e[lag:])) for lag in range(1, LAGS + 1)]
-    return float(f"{max(each) / float(e @ e) * np.sqrt(len(e)):.4g}")
+    return float(f"{largest_autocorrelation(e, LAGS) * np.sqrt(len(e)):.4g}")
 
 
 def parameters(words: str, found: Sequence[Numbers]) -> list[Row]:

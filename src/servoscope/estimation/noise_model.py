@@ -113,6 +113,12 @@ def sample_autocovariance(runs: Sequence[FloatArray], lags: int) -> FloatArray:
     return np.array(products) / total
 
 
+def largest_autocorrelation(e: FloatArray, lags: int) -> float:
+    """Return the largest autocorrelation of innovations (N,) at lags 1 ... lags, without its sign."""
+    gamma = sample_autocovariance([e], lags)
+    return float(np.abs(gamma[1:]).max() / gamma[0])
+
+
 def yule_walker(gamma: FloatArray) -> ArmaNoise:
     """Return the autoregression with an autocovariance (p + 1,) at lags 0 ... p.
 

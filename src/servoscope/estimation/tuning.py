@@ -72,6 +72,18 @@ def sandwich_covariance(G: FloatArray, X: FloatArray, size: FloatArray) -> Float
     return np.asarray(G @ X @ G.T / np.outer(size, size))
 
 
+def sum_covariance(score: FloatArray, lags: int) -> FloatArray:
+    """Return the covariance of the sum of correlated rows (N, k), which hardly know each other beyond some lags.
+
+    Newey and West (1987).
+    """
+    X = score.T @ score
+    for lag in range(1, lags + 1):
+        G = score[:-lag].T @ score[lag:]
+        X += (1.0 - lag / (lags + 1)) * (G + G.T)
+    return np.asarray(X)
+
+
 def prefers_white_noise(runs: Sequence[FloatArray], noises: WhiteNoiseFit, free: ArmaNoise) -> bool:
     """Return whether white noises explain residuals better than an autoregression, by Schwarz' criterion (1978).
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.plant_fit import PRIOR
-from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.estimation.tuning import sandwich_covariance
+from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
+from servoscope.estimation.tuning import sandwich_covariance, sum_covariance
 from servoscope.isolation.ml.kernels import Array
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.models.loop import Loop
@@ -157,26 +157,18 @@ class _InnovationSearch:
 
     def _describe(self, z: FloatArray, J: FloatArray) -> InnovationFit:
         e, _ = self._standardised(z)
-        power = float(e @ e)
-        largest = max(abs(float(e[:-lag] @ e[lag:])) for lag in range(1, LAGS + 1))
-        whiteness = largest / power * math.sqrt(self.samples)
+        largest = largest_autocorrelation(e, LAGS)
+        whiteness = largest * math.sqrt(self.samples)
         C: FloatArray = np.asarray(np.linalg.inv(J.T @ J))
         if whiteness > COLOURED:
             C = _inflate(C, J, self.residual(z), self.samples)
-        level = math.sqrt(power / self.samples)
-        return InnovationFit(self.names, z[:-1], C[:-1, :-1], self._noise(z).times(level), largest / power, whiteness)
+        level = math.sqrt(float(e @ e) / self.samples)
+        return InnovationFit(self.names, z[:-1], C[:-1, :-1], self._noise(z).times(level), largest, whiteness)
 
 
 def _inflate(C: FloatArray, J: FloatArray, e: FloatArray, N: int) -> FloatArray:
-    """Return the covariance with each standard deviation that of correlated innovations, where that is larger.
-
-    The variance of the score's sum is that of Newey and West (1987).
-    """
-    score = J[:N] * e[:N, None]
-    X = score.T @ score
-    for lag in range(1, LAGS + 1):
-        G = score[:-lag].T @ score[lag:]
-        X += (1.0 - lag / (LAGS + 1)) * (G + G.T)
+    """Return the covariance with each standard deviation that of correlated innovations, where that is larger."""
+    X = sum_covariance(J[:N] * e[:N, None], LAGS)
     robust = sandwich_covariance(C, X + J[N:].T @ J[N:], np.ones(len(C)))
     factor = np.sqrt(np.maximum(np.diag(robust) / np.diag(C), 1.0))
     return np.asarray(C * np.outer(factor, factor))

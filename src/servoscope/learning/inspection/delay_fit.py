@@ -16,7 +16,8 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.estimation.filter_bank import filter_cutoff
-from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
+from servoscope.estimation.tuning import sum_covariance
 from servoscope.isolation.ml.predictor import LONGEST, PredictorFactory
 from servoscope.isolation.ml.window import plant_input
 from servoscope.learning.inspection.delay import LATEST, LATEST_S
@@ -184,7 +185,7 @@ class DelaySearch:
             seconds=float(best.z[-1]) / rate,
             std_s=std * math.sqrt(inflation) / rate,
             ratio=max(null - best.cost, 0.0) / inflation,
-            largest_autocorrelation=_largest_autocorrelation(best.residual[: len(self.rows)]),
+            largest_autocorrelation=largest_autocorrelation(best.residual, LAGS),
             search=self,
         )
 
@@ -290,7 +291,7 @@ class DelaySearch:
         The innovations bend where the delay passes a whole sample, and a search may be stuck beside the bend.
         """
         end = self._fit(start.z, STEPS, held=False)
-        if not np.isfinite(end.cost) or _largest_autocorrelation(end.residual) < WHITE:
+        if not np.isfinite(end.cost) or largest_autocorrelation(end.residual, LAGS) < WHITE:
             return end
         whole = self._fit(np.append(end.z[:-1], round(end.z[-1])), STEPS, held=True)
         return min(end, self._fit(whole.z, STEPS, held=False), key=lambda each: each.cost)
@@ -298,8 +299,7 @@ class DelaySearch:
     def _delay_std(self, at: _Point) -> tuple[float, float]:
         """Return the standard deviation of the delay [samples], and by how much correlation inflates its variance.
 
-        The score of the delay, the others projected out, has the variance of its sum over blocks (Newey and West,
-        1987, for the general case) where the innovations are not white.
+        What counts is the score of the delay, the others projected out.
         """
         J = self._jacobian(at, held=False)
         _, H = self._normal(at, J)
@@ -307,10 +307,7 @@ class DelaySearch:
         own = J @ C[:, -1] / C[-1, -1]
         weight = len(at.residual) / float(at.residual @ at.residual)
         score = own * at.residual * weight
-        lags = np.arange(1, LAGS + 1)
-        each = np.array([float(score[:-lag] @ score[lag:]) for lag in lags])
-        naive = weight * float(own @ own)
-        robust = float(score @ score) + 2.0 * float(((1.0 - lags / (LAGS + 1)) * each).sum())
+        naive, robust = weight * float(own @ own), float(sum_covariance(score[:, None], LAGS)[0, 0])
         return math.sqrt(max(float(C[-1, -1]), 0.0)) or math.inf, max(robust / max(naive, 1e-300), 1.0)
 
 
@@ -319,8 +316,3 @@ def _white_noise_std(y: FloatArray, restart: BoolArray) -> float:
     jumps = np.diff(y, 2)[~restart[2:]]
     guess = float(np.median(np.abs(jumps))) / (0.6745 * math.sqrt(6.0)) if jumps.size else 0.0
     return max(guess, QUIETEST * float(y.std()))
-
-
-def _largest_autocorrelation(e: FloatArray) -> float:
-    power = float(e @ e)
-    return max(abs(float(e[:-lag] @ e[lag:])) / power for lag in range(1, LAGS + 1))
