@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 
 import servoscope as ss
 from servoscope.core.errors import RecordingError
+from servoscope.estimation.instrumental_fit import fit_with_instrument
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.estimation.tuning import least_squares
 from servoscope.learning.instrument import source_of
@@ -107,6 +108,20 @@ def test_a_closed_loop_takes_its_reference() -> None:
     assert learned.instrument is not None and learned.instrument.source == "reference"
     std = np.sqrt(np.diag(learned.covariance_array()))
     assert np.all(np.abs(np.array(learned.theta) - [8.0, 2.0]) < 3.0 * std)
+
+
+def test_an_instrument_from_r_does_not_know_the_noise_that_it_meets() -> None:
+    """Short, quiet moves at 0 dB: a model r -> y that was fitted to the same noise was wrong by four deviations."""
+    monitor = {"cutoff": 3.0, "memory": 20.0}
+    loop = ss.Loop.from_dict({"sample_rate": RATE, "plant": {"kind": "polynomial", "order": 2}, "monitor": monitor})
+    pipeline, off = Pipeline.of(loop), []
+    for seed in range(4, 10):
+        recording = noisy_output.drive(seed, "reference", 0, "moves").part(0.0, 45.0)
+        found = fit_with_instrument(pipeline, [recording], "reference", np.zeros(2))
+        assert found is not None
+        inertia, std = found.fit.tuning.theta[1], np.sqrt(found.fit.covariance[1, 1])
+        off.append((inertia - noisy_output.TRUE["reference"][1]) / std)
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
 
 
 def test_a_u_that_answers_the_noise_is_no_source() -> None:

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 import servoscope as ss
+from accuracy import smooth
 from accuracy.rig import SEEDS_PER_UNIT
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from servoscope.core.arrays import FloatArray
@@ -79,16 +80,19 @@ def pitch_job(seed: int, turbulence: float) -> Numbers:
     return found
 
 
-def motion(seed: int) -> FloatArray:
-    """Return random motion of variance one below 1 Hz, shape (N,)."""
+def motion(seed: int, kind: str) -> FloatArray:
+    """Return motion of variance one, shape (N,): random below 1 Hz, or moves of the least jerk."""
+    if kind == "moves":
+        r = smooth.motion(kind, SECONDS, RATE, seed)
+        return np.asarray((r - r.mean()) / r.std())
     a = np.exp(-2.0 * np.pi / RATE)
     slow = lfilter([1.0], np.poly([a, a, a]), np.random.default_rng(seed).normal(size=round(SECONDS * RATE) + 2000))
     return np.asarray(slow[2000:] / slow[2000:].std())
 
 
-def drive(seed: int, source: str, level_db: float) -> ss.Recording:
+def drive(seed: int, source: str, level_db: float, kind: str = "random") -> ss.Recording:
     """Return a pitch drive whose command is u, or an axis behind a P controller that answers the noise of y."""
-    command, open_loop = motion(seed), source == "input"
+    command, open_loop = motion(seed, kind), source == "input"
     lines = [[0.0, 1.0, 0.0], [-W * W, -2.0 * XI * W, W * W]] if open_loop else [[0.0, 1.0, 0.0], [0.0, -4.0, 0.5]]
     exact, x = expm(np.vstack([lines, np.zeros(3)]) / RATE), np.zeros(2)
     n = 10.0 ** (-level_db / 20.0) * np.random.default_rng(10_000 + seed).normal(size=len(command))
@@ -100,11 +104,11 @@ def drive(seed: int, source: str, level_db: float) -> ss.Recording:
     return clean(np.arange(len(n)) / RATE, u if open_loop else command, u, y, name=f"{seed}", sample_rate=RATE)
 
 
-def bias_job(seed: int, source: str, level_db: float) -> Numbers:
+def bias_job(seed: int, source: str, level_db: float, kind: str = "random") -> Numbers:
     """Learn one recording; errors and stated deviations are relative."""
     plant = {"kind": "polynomial", "order": 2, "stiffness": source == "input"}
     loop = ss.Loop.from_dict({"sample_rate": RATE, "plant": plant, "monitor": {"cutoff": 3.0, "memory": 20.0}})
-    learned = ss.learn(loop, [drive(2_000_000 + seed, source, level_db)])
+    learned = ss.learn(loop, [drive(2_000_000 + seed, source, level_db, kind)])
     true = np.array(TRUE[source])
     return {
         "error": (np.array(learned.theta) / true - 1.0).tolist(),
@@ -155,12 +159,14 @@ PITCH = tuple(
     Scenario(f"pitch/{level:g}", f"{level:g} times the turbulence", 25, pitch_job, (level,), pitch_rows)
     for level in TURBULENCE
 )
+SOURCES = {"input": "u is the command", "reference": "closed loop, r"}
 BIAS = tuple(
     Scenario(
-        f"noisy/{source}-{level}", f"{words}, {level} dB", 40, bias_job, (source, level),
+        f"noisy/{prefix}{source}-{level}", f"{words}{more}, {level} dB", 40, bias_job, (source, level, kind),
         functools.partial(bias_rows, source),
     )
-    for source, words in (("input", "u is the command"), ("reference", "closed loop, r"))
+    for kind, prefix, more in (("random", "", ""), ("moves", "moves-", ", moves"))
+    for source, words in SOURCES.items()
     for level in LEVELS_DB
 )  # fmt: skip
 TABLES = (

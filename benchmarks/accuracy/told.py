@@ -93,6 +93,7 @@ def baseline_rows(words: str, found: Sequence[Numbers], target: float) -> list[R
     """Show, over several baselines, what was detected and named, and how often the intervals hold."""
     total, runs = sum(unit["of"] for unit in found), seen(found)
     good = [run for run in runs if is_right(run)]
+    missed = [_missed(run) for unit in found for run in unit["runs"] if run not in runs or not is_named(run)]
     held = sum(low <= run["truth"][name] <= high for run in good for name, (_, low, high) in run["sizes"].items())
     return [
         (
@@ -102,6 +103,15 @@ def baseline_rows(words: str, found: Sequence[Numbers], target: float) -> list[R
             f"{sum(unit['sequential'] for unit in found)}",
             percent(len(runs), total),
             percent(sum(map(is_named, runs)), total, low=target),
+            "; ".join(missed),
             percent(held, len(good), low=0.92, high=0.98),
         )
     ]
+
+
+def _missed(run: Numbers) -> str:
+    """Return what a fault that was not named was, and what was said instead."""
+    truth = " + ".join(f"{name} x {ratio:.4g}" for name, ratio in run["truth"].items())
+    if "first" not in run:
+        return f"{truth}: no alarm"
+    return f"{truth}: {run['first']} {100 * run['said'][run['first']]:.0f} %"

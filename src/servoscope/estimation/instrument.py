@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, IndexArray
 from servoscope.estimation.filter_bank import InstrumentModel, instrument_system
 from servoscope.estimation.two_stage import laguerre_functions
 from servoscope.models.lfilter import lfilter
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FUNCTIONS = 8  # Laguerre functions of r
 POLES = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99)  # of theirs, per sample, out of which the one that explains y best is taken
+FOLDS = 4  # parts of the samples, in each of which the instrument comes from a model that has not seen it
 SLOWEST = 1e-3  # real part of a pole of the model over its magnitude, below which it would hardly settle
 
 Source = Literal["input", "reference"]
@@ -56,18 +57,27 @@ def instrument_model(loop: Loop, tuning: InstrumentTuning | None) -> InstrumentM
     return InstrumentModel(_plant_model(loop, _stable(polynomial)), from_input=True, derivative=powers[0])
 
 
-def fit_reference_model(recordings: Sequence[Recording]) -> InstrumentTuning | None:
-    """Fit r -> y by Laguerre functions, whose noise is that of y alone; None where r explains nothing."""
+def fit_reference_model(recordings: Sequence[Recording], fold: int | None = None) -> InstrumentTuning | None:
+    """Fit r -> y by Laguerre functions, whose noise is that of y alone; None where r explains nothing.
+
+    The samples of a fold are left out of the fit.
+    """
     best, least = None, np.inf
     parts = [part for rec in recordings for part in unbroken(rec)]
     y = np.concatenate([part.y - part.y.mean() for part in parts])
+    seen = np.ones(len(y), np.bool_) if fold is None else fold_of(len(y)) != fold
     for pole in POLES:
         phi = np.vstack([_functions_of(part.r, pole) for part in parts])
-        weights = np.linalg.lstsq(phi, y, rcond=1e-10)[0]
-        left = float(np.mean((y - phi @ weights) ** 2))
+        weights = np.linalg.lstsq(phi[seen], y[seen], rcond=1e-10)[0]
+        left = float(np.mean((y - phi @ weights)[seen] ** 2))
         if left < least and weights.any():
             best, least = InstrumentTuning("reference", tuple(weights.tolist()), pole), left
     return best
+
+
+def fold_of(samples: int) -> IndexArray:
+    """Return the fold of each sample of all recordings one after the other, shape (samples,)."""
+    return np.arange(samples) * FOLDS // samples
 
 
 def unbroken(recording: Recording) -> list[Recording]:

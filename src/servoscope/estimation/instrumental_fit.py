@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.estimation.instrument import InstrumentTuning, Source, fit_reference_model
+from servoscope.estimation.instrument import FOLDS, InstrumentTuning, Source, fit_reference_model, fold_of
 from servoscope.estimation.noise_model import sample_autocovariance, yule_walker
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, fit_tuning, least_squares
@@ -16,7 +16,9 @@ from servoscope.signals import Recording
 
 ROUNDS = 20  # of refinement; a fit that needs more does not settle
 SETTLED = 1e-3  # relative change of each coefficient of a round, below which it has settled
-LARGEST_DEVIATION = 0.3  # stated relative standard deviation, above which an estimate is no better than its bias
+# stated relative standard deviation, above which an estimate is no better than its bias; near the deviation itself only
+# those would pass that came out too large
+LARGEST_DEVIATION = 0.2
 FEEDBACK_LAGS = 6  # samples, from 0 on, in which a controller answers noise in y
 FEEDBACK_ORDER = 20  # of the autoregressions that whiten u and the residual
 FEWEST = 200  # samples of a recording that the question is asked of
@@ -58,6 +60,8 @@ def fit_with_instrument(
         model = tuning or InstrumentTuning("input", tuple(theta[:powers].tolist()))
         pipeline = Pipeline.of(loop, None, pipeline.still_speed, model)
         regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
+        if tuning is not None:
+            regressions = _held_out(pipeline, recordings, regressions)
         before, theta = theta, least_squares(_joined(regressions))
         settled = bool(np.all(np.abs(theta - before)[:powers] <= SETTLED * np.abs(theta[:powers])))
         if settled or tuning is not None or not np.isfinite(theta).all():
@@ -70,6 +74,28 @@ def fit_with_instrument(
     return InstrumentalFit(
         pipeline, regressions, fit, settled or tuning is not None, pipeline.bank.names[worst], float(relative[worst])
     )
+
+
+def _held_out(
+    pipeline: Pipeline, recordings: Sequence[Recording], regressions: Sequence[Regression]
+) -> list[Regression]:
+    """Return the regressions with z, in each fold, from a model r -> y that has not seen the fold.
+
+    The weights of a model carry the noise of y that it was fitted to. Used on the same samples, z is correlated with
+    the noise in phi, and where the motion says little the estimate is pulled back to that of least squares (Angrist,
+    Imbens and Krueger, 1999: jackknife instruments).
+    """
+    z = np.vstack([g.z for g in regressions])
+    folds = fold_of(len(z))
+    for fold in range(FOLDS):
+        model = fit_reference_model(recordings, fold)
+        if model is None:
+            continue
+        other = Pipeline.of(pipeline.loop, None, pipeline.still_speed, model)
+        made = np.vstack([other.regression(rec.r, rec.u, rec.y, rec.restart).z for rec in recordings])
+        z[folds == fold] = made[folds == fold]
+    ends = np.cumsum([len(g.z) for g in regressions])[:-1]
+    return [Regression(g.eta, g.phi, own, g.ok) for g, own in zip(regressions, np.split(z, ends), strict=True)]
 
 
 def has_feedback(pipeline: Pipeline, recordings: Sequence[Recording], theta: FloatArray) -> bool:
