@@ -12,8 +12,9 @@ from servoscope.cli import (  # their commands add themselves to the application
     recordings,
     service,
     simulate_design,
+    trend,
     web,
 )
 from servoscope.cli.app import app, main
 
-__all__ = ["alarms", "app", "export", "fleet", "main", "recordings", "service", "simulate_design", "web"]
+__all__ = ["alarms", "app", "export", "fleet", "main", "recordings", "service", "simulate_design", "trend", "web"]

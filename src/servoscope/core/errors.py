@@ -77,6 +77,10 @@ class AlarmError(ServoscopeError):
     """A command makes no sense in the state of the alarm."""
 
 
+class PrognosisError(ServoscopeError):
+    """A series of sizes cannot be read, or says nothing that a prognosis could rest on."""
+
+
 class StateError(ServoscopeError):
     """A saved state was written by another version, or is damaged."""
 

@@ -1,0 +1,84 @@
+"""The command that says how a size grows and until when it stays within a limit, thin: parse, call, print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from servoscope.cli.app import app
+from servoscope.cli.arguments import parse_time
+from servoscope.cli.exit import print_json
+from servoscope.cli.options import JsonOption
+from servoscope.cli.output_paths import check_output
+
+PICTURES = (".svg", ".png", ".pdf")
+
+
+@app.command()
+def trend(
+    source: Annotated[
+        str, typer.Argument(metavar="SIZES", help="CSV file with a header row; or service file or store, with --asset.")
+    ],
+    limit: Annotated[float, typer.Option(metavar="X", help="The value at which the machine is to be stopped.")],
+    value: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Column with the size; in a store, name of the fault.")
+    ] = None,
+    asset: Annotated[str | None, typer.Option(metavar="NAME", help="Asset, where sizes come from a store.")] = None,
+    time: Annotated[str, typer.Option(metavar="NAME", help="Column with dates, or seconds.")] = "time",
+    std: Annotated[str | None, typer.Option(metavar="NAME", help="Column with the standard deviation.")] = None,
+    interval: Annotated[
+        tuple[str, str] | None, typer.Option(metavar="LOW HIGH", help="Columns with the ends of the 95 % interval.")
+    ] = None,
+    covariate: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Column of what moves the size without wear (temperature); repeatable."),
+    ] = None,
+    since: Annotated[
+        str | None, typer.Option("--from", metavar="TIME", help="From this time on: after a repair, 2026-01-31T12:00.")
+    ] = None,
+    coverage: Annotated[float, typer.Option(metavar="P", help="Probability of the intervals.")] = 0.9,
+    as_json: JsonOption = False,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.svg", help="Draw values, limit and forecast.")] = None,
+) -> None:
+    """Say how a size grows and when it will reach a limit, or that nothing can be said."""
+    if not 0.0 < coverage < 1.0:
+        raise typer.BadParameter(f"--coverage {coverage:g}: give a number between 0 and 1, such as 0.9")
+    is_file = source.lower().endswith(".csv")
+    check_output(plot, "--plot", PICTURES, [Path(source)] if is_file else [])
+    begin = parse_time(since, "--from")
+
+    from servoscope.prognosis.forecast import prognose
+    from servoscope.prognosis.series import read_sizes
+
+    if is_file:
+        if value is None:
+            raise typer.BadParameter(f"{source}: name the column with the size: --value NAME")
+        series = read_sizes(
+            Path(source), value, time=time, std=std, interval=interval, covariates=covariate or (), after=begin
+        )
+    else:
+        from servoscope.cli.service import check_assets, open_store
+        from servoscope.service.store.queries import query_sizes
+
+        if asset is None:
+            raise typer.BadParameter(f"{source}: name the asset: --asset NAME")
+        store = open_store(source)
+        check_assets(store, [asset])
+        series = query_sizes(store, asset, value, begin)
+    found = prognose(series, limit, coverage)
+    if as_json:
+        print_json(found.model_dump(mode="json", exclude={"headline", "reasons"}), lines=False)
+    else:
+        from servoscope.cli.render import results
+
+        out = results.create_console()
+        out.print(found.summary, highlight=False)
+        results.print_notes(out, found.explanation, "blue", "-")
+    if plot is not None:
+        from servoscope.cli.render import results
+        from servoscope.report.trend_figure import write_trend_figure
+
+        write_trend_figure(plot, series, found)
+        results.print_written_path(results.create_console(stderr=as_json), plot)

@@ -1,0 +1,51 @@
+"""A prognosis as a picture: the values, the limit, and when it will be reached."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+from matplotlib.figure import Figure
+
+from servoscope.prognosis.forecast import DAY_S, Prognosis
+from servoscope.prognosis.series import NORMAL_95, SizeSeries
+from servoscope.report.plotting import COLOURS, plot_style, save_figure
+
+
+def draw_trend(series: SizeSeries, found: Prognosis) -> Figure:
+    """Return the picture: values with their 95 % intervals, limit, and the interval of the time until it."""
+    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+
+    days = series.t / DAY_S  # matplotlib counts days since 1970
+    axes.errorbar(
+        days,
+        series.value,
+        yerr=NORMAL_95 * series.std if series.std.any() else None,
+        fmt="o",
+        markersize=2.5,
+        linewidth=0.8,
+        color=COLOURS["ink"],
+    )
+    axes.axhline(found.limit, color=COLOURS["alarm"], linewidth=1.0)
+    if found.outlook == "forecast" and found.remaining_s is not None and found.value is not None:
+        low, middle, high = found.remaining_s
+        assert low is not None, "a forecast has an earlier end"
+        # an open end is drawn to the right border, half the history away
+        end = high if high is not None else max(2.0 * low, 0.5 * (found.to_t - found.from_t))
+        axes.axvspan((found.to_t + low) / DAY_S, (found.to_t + end) / DAY_S, color=COLOURS["alarm"], alpha=0.15, lw=0)
+        if middle is not None:
+            way = np.array([found.to_t, found.to_t + middle]) / DAY_S
+            axes.plot(way, [found.value[1], found.limit], "--", color=COLOURS["muted"])
+    locator = AutoDateLocator()  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    axes.set(ylabel=found.name, title=found.summary)
+    return figure
+
+
+def write_trend_figure(path: Path, series: SizeSeries, found: Prognosis) -> None:
+    """Write the picture; the suffix of the path is its format."""
+    with plot_style():
+        save_figure(draw_trend(series, found), path)
