@@ -9,6 +9,7 @@ from servoscope.cli import (  # their commands add themselves to the application
     alarms,
     export,
     fleet,
+    init,
     recordings,
     service,
     simulate_design,
@@ -16,4 +17,4 @@ from servoscope.cli import (  # their commands add themselves to the application
 )
 from servoscope.cli.app import app, main
 
-__all__ = ["alarms", "app", "export", "fleet", "main", "recordings", "service", "simulate_design", "web"]
+__all__ = ["alarms", "app", "export", "fleet", "init", "main", "recordings", "service", "simulate_design", "web"]

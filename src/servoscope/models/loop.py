@@ -28,6 +28,14 @@ LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a r
 Interval = tuple[Finite, Finite]
 
 
+class TextLayout(Settings):
+    """What cannot be found in a text file by itself: where its table begins."""
+
+    header_row: Annotated[int, Field(strict=True, ge=1)] | None = None  # line with the names of the columns, from 1
+    skip_rows: Annotated[int, Field(strict=True, ge=0)] = 0  # lines at the beginning that are not looked at
+    comment: NonEmptyStr | None = None  # what lines that hold no row begin with, in the place of #, % and //
+
+
 class Columns(Settings):
     """Where the signals stand in a recording."""
 
@@ -40,6 +48,7 @@ class Columns(Settings):
     output: NonEmptyStr | Annotated[tuple[NonEmptyStr, ...], Field(min_length=2)] = "y"
     time_unit: Literal["s", "ms", "us", "ns", "min"] = "s"  # unit of a numeric time column
     segment: tuple[NonEmptyStr, ...] = ()  # columns whose change starts a new run; a time reset does too
+    text: TextLayout | None = None  # of text files whose table is not found by itself
 
     @field_validator("output")
     @classmethod
@@ -246,6 +255,8 @@ class Loop(Settings):
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, ready for JSON, that `from_dict` turns into an equal loop."""
         plain: dict[str, Any] = self.model_dump(mode="json")
+        if self.columns.text is None:  # hashes of loops without it stay as they were
+            del plain["columns"]["text"]
         return {key: value for key, value in plain.items() if value is not None}
 
     def hash(self) -> str:
