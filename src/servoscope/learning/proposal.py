@@ -115,7 +115,7 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
     explained = message("init.explained", share=100.0 * share)
     doubtful = share < CLEAR
     lines = (
-        ProposalLine("", "sample_rate", repr(rate), message("init.rate", rate=rate, samples=recording.samples)),
+        ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
         *_column_lines(columns),
         ProposalLine("plant", "kind", '"polynomial"', message("init.kind")),
         ProposalLine("plant", "order", str(order), explained, doubtful),
