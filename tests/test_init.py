@@ -46,7 +46,7 @@ def test_the_proposal_is_the_machine_and_says_why(log: Path, tmp_path: Path) -> 
     assert 0.2 < (loop.monitor.cutoff or 0.0) <= RATE / 10.0 and 5.0 <= loop.monitor.memory <= 10.0
     text = target.read_text(encoding="utf-8")
     assert all("  # " in line for line in text.splitlines() if " = " in line)
-    assert "Nm" not in text and "mm in the name, factor to SI units" in text
+    assert 'input = "Drehmoment [Nm]"' in text and "mm in the name, factor to SI units" in text
     assert run("inspect", log, "--loop", target).code == 0
     one_line(run("init", log, "-o", target), "exists", "--yes")
 

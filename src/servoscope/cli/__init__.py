@@ -15,6 +15,8 @@ from servoscope.cli import (  # their commands add themselves to the application
     simulate_design,
     web,
 )
-from servoscope.cli.app import app, main
+from servoscope.cli.app import app, group_commands, main
+
+group_commands()
 
 __all__ = ["alarms", "app", "export", "fleet", "init", "main", "recordings", "service", "simulate_design", "web"]

@@ -127,7 +127,7 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
             message("init.stiffness" if stiffness else "init.free"),
         ),
         ProposalLine("plant", "offset", "true", message("init.offset")),
-        ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff", cutoff=cutoff)),
+        ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff")),
         ProposalLine("monitor", "memory", repr(memory), message("init.memory", length=recording.duration_s)),
         ProposalLine("monitor", "frequencies", repr(frequencies), message("init.frequencies")),
     )

@@ -19,6 +19,7 @@ from pydantic import (
 from servoscope.core.errors import LoopError
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
 from servoscope.core.settings_errors import describe_error
+from servoscope.core.short_repr import ShortRepr
 from servoscope.models import plants
 
 DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
@@ -104,7 +105,7 @@ class MonitorSettings(Settings):
     off_delay: NonNegative | None = None
 
 
-class Loop(Settings):
+class Loop(ShortRepr, Settings):
     """One closed loop: sampling, columns, plant, controller and how it is monitored."""
 
     name: NonEmptyStr = "loop"  # what the loop is called in reports
@@ -217,6 +218,25 @@ class Loop(Settings):
         """Whether r has a part in the loop; elsewhere u may stand for it in recordings that have none."""
         of_sign = getattr(self.plant, "sign_from", "output") == "reference"
         return self.controller is not None or self.monitor.two_stage != "none" or of_sign
+
+    def _shown_facts(self) -> dict[str, object]:
+        cutoff = self.monitor.cutoff
+        return {
+            "name": self.name,
+            "rate": f"{self.sample_rate:g} Hz",
+            "plant": self.plant.kind,
+            "controller": self.controller.kind if self.controller is not None else "none",
+            "cutoff": f"{cutoff:g} Hz" if cutoff is not None else "by itself",
+        }
+
+    @classmethod
+    def of(cls, source: Loop | str | Path) -> Loop:
+        """Return a loop as it is, or read it from a path; raises TypeError if it is neither."""
+        if isinstance(source, Loop):
+            return source
+        if not isinstance(source, str | Path):
+            raise TypeError(f"a loop is a Loop or the path of a loop file, not {type(source).__name__}")
+        return cls.load(source)
 
     @classmethod
     def load(cls, path: str | Path) -> Loop:

@@ -102,7 +102,7 @@ def unpack(path: Path, open_plain: Callable[[Path], TableFile]) -> TableFile:
         folder.cleanup()
         raise
     # a library of others unpacks: it raises nearly anything at damaged archives, also for a password
-    except (OSError, EOFError, zlib.error, lzma.LZMAError, ValueError, RuntimeError, NotImplementedError) as error:
+    except (zipfile.BadZipFile, OSError, EOFError, zlib.error, lzma.LZMAError, ValueError, RuntimeError) as error:
         folder.cleanup()
         raise RecordingError(f"{path}: cannot be unpacked ({shorten_error(error)}), pack it again") from None
 

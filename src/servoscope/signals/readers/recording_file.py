@@ -20,6 +20,7 @@ from servoscope.models.loop import Columns, Loop, TextLayout
 from servoscope.signals import Defect, Recording, clean, with_defects
 from servoscope.signals.readers.columns import LinearCombination, find_channel, parse_combination
 from servoscope.signals.readers.formats import open_file
+from servoscope.signals.readers.frames import Source, open_source
 from servoscope.signals.readers.select import CellReader, ColumnTypeChanged, RowFilter, format_cell
 from servoscope.signals.readers.table import Table, TableFile, TimeColumn, number_column
 
@@ -65,7 +66,7 @@ def _channel_info(name: str, types: list[str], ranges: list[tuple[float, float]]
 
 
 def read(
-    path: str | Path,
+    path: Source,
     loop: Loop | None = None,
     *,
     columns: Columns | None = None,
@@ -92,7 +93,7 @@ def read(
 
 
 def read_parts(
-    path: str | Path,
+    path: Source,
     loop: Loop | None = None,
     *,
     columns: Columns | None = None,
@@ -107,7 +108,7 @@ def read_parts(
     texts: set[str] = set()
     while True:
         try:
-            return _read_table_parts(open_file(path, columns.text), loop, columns, where or {}, by, texts)
+            return _read_table_parts(open_source(path, columns.text), loop, columns, where or {}, by, texts)
         except ColumnTypeChanged as found:  # what was taken for numbers belongs to a column of text
             texts.add(found.column)
 
@@ -261,3 +262,8 @@ def _evaluate_signal(table: Table, combination: LinearCombination, what: str) ->
     for name, factor in combination.factors.items():
         total += factor * number_column(table, name, what)
     return total
+
+
+def as_recording(source: Recording | Source, loop: Loop | None = None) -> Recording:
+    """Return a recording as it is, and anything else as `read` reads it."""
+    return source if isinstance(source, Recording) else read(source, loop)
