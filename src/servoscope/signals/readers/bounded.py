@@ -120,7 +120,8 @@ def extract_rows(
 
 def _open(module: str, function: str, path: str) -> TableFile:
     silent = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(silent, 2)  # libraries print what they know of a damaged file
+    for stream in (1, 2):  # libraries print what they know of a damaged file; answers have a stream of their own
+        os.dup2(silent, stream)
     os.close(silent)
     about = Path(path).stat()
     key = path, about.st_mtime_ns, about.st_size
