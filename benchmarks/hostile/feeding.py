@@ -31,7 +31,7 @@ def fed(target: Target, inputs: int, seed: int = 1) -> dict[str, Any]:
         target.feed(good, chance)  # as it is, it is read
     for number in range(inputs):
         data = damaged(chance.choice(target.good), chance, number) if target.good else b""
-        begun = time.process_time()
+        begun = time.perf_counter()
         try:
             target.feed(data, chance)
             came["read"] += 1
@@ -46,7 +46,7 @@ def fed(target: Target, inputs: int, seed: int = 1) -> dict[str, Any]:
             if shown <= SHOWN:
                 print(f"{target.name}, input {number}:", file=sys.stderr)
                 traceback.print_exc()
-        slowest = max(slowest, time.process_time() - begun)
+        slowest = max(slowest, time.perf_counter() - begun)
     return {
         "name": target.name, "inputs": inputs, **{key: came[key] for key in ("read", "refused", "badly told", "other")},
         "cases": dict(cases.most_common()), "slowest_s": round(slowest, 2),

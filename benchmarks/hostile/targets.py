@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import random
+import struct
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -90,13 +93,22 @@ def targets(folder: Path) -> list[Target]:
 def _files(folder: Path, recording: Recording) -> list[Target]:
     columns = {name: np.asarray(getattr(recording, name)) for name in "truy"}
     made = {"CSV": "csv", "Parquet": "parquet", "MAT 5": "mat", "MAT 7.3": "mat", "MDF": "mf4", "TDMS": "tdms"}
+    made |= {"HDF5": "h5", "Excel": "xlsx", "LVM": "lvm", "MCAP": "mcap", "ULog": "ulg", "gzip": "csv.gz", "ZIP": "zip"}
     writing: dict[str, Callable[[Path], object]] = {
         "MAT 5": lambda path: _mat(path, columns),
         "MAT 7.3": lambda path: _hdf5(path, columns),
         "MDF": lambda path: _mdf(path, columns),
         "TDMS": lambda path: _tdms(path, columns),
+        "HDF5": lambda path: _hdf5(path, columns),
+        "Excel": lambda path: _sheet(path, columns),
+        "LVM": lambda path: path.write_text(_lvm(columns)),
+        "MCAP": lambda path: _mcap(path, columns),
+        "ULog": lambda path: path.write_bytes(_ulog(columns)),
+        "gzip": lambda path: path.write_bytes(gzip.compress(_text(columns).encode())),
+        "ZIP": lambda path: _zip(path, columns),
     }
     found = []
+    clocked = {".mf4", ".mcap", ".ulg", ".lvm"}  # whose readers make a column called time
     for kind, suffix in made.items():
         path = folder / f"{kind.replace(' ', '-')}.{suffix}"
         writing.get(kind, lambda path: writers.write_table(path, columns))(path)
@@ -104,7 +116,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
         def feed(data: bytes, _: random.Random, path: Path = path) -> str:
             path.write_bytes(data)
             readers.list_channels(path)
-            readers.read(path, columns=Columns(time="time") if path.suffix == ".mf4" else None)
+            readers.read(path, columns=Columns(time="time") if path.suffix in clocked else None)
             return "read"
 
         good = [path.read_bytes()]
@@ -141,6 +153,56 @@ def _mdf(path: Path, columns: dict[str, Any]) -> None:
     with MDF(version="4.10") as file:
         file.append([Signal(columns[name], columns["t"], name=name) for name in "ruy"])
         file.save(path, overwrite=True)
+
+
+def _text(columns: dict[str, Any]) -> str:
+    rows = zip(*(columns[name] for name in "truy"), strict=True)
+    return "\n".join(["t,r,u,y", *(",".join(f"{cell:.9g}" for cell in row) for row in rows)]) + "\n"
+
+
+def _zip(path: Path, columns: dict[str, Any]) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("log.csv", _text(columns))
+
+
+def _sheet(path: Path, columns: dict[str, Any]) -> None:
+    import xlsxwriter
+
+    with xlsxwriter.Workbook(str(path)) as book:
+        sheet = book.add_worksheet()
+        for k, name in enumerate("truy"):
+            sheet.write(0, k, name)
+            sheet.write_column(1, k, columns[name])
+
+
+def _lvm(columns: dict[str, Any]) -> str:
+    head = "LabVIEW Measurement\t\nSeparator\tTab\nDecimal_Separator\t.\nX_Columns\tOne\n***End_of_Header***\t\n\t\n"
+    head += "Channels\t3\nSamples\t400\t400\t400\nX0\t0\t0\t0\nDelta_X\t0.01\t0.01\t0.01\n***End_of_Header***\t\n"
+    return head + "X_Value\tr\tu\ty\n" + _text(columns).replace(",", "\t").partition("\n")[2]
+
+
+def _mcap(path: Path, columns: dict[str, Any]) -> None:
+    from mcap_ros2.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        schema = writer.register_msgdef("rig/msg/State", "float64 r\nfloat64 u\nfloat64 y\n")
+        for t, *signals in zip(*(columns[name] for name in "truy"), strict=True):
+            ns = round(1e9 * t)
+            writer.write_message("/axis", schema, dict(zip("ruy", signals, strict=True)), log_time=ns, publish_time=ns)
+        writer.finish()
+
+
+def _ulog(columns: dict[str, Any]) -> bytes:
+    def message(kind: bytes, body: bytes) -> bytes:
+        return struct.pack("<HB", len(body), kind[0]) + body
+
+    data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message(b"B", bytes(40))
+    data += message(b"F", b"servo:uint64_t timestamp;double r;double u;double y;")
+    data += message(b"A", struct.pack("<BH", 0, 1) + b"servo")
+    for t, *signals in zip(*(columns[name] for name in "truy"), strict=True):
+        data += message(b"D", struct.pack("<HQ3d", 1, round(1e6 * t), *signals))
+    return data
 
 
 def _tdms(path: Path, columns: dict[str, Any]) -> None:

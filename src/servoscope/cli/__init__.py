@@ -9,12 +9,15 @@ from servoscope.cli import (  # their commands add themselves to the application
     alarms,
     export,
     fleet,
+    init,
     recordings,
     service,
     simulate_design,
     trend,
     web,
 )
-from servoscope.cli.app import app, main
+from servoscope.cli.app import app, group_commands, main
 
-__all__ = ["alarms", "app", "export", "fleet", "main", "recordings", "service", "simulate_design", "trend", "web"]
+group_commands()
+
+__all__ = ["alarms", "app", "export", "fleet", "init", "main", "recordings", "service", "simulate_design", "trend", "web"]

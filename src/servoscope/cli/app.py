@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import gc
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,9 +16,16 @@ GARBAGE = 200_000  # new objects before cycles are looked for: loading code make
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
+GROUPS = {
+    "Begin": ("demo", "init", "inspect", "help"),
+    "Judge recordings": ("learn", "diagnose", "verify"),
+    "Follow machines for months": ("run", "watch", "history", "trend", "alarms", "serve", "users", "publish", "fleet"),
+    "Before deployment, and in the drive": ("simulate", "design", "export"),
+    "Check servoscope itself": ("reproduce", "bench"),
+}
+
 app = typer.Typer(
     cls=CommandGroup,
-    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings=CONTEXT,
@@ -51,3 +58,34 @@ def servoscope(
     ] = False,
 ) -> None:
     """Say from r, u and y of a servo loop whether its actuator is healthy; if not, what changed, and when."""
+
+
+@app.command("help")
+def show_help(
+    context: typer.Context,
+    command: Annotated[str | None, typer.Argument(metavar="COMMAND", help="Command; none: all of them.")] = None,
+) -> None:
+    """Show what servoscope can do, or what one command does."""
+    whole = context.find_root()
+    shown = whole if command is None else _context_of(whole, command)
+    typer.echo(shown.get_help())
+
+
+def _context_of(whole: Any, name: str) -> Any:
+    found = whole.command.get_command(whole, name) if isinstance(whole.command, CommandGroup) else None
+    if found is None:
+        known = ", ".join(each for group in GROUPS.values() for each in group)
+        raise typer.BadParameter(f"{name!r} is no command; there are {known}")
+    return type(whole)(found, info_name=name, parent=whole)
+
+
+def group_commands() -> None:
+    """Put each command into its group, in the order in which they are met."""
+    panels = {name: panel for panel, names in GROUPS.items() for name in names}
+    order = list(panels)
+    for info in app.registered_commands:
+        info.name = info.name or (info.callback.__name__ if info.callback is not None else None)
+        info.rich_help_panel = panels[info.name or ""]
+    for group in app.registered_groups:
+        group.rich_help_panel = panels[str(group.name)]
+    app.registered_commands.sort(key=lambda info: order.index(info.name or ""))

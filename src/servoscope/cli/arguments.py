@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from servoscope.core.errors import RecordingError, ServoscopeError
+from servoscope.core.errors import ServoscopeError
 
 if TYPE_CHECKING:
-    from servoscope.models.loop import Columns, Loop
+    from servoscope.models.loop import Columns, Loop, TextLayout
     from servoscope.signals import Recording
     from servoscope.signals.readers import ChannelInfo
     from servoscope.simulation import FaultEvent
@@ -75,7 +75,8 @@ def parse_healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
     found = []
     for text in texts:
         named = re.fullmatch(r"(\w[\w-]*)=(.+)", text)
-        found.append((named[1], Path(named[2])) if named and not Path(text).exists() else ("", Path(text)))
+        point, path = (named[1], Path(named[2])) if named and not Path(text).exists() else ("", Path(text))
+        found += [(point, each) for each in expand_files([path])]
     without = [path for point, path in found if not point]
     if 0 < len(without) < len(found):
         raise typer.BadParameter(
@@ -133,13 +134,14 @@ UNBOUNDED = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class RecordingReader:
-    """How a command reads recordings: the loop, ``--columns``, ``--where``, ``--by``, ``--from``, ``--to``."""
+    """How a command reads recordings: the loop, ``--columns``, ``--where``, ``--by``, ``--from``, ``--to``, layout."""
 
     loop: Loop | None
     columns: Columns | None
     where: dict[str, str]
     by: str | None
     span: tuple[float, float]
+    text: TextLayout | None = None
 
     @classmethod
     def from_options(
@@ -149,19 +151,35 @@ class RecordingReader:
         where: Sequence[str] | None,
         by: str | None,
         span: tuple[float | None, float | None],
+        layout: tuple[int | None, int, str | None] = (None, 0, None),
     ) -> RecordingReader:
-        """Read the options; typer.BadParameter if one of them cannot be read."""
-        mapping = parse_mapping(columns, loop.columns if loop is not None else None)
+        """Read the options; typer.BadParameter if one of them cannot be read.
+
+        `layout`: ``--header-row``, ``--skip``, ``--comment``.
+        """
+        from servoscope.models.loop import Columns, TextLayout
+
+        base = loop.columns if loop is not None else None
+        mapping = parse_mapping(columns, base)
+        header_row, skip_rows, comment = layout
+        given = header_row is not None or skip_rows or comment
+        text = TextLayout(header_row=header_row, skip_rows=skip_rows, comment=comment or None) if given else None
+        if text is not None and (mapping is not None or base is not None):
+            mapping = (mapping or base or Columns()).model_copy(update={"text": text})
         start, end = (bound if bound is not None else limit for bound, limit in zip(span, UNBOUNDED, strict=True))
         if not start < end:
             raise typer.BadParameter(f"--from {start:g} must be before --to {end:g}")
-        return cls(loop, mapping, parse_conditions(where or ()), by, (start, end))
+        return cls(loop, mapping, parse_conditions(where or ()), by, (start, end), text)
 
     def read(self, path: Path) -> list[Recording]:
         """Return the recordings in a file: one, or one per value of the column in ``--by``."""
+        from servoscope.models.loop import Columns
         from servoscope.signals import readers
 
-        parts = readers.read_parts(path, self.loop, columns=self.columns, where=self.where, by=self.by)
+        columns = self.columns
+        if columns is None and self.text is not None:  # nobody says where the signals stand
+            columns = Columns(text=self.text)
+        parts = readers.read_parts(path, self.loop, columns=columns, where=self.where, by=self.by)
         if self.span == UNBOUNDED:
             return parts
         return [part.part(*self.span) for part in parts]
@@ -176,8 +194,16 @@ class RecordingReader:
 
         if self.loop is not None or self.columns is not None:
             return []
-        channels = readers.list_channels(path)
+        channels = readers.list_channels(path, self.text)
         return channels if {"t", "r", "u", "y"} - {channel.name for channel in channels} else []
+
+
+def expand_files(paths: Sequence[Path]) -> list[Path]:
+    """Return the recordings that are meant by files, folders, patterns and archives."""
+    from servoscope.signals import readers
+    from servoscope.signals.readers.archives import expand_paths
+
+    return expand_paths(paths, readers.readable_suffixes())
 
 
 def parse_fault_events(texts: Sequence[str]) -> list[FaultEvent]:
@@ -207,9 +233,3 @@ def check_length(duration_s: float, sample_rate: float) -> None:
     if not 0.5 < samples <= MOST_SAMPLES:  # not a number is refused too
         most = MOST_SAMPLES / sample_rate
         raise typer.BadParameter(f"--duration {duration_s:g}: give more than 0 s and at most {most:g} s")
-
-
-def missing_mapping_error(path: Path) -> RecordingError:
-    """Return the error that asks for a mapping."""
-    example = "--columns 't=..., r=..., u=..., y=...'"
-    return RecordingError(f"{path.name}: lacks a column t, r, u or y: say which they are, {example}, or give --loop")

@@ -17,6 +17,15 @@ WhereOption = Annotated[
     typer.Option(metavar="COND", help="Rows to take, 'load=20,run=1-5': values, lists, ranges."),
 ]
 ByOption = Annotated[str | None, typer.Option(metavar="COLUMN", help="One recording per value of this column.")]
+HeaderRowOption = Annotated[
+    int | None, typer.Option(min=1, metavar="LINE", help="Text files: the line with the names of the columns.")
+]
+SkipOption = Annotated[
+    int, typer.Option("--skip", min=0, metavar="LINES", help="Text files: leave out lines at the top.")
+]
+CommentOption = Annotated[
+    str | None, typer.Option(metavar="TEXT", help="Text files: what lines that hold no row begin with.")
+]
 FromOption = Annotated[
     float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time, in s.")
 ]

@@ -14,10 +14,13 @@ from servoscope.cli.exit import EXIT_FAULT, EXIT_INPUT, FailureCounter, print_js
 from servoscope.cli.options import (
     ByOption,
     ColumnsOption,
+    CommentOption,
     FromOption,
+    HeaderRowOption,
     JsonOption,
     LoopArgument,
     ReportOption,
+    SkipOption,
     ToOption,
     TraceOption,
     WhereOption,
@@ -35,12 +38,16 @@ def inspect(
     columns: ColumnsOption = None,
     where: WhereOption = None,
     by: ByOption = None,
+    header_row: HeaderRowOption = None,
+    skip: SkipOption = 0,
+    comment: CommentOption = None,
     from_s: FromOption = None,
     to_s: ToOption = None,
     as_json: JsonOption = False,
     report: ReportOption = None,
 ) -> None:
     """Say whether a log is usable, and if not, why; without a mapping, say which columns it has."""
+    logs = arguments.expand_files(logs)
     check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
 
     from servoscope.cli.progress import show_steps
@@ -50,7 +57,8 @@ def inspect(
     from servoscope.report import inspection_page, plain_values
 
     settings = Loop.load(loop) if loop is not None else None
-    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s))
+    layout = header_row, skip, comment
+    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s), layout)
     several = reader.expects_several(logs)
     pages = OutputPaths.from_option(report, ".html", several, logs)
     out, failures = results.create_console(), FailureCounter()
@@ -63,8 +71,8 @@ def inspect(
                         if as_json:
                             print_json(plain_values.channels_summary(path.name, channels), lines=several)
                         else:
-                            results.print_channels(out, path.name, channels)
-                    raise arguments.missing_mapping_error(path)
+                            results.print_channels(out, path, channels)
+                    continue
                 for recording in reader.read(path):
                     steps.advance("inspecting")
                     result = inspection.inspect(recording, settings)
@@ -107,6 +115,9 @@ def learn(
     columns: ColumnsOption = None,
     where: WhereOption = None,
     by: ByOption = None,
+    header_row: HeaderRowOption = None,
+    skip: SkipOption = 0,
+    comment: CommentOption = None,
     from_s: FromOption = None,
     to_s: ToOption = None,
     as_json: JsonOption = False,
@@ -134,7 +145,8 @@ def learn(
     from servoscope.report import plain_values
 
     settings = Loop.load(loop)
-    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s))
+    layout = header_row, skip, comment
+    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s), layout)
     if reader.columns is not None:  # they become part of the baseline, so that diagnose need not be told again
         settings = settings.model_copy(update={"columns": reader.columns})
     earlier = Baseline.load(compare) if compare is not None else None
@@ -193,6 +205,7 @@ def diagnose(
     fail_on_fault: Annotated[bool, typer.Option("--fail-on-fault", help="Exit with 3 if there is a fault.")] = False,
 ) -> None:
     """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure."""
+    recordings = arguments.expand_files(recordings)
     inputs = [baseline, *recordings]
     check_output(report, "--report", REPORTS, inputs, folder=True)
     check_output(trace, "--trace", TRACES, inputs, folder=True)

@@ -16,6 +16,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError
 from servoscope.core.files import atomic_write
 from servoscope.core.messages import MessageText
+from servoscope.core.short_repr import ShortRepr
 from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, worst_case_hypotheses
 from servoscope.detection.expectation import Expectation
 from servoscope.detection.learned_fault import LearnedFault
@@ -68,7 +69,7 @@ class ExactPredictorFit(_BaselineModel):
     misfit: float
 
 
-class Baseline(_BaselineModel):
+class Baseline(ShortRepr, _BaselineModel):
     """What a healthy loop looks like to the monitor; everything that `diagnose` needs.
 
     Parameters
@@ -282,6 +283,19 @@ class Baseline(_BaselineModel):
         """
         content = {"format": FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
         atomic_write(Path(path), (json.dumps(content, indent=1) + "\n").encode())
+
+    def _shown_facts(self) -> dict[str, object]:
+        healthy = ", ".join(f"{name} {value:.4g}" for name, value in zip(self.names, self.theta, strict=True))
+        return {"loop": self.loop.name, "recordings": len(self.sources), "healthy": healthy, "hash": self.hash}
+
+    @classmethod
+    def of(cls, source: Baseline | str | Path) -> Baseline:
+        """Return a baseline as it is, or read it from a path; raises TypeError if it is neither."""
+        if isinstance(source, Baseline):
+            return source
+        if not isinstance(source, str | Path):
+            raise TypeError(f"a baseline is a Baseline or the path of one, not {type(source).__name__}")
+        return cls.load(source)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, computed_field, model_validator
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.messages import Message, MessageField, message, read_messages, render, text_message
+from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.signals import Defect
 
@@ -193,7 +194,7 @@ class Provenance(_ResultModel):
 WRITTEN_INTERVAL = frozenset(FaultInterval.model_fields) - {"end_s", "from_start"}  # fields that a Diagnosis repeats
 
 
-class Diagnosis(_ResultModel):
+class Diagnosis(ShortRepr, _ResultModel):
     """The verdict on one recording.
 
     Parameters
@@ -249,6 +250,9 @@ class Diagnosis(_ResultModel):
     def current(self) -> FaultInterval:
         """The last interval; an empty one where there is none."""
         return self.intervals[-1] if self.intervals else FaultInterval()
+
+    def _shown_facts(self) -> dict[str, object]:
+        return {"recording": self.recording, "verdict": self.verdict, "summary": self.summary}
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -336,8 +340,8 @@ def any_exceeded(statistics: tuple[Statistic, ...]) -> BoolArray:
     return np.logical_or.reduce([statistic.exceeded for statistic in statistics])  # type: ignore[no-any-return]
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trace(ShortRepr):
     """The output of a monitor over time, K evaluations; for a fleet all shapes begin with the assets."""
 
     t: FloatArray  # in s, shape (K,)
@@ -354,6 +358,10 @@ class Trace:
     ifrf: FrequencyResponse  # at the monitored frequencies, of `theta`
     ifrf_expected: FrequencyResponse  # and of `expected`
     ready: BoolArray  # whether the estimator had learned anything by then, shape (K,)
+
+    def _shown_facts(self) -> dict[str, object]:
+        span = f"{self.t[0]:.4g} to {self.t[-1]:.4g} s" if self.t.size else "none"
+        return {"evaluations": self.t.size, "span": span, "coefficients": ", ".join(self.names)}
 
     @cached_property
     def statistics(self) -> tuple[Statistic, ...]:

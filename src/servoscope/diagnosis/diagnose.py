@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,6 +43,8 @@ from servoscope.diagnosis.warnings import detectable_sizes, estimate_warnings, p
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.isolation.isolate import isolate
 from servoscope.signals import MIN_SAMPLES, Recording
+from servoscope.signals.readers import as_recording
+from servoscope.signals.readers.frames import Source
 
 if TYPE_CHECKING:
     from servoscope.isolation.ml import RefitResult
@@ -52,8 +55,8 @@ DOUBTFUL = 0.05  # probability of an unknown change from which an operating poin
 
 @with_one_blas_thread
 def diagnose(
-    baseline: Baseline,
-    recording: Recording,
+    baseline: Baseline | str | Path,
+    recording: Recording | Source,
     progress: Callable[[str], None] = lambda _: None,
     *,
     point: str | None = None,
@@ -63,9 +66,9 @@ def diagnose(
     Parameters
     ----------
     baseline
-        What healthy looks like.
+        What healthy looks like, or its path.
     recording
-        The recording to judge.
+        The recording to judge, or what `read` reads: a path, a frame, arrays by name.
     progress
         Called with the name of each step.
     point
@@ -81,19 +84,22 @@ def diagnose(
     BaselineError
         If the baseline has no such point.
     """
-    return _diagnose_at_point(baseline, recording, progress, point)[0]
+    learned = Baseline.of(baseline)
+    return _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]
 
 
 @with_one_blas_thread
 def diagnose_with_trace(
-    baseline: Baseline,
-    recording: Recording,
+    baseline: Baseline | str | Path,
+    recording: Recording | Source,
     progress: Callable[[str], None] = lambda _: None,
     *,
     point: str | None = None,
 ) -> tuple[Diagnosis, Trace]:
     """Return the diagnosis of a recording together with its trace; arguments and errors as for `diagnose`."""
-    diagnosis, exam, correction = _diagnose_at_point(baseline, recording, progress, point)
+    learned = Baseline.of(baseline)
+    judged = as_recording(recording, learned.loop)
+    diagnosis, exam, correction = _diagnose_at_point(learned, judged, progress, point)
     return diagnosis, corrected_trace(exam, correction)
 
 

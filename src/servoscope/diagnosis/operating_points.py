@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from servoscope.core.errors import BaselineError, NotEnoughError
 from servoscope.core.messages import Message, message
@@ -14,13 +15,15 @@ from servoscope.learning import learn as learning
 from servoscope.learning.learn import Progress
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
+from servoscope.signals.readers import as_recording
+from servoscope.signals.readers.frames import Source
 
 LIKELY = 0.05  # probability from which a fault is noted that looks like another operating point
 
 
 def learn(
-    loop: Loop,
-    recordings: Sequence[Recording] | Mapping[str, Sequence[Recording]],
+    loop: Loop | str | Path,
+    recordings: Sequence[Recording | Source] | Mapping[str, Sequence[Recording | Source]],
     progress: Progress = lambda _: None,
     *,
     compare: Baseline | None = None,
@@ -35,10 +38,11 @@ def learn(
     Parameters
     ----------
     loop
-        The loop.
+        The loop, or its path.
     recordings
-        Healthy recordings, one or more; by the name of their operating point (a load, a temperature, a tool, a season)
-        where there are several, ``{"cold": [...], "warm": [...]}``.
+        Healthy recordings, or what `read` reads (paths, frames, arrays by name), one or more; by the name of their
+        operating point (a load, a temperature, a tool, a season) where there are several,
+        ``{"cold": [...], "warm": [...]}``.
     progress
         Called with the name of each step.
     compare
@@ -70,7 +74,11 @@ def learn(
         If a recording is a fault to the earlier baseline and the change is not accepted, if a point has no name, or if
         a fault has the name of one that the plant knows, or a point that has no healthy recordings.
     """
-    named = recordings if isinstance(recordings, Mapping) else {"": recordings}
+    loop = Loop.of(loop)
+    if isinstance(recordings, str | Path):
+        raise TypeError("recordings to learn from are a list, as in [path]")
+    given = recordings if isinstance(recordings, Mapping) else {"": recordings}
+    named = {name: [as_recording(one, loop) for one in some] for name, some in given.items()}
     for name, some in named.items():
         if not name and isinstance(recordings, Mapping):
             raise BaselineError("an operating point needs a name, as in {'cold': [...], 'warm': [...]}")
@@ -93,7 +101,7 @@ def learn(
 
 def _group_by_point(
     faults: LabelledRecordings | Mapping[str, LabelledRecordings],
-    recordings: Sequence[Recording] | Mapping[str, Sequence[Recording]],
+    recordings: Sequence[object] | Mapping[str, Sequence[object]],
 ) -> dict[str, LabelledRecordings]:
     """Return the labelled recordings of each operating point; the point of a baseline without points is ""."""
     found: dict[str, dict[str, Sequence[Recording]]] = {}

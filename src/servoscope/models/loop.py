@@ -19,6 +19,7 @@ from pydantic import (
 from servoscope.core.errors import LoopError
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
 from servoscope.core.settings_errors import describe_error
+from servoscope.core.short_repr import ShortRepr
 from servoscope.models import plants
 
 DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
@@ -26,6 +27,14 @@ RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # 
 LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a rule
 
 Interval = tuple[Finite, Finite]
+
+
+class TextLayout(Settings):
+    """What cannot be found in a text file by itself: where its table begins."""
+
+    header_row: Annotated[int, Field(strict=True, ge=1)] | None = None  # line with the names of the columns, from 1
+    skip_rows: Annotated[int, Field(strict=True, ge=0)] = 0  # lines at the beginning that are not looked at
+    comment: NonEmptyStr | None = None  # what lines that hold no row begin with, in the place of #, % and //
 
 
 class Columns(Settings):
@@ -40,6 +49,7 @@ class Columns(Settings):
     output: NonEmptyStr | Annotated[tuple[NonEmptyStr, ...], Field(min_length=2)] = "y"
     time_unit: Literal["s", "ms", "us", "ns", "min"] = "s"  # unit of a numeric time column
     segment: tuple[NonEmptyStr, ...] = ()  # columns whose change starts a new run; a time reset does too
+    text: TextLayout | None = None  # of text files whose table is not found by itself
 
     @field_validator("output")
     @classmethod
@@ -95,7 +105,7 @@ class MonitorSettings(Settings):
     off_delay: NonNegative | None = None
 
 
-class Loop(Settings):
+class Loop(ShortRepr, Settings):
     """One closed loop: sampling, columns, plant, controller and how it is monitored."""
 
     name: NonEmptyStr = "loop"  # what the loop is called in reports
@@ -209,6 +219,25 @@ class Loop(Settings):
         of_sign = getattr(self.plant, "sign_from", "output") == "reference"
         return self.controller is not None or self.monitor.two_stage != "none" or of_sign
 
+    def _shown_facts(self) -> dict[str, object]:
+        cutoff = self.monitor.cutoff
+        return {
+            "name": self.name,
+            "rate": f"{self.sample_rate:g} Hz",
+            "plant": self.plant.kind,
+            "controller": self.controller.kind if self.controller is not None else "none",
+            "cutoff": f"{cutoff:g} Hz" if cutoff is not None else "by itself",
+        }
+
+    @classmethod
+    def of(cls, source: Loop | str | Path) -> Loop:
+        """Return a loop as it is, or read it from a path; raises TypeError if it is neither."""
+        if isinstance(source, Loop):
+            return source
+        if not isinstance(source, str | Path):
+            raise TypeError(f"a loop is a Loop or the path of a loop file, not {type(source).__name__}")
+        return cls.load(source)
+
     @classmethod
     def load(cls, path: str | Path) -> Loop:
         """Read a loop file.
@@ -246,6 +275,8 @@ class Loop(Settings):
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, ready for JSON, that `from_dict` turns into an equal loop."""
         plain: dict[str, Any] = self.model_dump(mode="json")
+        if self.columns.text is None:  # hashes of loops without it stay as they were
+            del plain["columns"]["text"]
         return {key: value for key, value in plain.items() if value is not None}
 
     def hash(self) -> str:

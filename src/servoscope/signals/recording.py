@@ -10,12 +10,13 @@ import numpy.typing as npt
 
 from servoscope.core.arrays import Int32Array
 from servoscope.core.errors import RecordingError
+from servoscope.core.short_repr import ShortRepr
 from servoscope.signals.defects import Defect
 from servoscope.signals.samples import Samples
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Recording(Samples):
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Recording(ShortRepr, Samples):
     """Samples of one asset on one rising clock, of at least 20 rows, as `clean` makes them.
 
     Where the time in the file starts again with a new run, the runs are laid end to end.
@@ -40,6 +41,26 @@ class Recording(Samples):
     def columns(self) -> tuple[npt.NDArray[Any], ...]:
         """All that has one value per row, channels aside: t, r, u, y, restart, run."""
         return *super().columns, self.run
+
+    def _shown_facts(self) -> dict[str, object]:
+        return {
+            "name": self.name,
+            "length": f"{self.duration_s:.6g} s",
+            "samples": self.samples,
+            "rate": f"{self.sample_rate:g} Hz",
+            "defects": len(self.defects),
+        }
+
+    def to_frame(self) -> Any:
+        """Return a frame of pandas with the columns t, r, u, y, run and the channels, one row per sample.
+
+        Raises RecordingError if pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ModuleNotFoundError:
+            raise RecordingError(f"{self.name}: a frame needs pandas, pip install pandas") from None
+        return pd.DataFrame({"t": self.t, "r": self.r, "u": self.u, "y": self.y, "run": self.run, **self.channels})
 
     def __getitem__(self, rows: slice | npt.NDArray[Any]) -> Self:
         """Return some of the rows without the defects; a slice copies nothing."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ from servoscope.report.format_values import DASH, format_duration, format_percen
 from servoscope.report.page import say
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from servoscope.detection.baseline import Baseline
     from servoscope.learning.inspection import Inspection
     from servoscope.models.loop import Columns
@@ -151,17 +154,21 @@ def _format_sources(b: Baseline) -> str:
     return f"{', '.join(source.name for source in b.sources)}, {length}"
 
 
-def print_channels(out: Console, name: str, channels: Sequence[ChannelInfo]) -> None:
-    """Print the columns of a file, and which of them might be t, r, u and y."""
-    from servoscope.signals.readers.guess_columns import guess_columns
+def print_channels(out: Console, path: Path, channels: Sequence[ChannelInfo]) -> None:
+    """Print the columns of a file, which of them might be t, r, u and y, and what to do next."""
+    from servoscope.signals.readers.guess_columns import format_mapping, guess_mapping
 
-    print_title(out, name, f": {len(channels)} columns")
+    print_title(out, path.name, f": {len(channels)} columns")
     limits = [[f"{x:.6g}" if math.isfinite(x) else DASH for x in (c.min, c.max)] for c in channels]
     rows = [(c.name, c.dtype, *limit) for c, limit in zip(channels, limits, strict=True)]
     print_table(out, ("column", "type", "smallest", "largest"), rows, words=2)
-    if proposed := guess_columns([c.name for c in channels]):
-        mapping = ", ".join(f"{letter}={column}" for letter, column in proposed.items())
+    fields = guess_mapping([c.name for c in channels])
+    if mapping := format_mapping(fields):
         print_notes(out, [say("cli.proposed_mapping", mapping=mapping)])
+    missing = [letter for letter, field in (("u", "input"), ("y", "output")) if fields[field] is None]
+    if missing:
+        print_notes(out, [say("cli.missing_mapping", names=missing)])
+    print_notes(out, [say("cli.next_init", path=shlex.quote(str(path)))], "green", "-")
 
 
 def print_column_mapping(out: Console, columns: Columns) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from pydantic import PrivateAttr
 
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.core.messages import Message, MessageText, message
+from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.learning.inspection import delay, excitation, model_order, signals, simulation_fit
 from servoscope.learning.inspection import residual as leftover
@@ -32,6 +34,8 @@ from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.models.loop import DEFAULT_FREQUENCIES, Loop
 from servoscope.models.lti import settling_samples
 from servoscope.signals import MIN_SAMPLES, Recording
+from servoscope.signals.readers import as_recording
+from servoscope.signals.readers.frames import Source
 
 LEAST_USED = 0.1  # share of the samples that must be left when rest is left out
 
@@ -46,7 +50,7 @@ class InspectionTraces:
     rho: FloatArray
 
 
-class Inspection(InspectionMeasurements):
+class Inspection(ShortRepr, InspectionMeasurements):
     """What was measured, what follows from it, and the verdict.
 
     Parameters
@@ -65,6 +69,9 @@ class Inspection(InspectionMeasurements):
     recommendations: tuple[MessageText, ...]
     _traces: InspectionTraces | None = PrivateAttr(default=None)
 
+    def _shown_facts(self) -> dict[str, object]:
+        return {"recording": self.recording, "verdict": self.verdict, "summary": self.summary}
+
     @property
     def headline(self) -> str:
         """The verdict, and whether the recording is short to learn from."""
@@ -76,15 +83,15 @@ class Inspection(InspectionMeasurements):
         return self._traces
 
 
-def inspect(recording: Recording, loop: Loop | None = None) -> Inspection:
+def inspect(recording: Recording | Source, loop: Loop | str | Path | None = None) -> Inspection:
     """Say whether a recording is usable, and if not, why; never raises because of what is in the recording.
 
     Parameters
     ----------
     recording
-        The recording.
+        The recording, or what `read` reads: a path, a frame, arrays by name.
     loop
-        The loop it was taken from. Without it a generic inverse (a polynomial in s of order 1 to 3 with
+        The loop it was taken from, or its path. Without it a generic inverse (a polynomial in s of order 1 to 3 with
         offset, and with stiffness and Coulomb friction as far as they explain anything) takes its place.
 
     Returns
@@ -92,6 +99,8 @@ def inspect(recording: Recording, loop: Loop | None = None) -> Inspection:
     Inspection
         ``model_dump(mode="json")`` of it is one JSON object without NaN.
     """
+    loop = Loop.of(loop) if loop is not None else None
+    recording = as_recording(recording, loop)
     quantisation = tuple(signals.quantisation(name, getattr(recording, name)) for name in ("r", "u", "y"))
     basics: dict[str, InspectionModel | Message | str | tuple[InspectionModel, ...] | None] = {
         "recording": recording.name,

@@ -22,6 +22,7 @@ FIELDS = {
 }
 ALLOWED_EXPRESSIONS = "only sums of channels and numbers, times or divided by numbers, are understood"
 MAX_SHOWN = 12
+HEADER_HINT = "; if a line of it has their names, say --header-row"
 COLUMNS_HINT = "say where the signals stand: --columns 't=..., r=..., u=..., y=...' or [columns] in the loop file"
 
 
@@ -92,7 +93,8 @@ def find_channel(name: str, known: Iterable[str], where: str) -> str:
     if not near and name == getattr(defaults, key if key in Columns.model_fields else "name", None):
         where = where.removesuffix(f": [columns] {key}")
         name_ = f"no column {name!r}; {COLUMNS_HINT}; the file has {', '.join(known[:MAX_SHOWN]) or 'none'}"
-        raise RecordingError(f"{where}: {name_}" + (", ..." if len(known) > MAX_SHOWN else ""))
+        unnamed = HEADER_HINT if known == [f"c{index}" for index in range(len(known))] else ""
+        raise RecordingError(f"{where}: {name_}" + (", ..." if len(known) > MAX_SHOWN else "") + unnamed)
     shown = ", ".join(near or known[:MAX_SHOWN]) + (", ..." if not near and len(known) > MAX_SHOWN else "")
     hint = f"did you mean {shown}?" if near else f"the file has {shown or 'none'}"
     raise RecordingError(f"{where}: no column {name!r}, {hint}")

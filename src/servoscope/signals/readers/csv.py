@@ -4,40 +4,57 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from servoscope.core.errors import RecordingError
+from servoscope.models.loop import TextLayout
+from servoscope.signals.readers.guess_columns import WORDS
+from servoscope.signals.readers.layout import check_names, count_numeric, find_table
 from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number
 
 COMMENTS = ("#", "%", "//")
+DELIMITERS = (";", "\t", ",", "|", " ")
 HEAD_BYTES = 1 << 16  # that tell the layout
-SNIFF_LINES = 20
+HEAD_LINES = 400
+LONGEST_LINE = 1 << 16
+LINE_ENDS = ";%"  # that stand behind each row in files of some programs
 CHUNK_BYTES = 1 << 23  # bytes that are read at a time
 SINGLE_BLOCK_BYTES = 1 << 20  # bytes that Arrow parses as one block anyway
 MAX_BROKEN_SHARE = 0.01  # share of rows that may not fit the columns
+CHINESE = re.compile("[一-鿿]")
 
 
 @dataclass(frozen=True)
 class CsvLayout:
-    """How a text file is laid out: delimiter, decimal sign, names of the columns, lines before the rows, encoding."""
+    """How a text file is laid out: delimiter, decimal sign, names of the columns, lines before the rows, encoding.
+
+    `line_end`: what stands behind each row, if anything does; columns without a name are empty.
+    """
 
     delimiter: str
     decimal: str
     names: tuple[str, ...]
     skip_rows: int
     encoding: str = "utf-8-sig"
+    comments: tuple[str, ...] = COMMENTS
+    line_end: str = ""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The names that are some."""
+        return tuple(name for name in self.names if name)
 
 
-def open_csv(path: Path) -> TableFile:
-    """Open a text file, once its layout is known."""
+def open_csv(path: Path, text: TextLayout | None = None) -> TableFile:
+    """Open a text file, once its layout is known; `text`: what the user says of it."""
     with path.open("rb") as file:
-        layout = detect_layout(path, file.read(HEAD_BYTES))
-    return TableFile(path, layout.names, lambda *wanted: read_csv(path, layout, *wanted))
+        layout = detect_layout(path, file.read(HEAD_BYTES), text or TextLayout())
+    return TableFile(path, layout.columns, lambda *wanted: read_csv(path, layout, *wanted))
 
 
-def detect_layout(path: Path, head: bytes) -> CsvLayout:
+def detect_layout(path: Path, head: bytes, text: TextLayout) -> CsvLayout:
     """Find out how a text file is laid out from its first bytes.
 
     Raises RecordingError if it is not a table.
@@ -46,7 +63,69 @@ def detect_layout(path: Path, head: bytes) -> CsvLayout:
     lines = head.decode(encoding, errors="replace").splitlines()
     if len(head) == HEAD_BYTES:
         lines = lines[:-1] or lines
-    return replace(_detect_header(lines, path), encoding=encoding)
+    lines = lines[:HEAD_LINES]
+    comments = (text.comment,) if text.comment else COMMENTS
+    plain = ["" if line.lstrip().startswith(comments) else line for line in lines]
+    plain[: text.skip_rows] = [""] * min(text.skip_rows, len(plain))
+    if not any(line.strip() for line in plain):
+        raise RecordingError(f"{path}: holds comments only, no rows")
+    header = None if text.header_row is None else text.header_row - 1
+    if header is not None and not (header < len(plain) and lines[header].strip()):
+        raise RecordingError(f"{path}: --header-row {text.header_row}: there is no text in this line, name another")
+    if header is not None:
+        plain[header] = (
+            lines[header].lstrip().removeprefix(next(filter(lines[header].lstrip().startswith, comments), ""))
+        )
+    ends = [line.rstrip()[-1:] for line in plain if line.strip()]
+    line_end = next((end for end in LINE_ENDS if ends.count(end) > 0.8 * len(ends)), "")
+    split = {delimiter: _split_lines(plain, delimiter, line_end) for delimiter in DELIMITERS if delimiter != line_end}
+    if line_end == ";":  # it is the delimiter where it also stands between cells
+        split |= {";": _split_lines(plain, ";", "")}
+    delimiter = max(split, key=lambda each: _score(split[each]))
+    rows = split[delimiter]
+    found = find_table(rows, str(path), header)
+    used = "" if delimiter == line_end else line_end
+    if found is None:  # no row of numbers: the first line says what the columns are, and what follows is told later
+        delimiter = max(split, key=lambda each: len(next(filter(None, split[each]), [])))
+        first, cells = next((i, row) for i, row in enumerate(split[delimiter]) if row)
+        check_names(cells, str(path))
+        named = tuple(cell or f"c{index}" for index, cell in enumerate(cells))
+        return CsvLayout(delimiter, ".", named, first + 1, encoding, comments, used)
+    decimal = _detect_decimal(rows[found.first :], delimiter)
+    names = found.names
+    above = next((row for row in reversed(rows[: found.first]) if row), [])
+    if header is None and delimiter == "," and not any(map(is_number, above)) and 2 * len(above) == len(names):
+        raise RecordingError(
+            f"{path}: {len(names)} numbers stand under {len(above)} names: commas are decimal signs and delimiters at"
+            " once; export with ; between the columns, or with decimal points"
+        )
+    commented = [line.lstrip().lstrip("".join(comments)) for line in lines[: found.first] if line.strip()]
+    if names == tuple(f"c{index}" for index in range(len(names))) and commented and not above:
+        told = _split_lines(commented[-1:], delimiter, used)[0]  # the names may stand in the last comment
+        if len(told) == len(names) and all(told) and len(set(told)) == len(told) and not any(map(is_number, told)):
+            names = tuple(told)
+    return CsvLayout(delimiter, decimal, names, found.first, encoding, comments, used)
+
+
+def _score(rows: list[list[str]]) -> tuple[int, int]:
+    """Return how well a delimiter splits lines: rows of a table times its columns of numbers, two or more first."""
+    count, columns = count_numeric(rows)
+    return min(columns, 2), count * columns
+
+
+def _split_lines(lines: list[str], delimiter: str, line_end: str) -> list[list[str]]:
+    return [_split_cells(_strip_end(line, line_end), delimiter) if line.strip() else [] for line in lines]
+
+
+def _strip_end(line: str, end: str) -> str:
+    return line.rstrip().removesuffix(end) if end else line
+
+
+def _detect_decimal(rows: list[list[str]], delimiter: str) -> str:
+    cells = [cell for row in rows for cell in row]
+    comma = sum(re.fullmatch(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", cell) is not None for cell in cells)
+    point = sum("." in cell and is_number(cell) for cell in cells)
+    return "," if comma > point else "."
 
 
 def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collection[str] = ()) -> Iterator[Table]:
@@ -70,6 +149,7 @@ def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collec
             raise RecordingError(
                 f"{path}: {broken} rows do not fit, first row {odd[0]} with {odd[1]} columns instead of"
                 f" {len(layout.names)}: is it one table with one delimiter?"
+                " --header-row says which line names its columns"
             )
         yield table
 
@@ -77,7 +157,11 @@ def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collec
 def _iter_text_chunks(path: Path, layout: CsvLayout) -> Iterator[tuple[bytes, int, bool]]:
     """Yield whole lines, how many lines were before them, and whether they are the last ones."""
     before, held = 0, b""
-    plain = layout.encoding == "utf-8-sig" and layout.delimiter != " "
+    plain = (layout.encoding, layout.line_end, layout.comments) == (
+        "utf-8-sig",
+        "",
+        COMMENTS,
+    ) and layout.delimiter != " "
     for text in _iter_utf8(path) if plain else _iter_recoded(path, layout):
         if held:
             yield held, before, False
@@ -105,6 +189,10 @@ def _iter_recoded(path: Path, layout: CsvLayout) -> Iterator[bytes]:
     """Yield lines as UTF-8 with single blanks: Arrow knows no runs of them as one delimiter."""
     with path.open(encoding=layout.encoding, errors="replace") as file:
         while lines := file.readlines(CHUNK_BYTES):
+            if layout.comments != COMMENTS:  # what the user calls a comment may have as many cells as a row
+                lines = ["\n" if line.lstrip().startswith(layout.comments) else line for line in lines]
+            if layout.line_end:
+                lines = [_strip_end(line, layout.line_end) + "\n" for line in lines]
             if layout.delimiter == " ":
                 lines = [re.sub(r"[ \t]+", " ", line.strip()) + "\n" for line in lines]
             yield "".join(lines).encode()
@@ -119,10 +207,12 @@ def _parse_chunk(
 
     torn: list[tuple[int, int, str]] = []
     comments = 0
+    # columns without a name are empty; Arrow wants one that no other has
+    columns = [name or f"\0{index}" for index, name in enumerate(layout.names)]
 
     def invalid(row: Any) -> str:
         nonlocal comments
-        if row.text.lstrip().startswith(COMMENTS):
+        if row.text.lstrip().startswith(layout.comments):
             comments += 1
         else:
             torn.append((row.number, row.actual_columns, row.text))
@@ -131,7 +221,7 @@ def _parse_chunk(
     def parse(threads: bool) -> Any:
         return pc.read_csv(
             pa.BufferReader(text),
-            read_options=pc.ReadOptions(column_names=layout.names, skip_rows=skip_rows, use_threads=threads),
+            read_options=pc.ReadOptions(column_names=columns, skip_rows=skip_rows, use_threads=threads),
             parse_options=pc.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=invalid),
             convert_options=pc.ConvertOptions(
                 null_values=list(NULL_TEXTS),
@@ -157,55 +247,36 @@ def _parse_chunk(
 def _detect_encoding(head: bytes) -> str:
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
+    if is_utf16(head):
+        return "utf-16-le" if head[1:2] == b"\0" else "utf-16-be"
+    lines = head[: head.rfind(b"\n") + 1 or None]
     try:
-        head[: head.rfind(b"\n") + 1 or None].decode("utf-8")
+        lines.decode("utf-8")
     except UnicodeDecodeError:
-        return "latin-1"
+        # two bytes of Chinese are two letters of Latin: words that names of columns have tell
+        told = lines.decode("gb18030", errors="replace")
+        words = (word for each in WORDS.values() for word in each if CHINESE.search(word))
+        return "gb18030" if any(word in told for word in words) else "latin-1"
     return "utf-8-sig"
 
 
-def _detect_header(lines: list[str], path: Path) -> CsvLayout:
-    skipped = 0
-    while skipped < len(lines) and (not lines[skipped].strip() or lines[skipped].lstrip().startswith(COMMENTS)):
-        skipped += 1
-    sample = [line for line in lines[skipped:] if line.strip() and not line.lstrip().startswith(COMMENTS)][:SNIFF_LINES]
-    if not sample:
-        raise RecordingError(f"{path}: holds comments only, no rows")
-    delimiter = _detect_delimiter(sample)
-    body = sample[1:] or sample
-    decimal = "," if delimiter != "," and any(re.search(r"\d,\d|(?<!\d),\d", line) for line in body) else "."
-    cells = _split_cells(sample[0], delimiter)
-    if all(_is_value(cell, decimal) for cell in cells):
-        return CsvLayout(delimiter, decimal, tuple(f"c{index}" for index in range(len(cells))), skipped)
-    names = [cell or f"c{index}" for index, cell in enumerate(cells)]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise RecordingError(f"{path}: two columns are called {twice!r}, rename one of them")
-    return CsvLayout(delimiter, decimal, tuple(names), skipped + 1)
-
-
-def _detect_delimiter(sample: list[str]) -> str:
-    for delimiter in (";", "\t", ","):
-        if all(delimiter in line for line in sample):
-            return delimiter
-    # A torn row among the first ones must not hide the delimiter of all the others.
-    for delimiter in (";", "\t", ","):
-        if sum(delimiter in line for line in sample) > 0.8 * len(sample):
-            return delimiter
-    return " " if any(re.search(r"\S[ \t]+\S", line.strip()) for line in sample[1:]) else ","
+def is_utf16(head: bytes) -> bool:
+    """Tell whether bytes are UTF-16 without its mark: every other one is zero, and the others are text."""
+    for first in (0, 1):
+        zeros, others = head[first::2], head[1 - first :: 2]
+        if len(head) >= 8 and zeros.count(0) > 0.9 * len(zeros) and not any(byte < 9 for byte in others):
+            return True
+    return False
 
 
 def _split_cells(line: str, delimiter: str) -> list[str]:
     import csv
 
-    cells = line.split() if delimiter == " " else next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    if delimiter == " ":
+        cells = line.split()
+    else:
+        try:
+            cells = next(csv.reader([line[:LONGEST_LINE]], delimiter=delimiter, skipinitialspace=True), [])
+        except csv.Error:
+            cells = line.split(delimiter)
     return [cell.strip().strip("'\"") for cell in cells]
-
-
-def _is_value(cell: str, decimal: str) -> bool:
-    """Tell whether a cell of the first line is a value, and not the name of a column."""
-    return (
-        cell in NULL_TEXTS
-        or is_number(cell.replace(decimal, "."))
-        or re.fullmatch(r"\d{4}-\d\d-\d\d[T ].*", cell) is not None
-    )

@@ -2,33 +2,71 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.csv import open_csv
-from servoscope.signals.readers.mat import open_mat
-from servoscope.signals.readers.mdf_tdms import open_mdf, open_tdms
-from servoscope.signals.readers.parquet import open_parquet
+from servoscope.models.loop import TextLayout
+from servoscope.signals.readers.archives import ARCHIVES, archive_of, unpack
+from servoscope.signals.readers.bounded import open_bounded
+from servoscope.signals.readers.csv import is_utf16, open_csv
 from servoscope.signals.readers.table import TableFile
 
 ENTRY_POINTS = "servoscope.readers"  # of other packages: name is the suffix without its dot, object the function
 
 
 class Reader(NamedTuple):
-    """A kind of file, and the function that opens one."""
+    """A kind of file, and the function that opens one.
+
+    `module`, `function`: where that function is; `library`: what it imports beyond what servoscope needs; `extra`: with
+    what it is installed; `bounded`: whether a damaged file may hang or kill the process that reads it.
+    """
 
     format: str
-    open: Callable[[Path], TableFile]
+    module: str
+    function: str
+    library: str = ""
+    extra: str = ""
+    bounded: bool = False
+
+    @property
+    def installed(self) -> bool:
+        """Whether its library is there."""
+        return not self.library or find_spec(self.library) is not None
+
+    def open(self, path: Path, text: TextLayout | None) -> TableFile:
+        """Open a file; raises RecordingError if the library is missing or the file is damaged."""
+        if not self.installed:
+            raise RecordingError(
+                f"{path}: {self.format} files need {self.library}, pip install 'servoscope[{self.extra}]'"
+            )
+        if self.format == "CSV":
+            return open_csv(path, text)
+        if self.bounded:
+            return open_bounded(path, self.format, self.module, self.function, self.library or self.module)
+        opened: TableFile = getattr(importlib.import_module(self.module), self.function)(path)
+        return opened
 
 
-CSV, PARQUET, MAT = Reader("CSV", open_csv), Reader("Parquet", open_parquet), Reader("MAT", open_mat)
-MDF, TDMS = Reader("MDF", open_mdf), Reader("TDMS", open_tdms)
+_HERE = "servoscope.signals.readers"
+CSV, PARQUET = Reader("CSV", f"{_HERE}.csv", "open_csv"), Reader("Parquet", f"{_HERE}.parquet", "open_parquet")
+MAT = Reader("MAT", f"{_HERE}.mat", "open_mat")
+HDF5 = Reader("HDF5", f"{_HERE}.mat", "open_hdf5", bounded=True)
+MDF = Reader("MDF", f"{_HERE}.mdf_tdms", "open_mdf", "asammdf", "mdf", bounded=True)
+TDMS = Reader("TDMS", f"{_HERE}.mdf_tdms", "open_tdms", "nptdms", "tdms", bounded=True)
+SHEET = Reader("Excel", f"{_HERE}.programs", "open_sheet", "python_calamine", "formats", bounded=True)
+LVM = Reader("LVM", f"{_HERE}.programs", "open_lvm", "lvm_read", "formats", bounded=True)
+MCAP = Reader("MCAP", f"{_HERE}.topics", "open_mcap", "mcap_ros2", "formats", bounded=True)
+ULOG = Reader("ULog", f"{_HERE}.topics", "open_ulog", "pyulog", "formats", bounded=True)
 BUILT_IN = {
-    **{".csv": CSV, ".txt": CSV, ".tsv": CSV, ".dat": CSV},
+    **{".csv": CSV, ".txt": CSV, ".tsv": CSV, ".dat": CSV, ".asc": CSV, ".log": CSV},
     **{".parquet": PARQUET, ".pq": PARQUET, ".mat": MAT, ".mf4": MDF, ".mdf": MDF, ".tdms": TDMS},
+    **{".h5": HDF5, ".hdf5": HDF5, ".xlsx": SHEET, ".xls": SHEET, ".ods": SHEET, ".lvm": LVM},
+    **{".mcap": MCAP, ".ulg": ULOG},
 }
 MAGIC = {
     b"PAR1": "Parquet",
@@ -45,23 +83,36 @@ MAGIC = {
     b"MDF ": "MDF",
     b"UnFinMF ": "MDF file that its recorder never finished",
     b"TDSm": "TDMS",
+    b"LabVIEW Measurement": "LVM",
+    b"\x89MCAP0\r\n": "MCAP",
+    b"ULog\x01": "ULog",
 }
+SAME = {("MAT", "HDF5"), ("Excel", "ZIP archive or Excel workbook"), ("Excel", "Excel workbook"), ("HDF5", "MAT")}
 
 
 def readable_suffixes() -> list[str]:
-    """Return the suffixes of the files that can be read, those of other packages last."""
+    """Return the suffixes of the files that can be read with what is installed, those of other packages last."""
     others = (f".{found.name.lower()}" for found in entry_points(group=ENTRY_POINTS))
-    return list(dict.fromkeys([*BUILT_IN, *others]))
+    installed = (suffix for suffix, reader in BUILT_IN.items() if reader.installed)
+    return list(dict.fromkeys([*installed, *ARCHIVES, *others]))
 
 
-def open_file(path: str | Path) -> TableFile:
-    """Open a file; its rows are not read yet.
+def open_file(path: str | Path, text: TextLayout | None = None) -> TableFile:
+    """Open a file, also one in an archive (``log.zip/day.csv``, ``log.csv.gz``); its rows are not read yet.
+
+    `text`: what the user says of the layout of a text file.
 
     Raises RecordingError if the file cannot be read, is empty, or is not what its suffix says.
     """
     path = Path(path)
     if path.is_dir():
         raise RecordingError(f"{path}: is a directory, give a recording in it")
+    if archive_of(path) is not None:
+        return unpack(path, lambda inside: _open_plain(inside, text))
+    return _open_plain(path, text)
+
+
+def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
     try:
         with path.open("rb") as file:
             head = file.read(65536)
@@ -75,6 +126,7 @@ def open_file(path: str | Path) -> TableFile:
     reader = BUILT_IN.get(suffix)
     if reader is not None:
         _check_format(path, head, reader.format)
+        opened = reader.open(path, text)
     else:  # looked up only now: it takes a hundredth of a second
         other = next((found for found in entry_points(group=ENTRY_POINTS) if f".{found.name.lower()}" == suffix), None)
         if other is None:
@@ -82,8 +134,8 @@ def open_file(path: str | Path) -> TableFile:
             what = f", it looks like a {found}" if found else ""
             known = ", ".join(readable_suffixes())
             raise RecordingError(f"{path}: unknown kind of file {path.suffix!r}{what}; readable are {known}")
-        reader = Reader(other.name, other.load())
-    opened = reader.open(path)
+        opener: Callable[[Path], TableFile] = other.load()
+        opened = opener(path)
     if not opened.columns:
         raise RecordingError(f"{path}: holds no columns of numbers")
     return opened
@@ -96,20 +148,18 @@ def _recognise(head: bytes) -> str | None:
         (b"<!doctype", b"<html", b"<?xml", b"<svg")
     ):
         return "HTML or XML page"
-    if found is None and b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):
+    if found is None and b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")) and not is_utf16(head):
         return "binary file"
     return found
 
 
 def _check_format(path: Path, head: bytes, wanted: str) -> None:
     found = _recognise(head)
-    if found == wanted or (wanted == "MAT" and found == "HDF5") or (wanted == "CSV" and found is None):
+    if found == wanted or (wanted, found) in SAME or (wanted == "CSV" and found in (None, "LVM")):
         return
+    suffix = next((suffix for suffix, reader in BUILT_IN.items() if reader.format == found), None)
     advice = {
-        "Parquet": "rename it to .parquet",
-        "MAT": "rename it to .mat",
-        "MDF": "rename it to .mf4",
-        "TDMS": "rename it to .tdms",
         "MDF file that its recorder never finished": "finalize it with the recorder's own tool",
-    }.get(found or "", f"export it as {wanted}")
+        "gzip archive": f"rename it to {path.name}.gz",
+    }.get(found or "", f"rename it to {suffix}" if suffix else f"export it as {wanted}")
     raise RecordingError(f"{path}: is not {wanted} but a {found or 'text file'}: {advice}")

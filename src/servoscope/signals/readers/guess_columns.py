@@ -1,52 +1,177 @@
-"""Which columns of a file may be t, r, u and y, by their names: a proposal for the user to check."""
+"""Which columns of a file may be t, r, u and y, by their names in six languages: a proposal for the user to check."""
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from typing import Any
 
-# Words in names, the most telling first; the order of the letters decides which signal chooses first.
+from servoscope.signals.readers.units import si_factor, split_unit
+
+# Words in names, the most telling first; the order of the letters decides which signal chooses first. English, then
+# German, French, Italian, Spanish; without accents. Chinese names have no blanks: its words are looked for inside.
 WORDS = {
-    "t": ("t", "time", "timestamp", "zeit", "seconds", "elapsed", "datetime", "date"),
-    "r": ("r", "ref", "reference", "setpoint", "set", "soll", "target", "desired", "demand", "qg"),
+    "t": (
+        *("t", "time", "timestamp", "zeit", "zeitstempel", "temps", "tempo", "tiempo", "horodatage", "时间", "时刻"),
+        *(
+            "timer",
+            "seconds",
+            "elapsed",
+            "datetime",
+            "uhrzeit",
+            "heure",
+            "ora",
+            "hora",
+            "date",
+            "datum",
+            "fecha",
+            "data",
+        ),
+    ),
+    "r": (
+        *("r", "ref", "reference", "setpoint", "set", "sp", "soll", "sollwert", "sollposition", "sollwinkel", "target"),
+        *("solldrehzahl", "sollgeschwindigkeit", "fuhrungsgrosse", "consigne", "riferimento", "consigna", "referencia"),
+        *("desired", "demand", "demanded", "commanded", "objetivo", "obiettivo", "qg"),
+        *("设定", "给定", "目标", "指令", "参考"),
+    ),
     "u": (
-        *("u", "input", "control", "valve", "servo", "stell", "torque", "current", "voltage", "force", "pwm"),
-        *("effort", "vir"),
+        *("u", "input", "control", "controller", "valve", "servo", "stell", "stellgrosse", "stellsignal", "stellwert"),
+        *("ventil", "torque", "current", "voltage", "force", "pwm", "effort", "vir", "iq", "moment", "drehmoment"),
+        *("strom", "motorstrom", "spannung", "kraft", "couple", "courant", "tension", "commande", "coppia", "corrente"),
+        *("tensione", "comando", "forza", "par", "corriente", "tensionsalida", "mando", "fuerza", "voltaje"),
+        *("电流", "转矩", "扭矩", "力矩", "电压", "控制量", "阀"),
     ),
     "y": (
-        *("y", "output", "ist", "actual", "measured", "feedback", "position", "pos", "angle", "speed", "velocity"),
-        *("encoder", "displacement", "qm"),
+        *("y", "output", "ist", "istwert", "istposition", "istwinkel", "istdrehzahl", "actual", "act", "measured"),
+        *("feedback", "position", "pos", "angle", "speed", "velocity", "encoder", "displacement", "qm", "mesure"),
+        *("mesuree", "reelle", "vitesse", "misura", "misurata", "posizione", "reale", "velocita", "posicion", "medida"),
+        *("real", "velocidad", "lage", "winkel", "drehzahl", "geschwindigkeit", "weg"),
+        *("实际", "反馈", "位置", "测量", "速度", "角度"),
     ),
+}
+# what u is and r is not: a reference of the torque is what the controller puts out
+QUANTITIES = {
+    *(
+        "torque",
+        "current",
+        "voltage",
+        "force",
+        "drehmoment",
+        "strom",
+        "spannung",
+        "kraft",
+        "couple",
+        "courant",
+        "coppia",
+    ),
+    *("corrente", "forza", "corriente", "fuerza", "电流", "转矩", "扭矩", "力矩", "电压"),
+}
+# r - y in the place of y, as drives log it
+ERRORS = {
+    "error",
+    "err",
+    "deviation",
+    "abweichung",
+    "regelabweichung",
+    "schleppfehler",
+    "schleppabstand",
+    "erreur",
+    "ecart",
 }
 COMMAND = ("command", "cmd")  # what the controller commands where there is a reference besides, else the reference
 FIELDS = {"t": "time", "r": "reference", "u": "input", "y": "output"}
-UNITS = ("ms", "us", "ns", "min", "s")
+TIME_UNITS = {"ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns", "min": "min", "s": "s", "sec": "s"}
+CLOCK_PARTS = (
+    ("date", "datum", "fecha", "data"),
+    ("time", "zeit", "uhrzeit", "heure", "hora", "ora"),
+    ("millitm", "msec"),
+)
 
 
 def guess_columns(names: Sequence[str]) -> dict[str, str]:
     """Return the likeliest column for t, r, u and y, each column once; without those that no name suggests."""
-    parts = {name: {part.casefold() for part in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)} for name in names}
-    has_reference = any(parts[name] & set(WORDS["r"]) and not parts[name] & set(COMMAND) for name in names)
+    parts = {name: _words(name) for name in names}
+    values = [name for name in names if not parts[name] & ERRORS]
+    plain = [name for name in values if not parts[name] & QUANTITIES]
+    has_reference = any(parts[name] & set(WORDS["r"]) and not parts[name] & set(COMMAND) for name in plain)
     heir = "u" if has_reference else "r"
     words = {**WORDS, heir: (*WORDS[heir][:2], *COMMAND, *WORDS[heir][2:])}
     found: dict[str, str] = {}
     for whole in (True, False):  # a name that is the word comes before one that only contains it
         for letter in [each for each in words if each not in found]:
-            left = [name for name in names if name not in found.values()]
+            among = plain if letter == "r" else values
+            left = [name for name in among if name not in found.values()]
             matches = (
                 name
                 for word in words[letter]
                 for name in left
-                if (name.casefold() == word if whole else word in parts[name])
+                if (_plain(split_unit(name)[0]) == word if whole else word in parts[name])
             )
             if (match := next(matches, None)) is not None:
                 found[letter] = match
     return {letter: found[letter] for letter in WORDS if letter in found}
 
 
+def _plain(name: str) -> str:
+    """Return a name in small letters without accents."""
+    kept = unicodedata.normalize("NFKD", name.casefold())
+    return "".join(c for c in kept if not unicodedata.combining(c)).strip()
+
+
+def _words(name: str) -> set[str]:
+    """Return the words of a name, its unit aside; of Chinese, all words that it contains."""
+    bare = "".join(c for c in unicodedata.normalize("NFKD", split_unit(name)[0]) if not unicodedata.combining(c))
+    latin = {part.casefold() for part in re.findall(r"[A-Z]?[a-zß]+|[A-Z]+(?![a-z])", bare)}
+    return latin | {word for each in WORDS.values() for word in each if not word.isascii() and word in name}
+
+
 def guess_mapping(names: Sequence[str]) -> dict[str, Any]:
-    """Return the guess as the fields of `Columns`, None where no name suggests one, with the unit of the time."""
+    """Return the guess as the fields of `Columns`, in SI units after the units in the names.
+
+    None stands where no name suggests a column; a date and a time of day in two columns are one clock.
+    """
     found = guess_columns(names)
-    unit = next((unit for unit in UNITS if re.search(rf"[\[(_ /]{unit}[\])]?$", found.get("t", ""))), "s")
-    return {**{field: found.get(letter) for letter, field in FIELDS.items()}, "time_unit": unit, "segment": []}
+    fields: dict[str, Any] = {field: None for field in FIELDS.values()}
+    for letter, column in found.items():
+        fields[FIELDS[letter]] = column if letter == "t" else scaled_channel(column)
+    if "r" in found and "y" not in found:
+        error = next((name for name in names if _words(name) & ERRORS), None)
+        fields["output"] = error and f"{scaled_channel(found['r'], True)} - {scaled_channel(error, True)}"
+    clock = _clock_columns(names)
+    if len(clock) > 1:
+        fields["time"] = " + ".join(clock)
+    unit = "s" if len(clock) > 1 else TIME_UNITS.get(split_unit(found.get("t", ""))[1], "s")
+    return {**fields, "time_unit": unit, "segment": []}
+
+
+def format_mapping(fields: dict[str, Any]) -> str:
+    """Return a guess as ``--columns`` takes it; what was not found is left out."""
+    pairs = {letter: fields[field] for letter, field in FIELDS.items() if fields[field] is not None}
+    if "t" in pairs:
+        unit = "" if fields["time_unit"] == "s" else f"[{fields['time_unit']}]"
+        pairs["t"] = pairs["t"] if " + " in pairs["t"] else quoted_channel(pairs["t"]) + unit
+    quoted = {
+        letter: text if " " not in text or "`" in text or " + " in text else quoted_channel(text)
+        for letter, text in pairs.items()
+    }
+    return ", ".join(f"{letter}={text}" for letter, text in quoted.items())
+
+
+def scaled_channel(column: str, quoted: bool = False) -> str:
+    """Return a column as `[columns]` name it, times what turns it into SI units; `quoted`: as a part of a sum."""
+    factor = si_factor(column)
+    if factor == 1.0:
+        return quoted_channel(column) if quoted else column
+    return f"{factor:.15g} * {quoted_channel(column)}"
+
+
+def quoted_channel(column: str) -> str:
+    """Return a column's name, in backticks unless it is one plain word."""
+    return column if column.isidentifier() else f"`{column}`"
+
+
+def _clock_columns(names: Sequence[str]) -> list[str]:
+    """Return the columns that make one clock together: a date, a time of day, and its milliseconds."""
+    each = [next((name for name in names if _plain(name) in words), None) for words in CLOCK_PARTS]
+    return [name for name in each if name is not None] if each[1] and (each[0] or each[2]) else []

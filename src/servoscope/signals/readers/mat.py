@@ -1,13 +1,15 @@
-"""Reads MAT files.
+"""Reads MAT files, also with timetables and records of dSPACE ControlDesk, and other HDF5 files.
 
-Files of version 5 are checked first: SciPy trusts the types that they name, and a wrong one ends the process.
+MAT files of version 5 are checked first: SciPy trusts the types that they name, and a wrong one ends the process.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.bounded import open_bounded
 from servoscope.signals.readers.table import Table, TableFile, shorten_error
 
 HEADER_BYTES = 128  # bytes of text, version and byte order
@@ -24,16 +27,47 @@ MAX_DEPTH = 30  # structures in structures
 
 
 def open_mat(path: Path) -> TableFile:
-    """Open a MAT file, version 5 or 7.3."""
+    """Open a MAT file, version 5 or 7.3; what SciPy does not read, in a process of its own."""
+    import h5py
+
+    def has_objects(variables: Mapping[str, Any]) -> bool:
+        return any(name == "__function_workspace__" or _is_object(value) for name, value in variables.items())
+
+    if h5py.is_hdf5(path):
+        return open_bounded(path, "MAT", __name__, "open_mat_objects", "scipy.io")
+    return _open_variables(path, "MAT", _load_mat5, has_objects)
+
+
+def open_mat_objects(path: Path) -> TableFile:
+    """Open a MAT file of version 7.3, or one that holds objects, such as timetables."""
+    return _open_variables(path, "MAT", _load_mat)
+
+
+def open_hdf5(path: Path) -> TableFile:
+    """Open an HDF5 file: its datasets, tables with named columns among them, and frames of pandas."""
+    return _open_variables(path, "HDF5", lambda path: _load_hdf5(path, matlab=False))
+
+
+def _open_variables(
+    path: Path,
+    kind: str,
+    load: Callable[[Path], Mapping[str, Any]],
+    is_beyond: Callable[[Mapping[str, Any]], bool] = lambda _: False,
+) -> TableFile:
+    """Open a file whose variables are read at once; if they are beyond what `load` reads, in a process of its own."""
     import pyarrow as pa
 
     try:
-        variables = dict(_flatten(_load_mat(path)))
+        loaded = load(path)
+        beyond = is_beyond(loaded)
+        variables = {} if beyond else dict(_flatten(loaded))
     # SciPy and h5py raise nearly anything at damaged files, from MatReadError to AttributeError.
     except Exception as error:
         raise RecordingError(
-            f"{path}: is a damaged or unknown MAT file ({shorten_error(error)}), save it again"
+            f"{path}: is a damaged or unknown {kind} file ({shorten_error(error)}), save it again"
         ) from None
+    if beyond:
+        return open_bounded(path, kind, __name__, "open_mat_objects", "scipy.io")
     lengths = [x.size for x in variables.values() if x.size > 1]
     # The channels are the vectors of the length that most of them, and of those the longest, have.
     rows = max(lengths, key=lambda size: (lengths.count(size), size), default=0)
@@ -42,14 +76,55 @@ def open_mat(path: Path) -> TableFile:
     return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns)]), others)
 
 
-def _load_mat(path: Path) -> Mapping[str, Any]:
-    import h5py
+def _load_mat5(path: Path) -> dict[str, Any]:
     import scipy.io
 
-    if not h5py.is_hdf5(path):
-        check_mat5(path)
-        loaded: dict[str, Any] = scipy.io.loadmat(path, squeeze_me=False)
-        return {name: value for name, value in loaded.items() if not name.startswith("__")}
+    check_mat5(path)
+    loaded: dict[str, Any] = scipy.io.loadmat(path, squeeze_me=False)
+    hidden = ("__header__", "__version__", "__globals__")
+    return {name: value for name, value in loaded.items() if name not in hidden}
+
+
+def _load_mat(path: Path) -> dict[str, Any]:
+    import h5py
+
+    if h5py.is_hdf5(path):
+        loaded = _load_hdf5(path, matlab=True)
+        with h5py.File(path, "r") as file:
+            has_objects = "#subsystem#" in file
+    else:
+        loaded = _load_mat5(path)
+        has_objects = any(name == "__function_workspace__" or _is_object(x) for name, x in loaded.items())
+    if has_objects:
+        if find_spec("matio") is None:
+            raise ValueError("it holds objects, such as timetables: pip install 'servoscope[formats]'")
+        loaded |= _load_objects(path)
+    return {n: value for n, value in loaded.items() if not n.startswith(("__", "#")) and not _is_object(value)}
+
+
+def _is_object(value: Any) -> bool:
+    """Tell whether a variable is an object of MATLAB, which SciPy does not read."""
+    return type(value).__name__ == "MatlabOpaque" or getattr(getattr(value, "dtype", None), "names", None) == (
+        "s0", "s1", "s2", "arr",
+    )  # fmt: skip
+
+
+def _load_objects(path: Path) -> dict[str, Any]:
+    """Return tables and timetables as mappings of their columns."""
+    from matio import load_from_mat
+
+    found = {}
+    for name, value in load_from_mat(str(path)).items():
+        if hasattr(value, "columns") and hasattr(value, "index"):  # a frame of pandas
+            columns = {str(column): np.asarray(value[column]) for column in value.columns}
+            if value.index.dtype.kind in "mM":  # of a timetable
+                columns = {str(value.index.name or "Time"): np.asarray(value.index)} | columns
+            found[name] = columns
+    return found
+
+
+def _load_hdf5(path: Path, matlab: bool) -> dict[str, Any]:
+    import h5py
 
     def group(node: Any) -> dict[str, Any]:
         inner: dict[str, Any] = {}
@@ -57,12 +132,28 @@ def _load_mat(path: Path) -> Mapping[str, Any]:
             if isinstance(item, h5py.Group):
                 if not name.startswith("#"):
                     inner[name] = group(item)
-            elif item.attrs.get("MATLAB_class", b"double") not in (b"char", b"cell"):
-                inner[name] = np.asarray(item[()]).T  # MATLAB counts columns first
-        return inner
+            elif (
+                item.attrs.get("MATLAB_class", b"double") not in (b"char", b"cell")
+                and "MATLAB_object_decode" not in item.attrs
+            ):
+                values = np.asarray(item[()])
+                inner[name] = values.T if matlab else values  # MATLAB counts columns first
+        return _frame_columns(inner)
 
     with h5py.File(path, "r") as file:
         return group(file)
+
+
+def _frame_columns(node: dict[str, Any]) -> dict[str, Any]:
+    """Return a frame as pandas stores it, blocks with the names of their columns, as a mapping of its columns."""
+    blocks = [name.removesuffix("_values") for name in node if re.fullmatch(r"block\d+_values", name)]
+    if not blocks or "axis1" not in node:
+        return node
+    columns: dict[str, Any] = {}
+    for block in blocks:
+        names = [x.decode() if isinstance(x, bytes) else str(x) for x in node[f"{block}_items"].reshape(-1).tolist()]
+        columns |= {name: node[f"{block}_values"][:, k] for k, name in enumerate(names)}
+    return {"index": node["axis1"], **columns}
 
 
 def _flatten(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, npt.NDArray[Any]]]:
@@ -72,8 +163,21 @@ def _flatten(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[s
         array = value if isinstance(value, Mapping) else np.asarray(value)
         if isinstance(array, Mapping):
             yield from _flatten(array, f"{name}.")
+        elif array.dtype.names and {"Name", "Data"} <= set(array.dtype.names):
+            yield from _control_desk_channels(array, name)
         elif array.dtype.names and array.size == 1:
             yield from _flatten({part: array[part].item() for part in array.dtype.names}, f"{name}.")
+        elif array.dtype.names and array.ndim == 1:  # a table, as PyTables and h5py write it
+            yield from _flatten(
+                {part: array[part] for part in array.dtype.names}, prefix if key == "table" else f"{name}."
+            )
+        elif array.dtype.kind in "mM" and array.ndim == 1:
+            since = (
+                (array - array[:1]) / np.timedelta64(1, "ns")
+                if array.dtype.kind == "M"
+                else array / np.timedelta64(1, "ns")
+            )
+            yield name, np.asarray(since * 1e-9, dtype=np.float64)
         elif array.dtype.kind in "fiub" and array.ndim <= 2:
             plain = array.astype(array.dtype.newbyteorder("="))
             if plain.ndim < 2 or 1 in plain.shape:
@@ -81,6 +185,20 @@ def _flatten(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[s
             else:
                 for index in range(plain.shape[1]):
                     yield f"{name}[{index}]", np.ascontiguousarray(plain[:, index])
+
+
+def _control_desk_channels(records: npt.NDArray[Any], name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """Walk the axes or signals of a measurement of dSPACE ControlDesk, structs with Name and Data.
+
+    Source: dSPACE, ControlDesk Measurement and Recording, "Structure of the MAT file": X are time axes, Y signals.
+    """
+    for record in records.reshape(-1):
+        values = np.asarray(record["Data"]).reshape(-1)
+        label = "".join(map(str, np.asarray(record["Name"]).reshape(-1)))
+        label = re.sub(r'^.*?([^/"]+)"?\s*$', r"\1", label) or name
+        if values.dtype.kind in "fiub":
+            is_axis = name.rpartition(".")[2] == "X"
+            yield "time" if is_axis else label, np.ascontiguousarray(values.astype(values.dtype.newbyteorder("=")))
 
 
 def check_mat5(path: Path) -> None:

@@ -16,10 +16,11 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import message
 from servoscope.core.outofcore import GrowableArray
-from servoscope.models.loop import Columns, Loop
+from servoscope.models.loop import Columns, Loop, TextLayout
 from servoscope.signals import Defect, Recording, clean, with_defects
 from servoscope.signals.readers.columns import LinearCombination, find_channel, parse_combination
 from servoscope.signals.readers.formats import open_file
+from servoscope.signals.readers.frames import Source, open_source
 from servoscope.signals.readers.select import CellReader, ColumnTypeChanged, RowFilter, format_cell
 from servoscope.signals.readers.table import Table, TableFile, TimeColumn, number_column
 
@@ -36,12 +37,12 @@ class ChannelInfo:
     max: float
 
 
-def list_channels(path: str | Path) -> list[ChannelInfo]:
-    """Return what columns a file has, in its order.
+def list_channels(path: str | Path, text: TextLayout | None = None) -> list[ChannelInfo]:
+    """Return what columns a file has, in its order; `text`: what the user says of the layout of a text file.
 
     Raises RecordingError if the file cannot be read.
     """
-    opened = open_file(path)
+    opened = open_file(path, text)
     ranges: dict[str, list[tuple[float, float]]] = {name: [] for name in opened.columns}
     types: dict[str, list[str]] = {name: [] for name in opened.columns}
     for table in (each for names in opened.channel_groups or [opened.columns] for each in opened.iter_chunks(names)):
@@ -65,7 +66,7 @@ def _channel_info(name: str, types: list[str], ranges: list[tuple[float, float]]
 
 
 def read(
-    path: str | Path,
+    path: Source,
     loop: Loop | None = None,
     *,
     columns: Columns | None = None,
@@ -76,7 +77,8 @@ def read(
     Parameters
     ----------
     path
-        CSV (any delimiter, decimal comma with ``;``), Parquet, MAT (v5 and v7.3), MDF (3 and 4), or TDMS.
+        CSV and other text, Parquet, MAT (v5 and v7.3), HDF5, and with ``servoscope[formats]`` MDF (3 and 4), TDMS,
+        Excel, LabVIEW (.lvm), MCAP of ROS 2 and ULog; any of them in .gz or .zip.
     loop
         The loop it was taken from: columns, sample rate, input limits. None: columns t, r, u, y, rate as measured.
     columns
@@ -91,7 +93,7 @@ def read(
 
 
 def read_parts(
-    path: str | Path,
+    path: Source,
     loop: Loop | None = None,
     *,
     columns: Columns | None = None,
@@ -106,7 +108,7 @@ def read_parts(
     texts: set[str] = set()
     while True:
         try:
-            return _read_table_parts(open_file(path), loop, columns, where or {}, by, texts)
+            return _read_table_parts(open_source(path, columns.text), loop, columns, where or {}, by, texts)
         except ColumnTypeChanged as found:  # what was taken for numbers belongs to a column of text
             texts.add(found.column)
 
@@ -128,7 +130,10 @@ def _read_table_parts(
     clock = _find_time_column(opened, columns, loop)
     segments = [CellReader(find_channel(x, known, f"{name}: [columns] segment")) for x in columns.segment]
     wanted = {*chosen.columns, *(x for several in signals.values() for signal in several for x in signal.factors)}
-    wanted |= {each.column for each in (apart, clock, *segments) if each is not None}
+    wanted |= {each.column for each in (apart, *segments) if each is not None}
+    if clock is not None:
+        wanted |= set(clock.columns)
+        texts |= set(clock.columns) if len(clock.columns) > 1 else set()
     parts: dict[str, _RecordingBuilder] = {}
     run = 0
     for table in opened.iter_chunks(wanted, texts):
@@ -225,8 +230,11 @@ def _uniform_time(rows: int, rate: float) -> FloatArray:
 def _find_time_column(opened: TableFile, columns: Columns, loop: Loop | None) -> TimeColumn | None:
     """Return the time column; None where rows are uniform."""
     wanted, known = columns.time, opened.columns
+    where = f"{opened.name}: [columns] time"
+    if wanted is not None and wanted not in known and "+" in wanted:
+        return TimeColumn([find_channel(part, known, where) for part in wanted.split("+")], columns.time_unit)
     if wanted is not None and (wanted in known or wanted != Columns().time):
-        return TimeColumn(find_channel(wanted, known, f"{opened.name}: [columns] time"), columns.time_unit)
+        return TimeColumn([find_channel(wanted, known, where)], columns.time_unit)
     # A clock under another name must not be thrown away for a uniform one.
     clock = next((name for name in known if re.split(r"[\s\[(]", name.casefold())[0] in TIME_NAMES), None)
     if wanted is not None and (clock is not None or loop is None):
@@ -254,3 +262,8 @@ def _evaluate_signal(table: Table, combination: LinearCombination, what: str) ->
     for name, factor in combination.factors.items():
         total += factor * number_column(table, name, what)
     return total
+
+
+def as_recording(source: Recording | Source, loop: Loop | None = None) -> Recording:
+    """Return a recording as it is, and anything else as `read` reads it."""
+    return source if isinstance(source, Recording) else read(source, loop)

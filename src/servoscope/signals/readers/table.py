@@ -11,12 +11,14 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.clock import ClockParser, is_clock
 
 NULL_TEXTS = (
     *("", "NaN", "nan", "NAN", "-nan", "-NaN", "NA", "N/A", "#N/A", "#NA", "null", "NULL", "None", "-", "?"),
     "1.#QNAN",
 )
 MAX_COLUMNS = 20_000  # of a file: beyond that the description of the columns is what fills the memory
+TIME_UNITS_BY_NAME = {"millitm": "ms", "msec": "ms", "ms": "ms", "milliseconds": "ms"}  # beside a time of day
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 
@@ -75,25 +77,38 @@ def number_column(table: Table, name: str, what: str) -> FloatArray:
 
 
 class TimeColumn:
-    """A time column in seconds, chunk by chunk; date and time count from the first row that has them.
+    """The time in seconds, chunk by chunk; dates and times count from the first row that has them.
 
-    `column`: its name; `unit`: of numbers in it.
+    `columns`: names of a column, or of several that make one clock together: a date, a time of day, milliseconds;
+    `unit`: of numbers in one column.
     """
 
-    def __init__(self, column: str, unit: str) -> None:
-        self.column, self._unit = column, unit
+    def __init__(self, columns: Sequence[str], unit: str) -> None:
+        self.columns, self._unit = tuple(columns), unit
         self._origin: tuple[int, float] | None = None
+        self._begin: float | None = None
+        self._clocks = {column: ClockParser() for column in self.columns}
 
     def seconds(self, table: Table) -> FloatArray:
         """Return the time of a piece's rows [s], shape (N,).
 
         Raises RecordingError if a cell holds text that is neither number nor time.
         """
+        if len(self.columns) == 1:
+            return self._column_seconds(table, self.columns[0], self._unit)
+        parts = [
+            self._column_seconds(table, each, TIME_UNITS_BY_NAME.get(each.casefold(), "s")) for each in self.columns
+        ]
+        return np.asarray(np.sum(parts, axis=0))
+
+    def _column_seconds(self, table: Table, name: str, unit: str) -> FloatArray:
         import pyarrow as pa
 
-        column = table.columns[self.column]
+        column = table.columns[name]
+        if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+            return self._clock_seconds(table, name, unit)
         if not pa.types.is_temporal(column.type):
-            return number_column(table, self.column, "time") * TIME_UNITS[self._unit]
+            return number_column(table, name, "time") * TIME_UNITS[unit]
         missing = np.asarray(column.is_null().to_numpy(zero_copy_only=False), dtype=bool)
         if pa.types.is_date(column.type):
             column = column.cast(pa.timestamp("ms"))
@@ -113,6 +128,21 @@ class TimeColumn:
             since = (whole - begun) / per_second + (begun / per_second - first / per)
         return np.where(missing, np.nan, since)
 
+    def _clock_seconds(self, table: Table, name: str, unit: str) -> FloatArray:
+        """Return dates and times of day that are text, from the first of them on; else numbers that are text."""
+        cells = table.columns[name].to_pylist()
+        if not any(is_clock(cell) for cell in cells if cell):
+            return number_column(table, name, "time") * TIME_UNITS[unit]
+        found = self._clocks[name].seconds(cells)
+        if isinstance(found, int):
+            raise RecordingError(
+                f"{table.name}: row {table.row_number(found)}, column {name!r}: {str(cells[found])[:40]!r} is neither a"
+                " date nor a time, correct it or leave the cell empty"
+            )
+        if self._begin is None and len(self.columns) == 1 and np.isfinite(found).any():
+            self._begin = float(found[np.isfinite(found)][0])
+        return found - (self._begin or 0.0)
+
 
 def _parse_numbers(table: Table, name: str, cells: list[str | None]) -> FloatArray:
     numbers = np.empty(len(cells))
@@ -124,7 +154,7 @@ def _parse_numbers(table: Table, name: str, cells: list[str | None]) -> FloatArr
             shown = text if len(text) <= 40 else f"{text[:37]}..."
             raise RecordingError(
                 f"{table.name}: row {table.row_number(index)}, column {name!r}: {shown!r} is not a number,"
-                " correct it or leave the cell empty"
+                " correct it or leave the cell empty (--comment leaves out lines that hold no row)"
             ) from None
     return numbers
 

@@ -16,7 +16,13 @@ export function dropzone(words, several, taken, signal, begun = () => {}) {
   const said = h("div", { role: "status", class: "working" });
   const input = h("input", { type: "file", class: "hidden", id: "files", multiple: several, "aria-label": words });
   const choose = h("button", { type: "button", class: "first", onclick: () => input.click() }, several ? "Choose files" : "Choose a file");
-  const element = h("div", { class: "drop" }, h("span", {}, words), choose, input, h("small", {}, "CSV, Parquet, MAT, MDF4, TDMS, HDF5"), said);
+  const kinds = h("small", {});
+  const element = h("div", { class: "drop" }, h("span", {}, words), choose, input, kinds, said);
+  // what the server can read depends on what is installed there
+  get("/uploads", signal).then((found) => {
+    kinds.replaceChildren(found.suffixes.join(" "));
+    input.accept = found.suffixes.join(",");
+  }, () => kinds.replaceChildren());
   const take = async (files) => {
     begun();
     for (const file of several ? files : [...files].slice(0, 1)) {

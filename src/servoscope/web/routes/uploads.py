@@ -77,7 +77,7 @@ async def _save_body(request: Request, path: Path) -> int:
 @router.get("/uploads")
 def list_uploads(context: ContextDep) -> UploadList:
     """List the uploads."""
-    return UploadList(uploads=context.storage.list(UploadRow))
+    return UploadList(uploads=context.storage.list(UploadRow), suffixes=readable_suffixes())
 
 
 @router.get("/uploads/{id}")

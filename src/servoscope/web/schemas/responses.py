@@ -116,9 +116,10 @@ class UploadDetail(UploadRow, FilePreview):
 
 
 class UploadList(ApiResponse):
-    """Uploads, the newest last."""
+    """Uploads, the newest last, and the suffixes of files that this server reads."""
 
     uploads: list[UploadRow]
+    suffixes: list[str]
 
 
 class SignalColumns(ApiResponse):

@@ -1,0 +1,178 @@
+"""A loop file proposed from one log: columns, units, sample rate, plant, cutoff and memory, each with its evidence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from servoscope.core.errors import RecordingError
+from servoscope.core.messages import Message, message, render
+from servoscope.learning.inspection import Inspection, inspect
+from servoscope.models.loop import Columns, Loop, MonitorSettings
+from servoscope.signals.readers import ChannelInfo, read
+from servoscope.signals.readers.guess_columns import FIELDS, guess_mapping
+from servoscope.signals.readers.units import split_unit
+
+MEMORIES = 10.0  # that a recording to learn from should have at least
+LONGEST_MEMORY_S, LEAST_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
+WORTH = 0.005  # share of u that a higher order or a stiffness has to explain
+CLEAR = 0.9  # share of u that a plant explains; below it, the choice is in doubt
+
+
+@dataclass(frozen=True)
+class ProposalLine:
+    """A key of the loop file, its value as TOML, and why it is proposed; `doubtful`: somebody has to confirm it."""
+
+    section: str
+    key: str
+    value: str
+    why: Message
+    doubtful: bool = False
+
+
+@dataclass(frozen=True)
+class LoopProposal:
+    """A loop with the lines of its file."""
+
+    loop: Loop
+    lines: tuple[ProposalLine, ...]
+
+    def to_toml(self, origin: str) -> str:
+        """Return the loop file with comments; `origin`: the log that it was made from."""
+        written = [f"# {render(message('init.origin', log=origin))}"]
+        section = ""
+        for line in self.lines:
+            if line.section != section:
+                section = line.section
+                written += ["", f"[{section}]"]
+            written.append(f"{line.key} = {line.value}".ljust(40) + f"  # {render(line.why)}")
+        return "\n".join(written) + "\n"
+
+
+def propose_columns(path: Path, channels: Sequence[ChannelInfo]) -> Columns:
+    """Return the columns of a log by the words and units in their names.
+
+    Raises RecordingError if no name suggests u or y.
+    """
+    names = [channel.name for channel in channels]
+    fields = guess_mapping(names)
+    missing = [letter for letter in "uy" if fields[FIELDS[letter]] is None]
+    if missing:
+        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise RecordingError(
+            f"{path}: no name suggests {' and '.join(missing)}: say which columns they are,"
+            f" --columns 't=..., r=..., u=..., y=...'; the file has {shown}"
+        )
+    default = Columns()
+    fields["reference"] = fields["reference"] or default.reference  # u stands for it where there is none
+    return Columns.model_validate({**fields, "segment": ()})
+
+
+def propose_loop(path: Path, columns: Columns) -> LoopProposal:
+    """Return a loop for a log whose columns are known, as `inspect` measures it.
+
+    Raises RecordingError if the log cannot be read, or nothing moves in it.
+    """
+    recording = read(path, columns=columns)
+    found = inspect(recording)
+    best = found.best_order
+    if best is None or found.suggested_cutoff_hz is None:
+        raise RecordingError(f"{path}: {found.summary}")
+    rate = float(f"{recording.sample_rate:.6g}")
+    # the largest of two digits that the recommendation allows
+    cutoff = float(f"{found.suggested_cutoff_hz:.2g}")
+    memory = max(LEAST_PERIODS / cutoff, min(LONGEST_MEMORY_S, recording.duration_s / MEMORIES))
+    memory = float(f"{memory:.2g}")
+    frequencies = [f for f in MonitorSettings().frequencies if f <= cutoff] or [float(f"{cutoff / 2.0:.2g}")]
+    settings = {
+        "sample_rate": rate,
+        "columns": columns.model_dump(exclude_none=True) | {"time": columns.time},
+        "monitor": {"cutoff": cutoff, "memory": memory, "frequencies": frequencies},
+    }
+
+    def loop_of(order: int, stiffness: bool) -> Loop:
+        plant = {
+            "kind": "polynomial",
+            "order": order,
+            "friction": best.friction,
+            "stiffness": stiffness,
+            "offset": True,
+        }
+        return Loop.from_dict({**settings, "plant": plant}, source=str(path))
+
+    order, stiffness, share = best.order, best.stiffness, best.explained
+    # beside friction, a higher order and a stiffness may explain what friction leaves over: the simpler plant is taken
+    for simpler in ((order, False), (order - 1, False)):
+        if (
+            simpler[0]
+            and (fit := inspect(recording, loop_of(*simpler)).fit) is not None
+            and fit.explained > share - WORTH
+        ):
+            order, stiffness, share = *simpler, fit.explained
+    loop = loop_of(order, stiffness)
+    explained = message("init.explained", share=100.0 * share)
+    doubtful = share < CLEAR
+    lines = (
+        ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
+        *_column_lines(columns),
+        ProposalLine("plant", "kind", '"polynomial"', message("init.kind")),
+        ProposalLine("plant", "order", str(order), explained, doubtful),
+        ProposalLine("plant", "friction", json.dumps(best.friction), _friction_reason(best.friction)),
+        ProposalLine(
+            "plant",
+            "stiffness",
+            json.dumps(stiffness),
+            message("init.stiffness" if stiffness else "init.free"),
+        ),
+        ProposalLine("plant", "offset", "true", message("init.offset")),
+        ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff")),
+        ProposalLine("monitor", "memory", repr(memory), message("init.memory", length=recording.duration_s)),
+        ProposalLine("monitor", "frequencies", repr(frequencies), message("init.frequencies")),
+    )
+    return LoopProposal(loop, lines)
+
+
+def propose(path: str | Path, columns: Columns | None = None) -> tuple[LoopProposal, Inspection]:
+    """Return a loop for a log, and what `inspect` says of the log with this loop.
+
+    Parameters
+    ----------
+    path
+        The log.
+    columns
+        Where the signals stand; None: as the names of the columns suggest.
+
+    Raises RecordingError if the log cannot be read, nothing moves in it, or no name suggests u or y.
+    """
+    from servoscope.signals.readers import list_channels
+
+    path = Path(path)
+    proposal = propose_loop(path, columns or propose_columns(path, list_channels(path)))
+    return proposal, inspect(read(path, proposal.loop), proposal.loop)
+
+
+def _column_lines(columns: Columns) -> list[ProposalLine]:
+    lines = []
+    if columns.time is not None:
+        lines.append(ProposalLine("columns", "time", _quoted(columns.time), message("init.column")))
+        lines.append(ProposalLine("columns", "time_unit", _quoted(columns.time_unit), message("init.time_unit")))
+    for key, texts in (("reference", (columns.reference,)), ("input", (columns.input,)), ("output", columns.outputs)):
+        unit = split_unit(texts[0].rpartition("* ")[2].strip("`"))[1]
+        why = message("init.column_unit", unit=unit) if unit else message("init.column_plain")
+        value = _quoted(texts[0]) if len(texts) == 1 else f"[{', '.join(map(_quoted, texts))}]"
+        lines.append(ProposalLine("columns", key, value, why, doubtful=not unit and key == "output"))
+    if columns.text is not None:
+        given = columns.text.model_dump(exclude_defaults=True)
+        value = ", ".join(f"{key} = {json.dumps(each, ensure_ascii=False)}" for key, each in given.items())
+        lines.append(ProposalLine("columns", "text", f"{{{value}}}", message("init.layout")))
+    return lines
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _friction_reason(friction: str) -> Message:
+    return message("init.no_friction") if friction == "none" else message("init.friction")

@@ -1,0 +1,134 @@
+"""Recordings in archives, folders and globs: which files are meant, and what is inside of packed ones."""
+
+from __future__ import annotations
+
+import gzip
+import lzma
+import tempfile
+import weakref
+import zipfile
+import zlib
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, TypeVar
+
+from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.table import Table, TableFile, shorten_error
+
+_T = TypeVar("_T")
+
+GZIP, ZIP = ".gz", ".zip"
+ARCHIVES = (GZIP, ZIP)
+MOST_BYTES = 8_000_000_000  # of one file when it is unpacked
+MOST_RATIO = 200  # times its size in the archive; measured values shrink to a tenth
+LEAST_BYTES = 100_000_000  # that any file may have when it is unpacked
+
+
+def expand_paths(paths: Sequence[Path], suffixes: Collection[str]) -> list[Path]:
+    """Return the files that are meant by files, folders, globs and archives of several files, in order of their names.
+
+    Raises RecordingError if a folder or an archive holds none, or a pattern meets none.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files = sorted(each for each in path.iterdir() if each.is_file() and each.suffix.lower() in suffixes)
+            if not files:
+                raise RecordingError(f"{path}: holds no recordings; readable are {', '.join(suffixes)}")
+            found += expand_paths(files, suffixes)
+        elif any(sign in str(path) for sign in "*?[") and not path.exists():
+            root = Path(path.anchor) if path.is_absolute() else Path()
+            files = sorted(root.glob(str(path.relative_to(root))))
+            if not files:
+                raise RecordingError(f"{path}: no file has such a name, check the pattern")
+            found += expand_paths(files, suffixes)
+        elif path.suffix.lower() == ZIP and path.is_file():
+            members = list_members(path)
+            found += [path / member for member in members] if len(members) > 1 else [path]
+        else:
+            found.append(path)
+    return found
+
+
+def archive_of(path: Path) -> tuple[Path, str] | None:
+    """Return the archive that a path leads into, and the name inside, empty for its only file; None: it is none."""
+    if path.suffix.lower() in ARCHIVES and path.is_file():
+        return path, ""
+    for parent in path.parents:
+        if parent.suffix.lower() == ZIP and parent.is_file():
+            return parent, path.relative_to(parent).as_posix()
+    return None
+
+
+def list_members(path: Path) -> list[str]:
+    """Return the names of the files in an archive; raises RecordingError if it is damaged."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [info.filename for info in archive.infolist() if not info.is_dir()]
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise RecordingError(f"{path}: is a damaged ZIP archive ({shorten_error(error)}), pack it again") from None
+    return sorted(name for name in names if not Path(name).name.startswith((".", "_")))
+
+
+def unpack(path: Path, open_plain: Callable[[Path], TableFile]) -> TableFile:
+    """Open a file in an archive by way of a temporary file, which is removed with what is returned.
+
+    Raises RecordingError if the archive is damaged, holds several files, or its file is improbably large.
+    """
+    place = archive_of(path)
+    assert place is not None, "the caller has asked"
+    archive, member = place
+    folder = tempfile.TemporaryDirectory(prefix="servoscope-unpacked-")
+    try:
+        if archive.suffix.lower() == GZIP:
+            inside = Path(folder.name) / (archive.stem or "log.csv")
+            with gzip.open(archive) as source:
+                _copy(source, inside, path, archive.stat().st_size)
+        else:
+            names = list_members(archive)
+            if not member and len(names) != 1:
+                shown = ", ".join(f"{archive.name}/{name}" for name in names[:3]) or "none"
+                raise RecordingError(f"{path}: holds {len(names)} files, name one of them: {shown}")
+            with zipfile.ZipFile(archive) as opened:
+                name = member or names[0]
+                if name not in names:
+                    raise RecordingError(f"{path}: {archive.name} holds no {name}, but {', '.join(names[:5])}")
+                inside = Path(folder.name) / (Path(name).name or "log.csv")
+                with opened.open(name) as packed:
+                    _copy(packed, inside, path, opened.getinfo(name).compress_size)
+        table = _renamed(path, inside, lambda: open_plain(inside))
+    except RecordingError:
+        folder.cleanup()
+        raise
+    # a library of others unpacks: it raises nearly anything at damaged archives, also for a password
+    except (zipfile.BadZipFile, OSError, EOFError, zlib.error, lzma.LZMAError, ValueError, RuntimeError) as error:
+        folder.cleanup()
+        raise RecordingError(f"{path}: cannot be unpacked ({shorten_error(error)}), pack it again") from None
+
+    def read_chunks(wanted: Sequence[str], texts: Collection[str]) -> Iterator[Table]:
+        chunks = iter(table.read_chunks(wanted, texts))
+        while (chunk := _renamed(path, inside, lambda: next(chunks, None))) is not None:
+            yield chunk
+
+    unpacked = replace(table, path=path, read_chunks=read_chunks)
+    weakref.finalize(unpacked, folder.cleanup)
+    return unpacked
+
+
+def _copy(source: IO[bytes] | gzip.GzipFile, target: Path, path: Path, packed: int) -> None:
+    most = min(MOST_BYTES, max(LEAST_BYTES, MOST_RATIO * packed))
+    with target.open("wb") as file:
+        while piece := source.read(1 << 20):
+            file.write(piece)
+            if file.tell() > most:
+                raise RecordingError(f"{path}: is larger than {most / 1e6:.0f} MB when unpacked, unpack it yourself")
+
+
+def _renamed(path: Path, inside: Path, read: Callable[[], _T]) -> _T:
+    """Call a function whose errors name the temporary file; they name the archive then."""
+    try:
+        return read()
+    except RecordingError as error:
+        text = str(error).replace(str(inside), str(path)).replace(str(inside.parent), str(path))
+        raise type(error)(text) from None

@@ -1,0 +1,131 @@
+"""Files whose libraries a damaged one may hang or kill: read in processes of their own, with limits."""
+
+from __future__ import annotations
+
+import atexit
+import importlib
+import os
+import threading
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from servoscope.core.errors import RecordingError
+from servoscope.core.workers import ProcessLimits, Progress, Worker, WorkerError
+from servoscope.signals.readers.table import Table, TableFile
+
+START_S = 60.0  # that a process and the libraries may take to start, on a machine that is busy
+BASE_S, BYTES_PER_S = 15.0, 5e5  # that a small file may take, and what is larger, by the clock on the wall
+LIMITS = ProcessLimits(cpu_s=1e6, memory_mb=8000.0, file_mb=1e6)  # a task's time is bound, not the process's
+TASKS = "servoscope.signals.readers.bounded"
+
+_idle: list[Worker] = []  # kept, because starting one and loading its libraries takes a second
+_lock = threading.Lock()
+_opened: dict[tuple[str, int, int], TableFile] = {}  # in a worker: the file that it read last
+
+
+def open_bounded(path: Path, kind: str, module: str, function: str, library: str) -> TableFile:
+    """Open a file in a worker.
+
+    `kind`: what errors call the file; `module`, `function`: what opens it, with `library`. Raises RecordingError if it
+    cannot be read, also where it would take more time or memory than files of its size do.
+    """
+    timeout_s = BASE_S + path.stat().st_size / BYTES_PER_S
+    place = (module, function, str(path.absolute()), str(path))
+
+    def run(task: str, *arguments: Any) -> Any:
+        try:
+            answer = _run_task(library, task, place, arguments, timeout_s)
+        except WorkerError as error:
+            raise RecordingError(f"{path}: is a damaged {kind} file ({str(error)[:120]}), export it again") from None
+        if "error" in answer:  # in the reader's own words
+            raise RecordingError(answer["error"])
+        return answer
+
+    found = run("describe_file")
+
+    def read_chunks(wanted: Sequence[str], texts: Collection[str]) -> Iterator[Table]:
+        import pyarrow as pa
+
+        with TemporaryDirectory(prefix="servoscope-read-") as folder:
+            target = Path(folder) / "rows.arrow"
+            run("extract_rows", list(wanted), list(texts), str(target))
+            first = 1
+            with pa.OSFile(str(target)) as source:
+                for batch in pa.ipc.open_stream(source):
+                    columns = {name: pa.chunked_array([batch.column(name)]) for name in batch.schema.names}
+                    yield Table(path.name, columns, first)
+                    first += batch.num_rows
+
+    groups = tuple(tuple(each) for each in found["groups"])
+    return TableFile(path, tuple(found["columns"]), read_chunks, found["others"], groups)
+
+
+def _run_task(library: str, task: str, place: tuple[str, ...], arguments: tuple[Any, ...], timeout_s: float) -> Any:
+    with _lock:
+        worker = _idle.pop() if _idle else Worker(LIMITS)
+        if not _idle:
+            atexit.unregister(_stop_workers)
+            atexit.register(_stop_workers)
+    try:
+        worker.run(f"{TASKS}:load_library", library, timeout_s=START_S)
+        return worker.run(f"{TASKS}:{task}", *place, *arguments, timeout_s=timeout_s)
+    finally:  # after a failure, its next task starts its process again
+        with _lock:
+            _idle.append(worker)
+
+
+def _stop_workers() -> None:
+    while _idle:
+        _idle.pop().stop()
+
+
+def load_library(_: Progress, library: str) -> None:
+    """Load what a reader needs, before its time counts; in the worker."""
+    importlib.import_module(library)
+
+
+def describe_file(_: Progress, module: str, function: str, path: str, shown: str) -> dict[str, Any]:
+    """Open a file, and return what columns it has, or why it cannot be read; in the worker."""
+    try:
+        opened = _open(module, function, path)
+    except RecordingError as error:
+        return {"error": str(error).replace(path, shown)}
+    return {"columns": opened.columns, "others": opened.non_channels, "groups": opened.channel_groups}
+
+
+def extract_rows(
+    _: Progress, module: str, function: str, path: str, shown: str, wanted: list[str], texts: list[str], target: str
+) -> dict[str, str]:
+    """Write some columns of a file as a stream of Arrow batches, or return why that cannot be; in the worker."""
+    import pyarrow as pa
+
+    writer = schema = None
+    with pa.OSFile(target, "wb") as sink:
+        try:
+            for table in _open(module, function, path).read_chunks(wanted, texts):
+                rows = pa.table(table.columns)
+                if writer is None:
+                    schema = rows.schema
+                    writer = pa.ipc.new_stream(sink, schema)
+                writer.write_table(rows if rows.schema == schema else rows.cast(schema))
+        except RecordingError as error:
+            return {"error": str(error).replace(path, shown)}
+        if writer is None:
+            writer = pa.ipc.new_stream(sink, pa.schema([(name, pa.float64()) for name in wanted]))
+        writer.close()
+    return {}
+
+
+def _open(module: str, function: str, path: str) -> TableFile:
+    silent = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):  # libraries print what they know of a damaged file; answers have a stream of their own
+        os.dup2(silent, stream)
+    os.close(silent)
+    about = Path(path).stat()
+    key = path, about.st_mtime_ns, about.st_size
+    if key not in _opened:
+        _opened.clear()
+        _opened[key] = getattr(importlib.import_module(module), function)(Path(path))
+    return _opened[key]

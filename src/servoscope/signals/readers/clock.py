@@ -1,0 +1,104 @@
+"""Dates and times of day as text: ISO, German, American and MATLAB's, and durations."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import date
+from functools import cache
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+
+DAY_S = 86400.0
+MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+MOMENT = re.compile(
+    r"(?P<date>\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?\.\d\d?\.\d{2,4}|\d\d?/\d\d?/\d{2,4}|\d\d?-[A-Za-z]{3}-\d{4})?"
+    r"(?:^|(?<=\d)$|[T ]+|,\s*)"
+    r"(?:(?P<h>\d\d?):(?P<m>\d\d)(?::(?P<s>\d\d(?:[.,:]\d{1,9})?))?\s*(?P<half>[AaPp][Mm])?"
+    r"\s*(?P<zone>Z|UTC|[+-]\d\d:?\d\d)?)?"
+)
+DURATION = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s*(sec|s|ms|min|hr|h)")
+DURATIONS = {"sec": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "hr": 3600.0, "h": 3600.0}
+
+
+def is_clock(text: str) -> bool:
+    """Tell whether a text is a date, a time of day, both, or a duration with its unit."""
+    return parse_moment(text) is not None
+
+
+def parse_moment(text: str) -> tuple[int | None, float] | None:
+    """Return day, None where the text has no date, and seconds in it; None if it is no moment.
+
+    A local time counts as it is written: where clocks are put back, time starts again. A date of three numbers with
+    slashes is month, day, year, unless the first is more than 12.
+    """
+    text = text.strip()
+    if not text or not text[0].isdigit():
+        duration = DURATION.fullmatch(text)
+        return (None, float(duration[1]) * DURATIONS[duration[2]]) if duration else None
+    found = MOMENT.fullmatch(text)
+    if found is None or (found["date"] is None and found["h"] is None):
+        duration = DURATION.fullmatch(text)
+        return (None, float(duration[1]) * DURATIONS[duration[2]]) if duration else None
+    day = _day_number(found["date"]) if found["date"] else None
+    if (found["date"] and day is None) or int(found["h"] or 0) > 24 or int(found["m"] or 0) > 59:
+        return None
+    seconds = 3600.0 * int(found["h"] or 0) + 60.0 * int(found["m"] or 0)
+    if found["s"]:
+        whole, fraction = found["s"][:2], found["s"][3:]
+        seconds += int(whole) + (int(fraction) / 10 ** len(fraction) if fraction else 0.0)
+    if found["half"]:
+        seconds += {"am": 0.0, "pm": 43200.0}[found["half"].lower()] - 43200.0 * (int(found["h"]) == 12)
+    zone = found["zone"]
+    if zone and zone[0] in "+-":
+        minutes = 60 * int(zone[1:3]) + int(zone[-2:])
+        seconds -= 60.0 * minutes * (1 if zone[0] == "+" else -1)
+    return day, seconds
+
+
+@cache
+def _day_number(text: str) -> int | None:
+    """Return the number of a day, None if there is no such day."""
+    parts = re.split(r"[-/.]", text)
+    try:
+        if len(parts[0]) == 4:
+            year, month, day = map(int, parts)
+        elif parts[1].isalpha():
+            day, month, year = int(parts[0]), MONTHS.index(parts[1].lower()) + 1, int(parts[2])
+        else:
+            day, month, year = map(int, parts)
+            if "/" in text and day <= 12:
+                day, month = month, day
+        return date(year + 2000 * (year < 100), month, day).toordinal()
+    except ValueError:
+        return None
+
+
+class ClockParser:
+    """Turns dates and times of day into seconds, chunk by chunk; without dates, midnight starts a new day."""
+
+    def __init__(self) -> None:
+        self._first: int | None = None
+        self._last, self._days = -np.inf, 0
+
+    def seconds(self, cells: Sequence[str | None]) -> FloatArray | int:
+        """Return seconds since the first midnight, NaN for empty cells, shape (N,); else the index of a misfit."""
+        found = np.full(len(cells), np.nan)
+        for index, cell in enumerate(cells):
+            if cell is None or not cell.strip():
+                continue
+            moment = parse_moment(cell)
+            if moment is None:
+                return index
+            day, seconds = moment
+            if day is None:
+                if seconds < self._last - DAY_S / 2:
+                    self._days += 1
+                self._last = seconds
+                found[index] = seconds + DAY_S * self._days
+            else:
+                self._first = day if self._first is None else self._first
+                found[index] = seconds + DAY_S * (day - self._first)
+        return found

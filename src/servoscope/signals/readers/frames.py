@@ -1,0 +1,58 @@
+"""Frames and arrays in the place of files: the same columns, and the same rules for dirty rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.errors import RecordingError
+from servoscope.models.loop import TextLayout
+from servoscope.signals.readers.formats import open_file
+from servoscope.signals.readers.table import Table, TableFile, shorten_error
+
+
+class ArrowStream(Protocol):
+    """A frame that hands its columns over by Arrow's protocol, as those of pandas and polars do."""
+
+    def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
+        """Return a capsule of Arrow."""
+
+
+Source = str | Path | Mapping[str, npt.ArrayLike] | ArrowStream
+
+
+def open_source(source: Source, text: TextLayout | None = None) -> TableFile:
+    """Open a file, a frame, or a mapping of names to arrays.
+
+    Raises TypeError if it is none of these, RecordingError if it cannot be read.
+    """
+    if isinstance(source, str | Path):
+        return open_file(source, text)
+    import pyarrow as pa
+
+    if isinstance(source, Mapping):
+        columns = {str(name): np.asarray(values) for name, values in source.items()}
+        odd = next((name for name, x in columns.items() if x.ndim != 1), None)
+        if odd is not None:
+            raise RecordingError(f"arrays: {odd!r} has {columns[odd].ndim} dimensions, give columns of one")
+        lengths = {name: x.size for name, x in columns.items()}
+        if len(set(lengths.values())) > 1:
+            told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise RecordingError(f"arrays: their lengths differ ({told}), give columns of one length")
+        return _open_table("arrays", pa.table(columns))
+    if hasattr(source, "__arrow_c_stream__"):
+        try:
+            return _open_table("frame", pa.table(source))
+        except (pa.ArrowException, TypeError, ValueError) as error:
+            raise RecordingError(f"frame: cannot be read ({shorten_error(error)}), give plain columns") from None
+    kind = type(source).__name__
+    raise TypeError(f"a recording is read from a path, a frame or a mapping of arrays, not from {kind}")
+
+
+def _open_table(name: str, table: Any) -> TableFile:
+    columns = {column: table.column(column) for column in table.column_names}
+    return TableFile(Path(name), tuple(columns), lambda *_: iter([Table(name, columns)]))

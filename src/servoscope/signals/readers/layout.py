@@ -1,0 +1,166 @@
+"""Where the table begins in the rows of a text file or a sheet: preambles, headers, rows of units, kinds of cells."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.clock import is_clock
+from servoscope.signals.readers.guess_columns import guess_columns
+from servoscope.signals.readers.table import NULL_TEXTS, TIME_UNITS, is_number
+from servoscope.signals.readers.units import is_unit
+
+AHEAD = 5  # rows that tell whether a table begins
+BEGUN = 0.6  # share of them that must look like rows of it
+PAIR_KEY = "Name"  # before each channel's name in an export of TwinCAT Scope, as the other keys before their values
+SAMPLE_TIME_KEY = re.compile(r"SampleTime\[(\w+)\]")
+
+
+@dataclass(frozen=True)
+class TableStart:
+    """Names of the columns, empty where a column has none and is empty, and the index of the first row of cells."""
+
+    names: tuple[str, ...]
+    first: int
+
+
+def is_numeric(cell: str) -> bool:
+    """Tell whether a cell is a number, with a point or a comma, or a date or time."""
+    return is_number(cell) or is_number(cell.replace(",", ".", 1)) or is_clock(cell)
+
+
+def count_numeric(rows: Sequence[Sequence[str]]) -> tuple[int, int]:
+    """Return how many rows look like rows of a table, and how many columns of numbers it has."""
+    width, numeric = _table_shape(rows)
+    return sum(_is_row(row, width, numeric) for row in rows), len(numeric)
+
+
+def find_table(rows: Sequence[Sequence[str]], name: str, header: int | None = None) -> TableStart | None:
+    """Find a table among rows of cells; None if there is none.
+
+    Parameters
+    ----------
+    rows
+        The first rows of a file; blank lines are rows without cells.
+    name
+        What errors call the file.
+    header
+        Index of the row of names, where the user says so.
+
+    Raises RecordingError if two columns have the same name, or channels of TwinCAT Scope were sampled differently.
+    """
+    width, numeric = _table_shape(rows)
+    begun = [_is_row(row, width, numeric) for row in rows]
+    for first, here in enumerate(begun):
+        ahead = begun[first : first + AHEAD]
+        # a first row with text among its numbers is one of a header, unless the next one is a row too
+        sure = _is_pure(rows[first], numeric) or all(ahead[:2])
+        if here and sure and sum(ahead) >= BEGUN * len(ahead) and (header is None or first > header):
+            break
+    else:
+        return None
+    above = list(_rows_above(rows, first, width)) if header is None else [list(rows[header]) + [""] * width]
+    names = _pick_names([row[:width] for row in above], width, name)
+    if names is None:
+        names = [f"c{index}" for index in range(width)]
+    body = [row for row, is_row in zip(rows[first:], begun[first:], strict=True) if is_row]
+    used = [any(index < len(row) and row[index].strip() for row in body) for index in range(width)]
+    named = [label or (f"c{index}" if used[index] else "") for index, label in enumerate(names)]
+    check_names(named, name)
+    return TableStart(tuple(named), first)
+
+
+def check_names(names: Sequence[str], file: str) -> None:
+    """Refuse two columns of one name; raises RecordingError."""
+    twice = next((name for name in names if name and names.count(name) > 1), None)
+    if twice is not None:
+        raise RecordingError(f"{file}: two columns are called {twice!r}, rename one of them")
+
+
+def _table_shape(rows: Sequence[Sequence[str]]) -> tuple[int, list[int]]:
+    """Return how many columns most of the last rows have, and which of them hold numbers."""
+    tail = [row for row in rows if row][-max(1, len(rows) // 2) :]
+    widths = [len(row) for row in tail]
+    width = max(dict.fromkeys(widths), key=widths.count, default=0)
+    same = [row for row in tail if len(row) == width]
+    numeric = []
+    for index in range(width):
+        filled = [row[index] for row in same if row[index].strip() not in NULL_TEXTS]
+        if filled and sum(map(is_numeric, filled)) > 0.5 * len(filled):
+            numeric.append(index)
+    return width, numeric
+
+
+def _is_row(row: Sequence[str], width: int, numeric: Sequence[int]) -> bool:
+    """Tell whether a row belongs to the table: of its columns of numbers, more hold numbers than texts."""
+    if len(row) != width:
+        return False
+    filled = [row[index] for index in numeric if row[index].strip() not in NULL_TEXTS]
+    return 2 * sum(map(is_numeric, filled)) > len(filled)
+
+
+def _is_pure(row: Sequence[str], numeric: Sequence[int]) -> bool:
+    return all(index < len(row) and (row[index].strip() in NULL_TEXTS or is_numeric(row[index])) for index in numeric)
+
+
+def _rows_above(rows: Sequence[Sequence[str]], first: int, width: int) -> list[list[str]]:
+    """Return the rows right above the table that may say what its columns are, the nearest first."""
+    above: list[list[str]] = []
+    for row in reversed(rows[:first]):
+        cells = list(row)
+        while len(cells) > width and not cells[-1]:
+            cells.pop()
+        if not cells and not above:
+            continue  # a blank line between header and rows
+        lacking = width - len(cells)
+        # a preamble has another width; a row of names may lack the last, where lines end in a delimiter
+        if not cells or lacking < 0 or lacking > 1 or sum(map(bool, cells)) < min(2, width):
+            break
+        above.append(cells + [""] * lacking)
+    return above
+
+
+def _pick_names(above: list[list[str]], width: int, file: str) -> list[str] | None:
+    """Return the names of the columns, with the units of a row of units behind them."""
+    keyed = {row[0]: row for row in above if row[0]}
+    if PAIR_KEY in keyed and any(SAMPLE_TIME_KEY.fullmatch(key) for key in keyed):
+        return _scope_names(keyed, width, file)
+    units = next((row for row in above if _is_unit_row(row)), None)
+    others = [row for row in above if row is not units]
+    # of several rows, that whose words tell most; descriptions stand below or above it
+    row = max(others, key=lambda row: (len(guess_columns([c for c in row if c])), sum(map(bool, row))), default=None)
+    if row is None:
+        return None
+    if units is None:
+        return row
+    return [f"{cell} [{unit.strip('[]() ')}]" if cell and unit else cell for cell, unit in zip(row, units, strict=True)]
+
+
+def _is_unit_row(row: Sequence[str]) -> bool:
+    filled = [cell for cell in row if cell]
+    return bool(filled) and all(is_unit(cell.strip("[]() ")) or cell.strip("[]() ") in ("", "-") for cell in filled)
+
+
+def _scope_names(keyed: dict[str, list[str]], width: int, file: str) -> list[str]:
+    """Return names of an export of TwinCAT Scope: each channel has columns of time and value, or all share the time.
+
+    Source: Beckhoff, TE13xx TwinCAT 3 Scope View, "Export in csv"; rows are key and value by turns.
+    """
+    row = keyed[PAIR_KEY]
+    pairs = row[0::2].count(PAIR_KEY) > 1 or width == 2
+    places = range(1, width, 2) if pairs else range(1, width)
+    key = next(key for key in keyed if SAMPLE_TIME_KEY.fullmatch(key))
+    if len({keyed[key][place] for place in places}) > 1:
+        raise RecordingError(f"{file}: its channels have different sample times, export those of one sample time")
+    found = SAMPLE_TIME_KEY.fullmatch(key)
+    unit = found[1] if found is not None and found[1] in TIME_UNITS else "ms"
+    names = [""] * width
+    for place in places:
+        of = keyed.get("Unit", [""] * width)[place]
+        names[place] = f"{row[place]} [{of}]" if of and is_unit(of) else row[place]
+        if pairs:
+            names[place - 1] = f"time {1 + place // 2} [{unit}]"
+    names[0] = f"time [{unit}]"
+    return names

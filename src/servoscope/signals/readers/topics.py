@@ -1,0 +1,108 @@
+"""Logs of robots and vehicles, MCAP of ROS 2 and ULog of PX4: each topic is a raster with its own time."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
+
+MOST_VALUES = 200_000_000  # of all topics together, which are held in memory
+LONGEST_ARRAY = 64  # values of one field, such as the joints of a robot; images and scans have more
+
+Topics = Mapping[str, Mapping[str, npt.NDArray[Any]]]
+
+
+def open_mcap(path: Path) -> TableFile:
+    """Open an MCAP file with messages of ROS 2; ``/joint_states.position[0]`` is a field of a topic.
+
+    The time of a message is its header's stamp where it has one, else when it was logged.
+    """
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    rows: dict[str, list[dict[str, float]]] = {}
+    count = 0
+    try:
+        with path.open("rb") as file:
+            for _, channel, message, decoded in make_reader(
+                file, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages():
+                fields = dict(_message_fields(decoded))
+                stamp = [fields.pop(f"header.stamp.{part}", 0.0) for part in ("sec", "nanosec")]
+                seconds = stamp[0] + 1e-9 * stamp[1] if any(stamp) else 1e-9 * message.log_time
+                rows.setdefault(channel.topic, []).append({"time": seconds, **fields})
+                count += len(fields)
+                if count > MOST_VALUES:
+                    raise RecordingError(f"{path}: holds more than {MOST_VALUES} values, leave topics out")
+    except RecordingError:
+        raise
+    # the libraries raise nearly anything at damaged files
+    except Exception as error:
+        raise RecordingError(f"{path}: is a damaged MCAP file ({shorten_error(error)}), record it again") from None
+    topics = {}
+    for topic, messages in rows.items():
+        names = list(dict.fromkeys(name for fields in messages for name in fields))
+        topics[topic] = {name: np.array([each.get(name, np.nan) for each in messages]) for name in names}
+    return _open_topics(path, topics)
+
+
+def _message_fields(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, float]]:
+    """Walk the numbers of a message."""
+    for name in getattr(message, "__slots__", ()):
+        value = getattr(message, name)
+        if isinstance(value, bool | int | float):
+            yield f"{prefix}{name}", float(value)
+        elif isinstance(value, list | tuple | np.ndarray) and len(value) <= LONGEST_ARRAY:
+            for index, each in enumerate(value):
+                if isinstance(each, bool | int | float | np.number):
+                    yield f"{prefix}{name}[{index}]", float(each)
+                elif depth < 4:
+                    yield from _message_fields(each, f"{prefix}{name}[{index}].", depth + 1)
+        elif depth < 4 and not isinstance(value, str | bytes):
+            yield from _message_fields(value, f"{prefix}{name}.", depth + 1)
+
+
+def open_ulog(path: Path) -> TableFile:
+    """Open a ULog file of PX4; ``vehicle_attitude.q[0]`` is a field of a topic, ``topic/1.x`` of a second one."""
+    from pyulog import ULog
+
+    try:
+        log = ULog(str(path))
+        topics = {}
+        for each in log.data_list:
+            name = each.name + (f"/{each.multi_id}" if each.multi_id else "")
+            data = {field: np.asarray(x) for field, x in each.data.items() if np.asarray(x).dtype.kind in "fiub"}
+            topics[name] = {"time": 1e-6 * data.pop("timestamp"), **data}
+    # it raises what reading beyond the end, or of a format that is none, raises
+    except Exception as error:
+        raise RecordingError(f"{path}: is a damaged ULog file ({shorten_error(error)}), download it again") from None
+    return _open_topics(path, topics)
+
+
+def _open_topics(path: Path, topics: Topics) -> TableFile:
+    """Return topics as rasters; where there is one only, its fields need no prefix."""
+    full = {topic: fields for topic, fields in topics.items() if len(fields) > 1 and len(fields["time"])}
+    columns = {
+        f"{topic}.{name}" if len(full) > 1 else name: (topic, name) for topic, fields in full.items() for name in fields
+    }
+    check_width(path, len(columns))
+    groups = tuple(tuple(label for label, (of, _) in columns.items() if of == topic) for topic in full)
+
+    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
+        import pyarrow as pa
+
+        used = {columns[label][0] for label in wanted}
+        if len(used) > 1:
+            raise RecordingError(
+                f"{path}: {', '.join(sorted(used))} were not sampled together: log them in one topic, or resample them"
+            )
+        found = {label: full[columns[label][0]][columns[label][1]] for label in wanted}
+        yield Table(path.name, {label: pa.chunked_array([np.ascontiguousarray(x)]) for label, x in found.items()})
+
+    return TableFile(path, tuple(columns), read_chunks, channel_groups=groups)

@@ -1,0 +1,72 @@
+"""Units in the names of columns, and what a number in them is in SI units."""
+
+from __future__ import annotations
+
+import math
+import re
+
+RPM, DEG = 2.0 * math.pi / 60.0, math.pi / 180.0
+# factor to the SI unit, by unit; what is in no SI unit at all (percent, counts) has 1
+LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "µm": 1e-6, "um": 1e-6, "μm": 1e-6, "in": 0.0254, "inch": 0.0254}
+ANGLES = {
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "deg": DEG,
+    "°": DEG,
+    "degree": DEG,
+    "degrees": DEG,
+    "grad": DEG,
+    "rev": 2 * math.pi,
+}
+SPEEDS = {
+    **{f"{unit}/s": factor for unit, factor in {**LENGTHS, **ANGLES}.items()},
+    **{f"{unit}/min": factor / 60.0 for unit, factor in {**LENGTHS, **ANGLES}.items()},
+    **{"rpm": RPM, "1/min": RPM, "U/min": RPM, "rev/min": RPM, "tr/min": RPM, "min-1": RPM, "r/min": RPM},
+}
+INPUTS = {
+    **{"A": 1.0, "mA": 1e-3, "Arms": 1.0, "V": 1.0, "mV": 1e-3, "N": 1.0, "kN": 1e3, "Nm": 1.0, "N*m": 1.0, "N.m": 1.0},
+    **{"N·m": 1.0, "mNm": 1e-3, "bar": 1e5, "Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "%": 1.0, "W": 1.0, "kW": 1e3},
+}
+TIMES = ("s", "ms", "us", "µs", "ns", "min", "sec", "seconds", "h")
+OTHERS = (
+    "°C",
+    "C",
+    "K",
+    "Hz",
+    "kHz",
+    "inc",
+    "counts",
+    "incr",
+    "ticks",
+    "m/s²",
+    "m/s^2",
+    "rad/s²",
+    "rad/s^2",
+    "1",
+    "V/s",
+)
+FACTORS = {**LENGTHS, **ANGLES, **SPEEDS, **INPUTS}
+BEHIND = re.compile(r"^(.*?)\s*(?:\[\s*([^\[\]]+?)\s*\]|\(\s*([^()]+?)\s*\))\s*$")
+LOOSE = re.compile(r"^(.+?)(?:[_ ]|\s*/\s*)([A-Za-zµμ°%/]{1,5})$")  # a unit without brackets: pos_mm, t/ms
+
+
+def is_unit(text: str) -> bool:
+    """Tell whether a text is a unit that is known."""
+    return text in FACTORS or text in TIMES or text in OTHERS
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Return a column's name without its unit, and the unit; empty where it has none that is known."""
+    found = BEHIND.match(name)
+    if found is not None and is_unit(unit := found[2] or found[3]):
+        return found[1], unit
+    loose = LOOSE.match(name)
+    # a single letter is a name more often than a unit: joint_A, r_m
+    if loose is not None and is_unit(loose[2]) and (len(loose[2]) > 1 or loose[2] in "s°%"):
+        return loose[1], loose[2]
+    return name, ""
+
+
+def si_factor(name: str) -> float:
+    """Return what turns the numbers of a column into SI units, after the unit in its name; 1 if it has none."""
+    return FACTORS.get(split_unit(name)[1], 1.0)

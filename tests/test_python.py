@@ -1,0 +1,68 @@
+"""The face to Python: frames, arrays and paths where objects are, one-line errors, short representations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import servoscope as ss
+from logs import as_expected, lines, signals, written
+from servoscope.core.errors import RecordingError
+from servoscope.models.loop import Columns
+from servoscope.simulation import reference, simulate
+
+RIG = Path(ss.__file__).parent / "simulation" / "reference-rig.toml"
+
+
+def test_arrays_and_frames_are_read_like_files() -> None:
+    import pandas as pd
+    import pyarrow as pa
+
+    as_expected(ss.read(signals()))
+    as_expected(ss.read(pd.DataFrame(signals())))
+    as_expected(ss.read(pa.table(signals())))
+    back = ss.read(signals()).to_frame()
+    as_expected(ss.read(back))
+    assert list(back.columns) == ["t", "r", "u", "y", "run"]
+    other = {"time": signals()["t"], "y": signals()["y"], "torque": signals()["u"]}
+    found = ss.read(other, columns=Columns(time="time", input="2 * torque"))
+    np.testing.assert_allclose(found.u, 2.0 * signals()["u"])
+    spoilt = signals() | {"u": np.where(np.arange(300) == 100, np.nan, signals()["u"])}
+    assert [(d.kind, d.from_s) for d in ss.read(spoilt).defects] == [("nan", 1.0)]
+
+
+def test_what_is_no_recording_is_told_in_one_line() -> None:
+    with pytest.raises(TypeError, match="a path, a frame or a mapping of arrays, not from int"):
+        ss.read(3)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="a baseline is a Baseline or the path of one, not dict"):
+        ss.diagnose({}, signals())  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="a loop is a Loop or the path of a loop file, not int"):
+        ss.inspect(signals(), 3)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="are a list, as in"):
+        ss.learn(RIG, "healthy.csv")  # type: ignore[arg-type]
+    with pytest.raises(RecordingError, match=r"their lengths differ \(t 2, r 1"):
+        ss.read({"t": [0.0, 1.0], "r": [0.0], "u": [0.0], "y": [0.0]})
+
+
+def test_paths_stand_where_objects_do_and_what_comes_is_short(tmp_path: Path) -> None:
+    loop = ss.Loop.load(RIG)
+    recording = simulate(loop, reference("multisine", 20.0, loop.sample_rate), seed=1)[0]
+    path = tmp_path / "healthy.csv"
+    recording.to_frame().to_csv(path, index=False)
+    inspection = ss.inspect(path, RIG)
+    baseline = ss.learn(RIG, [path])
+    baseline.save(tmp_path / "baseline.json")
+    diagnosis = ss.diagnose(tmp_path / "baseline.json", path)
+    assert diagnosis.verdict == "healthy"
+    for shown in (loop, recording, inspection, baseline, diagnosis):
+        text, table = repr(shown), shown._repr_html_()
+        assert len(text) < 400 and "\n" not in text and text.startswith(type(shown).__name__)
+        assert table.startswith("<table><caption>") and table.count("<tr>") >= 3
+    assert "verdict: healthy" in repr(diagnosis)
+
+
+def test_a_name_cannot_put_markup_into_a_notebook(tmp_path: Path) -> None:
+    found = ss.read(written(tmp_path, lines(), "a&b.csv"))
+    assert "a&amp;b.csv" in found._repr_html_() and "a&b" in repr(found)
