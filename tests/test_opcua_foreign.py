@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,13 +17,14 @@ from reliability.servers import node_opcua
 from brokers import until
 from servoscope.core.errors import ConfigError
 from servoscope.service.opcua.monitored_items import ItemGrant
-from servoscope.service.opcua.settings import OpcuaNodes
+from servoscope.service.opcua.resample import Resampler
+from servoscope.service.opcua.settings import OpcuaNodes, describe_expiry
 from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
 from servoscope.service.opcua.subscriptions import ScalarSubscription
 from servoscope.service.opcua.update_rate import STEPS, UpdateRate
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
-from test_opcua import free_port
+from test_opcua import certificate, free_port
 
 RATE = 20.0
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -128,6 +132,38 @@ def test_a_rate_is_what_comes_and_not_what_a_server_says() -> None:
     for k in range(20):
         one.add(0.01 * k, float(k))
     assert one.contradicts(0.2) is True and one.contradicts(0.01) is False
+
+
+def test_a_hole_in_a_history_is_a_gap_and_no_machine_that_stood_still() -> None:
+    def resampled(history_until: float) -> tuple[int, list[int]]:
+        one = Resampler(2, 0.1, 1000.0)
+        one.restart(1000.0, complete=True, history_until=history_until)
+        one.add(0, 999.0, 5.0)  # holds since then
+        for t in (*np.arange(1000.1, 1002.0, 0.1), *np.arange(1032.0, 1034.0, 0.1)):
+            one.add(1, float(t), float(t))
+        found = one.take_samples(-math.inf)
+        assert (found.values[0] == 5.0).all()
+        return int((np.abs(found.values[1] - found.t) > 0.05).sum()), [gap.samples for gap in found.gaps]
+
+    held, gaps = resampled(1034.0)
+    assert held == 0 and len(gaps) == 1 and gaps[0] == pytest.approx(300, abs=2)
+    held, gaps = resampled(-math.inf)  # told as it happened, under a heartbeat: the machine did stand still
+    assert held == pytest.approx(300, abs=2) and not gaps
+
+
+def test_a_certificate_that_has_expired_is_told_while_samples_go_on(tmp_path: Path) -> None:
+    ours = certificate(tmp_path, "client", "urn:servoscope:client")
+    theirs = certificate(tmp_path, "server", "urn:servoscope")
+    settings = OpcuaSourceSettings.model_validate({"kind": "opcua", "url": "opc.tcp://plc", **ours})
+
+    def told(peer: bytes | None, now: datetime) -> str:
+        client = SimpleNamespace(security_policy=SimpleNamespace(peer_certificate=peer))
+        return describe_expiry(client, tmp_path, settings, now)
+
+    peer, now = (tmp_path / theirs["cert_file"]).read_bytes(), datetime.now(UTC)
+    assert told(peer, now) == told(None, now) == ""
+    later = told(peer, now + timedelta(days=3))  # they hold for two
+    assert "our certificate expired on 20" in later and "the server's certificate expired on 20" in later
 
 
 def test_a_node_that_cannot_be_one_is_refused_before_anything_starts() -> None:

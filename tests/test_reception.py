@@ -24,12 +24,14 @@ from halls import asked
 from servoscope.cli.app import app
 from servoscope.core.errors import ConfigError
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.actions import ActionSettings
 from servoscope.service.alarms import AlarmSettings
 from servoscope.service.asset import Asset, AssetPolicy
 from servoscope.service.build import build_components
 from servoscope.service.config import DiagnosisSettings, ServiceFile
 from servoscope.service.health import serve_health
 from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
+from servoscope.service.notifications import Notifier
 from servoscope.service.reception import AssetTrouble, ReceptionLog
 from servoscope.service.service import Service
 from servoscope.service.sources.block import Block
@@ -176,6 +178,18 @@ def test_a_client_that_is_thrown_out_by_one_of_its_name_says_so(tmp_path: Path, 
     assert ours.trouble  # it has come back, and will be thrown out again
     for one in (ours, theirs):
         one.close()
+
+
+def test_an_action_for_connections_takes_those_of_all_sources() -> None:
+    sinks = {"command": {"bell": {"argv": ["true"], "alarms": ["connection"]}}}
+    alarms = AlarmSettings.model_validate({"connection": {"on_delay_s": 0.0}})
+    notifier = Notifier("hall", alarms, ActionSettings.model_validate(sinks))
+    result = notifier.check_service(0.0, {"plant": "Not authorized", "plc": ""}, NOW)
+    assert [(one.alarm, one.cause) for one in result.transitions] == [("connection.plant", "Not authorized")]
+    (row,) = notifier.notify(result.transitions, {}, NOW)
+    assert row.table == "outbox" and row.values["event"]["alarm"] == "connection.plant"
+    assert notifier.check_service(0.0, {"plant": ""}, NOW + 1.0).transitions == []
+    assert set(notifier.status["alarms"]) == {"buffering", "connection.plant"}  # one that has no source is forgotten
 
 
 QUICK = "[alarms.connection]\non_delay_s = 0.1\n[alarms.reception]\non_delay_s = 0.1\n"

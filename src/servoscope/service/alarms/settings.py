@@ -124,6 +124,11 @@ for _name, _default in DEFAULT_ALARMS.items():
     _default |= {key: render(message(f"alarm.{key}.{_name}")) for key in ("consequence", "operator_action")}
 
 
+def alarm_kind(alarm: str) -> str:
+    """Return under which name an alarm is defined: a connection's is ``NAME.SOURCE``, for each source."""
+    return alarm.partition(".")[0]
+
+
 class AlarmSettings(Settings):
     """The section `[alarms]`: keys of the flood, and one table per alarm, laid over `DEFAULT_ALARMS`."""
 
@@ -161,8 +166,8 @@ class AlarmSettings(Settings):
         return {name: one for name, one in self.definitions.items() if one.enabled and one.source in SERVICE_SOURCES}
 
     def find(self, alarm: str) -> AlarmDefinition:
-        """Return the definition of an alarm, ``NAME`` or, of a connection, ``NAME.SOURCE``."""
-        return self.definitions[alarm.partition(".")[0]]
+        """Return the definition of an alarm."""
+        return self.definitions[alarm_kind(alarm)]
 
 
 def _parse_definition(name: str, table: Any) -> AlarmDefinition:

@@ -104,7 +104,7 @@ class MqttSource(BlockSource):
         self._broker.handle_disconnect(reason)
 
     @property
-    def connected(self) -> bool:
+    def connected(self) -> bool:  # type: ignore[override]  # others set it
         """Whether the broker has accepted us."""
         return self._broker.connected
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
@@ -75,7 +76,7 @@ def check_nodes(*nodes: str) -> None:
             raise ConfigError(f"{node!r} is no node id, write for example ns=2;s=press.y") from None
 
 
-def describe_expiry(client: Any, folder: Path, settings: CertificateSettings) -> str:
+def describe_expiry(client: Any, folder: Path, settings: CertificateSettings, now: datetime) -> str:
     """Return which certificate of a connection has expired, in words; empty: none.
 
     Neither side has to break off for that, so that samples go on; somebody has to renew it.
@@ -85,10 +86,10 @@ def describe_expiry(client: Any, folder: Path, settings: CertificateSettings) ->
     found = {"our": settings.certificate_bytes(folder), "server": client.security_policy.peer_certificate}
     words = []
     for whose, raw in found.items():
-        if raw:
-            load = x509.load_pem_x509_certificate if raw.startswith(b"-----") else x509.load_der_x509_certificate
-            end = load(raw).not_valid_after_utc
-            if end < datetime.now(UTC):
+        load = x509.load_pem_x509_certificate if raw and raw.startswith(b"-----") else x509.load_der_x509_certificate
+        with suppress(ValueError):  # none, a chain, or a form that cannot be read: the connection was accepted with it
+            end = load(raw or b"").not_valid_after_utc
+            if end < now:
                 words.append(render(message(f"service.trouble.{whose}_certificate", end=f"{end:%Y-%m-%d}")))
     return ", ".join(words)
 

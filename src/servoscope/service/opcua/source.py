@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -143,7 +143,7 @@ class OpcuaSource(BlockSource):
         self._trouble, self._connected = render(message("service.trouble.connecting")), False
 
     @property
-    def connected(self) -> bool:
+    def connected(self) -> bool:  # type: ignore[override]  # others set it
         """Whether the server is followed."""
         return self._connected
 
@@ -218,7 +218,7 @@ class OpcuaSource(BlockSource):
         for one in self._subscriptions:
             await one.read_missed(client, now)
         self._connected, self._last_heartbeat = True, time.monotonic()
-        self._trouble = describe_expiry(client, self._folder, self.settings)
+        self._trouble = describe_expiry(client, self._folder, self.settings, datetime.now(UTC))
         retry_at = time.monotonic() + RETRY_NODES_S
         log("info", "OPC UA server followed", url=show_address(self.settings.url))
         while not self._stop_event.is_set():

@@ -186,7 +186,7 @@ class ScalarSubscription(_Subscription):
                 self._add(k, value)
         for k, values in enumerate(histories):
             self._read_until[k] = max((self._add(k, value) for value in values or []), default=-math.inf)
-        self._resampler.restart(last, complete=True)
+        self._resampler.restart(last, complete=True, history_until=max(self._read_until))
 
     def add_value(self, node: int, value: Any) -> None:
         """Take a value, unless it was read from history."""

@@ -67,13 +67,10 @@ class BlockSource(ABC):
         1.0  # how fast the clock of the samples runs: 1 where they are measured now; 0 where it waits for polls
     )
 
+    connected = True  # whether it is connected to where its blocks come from
+
     def __init__(self) -> None:
         self.rejections = RejectionCounter()  # what came and could not be used
-
-    @property
-    def connected(self) -> bool:
-        """Whether it is connected to where its blocks come from."""
-        return True
 
     @property
     def trouble(self) -> str:
