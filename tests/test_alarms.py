@@ -289,7 +289,7 @@ def test_a_table_changes_keys_of_a_default_and_another_name_adds_an_alarm() -> N
     assert settings.asset_alarms["fault"] == AlarmSettings().asset_alarms["fault"].model_copy(
         update={"priority": "critical"}
     )
-    assert list(settings.asset_alarms) == ["fault", "data_quality", "near"]
+    assert list(settings.asset_alarms) == ["fault", "data_quality", "reception", "near"]
 
 
 @pytest.mark.parametrize(
