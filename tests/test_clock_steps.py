@@ -47,7 +47,7 @@ def test_a_service_s_own_alarm_keeps_its_dates(machine: MachineClock) -> None:
     alarms = AlarmSettings.model_validate({"buffering": {"on_delay_s": 1000.0, "off_delay_s": 0.0}})
     writer = SimpleNamespace(fill_ratio=1.0, add=lambda owner, rows: None)
     notifier = Notifier("hall", alarms, ActionSettings())
-    service: Any = SimpleNamespace(writer=writer, notifier=notifier, assets={}, clock=SteadyClock())
+    service: Any = SimpleNamespace(writer=writer, notifier=notifier, assets={}, troubles={}, clock=SteadyClock())
     housekeeping, start = Housekeeping(service), TIME()
     for machine.offset_s in (0.0, 7200.0, -7200.0):
         housekeeping._update_service_alarms()

@@ -172,7 +172,7 @@ def test_tls_and_password(tmp_path: Path) -> None:
         for keys, trouble in (({}, ""), ({"user": "guest"}, "Not authorized"), ({"ca_file": None}, "self-signed")):
             one = source(**keys)
             one.open({})
-            until(lambda one=one, trouble=trouble: trouble in one._trouble if trouble else one.connected)
+            until(lambda one=one, trouble=trouble: trouble in one.trouble if trouble else one.connected)
             one.close()
         with pytest.raises(ConfigError, match=r"nowhere: the password cannot be read \(No such file"):
             source(password_file="nowhere")

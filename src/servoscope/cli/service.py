@@ -24,6 +24,7 @@ from servoscope.core.settings_errors import suggest_name
 if TYPE_CHECKING:
     from rich.console import Group
 
+    from servoscope.service.config import ServiceFile
     from servoscope.service.store import Store
 
 
@@ -64,6 +65,12 @@ def run(
         typer.Option(metavar="ASSET", help="Begin with a new state behind the samples that were counted; repeatable."),
     ] = None,
     check: Annotated[bool, typer.Option("--check", help="Read the service file and what it names, and stop.")] = False,
+    online: Annotated[
+        bool, typer.Option("--online", help="With --check: connect to all sources, and tell how each asset is heard.")
+    ] = False,
+    listen_s: Annotated[
+        float, typer.Option("--for", metavar="S", min=0.1, help="With --online: listen for so long at most, in s.")
+    ] = 10.0,
 ) -> None:
     """Follow assets until stopped: what their sources say goes to the store, alarms go out; logs on stderr."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # nothing has begun yet
@@ -72,12 +79,16 @@ def run(
     from servoscope.service.config import ServiceFile
 
     settings = ServiceFile.load(config)
+    if online and not check:
+        raise ConfigError("--online: give it together with --check, which follows nothing")
     if check:
         with prefix_file_name(config):
             check_service_file(settings)
         counts = {"asset": len(settings.assets), "source": len(settings.sources)}
         counted = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items())
         typer.echo(f"{config}: {counted}; all can be used")
+        if online:
+            commission(settings, listen_s)
         return
     log.set_up_logging(settings.service.log)
     from servoscope.service.health import serve_health
@@ -171,6 +182,18 @@ def history(
             print_json(with_time_text(row), lines=True)
     else:
         results.create_console().print(tables.row_table(rows, COLUMNS[kind]))
+
+
+def commission(settings: ServiceFile, seconds: float) -> None:
+    """Print how each asset is heard; exit with 1 if one is not as its loop needs it."""
+    from servoscope.cli.render import history as tables
+    from servoscope.cli.render import results
+    from servoscope.service.commissioning import listen
+
+    rows = listen(settings, seconds)
+    results.create_console().print(tables.commissioning_table(rows))
+    if any(row.reception.state != "followed" for row in rows):
+        raise typer.Exit(1)
 
 
 @contextmanager

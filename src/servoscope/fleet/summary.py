@@ -23,7 +23,7 @@ COMMON, FAILED = "common cause", "failed"
 
 @dataclass(frozen=True)
 class AssetSummary:
-    """One asset on its last day; the size is that of the first fault that the diagnosis names."""
+    """One asset on the last day that tells how it is; the size is that of the first fault that the diagnosis names."""
 
     asset: str
     day: str
@@ -104,7 +104,7 @@ def summarise_fleet(
         asset: {day: _asset_state(entry, _accepted_cause(causes_by_day[day], asset)) for day, entry in days.items()}
         for asset, days in by_asset.items()
     }
-    last = [max(days.items())[1] for days in by_asset.values()]
+    last = [days[_last_known_day(states[asset])] for asset, days in by_asset.items()]
     now = _common_causes(last, groups, prior)
     assets = [_summarise_asset(entry, groups, now, states[entry["asset"]], prior) for entry in last]
     rank = ["fault", COMMON, "undetermined", FAILED, "healthy"]
@@ -112,6 +112,18 @@ def summarise_fleet(
     failed = [(e["asset"], e["day"], str(e["error"])) for e in entries if e["status"] == FAILED]
     since = tuple(_first_accepted_day(cause, causes_by_day) for cause in now)
     return Fleet(tuple(assets), tuple(now), since, states, tuple(failed), dict(unlearned), dict(late or {}))
+
+
+def _last_known_day(states: Mapping[str, str]) -> str:
+    """Return the day that tells how an asset is: its last one, unless that shows nothing and there was a fault before.
+
+    A file that is damaged, or of a machine that did not move, is no repair.
+    """
+    days = sorted(states, reverse=True)
+    told = next((day for day in days if states[day] not in ("undetermined", FAILED)), days[0])
+    if states[told] in ("fault", COMMON):
+        return told
+    return next((day for day in days if states[day] != FAILED), days[0])
 
 
 def _common_causes(entries: Iterable[Entry], groups: Mapping[str, Mapping[str, str]], prior: Prior) -> list[Cause]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from servoscope.core.errors import AlarmError, StateError
+from servoscope.core.messages import message, render
 from servoscope.core.settings_errors import suggest_name
 from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.follower import DiagnosisSchedule, Follower
@@ -34,7 +36,8 @@ from servoscope.service.examination_schedule import (
     schedule_full_diagnosis,
     update_examination,
 )
-from servoscope.service.records import StepResult, TableRow, transition_row
+from servoscope.service.reception import FOLLOWED
+from servoscope.service.records import BlockRefusal, StepResult, TableRow, transition_row
 from servoscope.service.residual_history import evaluation_status, update_history
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.continuity import BlockContinuity, check_continuity
@@ -71,6 +74,7 @@ class Asset:
         self._window: deque[Block] = deque()
         self._result = StepResult([], [])
         self.state: AssetState | None = None
+        self.reception = FOLLOWED
 
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
@@ -96,6 +100,7 @@ class Asset:
 
     def begin(self, position: StreamPosition) -> None:
         """Begin with a new state, before the first sample or behind those that were counted."""
+        before = {} if self.heard or self.state is None else self.state.alarms
         due = position.t + self.policy.diagnosis.window_s * (1.0 + examination_phase(self.name))
         self.state = AssetState(
             asset=self.name,
@@ -104,31 +109,53 @@ class Asset:
             monitor=self._follower.init(),
             quality=quality.init_state(),
             examination=ExaminationState(due=due, since=position.t),
-            alarms={name: initial_alarm_state(self.name, name, position.t) for name in self._definitions},
+            # those that stand since before the first block go on
+            alarms={
+                name: one
+                if (one := before.get(name)) and one.sequence
+                else initial_alarm_state(self.name, name, position.t)
+                for name in self._definitions
+            },
         )
+
+    @property
+    def heard(self) -> bool:
+        """Whether a block of it was ever counted."""
+        return self.state is not None and self.state.position.blocks > 0
+
+    def expect(self, now: float) -> None:
+        """Wait for the first block from `now` [UTC s] on: an asset that was never heard has a state too."""
+        self.begin(StreamPosition(now, now, rows=self.state.position.rows if self.state is not None else 0))
 
     def status(self, state: AssetState) -> AssetStatus:
         """Return what users see of a state."""
-        return asset_status(state, self._definitions, self._metadata)
+        return asset_status(state, self._definitions, self._metadata, self.reception)
 
     @property
     def first_needed_sequence(self) -> int:
         """The number of the first block of the window: earlier ones are no longer needed."""
         return self._window[0].sequence if self._window else self._current.position.blocks
 
-    def process(self, block: Block) -> StepResult:
-        """Process a block; one that was counted before has no effect.
+    def process(self, block: Block, latest: float = math.inf) -> StepResult:
+        """Process a block; one that was counted before has no effect, nor has one that is later than `latest` [UTC s].
 
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
-        start = block.start_time()
-        continuity = check_continuity(self.state.position if self.state is not None else None, block)
-        if self.state is None:
-            self.begin(StreamPosition(start, start, stream=block.stream))
+        start, credible = block.start_time(), block.until(latest)
+        if credible is None:
+            return self._leave_out(block, "future", ahead_s=start - latest)
+        block, start = credible, credible.start_time()
+        continuity = check_continuity(self._current.position if self.heard else None, block, latest)
+        if not self.heard:
+            rows = self.state.position.rows if self.state is not None else 0
+            self.begin(StreamPosition(start, start, stream=block.stream, rows=rows))
         position, self._result = self._current.position, StepResult([], [])
         if continuity is None:
-            self.state = replace(self._current, position=replace(position, repeated=position.repeated + 1))
-            return self._result
+            # its sender sends it again by design, or it is one of the last minutes
+            if block.retained or any(one.t[0] == block.t[0] for one in self._window):
+                self.state = replace(self._current, position=replace(position, repeated=position.repeated + 1))
+                return self._result
+            return self._leave_out(block, "late", behind_s=position.t - start)
         # stored under a number of our own, because the sender's may begin anew
         self._window.append(replace(block, sequence=position.blocks))
         self._result.rows.append(TableRow("recent", {"sequence": position.blocks, "samples": block.pack()}))
@@ -143,15 +170,31 @@ class Asset:
         self._trim_window()
         return self._result
 
+    def _leave_out(self, block: Block, kind: Literal["late", "future"], **seconds: float) -> StepResult:
+        """Count a block that is left out for its time stamps; its place in its stream has passed."""
+        refusal = BlockRefusal(kind, render(message(f"service.reception.{kind}", **seconds)))
+        if self.state is not None:
+            position = self.state.position
+            position = replace(position, **{kind: getattr(position, kind) + 1})
+            if kind == "future" and self.heard and block.stream == position.stream:
+                lost = max(0, block.sequence - position.sequence - 1)
+                sequence = max(block.sequence, position.sequence)
+                position = replace(position, sequence=sequence, lost=position.lost + lost)
+            self.state = replace(self.state, position=position)
+        return StepResult([], [], refusal)
+
     def advance_time(self, elapsed_s: float) -> StepResult:
         """Advance the asset's clock without a block: after a while, silence is an alarm."""
         self._result = StepResult([], [])
         if self.state is None:
             return self._result
         now = self.state.position.t + elapsed_s
-        quality_state, changed = quality.tick(self._limits, self.state.quality, now)
+        # before its first block it waits: that is told by its reception, and not as the silence of a sensor
+        quality_state, changed = self.state.quality, tuple[quality.QualityFinding, ...]()
+        if self.heard:
+            quality_state, changed = quality.tick(self._limits, self.state.quality, now)
         self.state = replace(self.state, quality=quality_state)
-        if changed or "silent" in quality.active_findings(quality_state):
+        if changed or not self.heard or "silent" in quality.active_findings(quality_state):
             self._advance_alarms(now)
         return self._result
 
@@ -203,8 +246,8 @@ class Asset:
         if diagnosis.verdict == "fault" and (examination.verdict != "fault" or window.until > examination.since):
             faults = diagnosis.document.get("faults", [])
             if faults or not examination.named:
-                examination = replace(examination, named=diagnosis.summary)
-            if examination.verdict == "fault":
+                examination = replace(examination, named=diagnosis.summary, diagnosed=window.until)
+            if examination.verdict == "fault" or examination.fault_at is not None:
                 onset = diagnosis.onset if first and diagnosis.onset is not None else examination.onset
                 examination = replace(examination, faults=faults or examination.faults, onset=onset)
         pending = tuple(one for one in state.pending_diagnoses if one != window)
@@ -272,6 +315,7 @@ class Asset:
             state.evaluation.exceeded,
             lambda: examine_blocks(self.baseline, self.name, recent),
             examination_phase(self.name),
+            sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )
         self.state = replace(state, examination=examination)
         if result is None:
@@ -294,6 +338,7 @@ class Asset:
             quality=findings,
             statistic=statistic,
             level=level,
+            reception=self.reception,
             cause=asset_summary(state.examination, findings),
         )
         alarms, transitions = advance_alarms(self._definitions, state.alarms, snapshot, t)

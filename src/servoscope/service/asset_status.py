@@ -16,6 +16,7 @@ from servoscope.detection.result import FaultEstimate
 from servoscope.service.alarms import FAULT_ALARM, AlarmDefinition, LifecycleState, Ne107, Priority, evaluate_ne107
 from servoscope.service.checkpoint import AssetState, StreamPosition
 from servoscope.service.examination_schedule import ExaminationState
+from servoscope.service.reception import FOLLOWED, Reception, ReceptionState
 from servoscope.service.residual_history import EvaluationStatus
 from servoscope.signals import quality
 
@@ -63,6 +64,10 @@ class AssetStatus(EvaluationStatus):
     quality: dict[str, float]  # findings of data quality that hold now, and since when [UTC s]
     alarms: dict[str, AlarmStatus]  # those that are not normal
     pending_diagnoses: tuple[int, ...] = Field((), alias="awaited")  # numbers of their rows
+    reception: ReceptionState = "followed"  # how its samples come in
+    # when sound data last showed the fault, and the end of the window that named it [UTC s]
+    fault_at: float | None = None
+    diagnosed: float | None = None
     position: StreamPosition = Field(alias="counted")
     metadata: AssetMetadata = Field(AssetMetadata(), alias="about")
 
@@ -109,23 +114,37 @@ def asset_metadata(baseline: Baseline, group: str, window_s: float) -> AssetMeta
     )
 
 
-def asset_summary(examination: ExaminationState, findings: Iterable[str]) -> str:
-    """Return the last examination's sentence, unless data quality overrules it."""
+def asset_summary(examination: ExaminationState, findings: Iterable[str], reception: Reception = FOLLOWED) -> str:
+    """Return the last examination's sentence, unless data quality or what is wrong with the reception overrules it."""
+    if reception.sentence:
+        return reception.sentence
     if quality.limit_verdict(examination.verdict, findings) == examination.verdict:
         return examination.summary
     return render(message("service.examination.data_quality", findings=quality.describe_findings(findings)))
 
 
-def asset_status(state: AssetState, definitions: Mapping[str, AlarmDefinition], metadata: AssetMetadata) -> AssetStatus:
+def asset_status(
+    state: AssetState,
+    definitions: Mapping[str, AlarmDefinition],
+    metadata: AssetMetadata,
+    reception: Reception = FOLLOWED,
+) -> AssetStatus:
     """Return the status of an asset."""
     examination, findings = state.examination, quality.active_findings(state.quality)
     verdict = quality.limit_verdict(examination.verdict, findings)
     ne107 = evaluate_ne107(verdict, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
     named = examination.named
+    if verdict == "healthy" and reception != FOLLOWED:
+        verdict = "undetermined"  # nobody knows what it does now
+    summary = named if verdict == "fault" and named else asset_summary(examination, findings, reception)
+    if verdict == "undetermined" and examination.fault_at is not None:
+        verdict = "fault"  # it was seen on sound data, and nothing has shown since that it has gone
+        fault = named or render(message("service.examination.seen"))
+        summary = render(message("service.examination.stands", fault=fault, t=examination.fault_at, since=summary))
     return AssetStatus.model_validate(
         {
             "verdict": verdict,
-            "summary": named if verdict == "fault" and named else asset_summary(examination, findings),
+            "summary": summary,
             "since": examination.since,
             "onset": examination.onset,
             "faults": examination.faults,
@@ -148,6 +167,9 @@ def asset_status(state: AssetState, definitions: Mapping[str, AlarmDefinition], 
             "awaited": [window.number for window in state.pending_diagnoses],
             "counted": state.position,
             "about": metadata,
+            **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
+            **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
+            **({} if reception == FOLLOWED else {"reception": reception.state}),
             **state.evaluation.model_dump(exclude_unset=True),
         }
     )

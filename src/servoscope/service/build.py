@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from servoscope.service.checkpoint import StreamPosition, unpack_state
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
 from servoscope.service.publishers.base import StatusPublisher
+from servoscope.service.reception import UNHEARD
 from servoscope.service.sources.base import BlockSource, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.store import Store
@@ -63,6 +65,9 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
             elif name in rows:
                 window = [Block.unpack(name, *one) for one in store.recent_samples(name)]
                 asset.resume(unpack_state(rows[name]["state"], name), window)
+            if not asset.heard:
+                asset.expect(time.time())
+                asset.reception = UNHEARD
         for name, source in sources.items():
             source.open(_resume_positions(config, name, assets))
         for publisher in publishers.values():
@@ -72,6 +77,14 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
         raise
     order = tuple(name for name in known if name in restarted)
     return ServiceComponents(assets, notifier, sources, publishers, store, order)
+
+
+def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, BlockSource]]:
+    """Return the assets and sources of a service file, these as visitors: a service that runs loses nothing to them."""
+    sources = {name: settings.for_visit() for name, settings in config.sources.items()}
+    visit = config.model_copy(update={"name": f"{config.name}.check", "sources": sources})
+    assets = _build_assets(config)
+    return assets, _build_sources(visit, assets)
 
 
 def check_service_file(config: ServiceFile) -> None:
@@ -85,7 +98,7 @@ def check_service_file(config: ServiceFile) -> None:
 def _resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:
     found = {}
     for name, asset in assets.items():
-        if config.assets[name].source == source and asset.state is not None:
+        if config.assets[name].source == source and asset.state is not None and asset.heard:
             position = asset.state.position
             found[name] = ResumePosition(position.sequence, position.began, position.stream, position.t)
     return found
@@ -129,12 +142,13 @@ def _build_sources(config: ServiceFile, assets: dict[str, Asset]) -> dict[str, B
             for each, one in config.assets.items()
             if one.source == name
         }
-        sources[name] = settings.create(f"{config.name}.{name}", own, config.folder)
+        sources[name] = settings.create(config.client_names()["sources", name], own, config.folder)
     return sources
 
 
 def _build_publishers(config: ServiceFile) -> dict[str, StatusPublisher]:
-    return {name: settings.create(f"{config.name}.{name}", config.folder) for name, settings in config.outlets.items()}
+    names = config.client_names()
+    return {name: one.create(names["outlets", name], config.folder) for name, one in config.outlets.items()}
 
 
 def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:

@@ -36,6 +36,9 @@ class StreamPosition:
     digest: int = 0  # CRC-32 of all samples, in order
     rows: int = 0  # number of the asset's last row in the store
     stream: int = 0  # of the last block
+    # late, future: blocks left out for their time stamps: behind what was counted, ahead of the service's clock
+    late: int = 0
+    future: int = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -18,3 +18,11 @@ class SteadyClock:
     def now(self) -> float:
         """Return the time (epoch, s)."""
         return self._start + time.monotonic()
+
+    def latest(self) -> float:
+        """Return the later of that and of the machine's clock (epoch, s): what is ahead of both is in the future.
+
+        A machine that starts without a battery learns the time only after its service has started; and one whose
+        clock is set back must not take what comes for the future.
+        """
+        return max(self.now(), time.time())

@@ -31,6 +31,8 @@ class ServiceSettings(Settings):
     # how many blocks may wait for a store that is full, locked or down; then the sources are stopped
     buffer: Annotated[int, Field(strict=True, ge=1)] = 10_000
     stop_within_s: NonNegative = 10.0  # how long a stop waits for such a store [s]
+    # how far time stamps may be ahead of the service's clock; what is further ahead is left out [s]
+    ahead_s: Seconds = 60.0
     log: Literal["debug", "info", "warning", "error"] = "info"  # what is logged, at least
 
 
@@ -108,6 +110,22 @@ class ServiceFile(FileSettings):
             object.__setattr__(self, name, value)  # frozen for everybody else
         return self
 
+    def client_names(self) -> dict[tuple[str, str], str]:
+        """Return by what names sources and outlets are known outside, by section and name."""
+        sources = {("sources", name): f"{self.name}.{name}" for name in self.sources}
+        # not as a source of the same name: brokers give a session to one client only
+        return sources | {("outlets", name): f"{self.name}.{name}.outlet" for name in self.outlets}
+
+    def _check_identities(self) -> None:
+        """Refuse two clients of one name: a broker throws out one for the other, and messages are lost."""
+        found: dict[str, str] = {}
+        for (section, name), client in self.client_names().items():
+            settings: SourceSettings | PublisherSettings = getattr(self, section)[name]
+            place, identity = f"[{section}] {name}", settings.identity(client)
+            if identity and identity in found:
+                raise ValueError(f"{place}: {identity} is that of {found[identity]} too, give each one of its own")
+            found[identity] = place
+
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:
         for name, asset in self.assets.items():
@@ -123,6 +141,7 @@ class ServiceFile(FileSettings):
                     )
                 if given and key != source.asset_key:
                     raise ValueError(f"[assets] {name}.{key}: leave it out, its source is of kind {source.kind}")
+        self._check_identities()
         if self.name in self.assets:
             raise ValueError(f"name: {self.name!r} is an asset's name too, call the service something else")
         return self

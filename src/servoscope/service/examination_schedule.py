@@ -49,6 +49,10 @@ class ExaminationState:
     faults: list[dict[str, Any]] = field(default_factory=list)  # by the last full diagnosis of this fault
     named: str = ""  # the summary of its last full diagnosis that named a fault, or of the first one
     again: float = 0.0  # when a fault that lasts is diagnosed in full once more
+    # fault_at, diagnosed: when sound data last showed the fault, and the end of the window that last named it. A fault
+    # stands until something shows that it has gone; None: there is none
+    fault_at: float | None = None
+    diagnosed: float | None = None
 
 
 def examination_phase(asset: str) -> float:
@@ -63,10 +67,12 @@ def update_examination(
     exceeded: bool,
     examine: Callable[[], StoredDiagnosis],
     phase: float = 0.0,
+    *,
+    sound: bool = True,
 ) -> tuple[ExaminationState, StoredDiagnosis | None]:
     """Return the state at time `t` [UTC s], and the result of the examination if one was due.
 
-    `exceeded`: whether the recursion is above a limit.
+    `exceeded`: whether the recursion is above a limit; `sound`: whether the data are good enough to show a fault.
     """
     if state.examined is not None and t < state.examined:  # the clock was set back
         state = replace(state, due=t, retry=t, again=t)
@@ -87,6 +93,9 @@ def update_examination(
     due = every * (math.floor((t + every / 2.0) / every - phase) + 1.0 + phase)
     if result.recovering:
         due = min(due, t + settings.window_s)
+    # nothing to be seen, of a machine that is off for example, is no repair
+    faulty, unseen = result.verdict == "fault", result.verdict == "undetermined" and not result.recovering
+    stands = unseen and state.fault_at is not None
     new = replace(
         state,
         due=due,
@@ -94,10 +103,12 @@ def update_examination(
         summary=result.summary,
         since=state.since if unchanged else t,
         # the onset has left a window that is above its limits throughout; an earlier examination has found it
-        onset=state.onset if unchanged and state.onset is not None else result.onset,
+        onset=state.onset if (unchanged or stands) and state.onset is not None else result.onset,
         examined=t,
-        faults=state.faults if result.verdict == "fault" else [],
-        named=state.named if unchanged or result.verdict != "fault" else "",
+        faults=state.faults if faulty or stands else [],
+        named=state.named if unchanged or not faulty or state.fault_at is not None else "",
+        fault_at=t if faulty and sound else state.fault_at if faulty or stands else None,
+        diagnosed=state.diagnosed if faulty or stands else None,
     )
     return new, result
 

@@ -41,6 +41,7 @@ class HealthReport:
 
     metrics: Callable[[], bytes]  # as Prometheus reads them
     unready: Callable[[], str]  # why it is not ready; empty: it is
+    degraded: Callable[[], str] = str  # what it does not do although it is ready; empty: nothing
     last_turn: Callable[[], float] | None = None  # when its loop last turned, by the monotonic clock [s]; None: no loop
 
     def answer(self, path: str) -> HealthAnswer | None:
@@ -49,7 +50,7 @@ class HealthReport:
             return HealthAnswer(200, self.metrics(), TEXT_TYPE)
         if path == "/health/ready":
             why = self.unready()
-            return _json_answer(not why, {"why": why})
+            return _json_answer(not why, {"why": why, "degraded": self.degraded()})
         if path == "/health/live":
             if self.last_turn is None:
                 return _json_answer(True, {})
@@ -96,6 +97,10 @@ class HealthSource(Protocol):
     def unready_reason(self) -> str:
         """Why it is not ready; empty: it is."""
 
+    @property
+    def degraded_reason(self) -> str:
+        """What it does not do although it is ready; empty: nothing."""
+
 
 class _HealthServer(ThreadingHTTPServer):
     """Keeps few connections: clients that are slow must not use up threads and files."""
@@ -132,7 +137,12 @@ def serve_health(service: HealthSource, listen: str) -> ThreadingHTTPServer:
 
     Raises ConfigError if the address cannot be had.
     """
-    report = HealthReport(service.metrics.render, lambda: service.unready_reason, lambda: service.last_turn)
+    report = HealthReport(
+        service.metrics.render,
+        lambda: service.unready_reason,
+        lambda: service.degraded_reason,
+        lambda: service.last_turn,
+    )
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Protocol
 
 from servoscope.core.errors import AlarmError, StoreUnavailableError
@@ -36,6 +37,13 @@ class HousekeepingContext(Protocol):
     metrics: ServiceMetrics
     residual_days: float  # how long residuals are kept
 
+    @property
+    def troubles(self) -> Mapping[str, str]:
+        """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
+
+    def note_refusal(self, name: str, why: str) -> None:
+        """Note that something of an asset came and could not be used."""
+
     def handle_result(self, asset: Asset, result: StepResult) -> None:
         """Store and announce what a step of an asset has led to."""
 
@@ -64,8 +72,9 @@ class Housekeeping:
     def _update_service_alarms(self) -> None:
         """Advance the service's own alarms, and the flood."""
         writer, notifier, now = self._service.writer, self._service.notifier, self._service.clock.now()
-        self._handle_own(notifier.check_buffer(writer.fill_ratio, now), now)
-        clocks = [asset.state.position.t for asset in self._service.assets.values() if asset.state is not None]
+        result = notifier.check_service(writer.fill_ratio, self._service.troubles, now)
+        self._handle_own(result, now)
+        clocks = [one.state.position.t for one in self._service.assets.values() if one.state is not None and one.heard]
         writer.add(notifier.name, notifier.advance_time(max(clocks, default=0.0), now))
 
     def _handle_own(self, result: StepResult, now: float) -> None:
@@ -85,6 +94,8 @@ class Housekeeping:
         for name, source in self._service.sources.items():
             for one in source.rejections.take():
                 self._service.metrics.record_rejection(name, one)
+                if one.asset:
+                    self._service.note_refusal(one.asset, one.reason)
                 self._rejections.add(one.asset or name, one.kind, one.reason, one.count)
         now = time.monotonic()
         if now < self._next_rejections:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from servoscope.core.errors import ConfigError
 from servoscope.service.asset import Asset
+from servoscope.service.config import ServiceFile
 from servoscope.service.health import status_gauges
 from servoscope.service.sources.base import BlockSource, Rejection
 from servoscope.service.writer import StoreWriter
@@ -22,17 +23,24 @@ STREAM_COUNTERS = {
     "samples": "Samples that were counted",
     "lost": "Blocks that never came",
     "repeated": "Blocks that came once more and were left out",
+    "late": "Blocks left out because their time stamps lie behind what was counted",
+    "future": "Blocks left out because their time stamps lie ahead of the service's clock",
 }
 
 
 class MetricsContext(Protocol):
     """What the metrics read of a service."""
 
+    config: ServiceFile
     assets: dict[str, Asset]
     sources: dict[str, BlockSource]
     writer: StoreWriter
     buffer: int  # how many blocks may wait to be stored
     last_turn: float  # when it last polled its sources, by the monotonic clock [s]
+
+    @property
+    def troubles(self) -> Mapping[str, str]:
+        """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
 
 
 class ServiceMetrics:
@@ -88,11 +96,35 @@ class ServiceMetrics:
             yield family
         last = GaugeMetricFamily("servoscope_last_sample_time_seconds", "Time of the last sample", labels=["asset"])
         for name, (position, _) in followed.items():
-            last.add_metric([name], position.t)
+            if position.blocks:
+                last.add_metric([name], position.t)
+        receptions = GaugeMetricFamily(
+            "servoscope_reception", "1 for how an asset's samples come in", labels=["asset", "source", "state"]
+        )
+        for name, asset in service.assets.items():
+            receptions.add_metric([name, service.config.assets[name].source, asset.reception.state], 1.0)
+        trouble = GaugeMetricFamily(
+            "servoscope_connection_trouble", "Whether something is wrong with a source or outlet", labels=["name"]
+        )
+        intervals = GaugeMetricFamily(
+            "servoscope_update_interval_seconds", "Between two values of a signal", labels=["source", "asset", "signal"]
+        )
+        for name, source in service.sources.items():
+            for (asset_name, signal), interval in source.update_intervals_s.items():
+                intervals.add_metric([name, asset_name, signal], interval)
+        for name, why in service.troubles.items():
+            trouble.add_metric([name], float(bool(why)))
         up = GaugeMetricFamily("servoscope_source_up", "Whether a source is connected", labels=["source"])
         for name, source in service.sources.items():
             up.add_metric([name], float(source.connected))
-        yield from (last, *status_gauges((name, status) for name, (_, status) in followed.items()), up)
+        yield from (
+            receptions,
+            trouble,
+            intervals,
+            last,
+            *status_gauges((name, status) for name, (_, status) in followed.items()),
+            up,
+        )
         for name, words, value in (
             ("store_up", "Whether the last attempt to store succeeded", service.writer.unavailable_since is None),
             ("buffered_blocks", "Blocks that wait to be stored", service.writer.waiting),

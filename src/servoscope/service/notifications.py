@@ -22,7 +22,6 @@ from servoscope.service.alarms import (
     LifecycleState,
     Notification,
     OperatorCommand,
-    advance_alarms,
     advance_flood,
     initial_alarm_state,
     notify_transition,
@@ -90,7 +89,7 @@ class Notifier:
         """Take transitions of an asset, in the order of time; return rows for outbox and audit."""
         rows: list[TableRow] = []
         for one in transitions:
-            priority = self._alarms.definitions[one.alarm].priority
+            priority = self._alarms.find(one.alarm).priority
             self._flood, notices = notify_transition(self._alarms.flood, self._flood, one, priority)
             rows += self._notification_rows(notices, details, now)
         return rows
@@ -117,7 +116,7 @@ class Notifier:
         return rows
 
     def _advice(self, alarm: str) -> dict[str, Any]:
-        return self._alarms.definitions[alarm].model_dump(include={"consequence", "operator_action", "response_time_s"})
+        return self._alarms.find(alarm).model_dump(include={"consequence", "operator_action", "response_time_s"})
 
     def notify_diagnosis(
         self, alarms: Mapping[str, AlarmState], diagnosis: StoredDiagnosis, t: float, now: float
@@ -137,12 +136,20 @@ class Notifier:
         sent = actions.diagnosis_entries(self._settings, alarm, priority, t, now, diagnosis.summary, details)
         return [self._outbox_row(one) for one in sent]
 
-    def check_buffer(self, fill_ratio: float, now: float) -> StepResult:
-        """Take how full the buffer is, and advance the service's own alarms."""
-        definitions, own = self._alarms.service_alarms, self._service_alarms
-        known = {name: own.get(name) or initial_alarm_state(self.name, name, now) for name in definitions}
-        snapshot = AssetSnapshot(buffered=fill_ratio, cause=render(message("alarm.cause_buffer", share=fill_ratio)))
-        self._service_alarms, transitions = advance_alarms(definitions, known, snapshot, now)
+    def check_service(self, fill_ratio: float, troubles: Mapping[str, str], now: float) -> StepResult:
+        """Take how full the buffer is, and what is wrong with each connection; advance the service's own alarms."""
+        own = {key: one for key, one in self._service_alarms.items() if key.partition(".")[2] in ("", *troubles)}
+        self._service_alarms, transitions = own, list[AlarmTransition]()
+        for name, definition in self._alarms.service_alarms.items():
+            if definition.source == "connection":
+                snapshots = {f"{name}.{one}": AssetSnapshot(connection=why) for one, why in troubles.items()}
+            else:
+                cause = render(message("alarm.cause_buffer", share=fill_ratio))
+                snapshots = {name: AssetSnapshot(buffered=fill_ratio, cause=cause)}
+            for key, snapshot in snapshots.items():
+                before = own.get(key) or initial_alarm_state(self.name, key, now)
+                own[key], found = step_alarm(definition, before, snapshot, now)
+                transitions += found
         return self._step_result(transitions)
 
     def execute(self, alarm: str, command: OperatorCommand, now: float) -> StepResult:
@@ -150,16 +157,16 @@ class Notifier:
 
         Raises AlarmError if there is no such alarm, or the command has no meaning in its state.
         """
-        own, definitions = self._service_alarms, self._alarms.definitions
+        own = self._service_alarms
         if alarm not in own:
             raise AlarmError(f"{self.name}: has no alarm {alarm!r}, {suggest_name(alarm, own)}")
-        own[alarm], transitions = step_alarm(definitions[alarm], own[alarm], command, now)
+        own[alarm], transitions = step_alarm(self._alarms.find(alarm), own[alarm], command, now)
         return self._step_result(transitions)
 
     def _step_result(self, transitions: Sequence[AlarmTransition]) -> StepResult:
         rows = []
         for number, one in enumerate(transitions, self._rows + 1):
-            row = transition_row(one, self._alarms.definitions[one.alarm])
+            row = transition_row(one, self._alarms.find(one.alarm))
             rows.append(TableRow("transitions", {"number": number, **row}))
         self._rows += len(rows)
         return StepResult(rows, list(transitions))

@@ -14,11 +14,19 @@ class TableRow(NamedTuple):
     values: dict[str, Any]
 
 
+class BlockRefusal(NamedTuple):
+    """Why a block was left out: in a word, and in a sentence."""
+
+    kind: str
+    why: str
+
+
 class StepResult(NamedTuple):
     """What a step of an asset leads to: rows for the store, and those of them of which operators may be notified."""
 
     rows: list[TableRow]
     transitions: list[AlarmTransition]
+    refusal: BlockRefusal | None = None  # why the block was left out, if it was
 
 
 def audit_row(event: str, document: dict[str, Any], user: str = "servoscope") -> TableRow:

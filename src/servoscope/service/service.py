@@ -20,6 +20,8 @@ from servoscope.service.examination_schedule import PendingDiagnosis
 from servoscope.service.housekeeping import Housekeeping
 from servoscope.service.log import log
 from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.publishers.base import publisher_trouble
+from servoscope.service.reception import FOLLOWED, ReceptionLog
 from servoscope.service.records import StepResult, audit_row
 from servoscope.service.sources.block import Block
 from servoscope.service.writer import StoreWriter
@@ -46,7 +48,7 @@ class Service:
         self._diagnosis_jobs: dict[tuple[str, PendingDiagnosis], Future[StoredDiagnosis]] = {}
         # s: that it has been ready for blocks; a sensor is not silent because the service is busy, or its buffer full
         self._listening_s = 0.0
-        self._last_block_s: dict[str, float] = {}  # by that clock, when the last block of each asset came
+        self._receptions = {name: ReceptionLog(heard_before=asset.heard) for name, asset in self.assets.items()}
         self._housekeeping = Housekeeping(self)
         self._next_commit = self._next_housekeeping = 0.0
         self._stopping = False
@@ -108,7 +110,7 @@ class Service:
         self._run_diagnoses(ended=self._exhausted)
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + HOUSEKEEPING_EVERY_S
-            self._check_silence()
+            self._check_reception()
             self._housekeeping.run_due()
         if now >= self._next_commit:
             self._next_commit = now + self.config.service.commit_every_s
@@ -116,11 +118,19 @@ class Service:
 
     def _process_block(self, block: Block) -> None:
         asset = self.assets[block.asset]
-        self._last_block_s[block.asset] = self._listening_s
+        source = self.sources[self.config.assets[block.asset].source]
+        # recordings are dated as they like
+        latest = self.clock.latest() + self.config.service.ahead_s if source.clock_rate == 1.0 else math.inf
         try:
-            result = asset.process(block)
+            result = asset.process(block, latest)
+            if result.refusal is None:
+                self._receptions[block.asset].hear(self._listening_s)
+                asset.reception = FOLLOWED
+            else:
+                source.rejections.add(block.asset, *result.refusal)
         except ServoscopeError as error:  # one asset's trouble must not stop the others
             log("error", "block refused", asset=block.asset, sequence=block.sequence, why=str(error))
+            self.note_refusal(block.asset, str(error))
             result = StepResult([audit_row("block refused", {"sequence": block.sequence, "why": str(error)})], [])
         self.handle_result(asset, result)
         self.writer.set_checkpoint(asset, block.completed_at)
@@ -158,15 +168,43 @@ class Service:
             self.writer.add(self.config.name, rows)
             self.writer.set_checkpoint(asset)
 
-    def _check_silence(self) -> None:
-        """Advance the clocks of assets from which no block comes, as fast as their samples' clock runs."""
+    def note_refusal(self, name: str, why: str) -> None:
+        """Note that something of an asset came and could not be used."""
+        self._receptions[name].refuse(self._listening_s, why)
+
+    def _check_reception(self) -> None:
+        """Look how each asset is heard, and advance the clocks of those that are not, as fast as their samples' run."""
+        if self._exhausted:
+            return
+        troubles = {name: (source.trouble, source.asset_troubles) for name, source in self.sources.items()}
         for name, asset in self.assets.items():
-            silence = self._listening_s - self._last_block_s.setdefault(name, self._listening_s)
-            if silence >= HOUSEKEEPING_EVERY_S and not self._exhausted:
-                rate = self.sources[self.config.assets[name].source].clock_rate
-                self.handle_result(asset, result := asset.advance_time(silence * rate))
-                if result.rows:
-                    self.writer.set_checkpoint(asset)
+            source = self.config.assets[name].source
+            reception, before, (trouble, of_assets) = self._receptions[name], asset.reception, troubles[source]
+            patience_s, own = self.config.quality.silent_s, of_assets.get(name)
+            if not math.isinf(self.sources[source].next_block_s):
+                asset.reception = reception.evaluate(self._listening_s, patience_s, trouble, own)
+            silence, result = reception.silence_s(self._listening_s), StepResult([], [])
+            if silence >= HOUSEKEEPING_EVERY_S:
+                result = asset.advance_time(silence * self.sources[source].clock_rate)
+                self.handle_result(asset, result)
+            if result.rows or asset.reception != before:
+                self.writer.set_checkpoint(asset)
+
+    @property
+    def degraded_reason(self) -> str:
+        """Which assets are not followed although the service itself is ready; empty: none."""
+        lacking = {name: asset for name, asset in self.assets.items() if asset.reception.state != "followed"}
+        if not lacking:
+            return ""
+        name, first = next(iter(lacking.items()))
+        counts = {"count": len(lacking), "total": len(self.assets)}
+        return render(message("service.degraded_assets", asset=name, why=first.reception.why, **counts))
+
+    @property
+    def troubles(self) -> dict[str, str]:
+        """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
+        outlets = {name: publisher_trouble(one) for name, one in self._publishers.items()}
+        return outlets | {name: outlets.get(name, "") or source.trouble for name, source in self.sources.items()}
 
     def _commit(self) -> None:
         """Write what was gathered; what cannot be written waits."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Group
 from rich.table import Table
@@ -15,6 +15,10 @@ from servoscope.cli.render.results import COLOURS
 from servoscope.report.format_values import DASH, format_duration, plain_name
 from servoscope.report.page import say
 from servoscope.service.store.queries import format_time
+
+if TYPE_CHECKING:
+    from servoscope.service.commissioning import CommissioningRow
+
 
 OLD_S = 60.0
 TIME_COLUMNS = ("t", "at", "created", "onset", "since", "due", "asked", "from", "until", "time")
@@ -67,6 +71,31 @@ def asset_table(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
             *(format_relative_residual(residual.get(f)) for f in frequencies),
             format_alarms(status["alarms"]),
             *(more if wide else ()),
+        )
+    return table
+
+
+def commissioning_table(rows: Sequence[CommissioningRow]) -> Table:
+    """Return how assets are heard, for somebody who has just connected them."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("asset", "source", "heard", "blocks", "Hz", "needed"):
+        table.add_column(name, justify="right" if name in ("blocks", "Hz", "needed") else "left", no_wrap=True)
+    table.add_column("newest sample", no_wrap=True)
+    table.add_column("what is wrong", overflow="fold")
+    for row in rows:
+        state, age = row.reception.state, row.age_s
+        when = DASH
+        if not math.isnan(age):
+            when = f"{format_duration(round(abs(age), 1))} {'ago' if age >= 0.0 else 'ahead'}"
+        table.add_row(
+            row.asset,
+            row.source,
+            Text(state, "green" if state == "followed" else "red"),
+            str(row.blocks),
+            DASH if math.isnan(row.rate_hz) else f"{row.rate_hz:.4g}",
+            f"{row.needed_hz:.4g}",
+            when,
+            row.reception.why or DASH,
         )
     return table
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from servoscope.service.actions.settings import DIAGNOSIS_EVENT, ActionSettings, RetrySettings
-from servoscope.service.alarms import AlarmState, AlarmTransition, LifecycleState, Notification, Priority
+from servoscope.service.alarms import AlarmState, AlarmTransition, LifecycleState, Notification, Priority, alarm_kind
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _alarm_entries(
     entries = []
     for name, sink in settings.sinks.items():
         filters: tuple[tuple[tuple[str, ...] | None, str], ...] = (
-            (sink.alarms, event["alarm"]),
+            (sink.alarms, alarm_kind(event["alarm"])),
             (sink.assets, event["asset"]),
             (sink.priorities, event["priority"]),
             (sink.events, event["event"]),

@@ -22,6 +22,7 @@ from servoscope.service.alarms.settings import (
     FloodSettings,
     Ne107,
     Priority,
+    alarm_kind,
 )
 from servoscope.service.alarms.state_table import COMMANDS, TRANSITION_TABLE, LifecycleEvent, LifecycleState
 
@@ -29,6 +30,6 @@ __all__ = [
     "COMMANDS", "DEFAULT_ALARMS", "FAULT_ALARM", "PRIORITIES", "TRANSITION_TABLE", "AlarmDefinition", "AlarmSettings",
     "AlarmState", "AlarmTransition", "AssetSnapshot", "Condition", "FloodSettings", "FloodState", "HeldAlarm",
     "LifecycleEvent", "LifecycleState", "Ne107", "Ne107Status", "Notification", "OperatorCommand", "Priority",
-    "advance_alarms", "advance_flood", "evaluate_condition", "evaluate_ne107", "initial_alarm_state",
+    "advance_alarms", "advance_flood", "alarm_kind", "evaluate_condition", "evaluate_ne107", "initial_alarm_state",
     "notify_transition", "step_alarm",
 ]  # fmt: skip

@@ -8,6 +8,7 @@ from typing import Literal
 
 from servoscope.core.messages import message, render
 from servoscope.service.alarms.settings import AlarmDefinition
+from servoscope.service.reception import Reception
 from servoscope.signals import quality
 
 Condition = Literal["normal", "abnormal", "unknown"]
@@ -24,7 +25,9 @@ class AssetSnapshot:
     # statistic, level: T^2 and the sequential test as multiples of their limits; None: not evaluated
     statistic: float | None = None
     level: float | None = None
+    reception: Reception | None = None  # how its samples come in; None: the service itself
     buffered: float | None = None  # share of the service's buffer that is filled; None: not the service
+    connection: str | None = None  # what is wrong with a connection of the service; None: not a connection
     alarms: tuple[str, ...] = ()  # the asset's alarms whose condition is abnormal; `advance_alarms` fills it in
     cause: str = ""  # what transitions name as their cause, for example the diagnosis in a sentence
 
@@ -43,6 +46,12 @@ def evaluate_condition(definition: AlarmDefinition, abnormal: bool, snapshot: As
         if any(kind in words for kind in snapshot.quality):
             return "abnormal"
         return "unknown" if any(kind in MASKING_FINDINGS for kind in snapshot.quality) else "normal"
+    if definition.source == "reception":
+        if snapshot.reception is None or snapshot.reception.source_down:  # the source has an alarm of its own
+            return "unknown"
+        return "abnormal" if snapshot.reception.state in words else "normal"
+    if definition.source == "connection":
+        return "unknown" if snapshot.connection is None else "abnormal" if snapshot.connection else "normal"
     value: float | None = getattr(snapshot, definition.source)
     if value is None or math.isnan(value):
         return "unknown"
@@ -53,6 +62,10 @@ def describe_cause(definition: AlarmDefinition, snapshot: AssetSnapshot) -> str:
     """Return the cause that an alarm's transitions name."""
     if definition.source == "quality":
         return quality.describe_findings(snapshot.quality)
+    if definition.source == "reception" and snapshot.reception is not None:
+        return snapshot.reception.why
+    if definition.source == "connection":
+        return snapshot.connection or ""
     if definition.source == "statistic" and snapshot.statistic is not None:
         return render(message("alarm.cause_statistic", ratio=snapshot.statistic))
     if definition.source == "level" and snapshot.level is not None:

@@ -11,28 +11,35 @@ from pydantic import Field, ValidationError, model_validator
 from servoscope.core.messages import message, render
 from servoscope.core.settings import Finite, NonNegative, Positive, Settings
 from servoscope.core.settings_errors import describe_error
+from servoscope.service.reception import ALARMED_STATES, STATES
 from servoscope.signals.quality import KINDS
 
 StrictText = Annotated[str, Field(strict=True)]
 
-AlarmSource = Literal["verdict", "quality", "statistic", "level", "buffered"]
+AlarmSource = Literal["verdict", "quality", "reception", "statistic", "level", "buffered", "connection"]
 Priority = Literal["low", "medium", "high", "critical"]
 Ne107 = Literal["good", "maintenance_required", "out_of_specification", "function_check", "failure"]
 
 PRIORITIES: tuple[Priority, ...] = ("low", "medium", "high", "critical")
 ALARM_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-SERVICE_SOURCES: tuple[AlarmSource, ...] = ("buffered",)  # sources of the service itself
-SOURCE_WORDS: dict[str, tuple[str, ...]] = {"verdict": ("fault", "undetermined"), "quality": KINDS}
+SERVICE_SOURCES: tuple[AlarmSource, ...] = ("buffered", "connection")  # sources of the service itself
+SOURCE_WORDS: dict[str, tuple[str, ...]] = {
+    "verdict": ("fault", "undetermined"), "quality": KINDS, "reception": STATES, "connection": ("trouble",),
+}  # fmt: skip
+ABNORMAL_WORDS: dict[str, tuple[str, ...]] = {  # where `when` says nothing
+    "verdict": ("fault",), "quality": KINDS, "reception": ALARMED_STATES, "connection": ("trouble",),
+}  # fmt: skip
 
 
 class AlarmDefinition(Settings):
     """One alarm of an asset."""
 
     enabled: Annotated[bool, Field(strict=True)] = True  # whether there is this alarm at all
-    # the ``verdict``, the findings of data ``quality``, the ``statistic`` T^2 or the sequential test's ``level`` as
-    # multiples of their limits, or the share of the buffer that waits to be stored, ``buffered``
+    # the ``verdict``, the findings of data ``quality``, how samples come in (``reception``), the ``statistic`` T^2 or
+    # the sequential test's ``level`` as multiples of their limits; of the service itself the share of the buffer that
+    # waits to be stored, ``buffered``, and the ``connection`` of each source and outlet
     source: AlarmSource
-    # words of the source that are abnormal, for ``verdict`` and ``quality``; None: ``fault``, and any finding
+    # words of the source that are abnormal, where it has words; None: ``fault``, any finding, any trouble
     when: tuple[StrictText, ...] | None = None
     limit: Finite = 1.0  # value from which on a number is abnormal
     # how far below the limit the number has to fall to be normal again; in units of the number
@@ -66,9 +73,7 @@ class AlarmDefinition(Settings):
     @property
     def abnormal_words(self) -> tuple[str, ...]:
         """Words of the source that are abnormal; empty where the source is a number."""
-        if self.when is not None:
-            return self.when
-        return {"verdict": ("fault",), "quality": KINDS}.get(self.source, ())
+        return self.when if self.when is not None else ABNORMAL_WORDS.get(self.source, ())
 
 
 class FloodSettings(Settings):
@@ -102,6 +107,14 @@ DEFAULT_ALARMS: dict[str, dict[str, Any]] = {  # a table of the same name change
         "on_delay_s": 10.0, "off_delay_s": 60.0,
         "priority": "medium", "response_time_s": 3600.0, "ne107": "out_of_specification",
     },
+    "reception": {
+        "source": "reception", "on_delay_s": 30.0, "off_delay_s": 10.0,
+        "priority": "medium", "response_time_s": 3600.0, "ne107": "function_check",
+    },
+    "connection": {
+        "source": "connection", "on_delay_s": 10.0, "off_delay_s": 60.0,
+        "priority": "high", "response_time_s": 900.0, "ne107": "good",
+    },
     "buffering": {
         "source": "buffered", "limit": 0.5, "hysteresis": 0.4, "on_delay_s": 10.0, "off_delay_s": 60.0,
         "priority": "high", "response_time_s": 900.0, "ne107": "good",
@@ -109,6 +122,11 @@ DEFAULT_ALARMS: dict[str, dict[str, Any]] = {  # a table of the same name change
 }  # fmt: skip
 for _name, _default in DEFAULT_ALARMS.items():
     _default |= {key: render(message(f"alarm.{key}.{_name}")) for key in ("consequence", "operator_action")}
+
+
+def alarm_kind(alarm: str) -> str:
+    """Return under which name an alarm is defined: a connection's is ``NAME.SOURCE``, for each source."""
+    return alarm.partition(".")[0]
 
 
 class AlarmSettings(Settings):
@@ -144,8 +162,12 @@ class AlarmSettings(Settings):
 
     @property
     def service_alarms(self) -> dict[str, AlarmDefinition]:
-        """The alarms that the service has of itself, by name."""
+        """The alarms that the service has of itself, by name; each connection has one."""
         return {name: one for name, one in self.definitions.items() if one.enabled and one.source in SERVICE_SOURCES}
+
+    def find(self, alarm: str) -> AlarmDefinition:
+        """Return the definition of an alarm."""
+        return self.definitions[alarm_kind(alarm)]
 
 
 def _parse_definition(name: str, table: Any) -> AlarmDefinition:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import socket
+import sys
+import time
+from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 from servoscope.core.errors import ConfigError
+from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
 from servoscope.service.config_types import read_password
+from servoscope.service.log import log
 from servoscope.service.network import TlsSettings
 
 if TYPE_CHECKING:
@@ -20,6 +25,8 @@ if TYPE_CHECKING:
 PLAIN_PORT, TLS_PORT = 1883, 8883
 KEEPALIVE_S = 15  # a cable that was pulled is noticed after one and a half of these
 MAX_RECONNECT_DELAY_S = 5  # between two attempts to connect
+SESSION_TAKEN_OVER = 0x8E  # reason code of a broker that has given our session to another client (MQTT 5, 3.14.2.1)
+REPEATED_LOSSES, TAKEOVER_S = 3, 60.0  # connections lost within so many seconds: no network does that for long
 
 
 class BrokerSettings(TlsSettings):
@@ -36,6 +43,65 @@ class BrokerSettings(TlsSettings):
     def address(self) -> tuple[str, int]:
         """Host and port."""
         return self.host, self.port or (TLS_PORT if self.tls else PLAIN_PORT)
+
+
+class SessionSettings(BrokerSettings):
+    """A broker at which we have a session that it keeps while we are away, and hands to nobody else."""
+
+    # name of the session at the broker; None: one of our own, from the service's name. No two clients may share one.
+    client: Annotated[str, Field(strict=True, min_length=1, max_length=200)] | None = None
+
+    def identity(self, name: str) -> str:
+        """Return what no other source or outlet may share: the session at this broker."""
+        host, port = self.address
+        return f"client {self.client or name} at {host}:{port}"
+
+
+class BrokerConnection:
+    """How the connection of one client to its broker is, as the client's callbacks tell it."""
+
+    def __init__(self, settings: SessionSettings, client_id: str) -> None:
+        self._settings, self._client_id = settings, client_id
+        self._lost_at, self._reason = deque[float](maxlen=REPEATED_LOSSES), ""
+        self.connected = False
+
+    def handle_connect(self, reason: Any) -> bool:
+        """Take the broker's answer; return whether it has accepted us."""
+        self.connected = not reason.is_failure
+        if self.connected:
+            self._reason = ""
+            log("info", "broker connected", broker=self._settings.host)
+        else:
+            self._report(render(message("service.trouble.refused", reason=str(reason))))
+        return self.connected
+
+    def handle_failure(self) -> None:
+        """Take an attempt that got no answer, whose exception is being handled."""
+        self._report(render(message("service.trouble.unreachable", reason=str(sys.exc_info()[1] or "no answer"))))
+
+    def handle_disconnect(self, reason: Any) -> None:
+        """Take the end of a connection."""
+        if self.connected:
+            # not every broker says that another client has our name: it shows by our coming back, and being lost again
+            taken = reason.value == SESSION_TAKEN_OVER
+            self._lost_at.extend([time.monotonic()] * (REPEATED_LOSSES if taken else 1))
+            log("warning", "broker lost", broker=self._settings.host, why=str(reason))
+            self._reason = render(message("service.trouble.lost", reason=str(reason)))
+        self.connected = False
+
+    def _report(self, trouble: str) -> None:
+        if trouble != self._reason:  # the client retries every few seconds; once in the log is enough
+            log("error", "broker cannot be reached", broker=self._settings.host, why=trouble)
+        self._reason = trouble
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong, in words; empty: nothing. Who has our name comes back, so that it counts for a while."""
+        if len(self._lost_at) == REPEATED_LOSSES and time.monotonic() - self._lost_at[0] < TAKEOVER_S:
+            return render(message("service.trouble.takeover", client=self._client_id))
+        if self.connected:
+            return ""
+        return self._reason or render(message("service.trouble.connecting"))
 
 
 def create_mqtt_client(settings: BrokerSettings, folder: Path, client_id: str, *, manual_ack: bool = False) -> Client:

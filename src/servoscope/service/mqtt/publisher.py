@@ -6,27 +6,22 @@ import json
 import threading
 import time
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from pydantic import Field
+from typing import Any, Literal
 
 from servoscope.core.settings import NonNegative
 from servoscope.service.mqtt import topics
-from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerSettings, create_mqtt_client
+from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_mqtt_client
 from servoscope.service.publishers.base import PublisherSettings, StatusByAsset
 
 IMMEDIATE_KEYS = ("verdict", "ne107", "alarms", "faults", "quality", "service")  # changes of these are sent at once
 
 
-class MqttPublisherSettings(BrokerSettings, PublisherSettings):
+class MqttPublisherSettings(SessionSettings, PublisherSettings):
     """An outlet of kind ``mqtt``."""
 
     kind: Literal["mqtt"]
     # what all topics begin with: the status of an asset is published under ``TOPIC/v1/status/ASSET``
     topic: topics.TopicPrefix = "servoscope"
-    client: Annotated[str, Field(strict=True, min_length=1, max_length=200)] | None = (
-        None  # session; ``SERVICE.OUTLET``
-    )
     every_s: NonNegative = 10.0  # time between two messages about an asset of which nothing but numbers has changed [s]
 
     def create(self, name: str, folder: Path) -> MqttPublisher:
@@ -40,11 +35,12 @@ class MqttPublisher:
     def __init__(self, settings: MqttPublisherSettings, folder: Path, client: str) -> None:
         self.settings = settings
         self._client = create_mqtt_client(settings, folder, settings.client or client)
+        self._broker = BrokerConnection(settings, settings.client or client)
         self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
+        self._client.on_connect_fail = lambda *_: self._broker.handle_failure()
         self._lock = threading.Lock()
         self._newest: dict[str, bytes] = {}
         self._published: dict[str, tuple[Any, float]] = {}
-        self._connected = False
 
     def open(self, statuses: StatusByAsset) -> None:
         """Connect, now or as soon as the broker is there."""
@@ -64,7 +60,7 @@ class MqttPublisher:
             message = json.dumps({"asset": name, **status}, separators=(",", ":")).encode()
             with self._lock:
                 self._newest[name] = message
-                if self._connected:
+                if self._broker.connected:
                     self._send(name)
 
     def _send(self, name: str) -> None:
@@ -72,13 +68,18 @@ class MqttPublisher:
 
     def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         with self._lock:
-            self._connected = not reason.is_failure
-            for name in self._newest if self._connected else ():  # the broker may have lost them, or never had them
+            accepted = self._broker.handle_connect(reason)
+            for name in self._newest if accepted else ():  # the broker may have lost them, or never had them
                 self._send(name)
 
-    def _on_disconnect(self, *_: Any) -> None:
+    def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         with self._lock:
-            self._connected = False
+            self._broker.handle_disconnect(reason)
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the connection, in words; empty: nothing."""
+        return self._broker.trouble
 
     def close(self) -> None:
         """Disconnect."""

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import Field
 
 from servoscope.core.errors import MessageError
 from servoscope.service.config_types import Seconds
-from servoscope.service.log import log
 from servoscope.service.mqtt import topics
-from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerSettings, create_mqtt_client
+from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_mqtt_client
 from servoscope.service.mqtt.payload import DecodedBlock, decode_block
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
@@ -30,19 +28,21 @@ POLL_S = 0.02
 OVERSIZE_FACTOR = 4  # times the largest message: so far it is received and rejected, beyond that the broker drops it
 
 
-class MqttSourceSettings(BrokerSettings, SourceSettings):
+class MqttSourceSettings(SessionSettings, SourceSettings):
     """A source of kind ``mqtt``."""
 
     kind: Literal["mqtt"]
     # what all topics begin with; blocks of an asset are expected under ``TOPIC/v1/data/ASSET``
     topic: topics.TopicPrefix = "servoscope"
-    # name of the session at the broker; None: ``SERVICE.SOURCE``. No two clients may share one.
-    client: Annotated[str, Field(strict=True, min_length=1, max_length=200)] | None = None
     # most messages that are received before the first of them is acknowledged. The broker may have a lower limit.
     in_flight: Annotated[int, Field(strict=True, ge=1, le=65535)] = 1000
     largest: Annotated[int, Field(strict=True, ge=1024, le=2**28)] = 2**20  # longest message that is accepted [bytes]
     # how long the broker keeps the session, and what comes for it, while we are disconnected [s]
     session_s: Annotated[Seconds, Field(lt=2**32 - 1)] = 7 * 86400.0
+
+    def for_visit(self) -> Self:
+        """Return the settings of a client with a session of its own, which the broker does not keep."""
+        return self.model_copy(update={"client": None, "session_s": 1.0})
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
         """Return the source."""
@@ -65,16 +65,16 @@ class MqttSource(BlockSource):
         super().__init__()
         self.settings, self._assets = settings, assets
         self._client = create_mqtt_client(settings, folder, settings.client or client, manual_ack=True)
+        self._broker = BrokerConnection(settings, settings.client or client)
         self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
-        self._client.on_connect_fail, self._client.on_message = self._on_connect_fail, self._on_message
+        self._client.on_connect_fail = lambda *_: self._broker.handle_failure()
+        self._client.on_message = self._on_message
         self._lock = threading.Lock()  # held while a message is acknowledged: never one of another connection
         self._connection = 0
-        self._trouble = ""
         self._waiting: dict[tuple[Any, ...], tuple[Block, _AckHandle]] = {}
         self._unacknowledged: dict[str, deque[_AckHandle]] = {name: deque() for name in assets}
         self._newest: dict[str, tuple[int, int]] = {}  # stream and sequence of the newest block that was received
         self._acknowledged: dict[str, tuple[int, int]] = {}
-        self.connected = False
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as the broker is there."""
@@ -91,30 +91,27 @@ class MqttSource(BlockSource):
         self._client.loop_start()
 
     def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        if reason.is_failure:
-            self._log_trouble(f"refused: {reason}")
-            return
         with self._lock:
             self._connection += 1
-        self.connected, self._trouble = True, ""
+        if not self._broker.handle_connect(reason):
+            return
         # also where the broker has the session: that of a killed process may have an old subscription
         self._client.subscribe(topics.data_topic(self.settings.topic, "+"), qos=1)
-        log("info", "broker connected", broker=self.settings.host)
-
-    def _on_connect_fail(self, _client: Any, _data: Any) -> None:
-        self._log_trouble(str(sys.exc_info()[1] or "no answer"))
-
-    def _log_trouble(self, trouble: str) -> None:
-        if trouble != self._trouble:  # the client retries every few seconds; once in the log is enough
-            log("error", "broker cannot be reached", broker=self.settings.host, why=trouble)
-        self._trouble = trouble
 
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         with self._lock:
             self._connection += 1
-        if self.connected:
-            log("warning", "broker lost", broker=self.settings.host, why=str(reason))
-        self.connected = False
+        self._broker.handle_disconnect(reason)
+
+    @property
+    def connected(self) -> bool:  # type: ignore[override]  # others set it
+        """Whether the broker has accepted us."""
+        return self._broker.connected
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the connection, in words; empty: nothing."""
+        return self._broker.trouble
 
     def _on_message(self, _client: Any, _data: Any, message: MQTTMessage) -> None:
         """Queue a message, in the client's thread."""

@@ -11,6 +11,7 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 
 MAX_FILL_SAMPLES = 100_000  # samples of constant values that are made at once
+HOLE_S = 10.0  # in a history: a pause that is longer is a hole
 CLOCK_STEP_S = 10.0  # a value that is older than the last sample by more shows that the clock was set back
 
 
@@ -44,17 +45,19 @@ class Resampler:
         self._order = 0
         self._newest = -math.inf
         self._restarted, self._restart_t = True, math.inf
+        self._history_until = -math.inf
         self._samples: list[tuple[float, FloatArray]] = []
         self._gaps: list[SampleGap] = []
         self.last_t = last_t  # time of the last sample that was made
         self.late = 0  # values that came after their sample had been made
 
-    def restart(self, t: float, *, complete: bool = False) -> None:
+    def restart(self, t: float, *, complete: bool = False, history_until: float = -math.inf) -> None:
         """Continue with a subscription from `t` on; older values only say what holds, and make no samples.
 
-        Unless all changes of the time between are known (`complete`), earlier values are unknown now.
+        Unless all changes of the time between are known (`complete`), earlier values are unknown now. What was read
+        from a history ends at `history_until`: a long pause in it may be a hole, since no heartbeat has filled it.
         """
-        self._restarted, self._restart_t = True, t
+        self._restarted, self._restart_t, self._history_until = True, t, history_until
         if not complete:
             self._known[:] = False
             self._pending.clear()
@@ -101,7 +104,9 @@ class Resampler:
             self.late += len(group)
         is_new = not behind and not (self._restarted and t < self._restart_t)
         steps = round((t - self.last_t) / self._period) if is_new and not self._restarted else 1
-        if steps > MAX_FILL_SAMPLES:
+        if steps > 1 and t <= self._history_until and t - self.last_t > HOLE_S:
+            self._restarted, self._restart_t = True, t  # a gap: held values would look like a machine that stood still
+        elif steps > MAX_FILL_SAMPLES:
             self.restart(t, complete=True)  # a clock that was set, or a source whose end was not noticed in time
         elif steps > 1:
             for between in np.linspace(self.last_t, t, steps + 1)[1:-1].tolist():

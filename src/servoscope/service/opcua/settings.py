@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
 from pydantic import model_validator
 
 from servoscope.core.errors import ConfigError
+from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr, Settings
 
 
@@ -22,6 +25,10 @@ class CertificateSettings(Settings):
         if (self.cert_file is None) != (self.key_file is None):
             raise ValueError("cert_file and key_file belong together")
         return self
+
+    def certificate_bytes(self, folder: Path) -> bytes:
+        """Return our certificate, DER or PEM; empty where there is none."""
+        return (folder / self.cert_file).read_bytes() if self.cert_file is not None else b""
 
     def certificate(self, folder: Path) -> tuple[str, str] | None:
         """Return the paths of certificate and key, if there is one."""
@@ -47,9 +54,44 @@ class OpcuaNodes(Settings):
         return self
 
     @property
+    def given(self) -> tuple[str, ...]:
+        """All nodes."""
+        return tuple(node for node in (self.block, *self.signals) if node is not None)
+
+    @property
     def signals(self) -> tuple[str | None, ...]:
         """The nodes r, u and y."""
         return self.r, self.u, self.y
+
+
+def check_nodes(*nodes: str) -> None:
+    """Check that these are node ids; raises ConfigError if one is not."""
+    from asyncua import ua
+    from asyncua.ua.uaerrors import UaError
+
+    for node in nodes:
+        try:
+            ua.NodeId.from_string(node)
+        except UaError:
+            raise ConfigError(f"{node!r} is no node id, write for example ns=2;s=press.y") from None
+
+
+def describe_expiry(client: Any, folder: Path, settings: CertificateSettings, now: datetime) -> str:
+    """Return which certificate of a connection has expired, in words; empty: none.
+
+    Neither side has to break off for that, so that samples go on; somebody has to renew it.
+    """
+    from cryptography import x509
+
+    found = {"our": settings.certificate_bytes(folder), "server": client.security_policy.peer_certificate}
+    words = []
+    for whose, raw in found.items():
+        load = x509.load_pem_x509_certificate if raw and raw.startswith(b"-----") else x509.load_der_x509_certificate
+        with suppress(ValueError):  # none, a chain, or a form that cannot be read: the connection was accepted with it
+            end = load(raw or b"").not_valid_after_utc
+            if end < now:
+                words.append(render(message(f"service.trouble.{whose}_certificate", end=f"{end:%Y-%m-%d}")))
+    return ", ".join(words)
 
 
 def import_asyncua() -> Any:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -17,17 +17,34 @@ from pydantic import AfterValidator, Field
 
 from servoscope.core.addresses import show_address
 from servoscope.core.errors import ConfigError
+from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
 from servoscope.service.config_types import Seconds, read_password
 from servoscope.service.log import log
 from servoscope.service.network import ConnectionSettings
-from servoscope.service.opcua.settings import CertificateSettings, OpcuaNodes, check_files, import_asyncua
-from servoscope.service.opcua.subscriptions import ArraySubscription, ScalarSubscription, timestamp
+from servoscope.service.opcua.monitored_items import (
+    ItemGrant,
+    ItemRequest,
+    monitor_nodes,
+    publishing_interval,
+    shorten_interval,
+)
+from servoscope.service.opcua.settings import (
+    CertificateSettings,
+    OpcuaNodes,
+    check_files,
+    check_nodes,
+    describe_expiry,
+    import_asyncua,
+)
+from servoscope.service.opcua.subscriptions import QUEUE_MARGIN, ArraySubscription, ScalarSubscription, timestamp
+from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
 
 POLL_S = 0.02
 SETTLING_S = 2.0  # behind the server's clock: a change that has not been reported by then has not happened
+RETRY_NODES_S = 30.0  # between two attempts to subscribe to nodes that the server has refused
 RECONNECT_S = 1.0  # between two attempts to connect
 MAX_BUFFERED = 10_000  # blocks that wait to be polled; then the oldest are dropped, and counted as rejected
 SERVER_TIME = "i=2258"  # Server_ServerStatus_CurrentTime, which every server has
@@ -116,13 +133,34 @@ class OpcuaSource(BlockSource):
         self._password = read_password(settings.password_file, folder)
         check_files(folder, settings.cert_file, settings.key_file, settings.server_cert_file)
         self._assets = dict(assets)
+        check_nodes(settings.heartbeat, *(node for nodes, _ in self._assets.values() for node in nodes.given))
         self._waiting: deque[Block] = deque()
+        self._handles = 1  # of the next item that is monitored
         self._stop_event = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="opcua", daemon=True)
         self._subscriptions: list[ArraySubscription | ScalarSubscription] = []
         self._last_heartbeat = self._server_time = math.nan
-        self._trouble = ""
-        self.connected = False
+        self._trouble, self._connected = render(message("service.trouble.connecting")), False
+
+    @property
+    def connected(self) -> bool:  # type: ignore[override]  # others set it
+        """Whether the server is followed."""
+        return self._connected
+
+    @property
+    def trouble(self) -> str:
+        """Why the server cannot be followed, or not for long, in words; empty: nothing is wrong."""
+        return self._trouble
+
+    @property
+    def asset_troubles(self) -> dict[str, AssetTrouble]:
+        """Assets whose nodes are refused, or come too slowly."""
+        return {one.asset: one.trouble for one in self._subscriptions if one.trouble is not None}
+
+    @property
+    def update_intervals_s(self) -> dict[tuple[str, str], float]:
+        """Time between two updates, as measured, by asset and signal [s]."""
+        return {(one.asset, name): value for one in self._subscriptions for name, value in one.intervals_s.items()}
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as the server is there."""
@@ -150,8 +188,11 @@ class OpcuaSource(BlockSource):
                     await self._run_subscription(client)
             except Exception as error:  # whatever a library, a network or a server comes up with: try again
                 if not self._stop_event.is_set():
-                    self._log_trouble(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
-            self.connected = False
+                    words = " ".join(str(error).split())[:200]
+                    self._log_trouble(
+                        render(message("service.trouble.unreachable", reason=words or type(error).__name__))
+                    )
+            self._connected = False
             await asyncio.sleep(RECONNECT_S if not self._stop_event.is_set() else 0.0)
 
     def _log_trouble(self, trouble: str) -> None:
@@ -168,13 +209,17 @@ class OpcuaSource(BlockSource):
             for k, node in enumerate(one.nodes):
                 by_node.setdefault(ua.NodeId.from_string(node), []).append((one, k))
         values: deque[tuple[Any, Any]] = deque()
-        handler = await self._subscribe(client, values)
+        handler, period = _SubscriptionHandler(values), self.settings.publishing_s
+        subscription = await client.create_subscription(1000.0 * period, handler)
+        grants = dict[str, ItemGrant]()
+        period = await self._subscribe(subscription, grants)
         heartbeat = ua.NodeId.from_string(self.settings.heartbeat)
         now = _parse_heartbeat(await client.get_node(heartbeat).read_data_value())
-        period = self.settings.publishing_s
         for one in self._subscriptions:
             await one.read_missed(client, now)
-        self.connected, self._trouble, self._last_heartbeat = True, "", time.monotonic()
+        self._connected, self._last_heartbeat = True, time.monotonic()
+        self._trouble = describe_expiry(client, self._folder, self.settings, datetime.now(UTC))
+        retry_at = time.monotonic() + RETRY_NODES_S
         log("info", "OPC UA server followed", url=show_address(self.settings.url))
         while not self._stop_event.is_set():
             await asyncio.sleep(period / 2.0)
@@ -190,29 +235,35 @@ class OpcuaSource(BlockSource):
                 raise ConnectionError(f"the server has ended the subscription ({handler.end_status})")
             for one in self._subscriptions:
                 one.emit_blocks(self._server_time - max(SETTLING_S, 4.0 * period))
+            missing = any(one.refusal for one in grants.values())
+            if missing and time.monotonic() >= retry_at:  # the PLC may have been given its program meanwhile
+                retry_at = time.monotonic() + RETRY_NODES_S
+                period = await self._subscribe(subscription, grants)
 
-    async def _subscribe(self, client: Any, values: deque[tuple[Any, Any]]) -> _SubscriptionHandler:
-        """Subscribe to all nodes and the heartbeat."""
-        from asyncua import ua
-        from asyncua.ua.attribute_ids import AttributeIds
+    async def _subscribe(self, subscription: Any, grants: dict[str, ItemGrant]) -> float:
+        """Subscribe to the heartbeat and to all nodes that are not yet granted; return the publishing interval [s].
 
-        handler, period = _SubscriptionHandler(values), self.settings.publishing_s
-        subscription = await client.create_subscription(1000.0 * period, handler)
-        stamped = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
-        wanted = {node: (one.sampling_ms, one.queue_size(period)) for one in self._subscriptions for node in one.nodes}
-        wanted[self.settings.heartbeat] = (1000.0 * period, 1)
-        items = [
-            ua.MonitoredItemCreateRequest(
-                ua.ReadValueId(NodeId=ua.NodeId.from_string(node), AttributeId=AttributeIds.Value),
-                ua.MonitoringMode.Reporting,
-                ua.MonitoringParameters(ClientHandle=k, SamplingInterval=sampling, QueueSize=queue, Filter=stamped),
-            )
-            for k, (node, (sampling, queue)) in enumerate(wanted.items(), 1)
-        ]
-        for node, answer in zip(wanted, await subscription.create_monitored_items(items), strict=True):
-            if not isinstance(answer, int):
-                raise ConfigError(f"{node} cannot be subscribed to ({answer.name})")
-        return handler
+        A server may grant less than it was asked for: where its queues are shorter, messages have to come sooner.
+        """
+        period, heartbeat = publishing_interval(subscription), self.settings.heartbeat
+        wanted = {
+            node: ItemRequest(one.sampling_ms, one.queue_size(period))
+            for one in self._subscriptions
+            for node in one.nodes
+        }
+        wanted[heartbeat] = ItemRequest(1000.0 * period, 1)
+        missing = {node: one for node, one in wanted.items() if node not in grants or grants[node].refusal}
+        changed = [one for one in self._subscriptions if not missing.keys().isdisjoint(one.nodes)]
+        grants |= await monitor_nodes(subscription, missing, self._handles)
+        self._handles += len(missing)
+        if grants[heartbeat].refusal:
+            raise ConfigError(render(message("service.trouble.node", node=heartbeat, reason=grants[heartbeat].refusal)))
+        longest = min((one.longest_interval_s(grants) for one in self._subscriptions), default=math.inf)
+        if longest < period:
+            period = await shorten_interval(subscription, longest / QUEUE_MARGIN)
+        for one in changed:
+            one.check_grants(grants, period)
+        return period
 
     def poll(self, limit: int) -> list[Block]:
         """Return blocks in the order in which they came."""

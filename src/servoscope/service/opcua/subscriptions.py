@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
 from servoscope.core.errors import MessageError
+from servoscope.core.messages import message, render
 from servoscope.service.mqtt.payload import MAX_TIME_S
+from servoscope.service.opcua.monitored_items import ItemGrant
 from servoscope.service.opcua.resample import CLOCK_STEP_S, Resampler, SampleGap
+from servoscope.service.opcua.update_rate import SLOW_PERIODS, UpdateRate
+from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
 
@@ -26,6 +30,8 @@ TRANSIENT_STATUSES = {  # status codes, the library's among them, of trouble tha
     "BadSecureChannelClosed", "BadSecureChannelIdInvalid", "BadCommunicationError", "BadServerNotConnected",
     "BadShutdown", "BadServerHalted", "BadDisconnect", "BadNotConnected", "BadTooManyOperations", "BadTcpServerTooBusy",
 }  # fmt: skip
+SIGNALS = ("r", "u", "y")  # what the nodes of single values hold, in this order
+HELD_S = 60.0  # of samples that wait for the decision whether they come too slowly
 MAX_EXACT_INT = 2.0**53  # beyond, a binary64 cannot count
 
 
@@ -45,10 +51,26 @@ class _Subscription(ABC):
         self.asset, self.nodes = asset, nodes
         self._sequence, self._last_t = resume.sequence, resume.last_t
         self._emit, self._rejections = emit, rejections
+        self.trouble: AssetTrouble | None = None  # why there are no samples although the server is there
 
     def queue_size(self, publishing_s: float) -> int:
         """Return how many values the server keeps between two messages: those of two intervals, and twice that."""
         return max(10, math.ceil(2 * QUEUE_MARGIN * publishing_s / self.value_s))
+
+    def check_grants(self, grants: Mapping[str, ItemGrant], publishing_s: float) -> None:
+        """Take what the server grants of each node, and of the time between two messages [s]."""
+        refused = [(node, grants[node].refusal) for node in self.nodes if grants[node].refusal]
+        words = [render(message("service.trouble.node", node=node, reason=reason)) for node, reason in refused]
+        self.trouble = AssetTrouble("refused", ", ".join(words)) if words else None
+
+    def longest_interval_s(self, grants: Mapping[str, ItemGrant]) -> float:
+        """Return how long messages may be apart before values are lost [s]; of blocks nobody knows."""
+        return math.inf
+
+    @property
+    def intervals_s(self) -> dict[str, float]:
+        """Time between two updates of each signal, as measured [s]."""
+        return {}
 
     @abstractmethod
     async def read_missed(self, client: Any, now: float) -> None:
@@ -103,6 +125,52 @@ class ScalarSubscription(_Subscription):
         self._resampler = Resampler(len(nodes), 1.0 / rate, resume.last_t)
         self._t, self._values = np.zeros(0), np.zeros((len(nodes), 0))
         self._read_until = [-math.inf] * len(nodes)  # the last time that was read from the history of each node
+        self._rates = [UpdateRate() for _ in nodes]
+        self._granted_ms: dict[int, float] = {}  # what the server says of signals that it would sample too slowly
+        self._short_queues, self._undecided = "", False
+
+    def longest_interval_s(self, grants: Mapping[str, ItemGrant]) -> float:
+        """Return how long messages may be apart before the shortest queue of its nodes runs over [s]."""
+        queues = [grants[node].queue for node in self.nodes if not grants[node].refusal]
+        return self.value_s * max(1, min(queues, default=0)) if queues else math.inf
+
+    def check_grants(self, grants: Mapping[str, ItemGrant], publishing_s: float) -> None:
+        """Take what the server grants: slower than the samples it has no samples for us."""
+        super().check_grants(grants, publishing_s)
+        self._rates = [UpdateRate() for _ in self.nodes]
+        needed = math.ceil(publishing_s / self.value_s)
+        granted = [grants[node] for node in self.nodes]
+        limit_ms = SLOW_PERIODS * self.sampling_ms
+        self._granted_ms = {k: one.sampling_ms for k, one in enumerate(granted) if one.sampling_ms > limit_ms}
+        values = {"publishing_ms": 1000.0 * publishing_s, "needed": needed}
+        short = [
+            render(message("service.trouble.queue", signal=SIGNALS[k], queue=one.queue, **values))
+            for k, one in enumerate(granted)
+            if not one.refusal and k not in self._granted_ms and one.queue < needed
+        ]
+        self._short_queues = ", ".join(short)
+        if self.trouble is None:
+            self._follow_rates()
+
+    @property
+    def intervals_s(self) -> dict[str, float]:
+        """Time between two updates of each signal, as measured [s]; without those of which too few have come."""
+        found = {name: rate.interval_s for name, rate in zip(SIGNALS, self._rates, strict=True)}
+        return {name: interval for name, interval in found.items() if not math.isnan(interval)}
+
+    def _follow_rates(self) -> None:
+        """Judge how often values come: of what is too slow no samples are made, since they would look like a fault."""
+        told = [self._rates[k].contradicts(granted_ms / 1000.0) for k, granted_ms in self._granted_ms.items()]
+        if True in told:
+            self._granted_ms = {}  # a server that is wrong of one signal is of all
+        slow = dict(self._granted_ms)
+        for k, one in enumerate(self._rates):
+            if k not in slow and one.is_too_slow(self.value_s):
+                slow[k] = float(f"{1000.0 * one.interval_s:.2g}")  # more digits would change with each look
+        words = [describe_slow(SIGNALS[k], interval_ms, self.sampling_ms) for k, interval_ms in sorted(slow.items())]
+        words += [self._short_queues] if self._short_queues else []
+        self.trouble = AssetTrouble("slow", ", ".join(words)) if words else None
+        self._undecided = bool(self._granted_ms) and False not in told
 
     async def read_missed(self, client: Any, now: float) -> None:
         """Read the values that were missed; without a history, there is a gap."""
@@ -118,11 +186,13 @@ class ScalarSubscription(_Subscription):
                 self._add(k, value)
         for k, values in enumerate(histories):
             self._read_until[k] = max((self._add(k, value) for value in values or []), default=-math.inf)
-        self._resampler.restart(last, complete=True)
+        self._resampler.restart(last, complete=True, history_until=max(self._read_until))
 
     def add_value(self, node: int, value: Any) -> None:
         """Take a value, unless it was read from history."""
-        self._add(node, value, self._read_until[node])
+        t = self._add(node, value, self._read_until[node])
+        if math.isfinite(t):
+            self._rates[node].add(t, parse_value(value)[1])
 
     def _add(self, node: int, value: Any, read_until: float = -math.inf) -> float:
         """Take a value unless it was read already; return its time [UTC s]."""
@@ -141,6 +211,8 @@ class ScalarSubscription(_Subscription):
 
     def emit_blocks(self, alive_until: float) -> None:
         """Make blocks of what is complete."""
+        if self.trouble is None or self.trouble.state == "slow":
+            self._follow_rates()
         t, values, gaps = self._resampler.take_samples(alive_until)
         for gap in gaps:
             self._rejections.add(self.asset, "gap", describe_gap(gap), gap.samples)
@@ -148,11 +220,23 @@ class ScalarSubscription(_Subscription):
             self._rejections.add(self.asset, "late", "values came after their samples were made", self._resampler.late)
             self._resampler.late = 0
         self._t, self._values = np.append(self._t, t), np.append(self._values, values, axis=1)
+        if self.trouble is not None:  # until it is known what a server's word is worth, a minute of samples waits
+            kept = round(HELD_S / self.value_s) if self._undecided else 0
+            lost = max(0, self._t.size - kept)
+            if lost:
+                self._rejections.add(self.asset, self.trouble.state, self.trouble.why, lost)
+            self._t, self._values = self._t[lost:], self._values[:, lost:]
+            return
         while self._t.size >= self._size:
             self._sequence += 1
             r, u, y = self._values[:, : self._size].copy()
             self._emit(Block(self.asset, self._sequence, self._t[: self._size].copy(), r, u, y, time.monotonic()))
             self._t, self._values = self._t[self._size :], self._values[:, self._size :]
+
+
+def describe_slow(signal: str, interval_ms: float, needed_ms: float) -> str:
+    """Return that a signal comes too slowly."""
+    return render(message("service.trouble.slow", signal=signal, interval_ms=interval_ms, needed_ms=needed_ms))
 
 
 def describe_gap(gap: SampleGap) -> str:

@@ -24,10 +24,19 @@ class StatusPublisher(Protocol):
         """Stop; it may be called twice."""
 
 
+def publisher_trouble(publisher: StatusPublisher) -> str:
+    """Return why nobody can be shown anything, in words; empty: nothing is wrong, or it is none that tells."""
+    return str(getattr(publisher, "trouble", ""))
+
+
 class PublisherSettings(Settings):
     """A table ``[outlets.NAME]``; a subclass adds the keys of its kind and says which publisher it creates."""
 
     kind: str
+
+    def identity(self, name: str) -> str:
+        """Return what no other source or outlet may share, in words; empty: nothing. `name`: as in `create`."""
+        return ""
 
     def create(self, name: str, folder: Path) -> StatusPublisher:
         """Return the publisher, not yet open; `name` is unique among services, paths are relative to `folder`.

@@ -8,10 +8,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 from servoscope.core.settings import Settings
 from servoscope.models.loop import Loop
+from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.block import Block, ResumePosition
 
 CHECKS = {  # what every source guarantees; tests/test_source_contract.py runs them for each kind
@@ -65,10 +66,26 @@ class BlockSource(ABC):
     clock_rate = (
         1.0  # how fast the clock of the samples runs: 1 where they are measured now; 0 where it waits for polls
     )
+
     connected = True  # whether it is connected to where its blocks come from
 
     def __init__(self) -> None:
         self.rejections = RejectionCounter()  # what came and could not be used
+
+    @property
+    def trouble(self) -> str:
+        """Why none of its assets can be followed as they should be, in words; empty: nothing is wrong."""
+        return ""
+
+    @property
+    def asset_troubles(self) -> Mapping[str, AssetTrouble]:
+        """Why some of its assets cannot be followed although it is connected."""
+        return {}
+
+    @property
+    def update_intervals_s(self) -> Mapping[tuple[str, str], float]:
+        """Time between two updates of single values, as measured, by asset and signal [s]; empty where blocks come."""
+        return {}
 
     @abstractmethod
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
@@ -105,6 +122,14 @@ class SourceSettings(Settings):
     asset_example: ClassVar[str] = ""  # what to write there
 
     kind: str
+
+    def identity(self, name: str) -> str:
+        """Return what no other source or outlet may share, in words; empty: nothing. `name`: as in `create`."""
+        return ""
+
+    def for_visit(self) -> Self:
+        """Return the settings of a client that only listens for a while, beside a service that runs."""
+        return self
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> BlockSource:
         """Return the source, not yet open; `name` is unique among services, paths are relative to `folder`.

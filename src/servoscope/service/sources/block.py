@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +46,13 @@ class Block:
         if not known.size or any(signal.shape != self.t.shape for signal in (self.r, self.u, self.y)):
             raise RecordingError(f"{self.asset}: block {self.sequence}: t, r, u, y must have one length, t a number")
         return float(self.t[known[0]])
+
+    def until(self, latest: float) -> Block | None:
+        """Return it without the stamps of samples that claim to be later [UTC s]; None: all of them claim that."""
+        future = self.t > latest
+        if not future.any():
+            return self
+        return None if (future | ~np.isfinite(self.t)).all() else replace(self, t=np.where(future, np.nan, self.t))
 
     @property
     def signals(self) -> FloatArray:

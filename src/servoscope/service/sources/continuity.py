@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from servoscope.service.checkpoint import StreamPosition
@@ -15,16 +16,19 @@ class BlockContinuity(NamedTuple):
     anew: bool
 
 
-def check_continuity(counted: StreamPosition | None, block: Block) -> BlockContinuity | None:
+def check_continuity(counted: StreamPosition | None, block: Block, latest: float = math.inf) -> BlockContinuity | None:
     """Return how a block follows what was counted; None: it was counted before, or its place has passed.
 
     Numbers of a named stream begin at 0, and a later stream has a greater name. A stream without a name is accepted
-    from any number on; where its numbers fall back while its time goes on, its sender has restarted.
+    from any number on; where its numbers fall back while its time goes on, its sender has restarted. `latest`: the
+    last time that can be true [UTC s].
     """
     if counted is None:
         return BlockContinuity(block.sequence if block.stream else 0, False)
     if block.stream == counted.stream and block.sequence > counted.sequence:
         return BlockContinuity(block.sequence - counted.sequence - 1, False)
+    if counted.t > latest:  # it was counted by a clock that was wrong: whatever comes now begins anew behind it
+        return BlockContinuity(0, True)
     if block.stream > counted.stream:
         return BlockContinuity(block.sequence, True)
     if not block.retained and block.t[0] > counted.t:

@@ -9,6 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 from starlette.exceptions import HTTPException
 
+from servoscope.service.alarms import alarm_kind
 from servoscope.service.store.queries import query_history
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.schemas import assets as schemas
@@ -38,7 +39,7 @@ def list_alarms(context: ContextDep, query: Annotated[AssetQuery, Query()]) -> s
 
 def _with_advice(context: Context, row: schemas.AlarmRow) -> schemas.AlarmDetail:
     """Return an alarm with what the service file says of it; nothing where the server has no such file."""
-    definition = context.config.alarms.definitions.get(row.alarm) if context.config is not None else None
+    definition = context.config.alarms.definitions.get(alarm_kind(row.alarm)) if context.config is not None else None
     return schemas.AlarmDetail(
         **dict(row),
         consequence=definition.consequence if definition is not None else None,

@@ -1,0 +1,75 @@
+"""How an asset's samples come in: whether it is heard at all, too slowly, or only with what cannot be used, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+from servoscope.core.messages import message, render
+
+ReceptionState = Literal["followed", "unheard", "silent", "slow", "refused"]
+STATES: tuple[ReceptionState, ...] = get_args(ReceptionState)
+ALARMED_STATES: tuple[ReceptionState, ...] = ("unheard", "slow", "refused")  # silence is a finding of data quality
+
+
+class AssetTrouble(NamedTuple):
+    """What a source knows of an asset that it cannot follow, though it is connected."""
+
+    state: Literal["slow", "refused"]
+    why: str
+
+
+@dataclass(frozen=True)
+class Reception:
+    """The reception of one asset."""
+
+    state: ReceptionState
+    why: str = ""  # in words; empty where it is followed
+    source_down: bool = False  # whether the trouble is that of the source, which has an alarm of its own
+
+    @property
+    def sentence(self) -> str:
+        """What it leaves of a verdict, as a sentence; empty where the asset is followed."""
+        return "" if self.state == "followed" else render(message("service.reception.sentence", why=self.why))
+
+
+FOLLOWED = Reception("followed")
+UNHEARD = Reception("unheard", render(message("service.reception.unheard")))
+
+
+class ReceptionLog:
+    """When an asset was heard, and when something of it was refused, by a clock that only runs while we listen [s]."""
+
+    def __init__(self, *, heard_before: bool, now: float = 0.0) -> None:
+        self._heard = heard_before
+        self._heard_at, self._refusal = now, (-float("inf"), "")
+
+    def hear(self, now: float) -> None:
+        """Note a block that could be used."""
+        self._heard, self._heard_at = True, now
+
+    def refuse(self, now: float, why: str) -> None:
+        """Note something that could not be used."""
+        self._refusal = now, why
+
+    def silence_s(self, now: float) -> float:
+        """Return how long nothing could be used [s]."""
+        return now - self._heard_at
+
+    def evaluate(self, now: float, patience_s: float, source_trouble: str, trouble: AssetTrouble | None) -> Reception:
+        """Return the reception.
+
+        `patience_s`: how long a pause may be [s]; `source_trouble`, `trouble`: what the source says of itself and of
+        the asset, if anything.
+        """
+        refused_at, refusal = self._refusal
+        if source_trouble and not (self._heard and self.silence_s(now) <= patience_s):
+            return Reception("silent" if self._heard else "unheard", source_trouble, source_down=True)
+        if trouble is not None:
+            return Reception(*trouble)
+        if self._heard and self.silence_s(now) <= patience_s:
+            return FOLLOWED
+        if now - refused_at <= patience_s:
+            return Reception("refused", refusal)
+        state: ReceptionState = "silent" if self._heard else "unheard"
+        return Reception(state, render(message(f"service.reception.{state}")))
