@@ -55,8 +55,8 @@ def servoscope_scores(loop: ss.Loop, healthy: Sequence[ss.Recording], judged: Se
     for recording in judged:
         _, trace = diagnose_with_trace(baseline, recording)
         ready = trace.ready
-        t2, level = (trace.statistic / trace.threshold)[ready], trace.level[ready]
-        largest.append(max(float(t2.max(initial=0.0)), float(level.max(initial=0.0))))
+        ratios = (one.value / one.limit for one in trace.statistics)
+        largest.append(max(float(ratio[ready].max(initial=0.0)) for ratio in ratios))
     return Scores(1.0, tuple(largest))
 
 

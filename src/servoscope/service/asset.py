@@ -270,7 +270,7 @@ class Asset:
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, recent),
+            lambda: examine_blocks(self.baseline, self.name, recent, state.evaluation.features),
             examination_phase(self.name),
         )
         self.state = replace(state, examination=examination)
