@@ -253,11 +253,19 @@ def score_limit(left_out: Sequence[float], false_alarms: float) -> float:
     """
     from scipy import special
 
-    logs, n = np.log(np.maximum(left_out, 1e-9)), len(left_out)
-    dof = n - 1.0 + SCORE_PRIOR
-    variance = ((n - 1.0) * float(logs.var(ddof=1)) + SCORE_PRIOR * SCORE_STD**2) / dof
-    quantile = float(special.stdtrit(dof, 1.0 - false_alarms))
-    return float(np.exp(logs.mean() + quantile * np.sqrt(variance * (1.0 + 1.0 / n))))
+    quantile = float(special.stdtrit(len(left_out) - 1.0 + SCORE_PRIOR, 1.0 - false_alarms))
+    return float(np.exp(_score_logs(left_out).mean() + quantile * score_std(left_out)))
+
+
+def score_std(left_out: Sequence[float]) -> float:
+    """Return the standard deviation of the logarithm of a further healthy recording's score around their mean."""
+    logs, n = _score_logs(left_out), len(left_out)
+    variance = ((n - 1.0) * float(logs.var(ddof=1)) + SCORE_PRIOR * SCORE_STD**2) / (n - 1.0 + SCORE_PRIOR)
+    return float(np.sqrt(variance * (1.0 + 1.0 / n)))
+
+
+def _score_logs(left_out: Sequence[float]) -> FloatArray:
+    return np.asarray(np.log(np.maximum(left_out, 1e-9)))
 
 
 def spans_in_a_row(layout: FeatureLayout, false_alarms: float, false_alarms_per_year: float) -> int:
