@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.detection.feature_model import (
@@ -26,6 +27,8 @@ FEWEST = 4  # recordings whose scatter is believed; fewer have no features
 BANDS = 7
 LOWEST = 4.0  # periods of the lowest band in a window
 HIGHEST = 0.45  # of the sample rate: the highest frequency
+MOST_WINDOWS = 2000  # of a recording that are learned from
+MOST_SAMPLES = 1_000_000  # of a recording, in which a period is looked for
 SHORTEST = 64  # samples of a window
 LONGEST_SPAN = 24  # windows
 EDGES = (1.0 / 32.0, 1.0 / 16.0, 1.0 / 8.0)  # of a period: octaves after a motion began, where friction builds up
@@ -42,7 +45,7 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
         return None, []
     layout = choose_layout(loop, recordings)
     runner = WindowFeatures(layout)
-    windows = [list(runner.run(runner.start(), one.r, one.u, one.y, one.restart)) for one in recordings]
+    windows = [_windows(runner, one) for one in recordings]
     if not all(windows):
         return None, [message("learning.features_short", window_s=layout.window / layout.sample_rate)]
     spans = [_spans(each, layout) for each in windows]
@@ -64,6 +67,18 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
         in_a_row=spans_in_a_row(layout, share, loop.monitor.false_alarms_per_year),
     )
     return model, []
+
+
+def _windows(runner: WindowFeatures, recording: Recording) -> list[Window]:
+    """Return the windows of a recording, of a long one those of its beginning: more say nothing new of its mean."""
+    state, found = runner.start(), list[Window]()
+    for rows in outofcore.iter_chunks(0, recording.samples):
+        part = recording.rows(rows)
+        found += runner.run(state, part.r, part.u, part.y, part.restart)
+        outofcore.release(*recording.columns)
+        if len(found) >= MOST_WINDOWS:
+            break
+    return found
 
 
 def _spans(windows: Sequence[Window], layout: FeatureLayout) -> list[SpanFeatures]:
@@ -139,7 +154,7 @@ def _period_of(recording: Recording) -> int:
             return int(lengths[0])
     if len(lengths) > 1:
         return 0
-    return _repetition(r)
+    return _repetition(r[:MOST_SAMPLES])
 
 
 def _repetition(r: FloatArray) -> int:
