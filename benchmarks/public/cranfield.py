@@ -61,11 +61,12 @@ def main() -> None:
             judged = [*held_out, *(run for _, run in faulty)]
             scores = {OURS: servoscope_scores(loop, healthy, judged)}
             scores |= {one.name: judge(one, healthy, judged) for one in detectors(CYCLE_S, CUTOFF_HZ)}
-            for name, (limit, largest) in scores.items():
+            for name, (limit, largest, order) in scores.items():
                 normal_scores, fault_scores = largest[: len(held_out)], largest[len(held_out) :]
                 false = sum(score > limit for score in normal_scores)
                 found = sum(score > limit for score in fault_scores)
-                ranked = sum(score > max(normal_scores) for score in fault_scores)
+                places = order or largest
+                ranked = sum(place > max(places[: len(held_out)]) for place in places[len(held_out) :])
                 kept = counts.setdefault(name, [0, 0, 0, 0, 0])
                 counts[name] = [
                     a + b for a, b in zip(kept, (false, len(held_out), found, ranked, len(faulty)), strict=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 import servoscope as ss
 from public.simple_detectors import Scores, detectors, judge
+from servoscope.detection.feature_model import score_std
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,15 +50,22 @@ COLUMNS = ("detector", "false", "found", "largest healthy score / limit", "small
 
 
 def servoscope_scores(loop: ss.Loop, healthy: Sequence[ss.Recording], judged: Sequence[ss.Recording]) -> Scores:
-    """Return the largest statistic of each recording as a multiple of its limit; the limit is 1."""
+    """Return the largest statistic of each recording as a multiple of its limit; the limit is 1.
+
+    Coefficients and features have scores of different spread: recordings are ranked by how far a score is from its
+    limit in standard deviations of its logarithm over the healthy recordings, each learned without it.
+    """
     baseline = ss.learn(loop, healthy)
-    largest = []
+    features = baseline.features
+    stds = {"features": score_std(features.left_out), "t2": score_std(baseline.left_out)} if features else {}
+    largest, order = [], []
     for recording in judged:
         _, trace = diagnose_with_trace(baseline, recording)
         ready = trace.ready
-        t2, level = (trace.statistic / trace.threshold)[ready], trace.level[ready]
-        largest.append(max(float(t2.max(initial=0.0)), float(level.max(initial=0.0))))
-    return Scores(1.0, tuple(largest))
+        ratios = {one.name: float((one.value / one.limit)[ready].max(initial=0.0)) for one in trace.statistics}
+        largest.append(max(ratios.values()))
+        order.append(max(ratio ** (1.0 / stds.get(name, 1.0)) for name, ratio in ratios.items()))
+    return Scores(1.0, tuple(largest), tuple(order))
 
 
 def all_scores(

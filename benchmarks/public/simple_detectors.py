@@ -28,6 +28,8 @@ class Scores(NamedTuple):
 
     limit: float
     largest: tuple[float, ...]
+    # what recordings are ranked by, where a detector has several scores; otherwise the largest
+    order: tuple[float, ...] | None = None
 
 
 class Detector(Protocol):

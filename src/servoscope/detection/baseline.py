@@ -19,6 +19,7 @@ from servoscope.core.messages import MessageText
 from servoscope.core.short_repr import ShortRepr
 from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, worst_case_hypotheses
 from servoscope.detection.expectation import Expectation
+from servoscope.detection.feature_model import FeatureModel
 from servoscope.detection.learned_fault import LearnedFault
 from servoscope.detection.sensors import SensorModel
 from servoscope.detection.threshold_calibration import SEQUENTIAL, CalibrationFactors, t2_threshold
@@ -107,6 +108,9 @@ class Baseline(ShortRepr, _BaselineModel):
         How the sensors of the output disagree; None where it has one.
     instrument
         The model behind the instrument of a loop without a controller; None where none was needed or learned.
+    features, left_out
+        What the healthy recordings show besides their coefficients, and the largest T^2 of each of them as a multiple
+        of its limit when learned without it. None and empty where there are fewer than four recordings.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -147,6 +151,8 @@ class Baseline(ShortRepr, _BaselineModel):
     learned: tuple[LearnedFault, ...] = ()
     sensors: SensorModel | None = None
     instrument: InstrumentTuning | None = None
+    features: FeatureModel | None = None
+    left_out: Vector = ()
     point: str = ""
     others: tuple[Baseline, ...] = ()
 
@@ -263,9 +269,14 @@ class Baseline(ShortRepr, _BaselineModel):
         monitor = self.loop.monitor
         budget = monitor.false_alarms_per_year / assets
         loop = self.loop.model_copy(update={"monitor": monitor.model_copy(update={"false_alarms_per_year": budget})})
-        limit = t2_threshold(loop, len(self.names), self.dof, self.rehearsed, bool(self.members))
+        features = self.features.shared(budget) if self.features is not None else None
+        limit = t2_threshold(
+            loop, len(self.names), self.dof, self.rehearsed, bool(self.members), features=features is not None
+        )
         others = tuple(other.shared(assets) for other in self.others)
-        changed = self.model_copy(update={"loop_settings": loop.to_dict(), "limit": limit, "others": others})
+        changed = self.model_copy(
+            update={"loop_settings": loop.to_dict(), "limit": limit, "features": features, "others": others}
+        )
         vars(changed).pop("loop", None)  # a copy takes along what was computed from the old settings
         return changed
 

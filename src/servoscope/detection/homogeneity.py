@@ -13,6 +13,8 @@ from servoscope.detection.chi2_test import t2_statistic
 
 BY_CHANCE = 1e-3  # probability with which recordings of one plant may be called different
 SCATTER_BY_CHANCE = 0.01  # probability of such scatter by noise alone, below which few recordings are believed
+WIDENING = 1.25  # factor by which the scatter's variance is raised at a time
+MOST_WIDENED = 1e3  # and at most in all
 ENOUGH = 4  # recordings whose scatter is believed in any case
 
 
@@ -116,3 +118,42 @@ def scatter(apart: FloatArray, covariances: FloatArray) -> FloatArray:
     beyond = np.maximum(apart.var(axis=0, ddof=1) - own, 0.0)
     students = (m - 1.0) / (m - 3.0) if m >= ENOUGH else 3.0
     return np.diag(beyond * students * (1.0 + 1.0 / m))
+
+
+def leave_one_out(
+    paths: Sequence[tuple[FloatArray, FloatArray]],
+    apart: FloatArray,
+    covariances: FloatArray,
+    common: FloatArray,
+    limit: float,
+) -> tuple[float, FloatArray]:
+    """Judge each of m >= 4 healthy recordings by what the others teach; return the scatter's factor, and the ratios.
+
+    The factor, at least 1, is by how much the scatter between recordings has to be larger so that none of them would
+    have been called faulty; the ratios, shape (m,), are their largest T^2 over its limit before that. More recordings
+    can so only raise the covariance that their own scatter has contradicted.
+
+    `paths`: theta_hat less what is expected of a healthy loop, shape (K, n), and its covariance (K, n, n), of each
+    recording; `apart`, `covariances`: as in `find_outliers`; `common`: what theta is known to without scatter, (n, n).
+    """
+    m = len(apart)
+    if m < ENOUGH:
+        return 1.0, np.zeros(0)
+    others = [np.delete(np.arange(m), i) for i in range(m)]
+    shifts = [apart[j].mean(axis=0) - apart.mean(axis=0) for j in others]
+    spreads = [scatter(apart[j], covariances[j]) for j in others]
+    ratios = np.zeros(m)
+    factors = np.ones(m)
+    for i, (d, S) in enumerate(paths):
+        if not len(d):
+            continue
+
+        def worst(
+            factor: float, d: FloatArray = d - shifts[i], S: FloatArray = S + common, B: FloatArray = spreads[i]
+        ) -> float:
+            return float(t2_statistic(d, np.zeros_like(d), S + factor * B).max()) / limit
+
+        ratios[i] = worst(1.0)
+        while worst(factors[i]) > 1.0 and factors[i] < MOST_WIDENED:
+            factors[i] *= WIDENING
+    return float(factors.max()), ratios

@@ -322,17 +322,18 @@ class Diagnosis(ShortRepr, _ResultModel):
 class Statistic:
     """One of the statistics that raise the alarm, over K evaluations."""
 
-    name: str  # ``t2``; ``cusum``, the sequential test
+    name: str  # ``t2``; ``cusum``, the sequential test; ``features``, what the loop shows besides its coefficients
     value: FloatArray  # shape (K,)
     limit: float | FloatArray
     exceeded: BoolArray  # shape (K,)
 
 
 def detection_statistics(
-    t2: FloatArray, limit: float | FloatArray, cusum: FloatArray, ready: BoolArray
+    t2: FloatArray, limit: float | FloatArray, cusum: FloatArray, ready: BoolArray, features: FloatArray | None = None
 ) -> tuple[Statistic, ...]:
     """Return the statistics that raise the alarm, each with where it is above its limit."""
-    return (Statistic("t2", t2, limit, ready & (t2 > limit)), Statistic("cusum", cusum, 1.0, ready & (cusum >= 1.0)))
+    found = Statistic("t2", t2, limit, ready & (t2 > limit)), Statistic("cusum", cusum, 1.0, ready & (cusum >= 1.0))
+    return found if features is None else (*found, Statistic("features", features, 1.0, features > 1.0))
 
 
 def any_exceeded(statistics: tuple[Statistic, ...]) -> BoolArray:
@@ -358,6 +359,8 @@ class Trace(ShortRepr):
     ifrf: FrequencyResponse  # at the monitored frequencies, of `theta`
     ifrf_expected: FrequencyResponse  # and of `expected`
     ready: BoolArray  # whether the estimator had learned anything by then, shape (K,)
+    # score of the features of the spans so far, as a multiple of its limit, shape (K,); None where none were learned
+    features: FloatArray | None = None
 
     def _shown_facts(self) -> dict[str, object]:
         span = f"{self.t[0]:.4g} to {self.t[-1]:.4g} s" if self.t.size else "none"
@@ -365,8 +368,8 @@ class Trace(ShortRepr):
 
     @cached_property
     def statistics(self) -> tuple[Statistic, ...]:
-        """The statistics that raise the alarm: T^2 and the sequential test."""
-        return detection_statistics(self.statistic, self.threshold, self.level, self.ready)
+        """The statistics that raise the alarm: T^2, the sequential test and, where they were learned, the features."""
+        return detection_statistics(self.statistic, self.threshold, self.level, self.ready, self.features)
 
     @cached_property
     def exceeded(self) -> BoolArray:
@@ -376,7 +379,7 @@ class Trace(ShortRepr):
     def table(self) -> dict[str, FloatArray]:
         """Return the columns of ``diagnose --trace``: t, theta_0 ..., ifrf_1Hz_real ..., statistic, threshold, level.
 
-        The last is the sequential test's, which alarms at 1.
+        Level and features are the sequential test's and the features', which alarm at 1.
         """
         columns = {"t": self.t}
         for i in range(self.theta.shape[1]):
@@ -387,4 +390,6 @@ class Trace(ShortRepr):
         columns["statistic"] = self.statistic
         columns["threshold"] = np.full(len(self.t), self.threshold)
         columns["level"] = self.level
+        if self.features is not None:
+            columns["features"] = self.features
         return columns

@@ -31,6 +31,7 @@ FEW = 10.0  # alarms: fewer are not believed where they would lower a limit
 COUNTED = 30.0  # alarms that theory expects among them
 SEED = 20
 UNLIKELY = 1e-3  # chance of an alarm during the healthy recordings from which noise is not believed to raise it
+FEATURES = 0.1  # share of the budget of false alarms that is the features', where there are any
 SEQUENTIAL = 0.5  # share of the budget of false alarms that is the sequential test's
 
 
@@ -42,10 +43,13 @@ class CalibrationFactors:
     cusum: float = 1.0
 
 
-def t2_threshold(loop: Loop, n: int, dof: float, calibration: CalibrationFactors, sequential: bool) -> float:
-    """Return the threshold of T^2 for its share of the loop's budget; without a sequential test that is all of it."""
+def t2_threshold(
+    loop: Loop, n: int, dof: float, calibration: CalibrationFactors, sequential: bool, features: bool = False
+) -> float:
+    """Return the threshold of T^2 for its share of the loop's budget: what sequential test and features leave of it."""
     monitor = loop.monitor
-    budget = monitor.false_alarms_per_year * (1.0 - SEQUENTIAL if sequential else 1.0)
+    share = 1.0 - (SEQUENTIAL if sequential else 0.0) - (FEATURES if features else 0.0)
+    budget = monitor.false_alarms_per_year * share
     return threshold(n, monitor.evaluation_rate, monitor.memory, budget, dof, calibration.statistic)
 
 

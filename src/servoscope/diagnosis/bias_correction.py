@@ -93,6 +93,7 @@ def corrected_trace(exam: Examination, correction: BiasCorrection | None, at: sl
         ifrf=response,
         ifrf_expected=healthy,
         ready=ready,
+        features=None if exam.features is None else exam.features.at(e.index[at]),
     )
 
 

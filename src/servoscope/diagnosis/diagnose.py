@@ -145,7 +145,14 @@ def _with_warnings(diagnosis: Diagnosis, more: Sequence[DiagnosisWarning]) -> Di
 
 def _first_alarm_time(exam: Examination) -> float:
     alarms = np.flatnonzero(exam.alarm)
-    return float(exam.t(alarms[0])) if alarms.size else np.inf
+    changed = _changed_at(exam)
+    return min(float(exam.t(alarms[0])) if alarms.size else np.inf, np.inf if changed is None else changed)
+
+
+def _changed_at(exam: Examination) -> float | None:
+    """Return the end of the span with which the features left their limit [s]; None where they did not."""
+    span = exam.features.changed if exam.features is not None else None
+    return None if span is None else float(exam.recording.t[span.end - 1])
 
 
 def _largest_statistic_ratio(exam: Examination) -> float:
@@ -175,10 +182,14 @@ def diagnose_examination(
     interval: FaultInterval | None = None
     onset: Onset | None = None
     detectable: dict[str, tuple[float, float]] = {}
-    at = last
+    at, features = last, exam.features
+    changed = features.changed if features is not None else None
     if alarm is not None:
         at = alarm.evaluation
         interval, onset, doubts = _explain_alarm(exam, alarm, progress)
+    elif changed is not None:
+        unknown = (Candidate(name=UNKNOWN, probability=1.0),)
+        interval, doubts = FaultInterval(detected_at_s=_changed_at(exam), probability=1.0, candidates=unknown), []
     else:
         detectable = detectable_sizes(exam)
         doubts = power_warnings(exam, detectable)
@@ -187,13 +198,20 @@ def diagnose_examination(
     correction = estimate_bias_correction(exam, interval.candidates if interval else (), onset, at)
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
+    reasons = build_reasons(exam, explained, interval) if alarm is not None and interval is not None else ()
+    if features is not None and changed is not None:
+        reasons = (*reasons, *features.reasons(changed))
+    if features is not None and changed is not None and alarm is None:
+        headline = features.headline(changed, baseline.point)
+    else:
+        headline = build_headline(verdict, interval, detectable, warnings, baseline.point)
     diagnosis = Diagnosis(
         recording=recording.name,
         samples=recording.samples,
         duration_s=recording.duration_s,
         verdict=verdict,
-        headline=build_headline(verdict, interval, detectable, warnings, baseline.point),
-        reasons=build_reasons(exam, explained, interval) if interval is not None else (),
+        headline=headline,
+        reasons=reasons,
         intervals=(interval,) if interval is not None else (),
         parameters=_final_coefficients(end),
         ifrf=_final_response(end),

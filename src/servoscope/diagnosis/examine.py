@@ -24,6 +24,7 @@ from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
 from servoscope.detection.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.detection.result import Statistic, any_exceeded, detection_statistics
+from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, RegressionRunner, Tuning
 from servoscope.models.plants import Plant
@@ -97,13 +98,21 @@ class Examination:
 
     @cached_property
     def statistics(self) -> tuple[Statistic, ...]:
-        """The statistics that raise the alarm: T^2 and the sequential test."""
-        return detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready)
+        """The statistics that raise the alarm: T^2, the sequential test and, where they were learned, the features."""
+        features = self.features.at(self.estimates.index) if self.features is not None else None
+        return detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready, features)
+
+    @cached_property
+    def features(self) -> FeatureEvidence | None:
+        """What the recording shows besides its coefficients; None where nothing of that was learned."""
+        model = self.baseline.features
+        return None if model is None else FeatureEvidence.of(model, self.recording)
 
     @cached_property
     def alarm(self) -> npt.NDArray[np.bool_]:
-        """Whether there was an alarm: any of the statistics above its limit, after the delays, shape (K,)."""
-        return apply_alarm_delays(any_exceeded(self.statistics), *self.pipeline.delays)
+        """Whether there was an alarm of the coefficients, which isolation explains, after the delays, shape (K,)."""
+        statistics = detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready)
+        return apply_alarm_delays(any_exceeded(statistics), *self.pipeline.delays)
 
     def memory_start(self, at: int) -> int:
         """Return the sample before which loop, filters and estimator have forgotten everything in an evaluation.

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.feature_monitor import FeatureMonitor, hold
 from servoscope.detection.result import Trace
 from servoscope.estimation import frequency_response
 from servoscope.estimation.frequency_response import FrequencyResponse
@@ -27,7 +28,8 @@ class Monitor:
 
     Its state is one plain array, shape (size,) for one asset and (assets, size) for a fleet: it is saved by copying it,
     resuming is bit-identical, and splitting the samples into blocks anywhere changes nothing. The states of a valve law
-    and of stage 1 precede that of stage 2.
+    and of stage 1 precede that of stage 2, that of the features follows it. A fleet is followed without features: each
+    asset cuts its windows elsewhere, and vector instructions need all of them at the same place.
 
     Parameters
     ----------
@@ -85,7 +87,10 @@ class Monitor:
         }
         self._limits = np.array([each.limit for each in self.baselines])[:, None]
         self._prefix_size = max(each.prefix_size for each in self._constants_of)  # where the state of stage 2 begins
-        self._size = self._prefix_size + max(recursion.size for _, recursion in self._groups)
+        self._features_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
+        model = None if self.fleet else self.baselines[0].features
+        self._features = None if model is None else FeatureMonitor(model)
+        self._size = self._features_at + (self._features.size if self._features is not None else 0)
         self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
         self._step_constants = np.zeros(0)
 
@@ -111,6 +116,8 @@ class Monitor:
         if self._prefix_size:
             for row, each in zip(states, self._constants_of, strict=True):
                 row[: each.prefix_size] = np.concatenate([each.pipeline.valve.start(), each.stage.start()])
+        if self._features is not None:
+            states[0, self._features_at :] = self._features.start()
         return states if self.fleet else states[0]
 
     def run(
@@ -156,17 +163,19 @@ class Monitor:
             if flags.shape != shape:
                 raise RecordingError("restart must have the shape of r")
         rows = np.ascontiguousarray(np.atleast_2d(state), dtype=np.float64)
-        if self._prefix_size:
+        gaps = np.zeros(shape, dtype=np.bool_) if flags is None else flags
+        if self._size > self._groups[0][1].size:
             rows = rows.copy()
-            gaps = np.zeros(shape, dtype=np.bool_) if flags is None else flags
+        features = self._follow_features(rows, signals, gaps)
+        if self._prefix_size:
             signals[1] = self._apply_input_stages(rows, signals[0], signals[1], signals[2], gaps)
-        if len(self._groups) == 1 and not self._prefix_size:
+        if len(self._groups) == 1 and rows.shape[1] == self._groups[0][1].size:
             ((_, recursion),) = self._groups
             index = recursion.rows(rows, shape[1])
             new, out = recursion.run(rows, signals[0], signals[1], signals[2], flags)
         else:
             new, out, index = self._run_groups(rows, signals, flags)
-        return new if self.fleet else new[0], self._trace(out, index)
+        return new if self.fleet else new[0], self._trace(out, index, features(index))
 
     def _run_groups(
         self, rows: FloatArray, signals: list[npt.NDArray[Any]], flags: npt.NDArray[np.bool_] | None
@@ -196,8 +205,10 @@ class Monitor:
                     "step follows one asset: give the state of a monitor with one baseline, or use run"
                 )
             self._step, self._step_constants = self._groups[0][1].stepper
+        one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
+        if self._features is not None:
+            self._follow_features(state[None, :], list(one), gap)
         if self._prefix_size:
-            one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
             u = float(self._apply_input_stages(state[None, :], one[0], one[1], one[2], gap)[0, 0])
             state = state[self._prefix_size :]
         return self._step(self._step_constants, state, r, u, y)
@@ -213,6 +224,18 @@ class Monitor:
             flow[i] = each.stage.run(rows[i, valve.size : each.prefix_size], r[i], behind_valve, flags[i])
         return flow
 
+    def _follow_features(
+        self, rows: FloatArray, signals: list[npt.NDArray[Any]], flags: npt.NDArray[np.bool_]
+    ) -> Callable[[npt.NDArray[np.int64]], FloatArray | None]:
+        """Change the features' state in place; return a function: what holds at each of some of the block's samples."""
+        if self._features is None:
+            return lambda index: None
+        own = rows[0, self._features_at :]
+        r, u, y = (np.asarray(signal[0], dtype=np.float64) for signal in signals)
+        before, spans = self._features.value(own), self._features.run(own, r, u, y, flags[0])
+        ends, values = np.array([span.end - 1 for span in spans], np.int64), np.array([span.value for span in spans])
+        return lambda index: hold(values, ends, index, before)
+
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of the latest evaluation in a state."""
         from servoscope.estimation.kernel.sample_steps import SAMPLE
@@ -221,13 +244,14 @@ class Monitor:
         out = np.empty((len(rows), self._groups[0][1].sizes.row))
         for assets, recursion in self._groups:
             out[assets] = recursion.evaluate(rows[assets, : recursion.size])
-        return self._trace(out[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]))
+        features = None if self._features is None else np.array([self._features.value(state[self._features_at :])])
+        return self._trace(out[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]), features)
 
     @property
     def _shape(self) -> tuple[int, ...]:
         return (len(self.baselines), self._size) if self.fleet else (self._size,)
 
-    def _trace(self, out: npt.NDArray[Any], index: npt.NDArray[np.int64]) -> Trace:
+    def _trace(self, out: npt.NDArray[Any], index: npt.NDArray[np.int64], features: FloatArray | None = None) -> Trace:
         """Return complete evaluations, shape (assets, K, row), as a trace."""
         n, f = len(self._constants_of[0].expected_theta), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)
         shape = out.shape[:2]
@@ -254,6 +278,7 @@ class Monitor:
             threshold=threshold,
             ifrf=FrequencyResponse(f, *response),
             ifrf_expected=expected,
+            features=features,
             **columns,
         )
 

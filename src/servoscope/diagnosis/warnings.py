@@ -56,6 +56,9 @@ def estimate_warnings(exam: Examination) -> list[DiagnosisWarning]:
     """Return warnings about the estimate itself."""
     warnings = []
     e, t = exam.estimates, exam.recording.t
+    if exam.features is not None and exam.features.unfamiliar:
+        count, spans = exam.features.unfamiliar, exam.features.unfamiliar + len(exam.features.spans)
+        warnings.append(warning_throughout(exam, "features", message("warning.unfamiliar", count=count, spans=spans)))
     if exam.replaced:
         warnings.append(warning_throughout(exam, "instrument", message("warning.instrument_failed")))
     if exam.skipped_share > MIN_SKIPPED_SHARE:

@@ -84,7 +84,8 @@ def export_c(
     golden = GoldenRun.of(baseline, made.recursion, baseline.limit, made.delays)
     values = common_words(made, name) | _number_words(single) | _sizes(made, single) | _code(made, name, single)
     values |= {
-        "left_out": " Only coefficients: there is no sequential test." if only_coefficients else "",
+        "left_out": (" Only coefficients: there is no sequential test." if only_coefficients else "")
+        + (" Features beside the coefficients are not exported." if baseline.features is not None else ""),
         "rounding": describe_rounding(made, only_coefficients, golden) if single else "",
     }
     named = {"monitor.c": f"{name}.c", "monitor.h": f"{name}.h", "check.c": "check.c", "Makefile": "Makefile"}

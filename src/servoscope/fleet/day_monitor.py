@@ -153,10 +153,12 @@ class DayMonitor:
     def _diagnose(self, state: DayState, end_us: int, history: RowLookup) -> dict[str, Any]:
         """Diagnose the window that ends there; return the error where that is impossible."""
         assert state.first_us is not None, "there was a row"
+        # without an alarm features stay out: their limit over single windows is no part of the fleet's budget
+        baseline = self.baseline if state.alarm_us is not None else self.baseline.model_copy(update={"features": None})
         rows = history(max(end_us - self._window, state.first_us - 1), end_us)
         try:
             recording = rows.to_recording(state.first_us, self.baseline.loop, "window")
-            diagnosis, trace = diagnose_with_trace(self.baseline, recording)
+            diagnosis, trace = diagnose_with_trace(baseline, recording)
         except ServoscopeError as error:
             return {"error": str(error).removeprefix("window: ")}
         evidence = json.dumps(asdict(trace_evidence(self.baseline, trace)))

@@ -14,7 +14,7 @@ from servoscope.core.messages import Message, message
 from servoscope.detection.baseline import Baseline, BaselineSource, digest
 from servoscope.detection.cusum_design import CusumHypothesis
 from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system
-from servoscope.detection.homogeneity import describe_outliers, find_outliers, scatter
+from servoscope.detection.homogeneity import describe_outliers, find_outliers, leave_one_out, scatter
 from servoscope.detection.plant_fit import (
     MOST_SATURATED,
     can_simulate,
@@ -41,6 +41,7 @@ from servoscope.learning.detectability import (
     noise_notes,
     supported_budget,
 )
+from servoscope.learning.features import learn_features
 from servoscope.learning.innovation_fit import FILE_ERROR, fit_innovations
 from servoscope.learning.instrument import learn_instrument, learns_instrument
 from servoscope.models.loop import Loop
@@ -243,18 +244,24 @@ def _assemble_baseline(
                     notes += warnings
             if healthy.misfit > 10.0 * pipeline.bank.n:
                 notes.append(message("learning.physics_misfit", misfit=healthy.misfit, expected=pipeline.bank.n))
-    covariance = theta_covariance + scatter(deviations_between, fit.each_covariance) + error
+    between = scatter(deviations_between, fit.each_covariance)
     outliers = find_outliers(deviations_between, fit.each_covariance + error)
     notes += describe_outliers(outliers, [rec.name for rec in recordings], pipeline.bank.names)
     tuning = replace(fit.tuning, theta=theta)
     plant = loop.plant.scaled(ratios) if ratios else loop.plant
-    limit = t2_threshold(loop, pipeline.bank.n, fit.dof, calibration, bool(hypotheses))
+    progress("features")
+    features, warnings = learn_features(loop, recordings)
+    notes += warnings
+    limit = t2_threshold(loop, pipeline.bank.n, fit.dof, calibration, bool(hypotheses), features is not None)
     progress("promises")
     estimates = [pipeline.estimate(tuning, rec) for rec in recordings]
     expected = [replace(e, tuning=tuning).healthy_path(plant, model_theta) for e in expectations] or [theta] * len(
         estimates
     )
     deviations = [e.theta - mean for e, mean in zip(estimates, expected, strict=True)]
+    paths = [(d[e.updates > 0], e.S[e.updates > 0]) for d, e in zip(deviations, estimates, strict=True)]
+    factor, left_out = leave_one_out(paths, deviations_between, fit.each_covariance, theta_covariance + error, limit)
+    covariance = theta_covariance + factor * between + error
     notes += noise_notes(pipeline, fit, estimates, can_simulate(loop))
     excess, suggestion = baseline_misfit(estimates, deviations, covariance, fit)
     if fit.explained < LEAST_EXPLAINED:
@@ -304,6 +311,8 @@ def _assemble_baseline(
         notes=tuple(notes),
         sensors=learn_sensors(loop, recordings),
         instrument=pipeline.instrument,
+        features=features,
+        left_out=tuple(left_out),
     )
     progress("predictor")
     predictor = fit_exact_predictor(baseline, recordings)

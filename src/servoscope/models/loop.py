@@ -23,6 +23,7 @@ from servoscope.core.short_repr import ShortRepr
 from servoscope.models import plants
 
 DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
+FEATURE_FALSE_ALARMS = 0.005
 RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # names that mean something else
 LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a rule
 
@@ -100,6 +101,8 @@ class MonitorSettings(Settings):
     # monitored frequencies [Hz]
     frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
     false_alarms_per_year: Positive = 1.0  # budget that the alarm is set for, after its delays
+    # share of healthy recordings that the features beside the coefficients may call changed; 0: no features
+    feature_false_alarms: Annotated[float, Field(ge=0.0, le=0.5)] = FEATURE_FALSE_ALARMS
     on_delay: NonNegative = 0.0  # how long a limit must be exceeded before the alarm is raised [s]
     # how long the alarm stays after the limit was exceeded last [s]; None: for the memory
     off_delay: NonNegative | None = None
@@ -277,6 +280,8 @@ class Loop(ShortRepr, Settings):
         plain: dict[str, Any] = self.model_dump(mode="json")
         if self.columns.text is None:  # hashes of loops without it stay as they were
             del plain["columns"]["text"]
+        if self.monitor.feature_false_alarms == FEATURE_FALSE_ALARMS:
+            del plain["monitor"]["feature_false_alarms"]  # came later: files and hashes of loops without it stay
         return {key: value for key, value in plain.items() if value is not None}
 
     def hash(self) -> str:

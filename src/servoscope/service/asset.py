@@ -313,7 +313,7 @@ class Asset:
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, recent),
+            lambda: examine_blocks(self.baseline, self.name, recent, state.evaluation.features),
             examination_phase(self.name),
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )

@@ -51,8 +51,13 @@ def undetermined(key: str, **values: Any) -> StoredDiagnosis:
     return StoredDiagnosis(verdict="undetermined", headline=message(f"service.examination.{key}", **values))
 
 
-def examine_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
+def examine_blocks(
+    baseline: Baseline, name: str, blocks: Sequence[Block], features: float | None = None
+) -> StoredDiagnosis:
     """Examine the last minutes with the reference that was applied in them, without a refit.
+
+    `features`: their score in the monitor, as a multiple of its limit. It has seen more spans than the last minutes
+    hold, so its word counts where the coefficients are healthy.
 
     Where the samples cannot be used, the verdict is ``undetermined`` and the headline has the reason.
     """
@@ -61,10 +66,13 @@ def examine_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> St
 
     try:
         recording, start = blocks_to_recording(baseline, name, blocks)
-        exam = Examination.from_recording(baseline, recording)
+        exam = Examination.from_recording(baseline.model_copy(update={"features": None}), recording)
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
     if not exam.alarm.any():
+        if features is not None and features > 1.0:
+            headline = message("service.examination.features", excess=features)
+            return StoredDiagnosis(verdict="fault", headline=headline, onset=None)
         diagnosis, _ = diagnose_examination(exam)
         document = diagnosis.model_dump(mode="json")
         return StoredDiagnosis(verdict=diagnosis.verdict, headline=diagnosis.headline, document=document)

@@ -24,6 +24,7 @@ class EvaluationStatus(BaseModel):
     t: float | None = None  # [UTC s]; None: there was none yet
     statistic: float | None = None
     level: float | None = None
+    features: float | None = None  # None: not learned
     peaks: tuple[float | None, float | None] = (None, None)  # largest of both in the block: what alarms go by
     # per frequency [Hz]: real and imaginary part of the iFRF's residual, and magnitude of the healthy iFRF
     residual: tuple[ResidualRow, ...] = ()
@@ -47,6 +48,7 @@ def evaluation_status(trace: Trace, t: float) -> EvaluationStatus:
         t=t,
         statistic=float(excess[-1]),
         level=float(trace.level[-1]),
+        **({} if trace.features is None else {"features": float(trace.features[-1])}),
         peaks=(float(excess.max()), float(trace.level.max())),
         residual=ifrf_residual(trace, -1),
         exceeded=bool(trace.exceeded[-1]),

@@ -145,6 +145,28 @@ def _baseline_facts(b: Baseline) -> Iterator[tuple[str, str]]:
     yield "data support", say("cli.baseline.data_support", budget=supported)
     error = {"set": b.loop.monitor.model_error, "suggested": b.suggested_model_error}
     yield "model_error", say("cli.baseline.model_error", **error)
+    if b.features is None:
+        return
+    n = b.features.recordings
+    for name, ratios in (
+        ("coefficients", b.left_out),
+        ("features", [x / b.features.limit for x in b.features.left_out]),
+    ):
+        if ratios:
+            above = sum(ratio > 1.0 for ratio in ratios)
+            yield name, say("cli.baseline.left_out", recordings=n, above=above, worst=max(ratios))
+    yield (
+        "guarantee",
+        say(
+            "cli.baseline.guarantee",
+            recordings=n,
+            among=n + 1,
+            one_in=round(1.0 / b.features.false_alarms),
+            limit=b.features.limit,
+            in_a_row=b.features.in_a_row,
+            span_s=b.features.layout.span_s,
+        ),
+    )
 
 
 def _format_sources(b: Baseline) -> str:

@@ -1,0 +1,127 @@
+"""What a recording shows besides its coefficients, against healthy recordings: how unlike them it is, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from servoscope.core import outofcore
+from servoscope.core.arrays import FloatArray, IntArray
+from servoscope.core.messages import Message, message
+from servoscope.detection.feature_model import FeatureModel, FeatureName, SpanFeatures
+from servoscope.detection.feature_monitor import FeatureMonitor, SpanScore, hold, smallest_in_a_row
+from servoscope.signals import Recording
+
+LISTED = 3  # features that are named
+MIN_STD = 2.0  # standard deviations from which a feature is named, the most changed one apart
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureEvidence:
+    """The spans of one recording, scored.
+
+    A recording of a few spans is one draw from the healthy population: all its spans together decide. In a longer one
+    as many in a row must be above the limit as in a running monitor.
+    """
+
+    model: FeatureModel
+    spans: tuple[SpanScore, ...]  # those whose motion healthy recordings show too
+    unfamiliar: int  # the number of the others
+
+    @classmethod
+    def of(cls, model: FeatureModel, recording: Recording) -> FeatureEvidence:
+        """Score the spans of a recording; the last one counts if it is at least half as long as the others."""
+        monitor, spans = FeatureMonitor(model), list[SpanScore]()
+        state = monitor.start()
+        for rows in outofcore.iter_chunks(0, recording.samples):
+            part = recording.rows(rows)
+            spans += monitor.run(state, part.r, part.u, part.y, part.restart)
+        if (last := monitor.unfinished(state, recording.samples)) is not None:
+            spans.append(last)
+        known = tuple(span for span in spans if np.isfinite(span.ratio))
+        return cls(model, known, len(spans) - len(known))
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """For each span, the smallest of the scores that must be above the limit together, shape (J,)."""
+        ratios = np.array([span.ratio for span in self.spans])
+        return smallest_in_a_row(ratios, min(self.model.in_a_row, max(len(self.spans), 1)))
+
+    def at(self, samples: IntArray) -> FloatArray:
+        """Return the value that holds at some samples; that of the last span holds at the last of them at least."""
+        ends = np.array([span.end for span in self.spans], dtype=np.int64) - 1
+        if len(samples):
+            ends = np.minimum(ends, samples[-1])
+        return hold(self.values, ends, samples)
+
+    @property
+    def changed(self) -> SpanScore | None:
+        """The span with which the recording was found to have changed; None where it has not."""
+        above = np.flatnonzero(self.values > 1.0)
+        return self.spans[int(above[0])] if above.size else None
+
+    @cached_property
+    def p_value(self) -> float | None:
+        """How often chance makes a healthy recording as unlike the others, whatever their distribution; None: no span.
+
+        See `FeatureModel.conformal_p_value`.
+        """
+        return self.model.conformal_p_value(mean_of([span.features for span in self.spans])) if self.spans else None
+
+    def headline(self, span: SpanScore, point: str = "") -> Message:
+        """Return the verdict in one sentence, of a recording whose coefficients are healthy."""
+        at = message("diagnosis.point", name=point) if point else None
+        return message("diagnosis.changed", point=at, change=self._changes(span)[0])
+
+    def reasons(self, span: SpanScore) -> tuple[Message, ...]:
+        """Say what differs in a span, and how sure that is."""
+        chance = message(
+            "diagnosis.features_chance",
+            recordings=self.model.recordings,
+            guaranteed=self.p_value,
+            model=self.model.false_alarms,
+        )
+        return message("diagnosis.features", changes=self._changes(span)), chance
+
+    def _changes(self, span: SpanScore) -> tuple[Message, ...]:
+        """Say which features differ, the most changed first: of which signal, in which motion and band."""
+        scores = self.model.scores(span.features)
+        one = self.model.statistics[int(np.argmax(scores))]
+        values = span.features.values[one.level]
+        off = np.nan_to_num(one.deviations(values))
+        most = np.argsort(-np.abs(off))[:LISTED].tolist()
+        return tuple(
+            _describe(FeatureName.of(self.model.layout, int(one.kept[k])), float(values[one.kept[k]]), one.centre[k])
+            for k in most
+            if abs(off[k]) >= MIN_STD or k == most[0]
+        )
+
+
+def mean_of(spans: Sequence[SpanFeatures]) -> SpanFeatures:
+    """Return the mean of spans, each weighted by its windows."""
+    counts = np.array([span.counts for span in spans])
+    values = np.array([span.values for span in spans])
+    seen = np.isfinite(values)
+    weights = np.where(seen, counts[:, :, None], 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = (weights * np.where(seen, values, 0.0)).sum(axis=0) / weights.sum(axis=0)
+    return SpanFeatures(mean, counts.sum(axis=0), spans[-1].motion)
+
+
+def _describe(name: FeatureName, value: float, healthy: float) -> Message:
+    signal, motion = message(f"diagnosis.feature_{name.signal}"), message(f"diagnosis.motion_{name.motion}")
+    if name.band_hz is not None:
+        low, high = name.band_hz
+        values = {"signal": signal, "motion": motion, "low_hz": low, "high_hz": high}
+        return message("diagnosis.feature_band", ratio=float(np.exp(value - healthy)), **values)
+    from_s, to_s = name.since_s if name.since_s is not None else (0.0, np.inf)
+    if from_s == 0.0 and np.isinf(to_s):
+        when = None
+    elif np.isinf(to_s):
+        when = message("diagnosis.since_motion_late", from_s=from_s)
+    else:
+        when = message("diagnosis.since_motion", from_s=from_s, to_s=to_s)
+    return message("diagnosis.feature_level", signal=signal, motion=motion, when=when, value=value, healthy=healthy)

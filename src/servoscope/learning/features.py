@@ -1,0 +1,183 @@
+"""Healthy recordings to the model of their features: windows, limit, and what so many recordings can guarantee."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from servoscope.core import outofcore
+from servoscope.core.arrays import FloatArray
+from servoscope.core.messages import Message, message
+from servoscope.detection.feature_model import (
+    SLACK,
+    WIDER,
+    FeatureModel,
+    GroupStatistic,
+    SpanFeatures,
+    fit_groups,
+    score_limit,
+    spans_in_a_row,
+)
+from servoscope.estimation.window_features import SPEED_TIME, FeatureLayout, Window, WindowFeatures
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
+
+FEWEST = 4  # recordings whose scatter is believed; fewer have no features
+BANDS = 7
+LOWEST = 4.0  # periods of the lowest band in a window
+HIGHEST = 0.45  # of the sample rate: the highest frequency
+MOST_WINDOWS = 2000  # of a recording that are learned from
+MOST_SAMPLES = 1_000_000  # of a recording, in which a period is looked for
+SHORTEST = 64  # samples of a window
+LONGEST_SPAN = 24  # windows
+EDGES = (1.0 / 32.0, 1.0 / 16.0, 1.0 / 8.0)  # of a period: octaves after a motion began, where friction builds up
+LEVELS = 3  # lengths of windows where motion does not repeat
+REST_SHARE = 0.05  # of the largest speed, below which the reference rests
+SILENT = 1e-9  # share of a signal's power below which a band is silent
+REPEATS = 0.02  # of the variance: the reference repeats where its difference after a period stays below
+
+
+def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[FeatureModel | None, list[Message]]:
+    """Learn the features of healthy recordings; None where there are too few recordings, or too short ones."""
+    share = loop.monitor.feature_false_alarms
+    if not share or len(recordings) < FEWEST:
+        return None, []
+    layout = choose_layout(loop, recordings)
+    runner = WindowFeatures(layout)
+    windows = [_windows(runner, one) for one in recordings]
+    if not all(windows):
+        return None, [message("learning.features_short", window_s=layout.window / layout.sample_rate)]
+    spans = [_spans(each, layout) for each in windows]
+    low, high = _motion_range(spans)
+    left_out = []
+    for i, own in enumerate(spans):
+        groups = fit_groups(windows[:i] + windows[i + 1 :], layout)
+        statistics = [GroupStatistic.of(group) for group in groups]
+        left_out.append(max(one.score(s.values[one.level], s.counts[one.level]) for s in own for one in statistics))
+    limit = score_limit(left_out, share)
+    model = FeatureModel(
+        layout=layout,
+        groups=fit_groups(windows, layout),
+        motion_low=tuple(low),
+        motion_high=tuple(high),
+        left_out=tuple(left_out),
+        limit=limit,
+        false_alarms=share,
+        in_a_row=spans_in_a_row(layout, share, loop.monitor.false_alarms_per_year),
+    )
+    return model, []
+
+
+def _windows(runner: WindowFeatures, recording: Recording) -> list[Window]:
+    """Return the windows of a recording, of a long one those of its beginning: more say nothing new of its mean."""
+    state, found = runner.start(), list[Window]()
+    for rows in outofcore.iter_chunks(0, recording.samples):
+        part = recording.rows(rows)
+        found += runner.run(state, part.r, part.u, part.y, part.restart)
+        outofcore.release(*recording.columns)
+        if len(found) >= MOST_WINDOWS:
+            break
+    return found
+
+
+def _spans(windows: Sequence[Window], layout: FeatureLayout) -> list[SpanFeatures]:
+    """Return the spans of a recording; the last one if it is at least half as long as the others."""
+    numbers = sorted({window.span for window in windows})
+    members = [[window for window in windows if window.span == number] for number in numbers]
+    found = [SpanFeatures.of(each, layout) for each in members]
+    return [span for span in found if 2.0 * span.counts[0] >= layout.span] or found[:1]
+
+
+def _motion_range(spans: Sequence[Sequence[SpanFeatures]]) -> tuple[FloatArray, FloatArray]:
+    seen = np.array([span.motion for each in spans for span in each])
+    seen = np.where(np.isfinite(seen), seen, np.nanmean(np.where(np.isfinite(seen), seen, 0.0), axis=0))
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    wider = WIDER * (high - low) + SLACK
+    return low - wider, high + wider
+
+
+def choose_layout(loop: Loop, recordings: Sequence[Recording]) -> FeatureLayout:
+    """Choose windows: whole periods where the reference repeats, otherwise half the memory, the memory and twice it."""
+    rate, memory = loop.sample_rate, loop.monitor.memory
+    period = _period(recordings)
+    if period:
+        window, levels = period * max(1, round(memory * rate / period)), 1
+        edges = tuple(share * period / rate for share in EDGES)
+    else:
+        window, levels, edges = max(round(memory * rate / 2.0), SHORTEST), LEVELS, ()
+    counts = [recording.samples // window for recording in recordings]
+    whole = float(np.median(counts))
+    first = 1 if whole >= 3.0 else 0  # start-up is unlike what follows, where anything follows
+    speed = np.concatenate([np.abs(_speed(one)) for one in recordings])
+    powers = [
+        float(np.mean([np.var(x) for x in each])) for each in zip(*((r.u, r.r - r.y) for r in recordings), strict=True)
+    ]
+    top = HIGHEST * rate
+    return FeatureLayout(
+        sample_rate=rate,
+        window=window,
+        levels=levels,
+        span=int(np.clip(whole - first, 1, LONGEST_SPAN)),
+        settling=first * window,
+        rest_speed=REST_SHARE * float(speed.max()),
+        edges_s=edges,
+        bands_hz=tuple(np.geomspace(min(LOWEST * rate / window, top / 2.0), top, BANDS + 1).tolist()),
+        floors=(SILENT * powers[0] + np.finfo(float).tiny, SILENT * powers[1] + np.finfo(float).tiny),
+    )
+
+
+def _speed(recording: Recording) -> FloatArray:
+    """Return the speed of the reference, but for jumps at restarts."""
+    steps = np.diff(recording.r) * recording.sample_rate
+    steps = np.where(recording.restart[1:], 0.0, steps)
+    size = max(1, round(SPEED_TIME * recording.sample_rate))
+    return np.convolve(steps, np.full(size, 1.0 / size), mode="same")
+
+
+def _period(recordings: Sequence[Recording]) -> int:
+    """Return the period of the reference that all recordings share [samples]; 0 where there is none."""
+    found = {_period_of(one) for one in recordings}
+    return found.pop() if len(found) == 1 else 0
+
+
+def _period_of(recording: Recording) -> int:
+    """Return after how many samples the reference repeats, from segment to segment or within one."""
+    cuts = np.append(np.flatnonzero(recording.restart), recording.samples)
+    if not recording.restart[0]:
+        cuts = np.insert(cuts, 0, 0)
+    lengths = np.diff(cuts)
+    r = recording.r
+    if len(lengths) > 1 and len(set(lengths.tolist())) == 1:
+        segments = r.reshape(len(lengths), -1)
+        if float(segments.var(axis=0).mean()) <= REPEATS * float(r.var()):
+            return int(lengths[0])
+    if len(lengths) > 1:
+        return 0
+    return _repetition(r[:MOST_SAMPLES])
+
+
+def _repetition(r: FloatArray) -> int:
+    """Return the lag after which a signal repeats: the first at which it has become unlike itself and alike again."""
+    n, x = len(r), r - r.mean()
+    variance = float(x.var())
+    if not variance > 0.0:
+        return 0
+    size = 1 << (2 * n - 1).bit_length()
+    spectrum = np.fft.rfft(x, size)
+    products = np.fft.irfft(spectrum * spectrum.conj(), size)[: n // 2]
+    squares = np.concatenate([[0.0], np.cumsum(x**2)])
+    lags = np.arange(len(products))
+    pairs = n - lags
+    difference = (squares[n - lags] + squares[n] - squares[lags] - 2.0 * products) / pairs
+    unlike = np.flatnonzero(difference > variance)
+    if not len(unlike):
+        return 0
+    alike = np.flatnonzero(difference[unlike[0] :] < REPEATS * variance)
+    if not len(alike):
+        return 0
+    first = unlike[0] + int(alike[0])
+    # the dip is as wide as the motion is smooth: its lowest point is the period
+    after = np.flatnonzero(difference[first:] >= REPEATS * variance)
+    end = first + (int(after[0]) if len(after) else len(difference) - first)
+    return int(first + np.argmin(difference[first:end]))
