@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy import motion as study
+from accuracy import rig
 from accuracy.axis import AXES, RATE, loop, moves, random_motion, record
 
 import servoscope as ss
+from servoscope.core.errors import RecordingError
 from servoscope.detection.motion import WINDOWS, RecordedMotion
 from servoscope.diagnosis.examine import Examination
 from servoscope.service.examination import examine_blocks
@@ -116,8 +118,6 @@ def test_a_square_root_valve_with_a_linear_file_is_no_leak_at_another_amplitude(
 
 def test_a_plant_that_explains_its_recordings_holds_under_any_motion() -> None:
     """The reference rig's file is right, so a fault under a motion never seen is named as before."""
-    from accuracy import rig
-
     learned = rig.baseline("multisine", 60.0, 0)
     assert learned.extrapolates and learned.motion is not None and learned.limited_motion is None
     r = 0.5 * reference("profile", 60.0, 100.0)
@@ -160,3 +160,19 @@ def test_healthy_names_what_is_not_watched() -> None:
     )
     stiff = loop().plant.model_copy(update={"friction": "none", "offset": False, "order": 4})
     assert stiff.unwatched == ("backlash", "coulomb_friction", "load")
+
+
+def test_signals_beyond_all_units_are_an_error_of_one_line() -> None:
+    recording = under("as learned")
+    with pytest.raises(RecordingError, match="check the units of r, u and y") as raised:
+        ss.diagnose(belt(), study.replace(recording, y=1e300 * recording.y))
+    assert "\n" not in str(raised.value)
+
+
+def test_an_output_that_never_changes_says_nothing() -> None:
+    """Of a loop that is known to the last sample it is less than the noise, by which the refit divided."""
+    recording, _ = ss.simulate(rig.loop(), reference("multisine", 30.0, 100.0), seed=1)
+    diagnosis = ss.diagnose(
+        rig.baseline("multisine", 60.0, 0), study.replace(recording, u=0.0 * recording.u, y=0.0 * recording.y)
+    )
+    assert diagnosis.verdict == "undetermined" and not diagnosis.candidates

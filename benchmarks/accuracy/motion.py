@@ -21,7 +21,7 @@ MOTIONS: dict[str, Motion] = {
     "as learned": moves,
     "slower": lambda seed: moves(seed, time=2.0),
     "larger": lambda seed: moves(seed, size=0.5, time=1.6),
-    "random, 2 Hz": functools.partial(random_motion, acceleration=4.0),
+    "random, 2 Hz": functools.partial(random_motion, acceleration=6.0),
     "random, u at its limits": functools.partial(random_motion, acceleration=9.0),
 }
 FAULTS: dict[str, tuple[str, Callable[[Axis], Axis]]] = {

@@ -25,6 +25,7 @@ __all__ = ["QUANTITIES", "MotionRange", "RecordedMotion", "learn_motion"]
 QUANTITIES = ("amplitude", "speed", "acceleration", "frequency")
 # of the windows in memories: the last ones, which the estimate remembers, and those around, which vary less
 WINDOWS = ((2.0, False), (4.0, True))
+TOLERANCE = 0.05  # relative excess by which recordings of one kind of motion differ
 ENOUGH = 0.5  # of a window, from which what it holds of the recording's beginning counts
 SMALLEST = 1e-3  # of the largest value of a quantity: below, r or y counts as still
 WEAKEST = 1e-6  # of the mean square of a regressor: directions without motion say nothing
@@ -127,15 +128,16 @@ class RecordedMotion:
     def model_error(self, seen: MotionRange, tuning: Tuning, at: slice) -> FloatArray:
         """Return the covariance that the model's error may add to theta_hat at evaluations, shape (K, n, n).
 
-        It is the bound of this module's first lines times the squared excess, up to 1; with the size of eta grows what
-        the model leaves out of it.
+        It is the bound of this module's first lines times the squared excess beyond `TOLERANCE`, up to 1. What the
+        model leaves out of eta grows with the size of eta.
         """
         n, scale, theta = len(tuning.theta), tuning.scale, tuning.theta
         means, _ = self._means(at, *WINDOWS[0])
         normal = means[:, SIGNALS * MOMENTS :].reshape(-1, n, n)
         healthy = tuning.R / self.pipeline.memory * np.linalg.inv(tuning.P_d)
         larger = np.maximum((normal @ theta @ theta) / (theta @ healthy @ theta), 1.0)
-        growth = np.minimum(np.abs(self.excess(seen, at)).max(axis=1), 1.0) ** 2
+        excess = np.abs(self.excess(seen, at)).max(axis=1)
+        growth = np.clip(excess - TOLERANCE, 0.0, 1.0) ** 2
         units = np.outer(scale, scale)
         inverse = np.linalg.inv(normal / units + WEAKEST * np.eye(n)) / units
         return np.asarray((tuning.R * larger * growth)[:, None, None] * inverse)

@@ -132,6 +132,8 @@ def _judge_signals(
     points = baseline.per_point if point is None else (baseline.at(point),)
     recording, sensors = check_sensors(points[0], recording)
     exams = [Examination.from_recording(one, recording) for one in points]
+    if recording.y.min() == recording.y.max():  # without the sensor's noise, which every likelihood divides by
+        return leave_undetermined(exams[0], message("warning.no_motion")), exams[0], None
     last = max(_first_alarm_time(exam) for exam in exams)
     near = last - baseline.loop.monitor.memory if np.isfinite(last) else last
     rivals = sorted((exam for exam in exams if _first_alarm_time(exam) >= near), key=_largest_statistic_ratio)
