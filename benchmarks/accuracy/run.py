@@ -34,6 +34,8 @@ from accuracy import (  # noqa: E402
     confidence,
     delay,
     isolation,
+    mixed,
+    motion,
     noisy_output,
     onset,
     pairs,
@@ -53,7 +55,14 @@ PAGE, IMAGES = DOCS / "accuracy.md", DOCS / "images" / "accuracy"
 TABLES: tuple[Table, ...] = (
     *(*bias.TABLES, *confidence.TABLES, *alarms.TABLES, *delay.TABLES),
     *(*isolation.TABLES, *unknown.TABLES, *pairs.TABLES, *sizes.TABLES, *onset.TABLES, *smooth.TABLES),
-    *(*second_rig.TABLES, *wrong_file.TABLES, *noisy_output.TABLES, *signal_defects.TABLES),
+    *(
+        *second_rig.TABLES,
+        *wrong_file.TABLES,
+        *noisy_output.TABLES,
+        *signal_defects.TABLES,
+        *motion.TABLES,
+        *mixed.TABLES,
+    ),
 )
 SCENARIOS = {scenario.id: scenario for table in TABLES for scenario in table.scenarios}
 

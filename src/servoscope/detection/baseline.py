@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError
@@ -21,6 +29,7 @@ from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_const
 from servoscope.detection.expectation import Expectation
 from servoscope.detection.feature_model import FeatureModel
 from servoscope.detection.learned_fault import LearnedFault
+from servoscope.detection.motion import MotionRange
 from servoscope.detection.sensors import SensorModel
 from servoscope.detection.threshold_calibration import SEQUENTIAL, CalibrationFactors, t2_threshold
 from servoscope.estimation.filter_bank import nominal_theta
@@ -111,6 +120,8 @@ class Baseline(ShortRepr, _BaselineModel):
     features, left_out
         What the healthy recordings show besides their coefficients, and the largest T^2 of each of them as a multiple
         of its limit when learned without it. None and empty where there are fewer than four recordings.
+    motion
+        The motion that the recordings hold; None in baselines of earlier versions, and where they are very short.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -153,6 +164,7 @@ class Baseline(ShortRepr, _BaselineModel):
     instrument: InstrumentTuning | None = None
     features: FeatureModel | None = None
     left_out: Vector = ()
+    motion: MotionRange | None = None
     point: str = ""
     others: tuple[Baseline, ...] = ()
 
@@ -185,6 +197,14 @@ class Baseline(ShortRepr, _BaselineModel):
         if any(other.others for other in self.others):
             raise ValueError("others must have no others")
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_nothing(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave the motion out where there is none: a baseline of an earlier version is written as it was."""
+        fields: dict[str, Any] = write(self)
+        if self.motion is None:
+            fields.pop("motion", None)
+        return fields
 
     @cached_property
     def loop(self) -> Loop:
@@ -227,6 +247,20 @@ class Baseline(ShortRepr, _BaselineModel):
         theta, scale, P_d = (np.array(value) for value in arrays)
         a, b, gamma = (np.array(value) for value in (self.noise_a, self.noise_b, self.noise_gamma))
         return Tuning(theta, scale, P_d, self.R, ArmaNoise(a, b, gamma, self.noise_variance))
+
+    @property
+    def extrapolates(self) -> bool:
+        """Whether the model holds under a motion that the recordings do not hold.
+
+        So it does where the plant of the loop file explains them down to their noise as it stands. A plant that is not
+        linear, or a file that is wrong, asks for further parameters, or leaves no sequential test.
+        """
+        return bool(self.members) and set(self.ratios) == set(self.loop.plant.parameters)
+
+    @property
+    def limited_motion(self) -> MotionRange | None:
+        """The motion outside of which the model is not known to hold; None where it is, or nothing was stored."""
+        return None if self.extrapolates else self.motion
 
     def pipeline(self) -> Pipeline:
         """Return the loop's chain of constant matrices."""

@@ -88,4 +88,5 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     recalled = recording.rows(slice(first, last + 1))
     settled = whole is not None
     signatures = fault_signatures(exam.baseline, recalled, expectation, max(onset.sample - first, 0), settled)
-    return signatures, deviation, covariance + exam.baseline.covariance_array()
+    model_error = exam.model_error(slice(at, at + 1))[0]
+    return signatures, deviation, covariance + exam.baseline.covariance_array() + model_error

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from servoscope.core.blas import with_one_blas_thread
-from servoscope.core.messages import message
+from servoscope.core.errors import RecordingError, SimulationError
+from servoscope.core.messages import Message, message
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import Onset, estimate_onset
 from servoscope.detection.result import (
@@ -27,8 +28,8 @@ from servoscope.detection.result import (
 from servoscope.detection.signal_defects import find_signal_defect
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
-from servoscope.diagnosis.examine import Examination
-from servoscope.diagnosis.explanation import build_headline, build_reasons
+from servoscope.diagnosis.examine import UNSEEN, Examination
+from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
 from servoscope.diagnosis.ml_refit import (
     disagreement_warnings,
     refit_candidates,
@@ -36,6 +37,7 @@ from servoscope.diagnosis.ml_refit import (
     refit_recording,
     summarise_refit,
 )
+from servoscope.diagnosis.motion_check import motion_warnings
 from servoscope.diagnosis.output_onset import refine_onset
 from servoscope.diagnosis.sensor_check import check_sensors
 from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from servoscope.isolation.ml import RefitResult
 
 SURE = 0.95  # probability from which a fault is named
+LARGEST = 1e60  # of a signal; products of four of them still are numbers
 DOUBTFUL = 0.05  # probability of an unknown change from which an operating point does not explain a recording
 
 
@@ -107,6 +110,20 @@ def _diagnose_at_point(
     baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     """Return the diagnosis at the operating point that explains the recording, and what its trace is made of."""
+    largest = max(float(max(x.max(), -x.min())) for x in (recording.r, recording.u, recording.y))
+    if largest > LARGEST:
+        raise RecordingError(f"{recording.name}: has values up to {largest:.2g}, check the units of r, u and y")
+    try:
+        return _judge_sound_part(baseline, recording, progress, point)
+    except (np.linalg.LinAlgError, SimulationError, ArithmeticError) as error:
+        reason = f"its numbers have no solution ({error})"
+        raise RecordingError(f"{recording.name}: {reason}; check units, signs and sizes of r, u and y") from None
+
+
+def _judge_sound_part(
+    baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
+) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
+    """Return what `_diagnose_at_point` does, of the recording up to a signal that is stuck or jumps."""
     defect = find_signal_defect(recording)
     if defect is not None:
         sound = recording.part(float(recording.t[0]), float(recording.t[max(defect.begin, MIN_SAMPLES)]))
@@ -121,6 +138,8 @@ def _judge_signals(
     points = baseline.per_point if point is None else (baseline.at(point),)
     recording, sensors = check_sensors(points[0], recording)
     exams = [Examination.from_recording(one, recording) for one in points]
+    if recording.y.min() == recording.y.max():  # without the sensor's noise, which every likelihood divides by
+        return leave_undetermined(exams[0], message("warning.no_motion")), exams[0], None
     last = max(_first_alarm_time(exam) for exam in exams)
     near = last - baseline.loop.monitor.memory if np.isfinite(last) else last
     rivals = sorted((exam for exam in exams if _first_alarm_time(exam) >= near), key=_largest_statistic_ratio)
@@ -131,7 +150,8 @@ def _judge_signals(
     if (reason := describe_correction(points, recording)) is not None:
         return leave_undetermined(rivals[0], reason), rivals[0], None
     found = sorted(
-        ((*diagnose_examination(exam, progress), exam) for exam in rivals), key=lambda one: _change_size(one[0])
+        ((*diagnose_examination(exam, progress), exam) for exam in rivals),
+        key=lambda one: (one[0].verdict != "fault", _change_size(one[0])),
     )
     diagnosis, correction, exam = found[0]
     others = [message("warning.point", other=other.headline) for other, *_ in found[1:] if _is_explained(other)]
@@ -144,7 +164,7 @@ def _with_warnings(diagnosis: Diagnosis, more: Sequence[DiagnosisWarning]) -> Di
 
 
 def _first_alarm_time(exam: Examination) -> float:
-    alarms = np.flatnonzero(exam.alarm)
+    alarms = np.flatnonzero(exam.apparent_alarm)
     changed = _changed_at(exam)
     return min(float(exam.t(alarms[0])) if alarms.size else np.inf, np.inf if changed is None else changed)
 
@@ -168,7 +188,8 @@ def _change_size(diagnosis: Diagnosis) -> float:
 
 def _is_explained(diagnosis: Diagnosis) -> bool:
     """Return whether known faults explain the change."""
-    return all(c.probability < DOUBTFUL for c in diagnosis.candidates if c.name == UNKNOWN)
+    known = all(c.probability < DOUBTFUL for c in diagnosis.candidates if c.name == UNKNOWN)
+    return known and bool(diagnosis.candidates)
 
 
 def diagnose_examination(
@@ -182,6 +203,7 @@ def diagnose_examination(
     interval: FaultInterval | None = None
     onset: Onset | None = None
     detectable: dict[str, tuple[float, float]] = {}
+    unwatched: tuple[Message, ...] = ()
     at, features = last, exam.features
     changed = features.changed if features is not None else None
     if alarm is not None:
@@ -193,8 +215,9 @@ def diagnose_examination(
     else:
         detectable = detectable_sizes(exam)
         doubts = power_warnings(exam, detectable)
-        verdict = "undetermined" if doubts else "healthy"
-    warnings += doubts
+        verdict = "undetermined" if doubts or exam.apparent_alarm.any() else "healthy"
+        unwatched = unwatched_changes(baseline.plant, detectable)
+    warnings += motion_warnings(exam) + doubts
     correction = estimate_bias_correction(exam, interval.candidates if interval else (), onset, at)
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
@@ -204,7 +227,7 @@ def diagnose_examination(
     if features is not None and changed is not None and alarm is None:
         headline = features.headline(changed, baseline.point)
     else:
-        headline = build_headline(verdict, interval, detectable, warnings, baseline.point)
+        headline = build_headline(verdict, interval, detectable, warnings, baseline.point, unwatched)
     diagnosis = Diagnosis(
         recording=recording.name,
         samples=recording.samples,
@@ -229,7 +252,9 @@ def _explain_alarm(
     recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
     progress("refit")
     last = int(exam.estimates.index[alarm.evaluation])
-    refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit"))
+    # the refit takes the model for exact
+    seen = (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
+    refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
         candidates, refit = refit_candidates(refined), summarise_refit(refined, exam, recursive)
         onset = onset if refined.is_unknown else refit_onset(refined, exam)

@@ -23,6 +23,7 @@ from servoscope.detection import cusum_design
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
 from servoscope.detection.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
+from servoscope.detection.motion import RecordedMotion
 from servoscope.detection.result import Statistic, any_exceeded, detection_statistics
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
@@ -35,6 +36,8 @@ MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip b
 WEAKEST_INSTRUMENT = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
 FALL_BACK = {"estimator": "akf"}
 MIN_NOISE_GROWTH = 1.5  # of the variance; below it counts as none
+UNSEEN = 0.1  # relative, by which a motion is outside of the baseline's from which on it counts as never seen
+AT_ONCE = 4096  # evaluations
 FORGOTTEN = 1e-9  # share of the past below which it counts as forgotten
 MEMORIES = 22.0  # after which it usually is
 
@@ -108,11 +111,48 @@ class Examination:
         model = self.baseline.features
         return None if model is None else FeatureEvidence.of(model, self.recording)
 
+    @property
+    def _of_coefficients(self) -> tuple[Statistic, ...]:
+        return detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready)
+
+    @cached_property
+    def apparent_alarm(self) -> npt.NDArray[np.bool_]:
+        """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
+        return apply_alarm_delays(any_exceeded(self._of_coefficients), *self.pipeline.delays)
+
     @cached_property
     def alarm(self) -> npt.NDArray[np.bool_]:
-        """Whether there was an alarm of the coefficients, which isolation explains, after the delays, shape (K,)."""
-        statistics = detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready)
-        return apply_alarm_delays(any_exceeded(statistics), *self.pipeline.delays)
+        """Whether there was an alarm of the coefficients that a motion never seen does not explain, shape (K,)."""
+        if self.motion is None or not self.apparent_alarm.any():
+            return self.apparent_alarm
+        exceeded = np.zeros(self.evaluations, dtype=np.bool_)
+        e, limit = self.estimates, self.baseline.limit
+        for at in outofcore.iter_chunks(0, self.evaluations, e.theta, e.S, at_once=AT_ONCE):
+            C = self.covariance(at) + self.model_error(at)
+            T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
+            # the sequential test knows no model error
+            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN))
+        return apply_alarm_delays(exceeded & any_exceeded(self._of_coefficients), *self.pipeline.delays)
+
+    @cached_property
+    def motion(self) -> RecordedMotion | None:
+        """The motion; None where the model is known to hold under any."""
+        seen = self.baseline.limited_motion
+        return None if seen is None else RecordedMotion.from_recording(self.pipeline, self.recording, seen.origin)
+
+    def motion_excess(self, at: slice) -> FloatArray:
+        """Return how far the motion is outside of the baseline's at some evaluations, relative, shape (K,)."""
+        seen = self.baseline.limited_motion
+        if self.motion is None or seen is None:
+            return np.zeros(len(self.statistic[at]))
+        return np.asarray(np.abs(self.motion.excess(seen, at)).max(axis=1))
+
+    def model_error(self, at: slice) -> FloatArray:
+        """Return what a motion never seen adds to the covariance at some evaluations, shape (K, n, n)."""
+        seen = self.baseline.limited_motion
+        if self.motion is None or seen is None:
+            return np.zeros_like(self.estimates.S[at])
+        return self.motion.model_error(seen, self.tuning, at)
 
     def memory_start(self, at: int) -> int:
         """Return the sample before which loop, filters and estimator have forgotten everything in an evaluation.

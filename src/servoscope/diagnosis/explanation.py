@@ -22,6 +22,7 @@ from servoscope.detection.result import (
 )
 from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.models.plants import Plant
 
 MIN_CHANGE_STD = 3.0  # standard deviations from which a value has changed
 MOST_LISTED = 3  # values, and rejected candidates
@@ -41,18 +42,22 @@ def build_headline(
     detectable: Mapping[str, tuple[float, float]],
     warnings: Sequence[DiagnosisWarning],
     point: str = "",
+    unwatched: Sequence[Message] = (),
 ) -> Message:
     """Return the verdict in one sentence.
 
-    `detectable`: by parameter, the smallest change that the recording would have shown, and what the baseline promises.
+    `detectable`: by parameter, the smallest change that the recording would have shown, and what the baseline promises;
+    `unwatched`: changes of which it would have shown nothing.
     """
     at = message("diagnosis.point", name=point) if point else None
     if verdict == "healthy":
         sizes = sorted((size, parameter) for parameter, (size, _) in detectable.items())
         smallest = tuple(message("diagnosis.smallest", parameter=parameter, size=size) for size, parameter in sizes)
-        return message("diagnosis.healthy", point=at, smallest=smallest)
+        if not unwatched:
+            return message("diagnosis.healthy", point=at, smallest=smallest)
+        return message("diagnosis.healthy_limits", point=at, smallest=smallest, unwatched=tuple(unwatched))
     if verdict == "undetermined" or interval is None:
-        reason = next(warning.description for warning in warnings if warning.kind == "power")
+        reason = next(warning.description for warning in warnings if warning.kind in ("motion", "power"))
         return undetermined_headline(reason, point)
     since = _onset_message(interval)
     mimic = interval.refit.mimics[0].description if interval.refit and interval.refit.mimics else None
@@ -71,6 +76,15 @@ def build_headline(
             return message("diagnosis.unknown", point=at, since=since, mimic=instead)
         return message("diagnosis.unknown_singles", point=at, since=since, mimic=instead)
     return _ambiguous_headline(likely, at, since)
+
+
+def unwatched_changes(plant: Plant, detectable: Mapping[str, tuple[float, float]]) -> tuple[Message, ...]:
+    """Return the changes of which a healthy verdict says nothing: without a size that would have shown."""
+    hidden = [
+        fault.parameter for fault in plant.faults if not np.isfinite(detectable.get(fault.parameter, (np.inf,))[0])
+    ]
+    parameters = tuple(message("cause.change_of", parameter=parameter) for parameter in dict.fromkeys(hidden))
+    return (*parameters, *(message(f"cause.{kind}") for kind in plant.unwatched))
 
 
 def _onset_message(interval: FaultInterval) -> Message | None:

@@ -21,7 +21,7 @@ def describe_correction(points: Sequence[Baseline], recording: Recording) -> Mes
     first = points[0]
     for correction in find_corrections(first.pipeline(), np.array(first.theta), first.R, recording):
         corrected = correction.apply(recording)
-        if any(not Examination.from_recording(point, corrected).alarm.any() for point in points):
+        if any(not Examination.from_recording(point, corrected).apparent_alarm.any() for point in points):
             return correction.description
     return None
 

@@ -15,6 +15,7 @@ from servoscope.detection.baseline import Baseline, BaselineSource, digest
 from servoscope.detection.cusum_design import CusumHypothesis
 from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system
 from servoscope.detection.homogeneity import describe_outliers, find_outliers, leave_one_out, scatter
+from servoscope.detection.motion import learn_motion
 from servoscope.detection.plant_fit import (
     MOST_SATURATED,
     can_simulate,
@@ -313,6 +314,7 @@ def _assemble_baseline(
         instrument=pipeline.instrument,
         features=features,
         left_out=tuple(left_out),
+        motion=learn_motion(pipeline, recordings),
     )
     progress("predictor")
     predictor = fit_exact_predictor(baseline, recordings)

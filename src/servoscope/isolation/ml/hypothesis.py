@@ -97,17 +97,20 @@ def fit_hypothesis(
     ends = []
     for x in starts:
         z = np.clip(np.concatenate([d, x])[held:], lowest + AT_BOUND, highest - AT_BOUND)
-        found = minimise(
-            residual,
-            z,
-            jacobian,
-            bounds=(lowest, highest),
-            x_scale="jac",
-            ftol=1e-7 if free else 1e-4,
-            xtol=1e-7 if free else 1e-4,
-            gtol=None,
-            max_nfev=STEPS,
-        )
+        try:
+            found = minimise(
+                residual,
+                z,
+                jacobian,
+                bounds=(lowest, highest),
+                x_scale="jac",
+                ftol=1e-7 if free else 1e-4,
+                xtol=1e-7 if free else 1e-4,
+                gtol=None,
+                max_nfev=STEPS,
+            )
+        except ValueError as error:  # residuals that are no numbers
+            raise np.linalg.LinAlgError(str(error)) from None
         ends.append(found)
     best = min(ends, key=lambda found: float(found.cost))
     z, J = whole(np.asarray(best.x)), np.asarray(best.jac, dtype=np.float64)

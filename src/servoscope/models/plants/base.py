@@ -171,6 +171,11 @@ class Plant(BaseModel, abc.ABC):
         return expanded
 
     @property
+    def unwatched(self) -> tuple[str, ...]:
+        """Kinds of change of which no coefficient tells, by their key among the catalogue's causes."""
+        return "backlash", "compliance", "load"
+
+    @property
     def causes(self) -> Mapping[str, str]:
         """Further names that `scaled` takes, changes that are no fault of the list, each with what it would mean."""
         return {}

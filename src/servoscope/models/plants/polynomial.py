@@ -88,6 +88,17 @@ class PolynomialPlant(Plant):
         return (*friction[self.friction], *(("one",) if self.offset else ()))
 
     @property
+    def unwatched(self) -> tuple[str, ...]:
+        """Friction, load and compliance only where no coefficient of their own shows them."""
+        friction = () if self.friction != "none" else ("coulomb_friction",)
+        return (
+            "backlash",
+            *friction,
+            *(() if self.order == 4 else ("compliance",)),
+            *(() if self.offset else ("load",)),
+        )
+
+    @property
     def has_physics(self) -> bool:
         """Whether nominal coefficients are given."""
         return self.coefficients is not None

@@ -1,0 +1,177 @@
+"""Which motion the healthy recordings hold, and how far the model may be off under a motion that they do not hold.
+
+What a model leaves out is orthogonal to its regressors under the motion that it was fitted to, and under no other. Of a
+residual of variance R it moves least squares by at most (R (sum phi phi'/N)^-1)^1/2 in any direction, by Cauchy and
+Schwarz, and it grows with the distance from the motion that was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from servoscope.core import outofcore
+from servoscope.core.arrays import FloatArray
+from servoscope.estimation.filter_bank import filter_cutoff
+from servoscope.estimation.pipeline import Pipeline, RegressionRunner, Tuning
+from servoscope.models.plants.polynomial import PolynomialPlant
+from servoscope.signals import Recording
+
+__all__ = ["QUANTITIES", "MotionRange", "RecordedMotion", "learn_motion"]
+
+QUANTITIES = ("amplitude", "speed", "acceleration", "frequency")
+# of the windows in memories: the last ones, which the estimate remembers, and those around, which vary less
+WINDOWS = ((2.0, False), (4.0, True))
+TOLERANCE = 0.05  # relative excess by which recordings of one kind of motion differ
+ENOUGH = 0.5  # of a window, from which what it holds of the recording's beginning counts
+SMALLEST = 1e-3  # of the largest value of a quantity: below, r or y counts as still
+WEAKEST = 1e-6  # of the mean square of a regressor: directions without motion say nothing
+SIGNALS = 2  # r and y
+MOMENTS = 3  # mean squares of position, speed and acceleration
+
+Ranges = tuple[tuple[tuple[float, ...], ...], ...]
+
+
+class MotionRange(BaseModel):
+    """The motion of the healthy recordings: what root mean squares over windows of `WINDOWS` were between.
+
+    `least`, `most`: window by window, of r and of y, the `QUANTITIES`: distance from `origin`, speed, acceleration, and
+    acceleration over speed as a frequency [Hz].
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    origin: float  # mean of y
+    least: Ranges
+    most: Ranges
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedMotion:
+    """The motion of a recording around each of its K evaluations, from sums over all samples that updated the estimate.
+
+    `sums`, shape (K + 1, 1 + 6 + n n): their number, squares of position, speed and acceleration of r and of y behind
+    the loop's filter, and phi phi'.
+    """
+
+    pipeline: Pipeline
+    sums: FloatArray
+
+    @classmethod
+    def from_recording(cls, pipeline: Pipeline, recording: Recording, origin: float) -> RecordedMotion:
+        """Read a recording once."""
+        own, (of_r, of_y) = RegressionRunner(pipeline), (_kinematics(pipeline) for _ in range(SIGNALS))
+        n, every = pipeline.bank.n, pipeline.every
+        evaluations = recording.samples // every
+        sums = outofcore.empty((evaluations + 2, 1 + SIGNALS * MOMENTS + n * n))
+        sums[:] = 0.0
+        for rows in outofcore.iter_chunks(0, recording.samples):
+            part = recording.rows(rows)
+            r, y = part.r - origin, part.y - origin
+            g = own.advance(part.r, part.u, part.y, part.restart)
+            motion = [runner.advance(x, x, x, part.restart).phi for runner, x in ((of_r, r), (of_y, y))]
+            products = (g.phi[:, :, None] * g.phi[:, None, :]).reshape(len(r), -1)
+            columns = np.column_stack([np.ones_like(r), *(x**2 for x in motion), products]) * g.ok[:, None]
+            which = np.arange(rows.start, rows.stop) // every
+            first = np.flatnonzero(np.diff(which, prepend=-1))
+            sums[which[first] + 1] += np.add.reduceat(columns, first, axis=0)
+            outofcore.release(*recording.columns)
+        np.cumsum(sums, axis=0, out=sums)
+        return cls(pipeline, sums[: evaluations + 1])
+
+    def _means(self, at: slice, memories: float, centred: bool) -> tuple[FloatArray, FloatArray]:
+        """Return means over the window of each of some evaluations, and the samples in it."""
+        updates, length = self.sums[:, 0], memories * self.pipeline.memory
+        end = np.arange(1, len(self.sums))[at]
+        if centred:  # at the ends of a recording the window stays as long as it is
+            upper = np.clip(updates[end] + length / 2.0, length, updates[-1])
+            end = np.minimum(np.searchsorted(updates, upper), len(updates) - 1)
+        begin = np.maximum(np.searchsorted(updates, updates[end] - length, side="right") - 1, 0)
+        inside = self.sums[end] - self.sums[begin]
+        return inside[:, 1:] / np.maximum(inside[:, :1], 1.0), inside[:, 0]
+
+    def quantities(self, at: slice) -> tuple[FloatArray, FloatArray]:
+        """Return `QUANTITIES` at evaluations, window by window, of r and y, shape (K, 2, 2, 4).
+
+        And what share of its length each window has, shape (K, 2).
+        """
+        values, filled = [], []
+        for memories, centred in WINDOWS:
+            means, updates = self._means(at, memories, centred)
+            squares = means[:, : SIGNALS * MOMENTS].reshape(-1, SIGNALS, MOMENTS)
+            amplitude, speed, acceleration = np.moveaxis(np.sqrt(np.maximum(squares, 0.0)), -1, 0)
+            frequency = np.divide(acceleration, 2.0 * np.pi * speed, out=np.zeros_like(speed), where=speed > 0.0)
+            values.append(np.stack([amplitude, speed, acceleration, frequency], axis=-1))
+            filled.append(updates / (memories * self.pipeline.memory))
+        return np.stack(values, axis=1), np.stack(filled, axis=1)
+
+    def excess(self, seen: MotionRange, at: slice) -> FloatArray:
+        """Return how far each quantity is outside of what was seen, relative, negative below, shape (K, 4).
+
+        r and y must both be outside, and on the same side: a fault changes y alone, and r alone moves nothing.
+        """
+        values, filled = self.quantities(at)
+        least, most = np.array(seen.least), np.array(seen.most)
+        floor = SMALLEST * most.max(axis=(0, 1)) + np.finfo(np.float64).tiny
+        values, least, most = (np.maximum(x, floor) for x in (values, least, most))
+        above, below = ((values / most).min(axis=2) - 1.0, (least / values).min(axis=2) - 1.0)
+        outside = np.where(above > 0.0, above, -np.maximum(below, 0.0))
+        outside[filled < ENOUGH] = 0.0
+        if 0 not in self.pipeline.loop.plant.powers:  # without stiffness one place is like another
+            outside[..., 0] = 0.0
+        larger = np.abs(outside).argmax(axis=1)[:, None]
+        return np.asarray(np.take_along_axis(outside, larger, axis=1)[:, 0])
+
+    def model_error(self, seen: MotionRange, tuning: Tuning, at: slice) -> FloatArray:
+        """Return the covariance that the model's error may add to theta_hat at evaluations, shape (K, n, n).
+
+        It is the bound of this module's first lines times the squared excess beyond `TOLERANCE`, up to 1. What the
+        model leaves out of eta grows with the size of eta.
+        """
+        n, scale, theta = len(tuning.theta), tuning.scale, tuning.theta
+        means, _ = self._means(at, *WINDOWS[0])
+        normal = means[:, SIGNALS * MOMENTS :].reshape(-1, n, n)
+        healthy = tuning.R / self.pipeline.memory * np.linalg.inv(tuning.P_d)
+        larger = np.maximum((normal @ theta @ theta) / (theta @ healthy @ theta), 1.0)
+        excess = np.abs(self.excess(seen, at)).max(axis=1)
+        growth = np.clip(excess - TOLERANCE, 0.0, 1.0) ** 2
+        units = np.outer(scale, scale)
+        inverse = np.linalg.inv(normal / units + WEAKEST * np.eye(n)) / units
+        return np.asarray((tuning.R * larger * growth)[:, None, None] * inverse)
+
+
+def learn_motion(pipeline: Pipeline, recordings: Sequence[Recording]) -> MotionRange | None:
+    """Return which motion healthy recordings hold; None where none is as long as the shortest window."""
+    origin = float(np.average([rec.y.mean() for rec in recordings], weights=[rec.samples for rec in recordings]))
+    found: list[FloatArray] = []
+    for recording in recordings:
+        motion = RecordedMotion.from_recording(pipeline, recording, origin)
+        values, filled = motion.quantities(slice(None))
+        full = filled[:, 0] >= min(1.0, filled[:, 0].max(initial=0.0))
+        if full.any() and filled[:, 0].max() >= ENOUGH:
+            found.append(values[full])
+    if not found:
+        return None
+    values = np.concatenate(found)
+    least, most = (_nested(x) for x in (values.min(axis=0), values.max(axis=0)))
+    return MotionRange(origin=origin, least=least, most=most)
+
+
+def _nested(x: FloatArray) -> Ranges:
+    return tuple(tuple(tuple(map(float, row)) for row in window) for window in x)
+
+
+def _kinematics(pipeline: Pipeline) -> RegressionRunner:
+    """Return what forms position, speed and acceleration of a signal behind a filter with the loop's cutoff."""
+    loop = pipeline.loop
+    plain = {"structure": "svf", "cutoff": filter_cutoff(loop), "estimator": "akf", "two_stage": "none"}
+    update = {
+        "plant": PolynomialPlant(order=2, stiffness=True),
+        "monitor": loop.monitor.model_copy(update=plain),
+        "input_deadzone": None,
+        "delay": 0.0,
+    }
+    return RegressionRunner(Pipeline.of(loop.model_copy(update=update)))
