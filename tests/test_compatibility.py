@@ -22,10 +22,11 @@ from golden.results import FOLDER
 WORDS = {"verdict", "name", "parameter", "kind", "recording", "point", "asset", "alarm", "before", "after", "grounds"}
 WORDS |= {"event", "priority", "unit", "loop", "magic", "baseline", "defect"}
 # Keys of results that came later than version 0.1.0.
-ADDED = {"headline", "reasons", "intervals", "description", "sensors", "provenance", "instrument", "features", "left_out"} | {
+ADDED = {
+    *("headline", "reasons", "intervals", "description", "sensors", "provenance", "instrument", "features", "left_out"),
     # of the service: how samples come in, blocks left out for their time stamps, clocks of a fault that stands
-    "reception", "late", "future", "fault_at", "diagnosed",
-}  # fmt: skip
+    *("reception", "late", "future", "fault_at", "diagnosed"),
+}
 # Where version 0.1.0 fitted a delay of noise, the likelihood says 0 [s].
 TOLERANCE = {"delay_s": 1e-4}
 PUBLIC = (FOLDER / "names.txt").read_text(encoding="utf-8").split()

@@ -90,7 +90,7 @@ def refit(*words: str) -> RefitSummary:
 def test_every_case_of_a_fault(candidates: list[Candidate], refit_: RefitSummary | None, expected: str) -> None:
     faults = candidates[0].faults if candidates[0].probability >= 0.95 else ()
     interval = FaultInterval(onset_s=(29.0, 30.0, 31.0), faults=faults, candidates=tuple(candidates), refit=refit_)
-    assert str(build_headline("fault", interval, {}, ())) == expected
+    assert str(build_headline("fault", (interval,), {}, ())) == expected
 
 
 @pytest.mark.parametrize(
@@ -105,16 +105,16 @@ def test_every_case_of_a_fault(candidates: list[Candidate], refit_: RefitSummary
 def test_the_onset_as_it_is_known(changes: dict[str, Any], expected: str) -> None:
     sure = candidate(0.99, LEAK)
     interval = FaultInterval(onset_s=(29.0, 30.0, 31.0), faults=sure.faults, candidates=(sure,), **changes)
-    headline = str(build_headline("fault", interval, {}, (), "warm"))
+    headline = str(build_headline("fault", (interval,), {}, (), "warm"))
     assert headline.startswith("Fault at warm: leakage. ") and headline.endswith(expected)
 
 
 def test_healthy_and_undetermined() -> None:
     sizes = {"C_ie": (0.036, 0.05), "p_s": (0.0169, 0.02)}
-    assert str(build_headline("healthy", None, sizes, ())) == (
+    assert str(build_headline("healthy", (), sizes, ())) == (
         "Healthy: no change found. This recording would have shown changes of p_s by 1.69 %, C_ie by 3.6 % or more."
     )
     short = DiagnosisWarning(kind="power", from_s=0.0, to_s=1.0, count=1, description=message("warning.no_motion"))
-    assert str(build_headline("undetermined", None, {}, (short,), "cold")) == (
+    assert str(build_headline("undetermined", (), {}, (short,), "cold")) == (
         "Undetermined at cold: too short or too little motion: no change of any size could have been detected."
     )

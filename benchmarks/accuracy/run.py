@@ -38,11 +38,13 @@ from accuracy import (  # noqa: E402
     motion,
     noisy_output,
     onset,
+    own_past,
     pairs,
     second_rig,
     signal_defects,
     sizes,
     smooth,
+    timelines,
     unknown,
     wrong_file,
 )
@@ -54,15 +56,9 @@ DOCS = BENCHMARKS.parent / "docs"
 PAGE, IMAGES = DOCS / "accuracy.md", DOCS / "images" / "accuracy"
 TABLES: tuple[Table, ...] = (
     *(*bias.TABLES, *confidence.TABLES, *alarms.TABLES, *delay.TABLES),
-    *(*isolation.TABLES, *unknown.TABLES, *pairs.TABLES, *sizes.TABLES, *onset.TABLES, *smooth.TABLES),
-    *(
-        *second_rig.TABLES,
-        *wrong_file.TABLES,
-        *noisy_output.TABLES,
-        *signal_defects.TABLES,
-        *motion.TABLES,
-        *mixed.TABLES,
-    ),
+    *(*isolation.TABLES, *unknown.TABLES, *pairs.TABLES, *sizes.TABLES, *onset.TABLES, *timelines.TABLES),
+    *(*own_past.TABLES, *smooth.TABLES, *second_rig.TABLES, *wrong_file.TABLES, *noisy_output.TABLES),
+    *(*signal_defects.TABLES, *motion.TABLES, *mixed.TABLES),
 )
 SCENARIOS = {scenario.id: scenario for table in TABLES for scenario in table.scenarios}
 

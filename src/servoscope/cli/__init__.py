@@ -20,4 +20,16 @@ from servoscope.cli.app import app, group_commands, main
 
 group_commands()
 
-__all__ = ["alarms", "app", "export", "fleet", "init", "main", "recordings", "service", "simulate_design", "trend", "web"]
+__all__ = [
+    "alarms",
+    "app",
+    "export",
+    "fleet",
+    "init",
+    "main",
+    "recordings",
+    "service",
+    "simulate_design",
+    "trend",
+    "web",
+]

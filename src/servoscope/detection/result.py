@@ -173,7 +173,8 @@ class FaultInterval(_ResultModel):
 
     detected_at_s: float | None = None  # first evaluation above a threshold
     onset_s: tuple[float, float, float] | None = None  # lower end, most likely, upper end of the 95 % interval
-    end_s: float | None = None  # when the alarm went; None while it lasts
+    end_s: float | None = None  # when it was over, or the alarm gone; None while it lasts
+    end_interval_s: tuple[float, float, float] | None = None  # the same with its 95 % interval, where a refit dates it
     from_start: bool = False  # the change may be older than the recording
     probability: float | None = None  # of the first candidate
     faults: tuple[FaultEstimate, ...] = ()  # those that are named; none where no candidate reaches probability 0.95
@@ -191,7 +192,11 @@ class Provenance(_ResultModel):
     recording: str
 
 
-WRITTEN_INTERVAL = frozenset(FaultInterval.model_fields) - {"end_s", "from_start"}  # fields that a Diagnosis repeats
+WRITTEN_INTERVAL = frozenset(FaultInterval.model_fields) - {
+    "end_s",
+    "end_interval_s",
+    "from_start",
+}  # fields that a Diagnosis repeats
 
 
 class Diagnosis(ShortRepr, _ResultModel):

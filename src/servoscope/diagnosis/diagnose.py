@@ -39,8 +39,10 @@ from servoscope.diagnosis.ml_refit import (
 )
 from servoscope.diagnosis.motion_check import motion_warnings
 from servoscope.diagnosis.output_onset import refine_onset
+from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
 from servoscope.diagnosis.sensor_check import check_sensors
 from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
+from servoscope.diagnosis.timeline import trace_timeline
 from servoscope.diagnosis.warnings import detectable_sizes, estimate_warnings, power_warnings, warning_throughout
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.isolation.isolate import isolate
@@ -140,6 +142,9 @@ def _judge_signals(
     exams = [Examination.from_recording(one, recording) for one in points]
     if recording.y.min() == recording.y.max():  # without the sensor's noise, which every likelihood divides by
         return leave_undetermined(exams[0], message("warning.no_motion")), exams[0], None
+    if (own := next(filter(None, map(examine_by_own_past, exams)), None)) is not None and own.alarm.any():
+        diagnosis, correction = diagnose_examination(own, progress)
+        return _with_warnings(diagnosis, [own_past_warning(own), *sensors]), own, correction
     last = max(_first_alarm_time(exam) for exam in exams)
     near = last - baseline.loop.monitor.memory if np.isfinite(last) else last
     rivals = sorted((exam for exam in exams if _first_alarm_time(exam) >= near), key=_largest_statistic_ratio)
@@ -200,7 +205,7 @@ def diagnose_examination(
     warnings = [DiagnosisWarning.of(defect) for defect in recording.defects] + estimate_warnings(exam)
     alarm = first_alarm(exam, progress)
     verdict: Verdict = "fault"
-    interval: FaultInterval | None = None
+    intervals: tuple[FaultInterval, ...] = ()
     onset: Onset | None = None
     detectable: dict[str, tuple[float, float]] = {}
     unwatched: tuple[Message, ...] = ()
@@ -208,16 +213,18 @@ def diagnose_examination(
     changed = features.changed if features is not None else None
     if alarm is not None:
         at = alarm.evaluation
-        interval, onset, doubts = _explain_alarm(exam, alarm, progress)
+        intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
     elif changed is not None:
         unknown = (Candidate(name=UNKNOWN, probability=1.0),)
-        interval, doubts = FaultInterval(detected_at_s=_changed_at(exam), probability=1.0, candidates=unknown), []
+        doubts = []
+        intervals = (FaultInterval(detected_at_s=_changed_at(exam), probability=1.0, candidates=unknown),)
     else:
         detectable = detectable_sizes(exam)
         doubts = power_warnings(exam, detectable)
         verdict = "undetermined" if doubts or exam.apparent_alarm.any() else "healthy"
         unwatched = unwatched_changes(baseline.plant, detectable)
     warnings += motion_warnings(exam) + doubts
+    interval = next((one for one in intervals if _covers(one, float(exam.t(at)))), intervals[-1] if intervals else None)
     correction = estimate_bias_correction(exam, interval.candidates if interval else (), onset, at)
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
@@ -227,7 +234,7 @@ def diagnose_examination(
     if features is not None and changed is not None and alarm is None:
         headline = features.headline(changed, baseline.point)
     else:
-        headline = build_headline(verdict, interval, detectable, warnings, baseline.point, unwatched)
+        headline = build_headline(verdict, intervals, detectable, warnings, baseline.point, unwatched)
     diagnosis = Diagnosis(
         recording=recording.name,
         samples=recording.samples,
@@ -235,7 +242,7 @@ def diagnose_examination(
         verdict=verdict,
         headline=headline,
         reasons=reasons,
-        intervals=(interval,) if interval is not None else (),
+        intervals=intervals,
         parameters=_final_coefficients(end),
         ifrf=_final_response(end),
         warnings=tuple(sorted(warnings, key=lambda warning: warning.from_s)),
@@ -246,8 +253,8 @@ def diagnose_examination(
 
 def _explain_alarm(
     exam: Examination, alarm: RecordingAlarm, progress: Callable[[str], None]
-) -> tuple[FaultInterval, Onset, list[DiagnosisWarning]]:
-    """Return the interval that begins with an alarm, its onset, and doubts about the explanation."""
+) -> tuple[tuple[FaultInterval, ...], Onset, list[DiagnosisWarning]]:
+    """Return the intervals that begin with an alarm, the onset of the explained one, and doubts about explanations."""
     onset, refit, doubts = alarm.onset, None, list[DiagnosisWarning]()
     recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
     progress("refit")
@@ -256,6 +263,9 @@ def _explain_alarm(
     seen = (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
     refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
+        several = trace_timeline(exam, refined, alarm.onset, recursive, SURE, lambda: progress("refit"))
+        if several:
+            return several, _onset_of(several, exam, alarm), []
         candidates, refit = refit_candidates(refined), summarise_refit(refined, exam, recursive)
         onset = onset if refined.is_unknown else refit_onset(refined, exam)
         doubts = disagreement_warnings(exam, candidates, refit, SURE)
@@ -271,7 +281,20 @@ def _explain_alarm(
         candidates=candidates,
         refit=refit,
     )
-    return interval, onset, doubts
+    return (interval,), onset, doubts
+
+
+def _covers(interval: FaultInterval, t: float) -> bool:
+    begin = -np.inf if interval.onset_s is None else interval.onset_s[1]
+    return begin <= t and (interval.end_s is None or t <= interval.end_s)
+
+
+def _onset_of(intervals: Sequence[FaultInterval], exam: Examination, alarm: RecordingAlarm) -> Onset:
+    """Return the onset of the interval in which the explained evaluation lies, the last one where none does."""
+    at = float(exam.t(alarm.evaluation))
+    one = next((each for each in intervals if _covers(each, at)), intervals[-1])
+    assert one.onset_s is not None
+    return Onset(*one.onset_s, int(np.searchsorted(exam.recording.t, one.onset_s[1])))
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def undetermined_headline(reason: Message, point: str = "") -> Message:
 
 def build_headline(
     verdict: Verdict,
-    interval: FaultInterval | None,
+    intervals: Sequence[FaultInterval],
     detectable: Mapping[str, tuple[float, float]],
     warnings: Sequence[DiagnosisWarning],
     point: str = "",
@@ -56,9 +56,12 @@ def build_headline(
         if not unwatched:
             return message("diagnosis.healthy", point=at, smallest=smallest)
         return message("diagnosis.healthy_limits", point=at, smallest=smallest, unwatched=tuple(unwatched))
-    if verdict == "undetermined" or interval is None:
+    if verdict == "undetermined" or not intervals:
         reason = next(warning.description for warning in warnings if warning.kind in ("motion", "power"))
         return undetermined_headline(reason, point)
+    interval = intervals[-1]
+    if interval.end_interval_s is not None or len(intervals) > 1:
+        return _timeline_headline(intervals, at)
     since = _onset_message(interval)
     mimic = interval.refit.mimics[0].description if interval.refit and interval.refit.mimics else None
     if interval.faults:
@@ -85,6 +88,34 @@ def unwatched_changes(plant: Plant, detectable: Mapping[str, tuple[float, float]
     ]
     parameters = tuple(message("cause.change_of", parameter=parameter) for parameter in dict.fromkeys(hidden))
     return (*parameters, *(message(f"cause.{kind}") for kind in plant.unwatched))
+
+
+def _timeline_headline(intervals: Sequence[FaultInterval], at: Message | None) -> Message:
+    """Say what happened from when to when, and whether it is over."""
+    last = intervals[-1]
+    now = None if last.end_s is None else message("diagnosis.healed", t=last.end_s)
+    return message("diagnosis.timeline", point=at, stretches=tuple(map(_stretch_message, intervals)), now=now)
+
+
+def _stretch_message(interval: FaultInterval) -> Message:
+    assert interval.onset_s is not None
+    begin = interval.onset_s[1]
+    if interval.from_start:
+        when = message(
+            "diagnosis.stretch_start" if interval.end_s is None else "diagnosis.stretch_until", to_s=interval.end_s
+        )
+    elif interval.end_s is None:
+        when = message("diagnosis.stretch_since", from_s=begin)
+    else:
+        when = message("diagnosis.stretch_when", from_s=begin, to_s=interval.end_s)
+    if not interval.faults:
+        best = interval.candidates[0]
+        return message("diagnosis.stretch_open", names=best.names, probability=best.probability, when=when)
+    names = tuple(fault.name for fault in interval.faults)
+    sizes = tuple(
+        message("diagnosis.stretch_size", parameter=fault.parameter, **_size_values(fault)) for fault in interval.faults
+    )
+    return message("diagnosis.stretch", names=names, sizes=sizes, when=when)
 
 
 def _onset_message(interval: FaultInterval) -> Message | None:
@@ -144,8 +175,10 @@ def build_reasons(exam: Examination, trace: Trace, interval: FaultInterval) -> t
     return tuple(reason for reason in reasons if reason is not None)
 
 
-def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message:
-    first = int(np.flatnonzero(exam.alarm)[0])
+def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
+    if interval.detected_at_s is None:
+        return None  # the alarm was there already
+    first = int(np.searchsorted(exam.t(slice(None)), interval.detected_at_s))
     if exam.estimates.level[first] >= 1.0:
         return message("diagnosis.alarm_cusum", t=interval.detected_at_s)
     value = float(exam.statistic[first])

@@ -59,8 +59,10 @@ def refit_onset(refined: RefitResult, exam: Examination) -> Onset:
     return Onset(float(t[max(low - 1, 0)]), float(t[likely]), float(t[high]), likely)
 
 
-def summarise_refit(refined: RefitResult, exam: Examination, recursive: tuple[Candidate, ...]) -> RefitSummary:
-    """Return the part of a refit that a diagnosis keeps."""
+def summarise_refit(
+    refined: RefitResult, exam: Examination, recursive: tuple[Candidate, ...], first: int = 0
+) -> RefitSummary:
+    """Return the part of a refit that a diagnosis keeps; its samples are counted from sample `first` on."""
     from servoscope.isolation.ml import find_other_causes
 
     t, window = exam.recording.t, refined.window
@@ -68,8 +70,8 @@ def summarise_refit(refined: RefitResult, exam: Examination, recursive: tuple[Ca
     of_y, of_u = exam.baseline.plant.units
     units = {"of y": of_y or "in units of y", "of u": of_u or "in units of u"}
     return RefitSummary(
-        from_s=float(t[window.first_sample]),
-        to_s=float(t[window.first_sample + window.samples - 1]),
+        from_s=float(t[first + window.first_sample]),
+        to_s=float(t[first + window.first_sample + window.samples - 1]),
         over_s=over / exam.recording.sample_rate if over > refined.onset.high - refined.onset.low else 0.0,
         noise=float(np.sqrt(refined.noise_variance)),
         misfit=refined.goodness.statistic,

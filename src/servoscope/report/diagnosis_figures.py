@@ -257,10 +257,16 @@ def _gaps(ax: Axes, t: FloatArray, restart: BoolArray, longest: float) -> None:
 def _marks(ax: Axes, diagnosis: Diagnosis | None, factor: float) -> None:
     if diagnosis is None:
         return
-    if diagnosis.onset_s is not None:
-        low, likely, high = (value / factor for value in diagnosis.onset_s)
-        ax.axvspan(low, high, facecolor=ALARM, edgecolor=ALARM, linewidth=0.5, alpha=0.22, zorder=0)
-        ax.axvline(likely, color=ALARM, linewidth=1.0, alpha=0.8, zorder=1)
+    for one in diagnosis.intervals:
+        for change in (one.onset_s, one.end_interval_s):
+            if change is not None:
+                low, likely, high = (value / factor for value in change)
+                ax.axvspan(low, high, facecolor=ALARM, edgecolor=ALARM, linewidth=0.5, alpha=0.22, zorder=0)
+                ax.axvline(likely, color=ALARM, linewidth=1.0, alpha=0.8, zorder=1)
+        if one.onset_s is not None and (len(diagnosis.intervals) > 1 or one.end_interval_s is not None):
+            # how long each lasted: a band along the top
+            end = ax.get_xlim()[1] if one.end_s is None else one.end_s / factor
+            ax.axvspan(one.onset_s[1] / factor, end, ymin=0.96, facecolor=ALARM, linewidth=0.0, alpha=0.8, zorder=3)
     if diagnosis.detected_at_s is not None:
         ax.axvline(diagnosis.detected_at_s / factor, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), zorder=2)
 

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, INDENT, print_facts, print_notes, print_table, print_title
 from servoscope.core.number_format import format_ratios, format_short
-from servoscope.detection.result import Candidate, Diagnosis, DiagnosisWarning, RefitSummary
+from servoscope.detection.result import Candidate, Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary
 from servoscope.report.format_values import format_duration, format_probability
 from servoscope.report.page import say
 
@@ -31,6 +31,8 @@ def print_diagnosis(out: Console, d: Diagnosis) -> None:
         times.append(("onset", f"{likely:.4g} s ({low:.4g} to {high:.4g} s, 95 %)"))
     if times:
         print_facts(out, times)
+    if d.current.end_interval_s is not None or len(d.intervals) > 1:
+        _print_timeline(out, d.intervals)
     _print_candidates(out, d.candidates)
     if d.explanation:
         out.print("  Why:")
@@ -38,6 +40,17 @@ def print_diagnosis(out: Console, d: Diagnosis) -> None:
     if d.refit is not None:
         print_facts(out, _refit_facts(d.refit))
     _print_warnings(out, d.warnings)
+
+
+def _print_timeline(out: Console, intervals: Sequence[FaultInterval]) -> None:
+    """Print what was there from when to when, one line per interval."""
+    rows = []
+    for one in intervals:
+        dates = (one.onset_s, one.end_interval_s)
+        times = [f"{t[1]:.4g} s ({t[0]:.4g} to {t[2]:.4g})" if t is not None else "" for t in dates]
+        sizes = "\n".join(f"{f.name} x {format_ratios(f.ratio, *f.interval)[0]}" for f in one.faults)
+        rows.append((*times, sizes or say("cli.not_named"), format_probability(one.probability or 0.0)))
+    print_table(out, ["from", "to", "fault", "probability"], rows)
 
 
 def _refit_facts(refit: RefitSummary) -> Iterator[tuple[str, str]]:

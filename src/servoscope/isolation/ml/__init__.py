@@ -2,5 +2,16 @@
 
 from servoscope.isolation.ml.other_causes import OtherCause, find_other_causes
 from servoscope.isolation.ml.search import MAX_WINDOW_SAMPLES, Hypothesis, RefitResult, fit_hypotheses
+from servoscope.isolation.ml.timeline import TimelineStretch, find_timeline, is_constant
 
-__all__ = ["MAX_WINDOW_SAMPLES", "Hypothesis", "OtherCause", "RefitResult", "find_other_causes", "fit_hypotheses"]
+__all__ = [
+    "MAX_WINDOW_SAMPLES",
+    "Hypothesis",
+    "OtherCause",
+    "RefitResult",
+    "TimelineStretch",
+    "find_other_causes",
+    "find_timeline",
+    "fit_hypotheses",
+    "is_constant",
+]

@@ -106,6 +106,11 @@ def fit_hypotheses(
     return search.run()
 
 
+def fit_stretch(window: RefitWindow, faults: Sequence[Fault], progress: Callable[[], None]) -> RefitResult:
+    """Fit every fault and every pair to a window in which the plant differs from healthy from the first sample on."""
+    return _HypothesisSearch(window, faults, window.first_sample, window.first_sample, progress).run()
+
+
 class _HypothesisSearch:
     def __init__(
         self, window: RefitWindow, faults: Sequence[Fault], onset: int, announced: int, progress: Callable[[], None]

@@ -1,0 +1,103 @@
+"""Several changes in one recording as part of a diagnosis: when the actuator was not healthy, and how."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from servoscope.detection.chi2_test import Onset
+from servoscope.detection.result import UNKNOWN, Candidate, FaultInterval
+from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.ml_refit import refit_candidates, summarise_refit
+
+if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
+    from servoscope.isolation.ml import RefitResult, TimelineStretch
+
+MARGIN_S = 1.0  # before the earliest onset, from which the past is not sure to be healthy
+
+
+def trace_timeline(
+    exam: Examination,
+    refined: RefitResult,
+    onset: Onset,
+    recursive: tuple[Candidate, ...],
+    sure: float,
+    progress: Callable[[], None],
+) -> tuple[FaultInterval, ...]:
+    """Return when the actuator differed from healthy and what explains that; nothing where a single change suffices.
+
+    Looked at from the refit's first sample on, where its single change does not explain the recording, does not last,
+    or does not stay the same. A stretch that nothing explains leaves the single change as it was.
+    """
+    from servoscope.isolation.ml import MAX_WINDOW_SAMPLES, find_timeline, is_constant
+    from servoscope.isolation.ml.window import RefitWindow
+
+    explained = not refined.is_unknown and refined.goodness.statistic <= refined.goodness.limit
+    lasts = bool(exam.alarm[-1]) and not refined.onset.profile.duration  # a drift may be steps
+    if explained and lasts and is_constant(refined):
+        return ()
+    first = refined.window.first_sample
+    end = min(exam.recording.samples, first + MAX_WINDOW_SAMPLES)
+    window = RefitWindow.from_recording(exam.baseline, exam.recording.rows(slice(first, end)), 0, end - first)
+    rate = exam.recording.sample_rate
+    likely_healthy = onset.low_s if refined.is_unknown else min(onset.low_s, _time(exam, first + refined.onset.low))
+    healthy = int(np.searchsorted(exam.recording.t[first:end], likely_healthy - MARGIN_S))
+    found = find_timeline(window, exam.baseline.plant.all_faults, healthy, refined.best.fitted, progress)
+    if any(one.refit is not None and one.refit.is_unknown for one in found):
+        return ()
+    return _fault_intervals(exam, found, first, recursive, sure, 3.0 * exam.pipeline.bank.wait / rate)
+
+
+def _fault_intervals(
+    exam: Examination,
+    found: Sequence[TimelineStretch],
+    first: int,
+    recursive: tuple[Candidate, ...],
+    sure: float,
+    early_s: float,
+) -> tuple[FaultInterval, ...]:
+    intervals = []
+    for one, following in pairwise([*found, None]):
+        if one is None or one.refit is None:
+            continue
+        candidates = refit_candidates(one.refit)
+        best, onset = candidates[0], _dates(exam, first, one.begin)
+        end = None if following is None else _dates(exam, first, following.begin)
+        intervals.append(
+            FaultInterval(
+                detected_at_s=_detection(exam, onset[0], np.inf if end is None else end[1]),
+                onset_s=onset,
+                end_s=None if end is None else end[1],
+                end_interval_s=end,
+                from_start=onset[1] - float(exam.recording.t[0]) <= early_s,
+                probability=best.probability,
+                faults=best.faults if best.probability >= sure and best.name != UNKNOWN else (),
+                candidates=candidates,
+                refit=summarise_refit(one.refit, exam, recursive, first),
+            )
+        )
+    return tuple(intervals)
+
+
+def _dates(exam: Examination, first: int, begin: tuple[int, int, int]) -> tuple[float, float, float]:
+    """Return when a change came; the first changed sample ends the time in which it did."""
+    low, likely, high = (first + k for k in begin)
+    return _time(exam, max(low - 1, 0)), _time(exam, likely), _time(exam, high)
+
+
+def _time(exam: Examination, sample: int) -> float:
+    return float(exam.recording.t[min(sample, exam.recording.samples - 1)])
+
+
+def _detection(exam: Examination, from_s: float, to_s: float) -> float | None:
+    """Return when an alarm was raised in an interval; None where it was there already."""
+    raised = np.flatnonzero(np.diff(exam.alarm.astype(np.int8), prepend=0) > 0)
+    times = exam.t(raised)
+    inside = raised[(times >= from_s) & (times <= to_s)]
+    if not len(inside):
+        return None
+    crossed = int(exam.estimates.crossed[inside[0]]) - 1
+    return float(exam.recording.t[crossed] if crossed >= 0 else exam.t(inside[0]))
