@@ -62,7 +62,10 @@ class OidcClient:
         try:
             async with self._session() as session:
                 token = await session.fetch_token(metadata["token_endpoint"], code=code, code_verifier=verifier)
-            return await self._check(dict(token), nonce)
+            claims = await self._check(dict(token), nonce)
+            if self._settings.user_name(claims) is None or self._settings.role(claims) is None:
+                claims = {**await self._load_userinfo(token, claims["sub"]), **claims}
+            return claims
         except (httpx.HTTPError, httpx.InvalidURL, AuthlibBaseError, JoseError) as error:
             raise self._problem(error) from None
         except (ValueError, KeyError, TypeError, AttributeError) as error:  # of answers that are no tokens
@@ -84,6 +87,16 @@ class OidcClient:
         claims.validate(leeway=LEEWAY_S)
         return dict(claims)
 
+    async def _load_userinfo(self, token: Mapping[str, Any], subject: str) -> dict[str, Any]:
+        """Return what the provider tells of a user beside the ID token (Core 5.3); nothing if it tells no more."""
+        url = (await self._load_metadata()).get("userinfo_endpoint")
+        if url is None:
+            return {}
+        found = await self._get(url, {"Authorization": f"Bearer {token['access_token']}"})
+        if found.get("sub") != subject:  # else the token of one user could bring the groups of another
+            raise self._problem(ValueError("its userinfo is of another user than its ID token"))
+        return found
+
     async def _load_metadata(self) -> dict[str, Any]:
         if self._metadata and time.monotonic() < self._metadata_until:
             return self._metadata
@@ -91,7 +104,7 @@ class OidcClient:
         if found.get("issuer") != self._settings.issuer:
             raise self._problem(ValueError("it names itself otherwise: issuer must be written as it does"))
         secure = urlsplit(self._settings.issuer).scheme
-        for name in ENDPOINTS:
+        for name in (*ENDPOINTS, *({"userinfo_endpoint"} & found.keys())):
             if not str(found.get(name, "")).startswith(("https://", f"{secure}://")):
                 raise self._problem(ValueError(f"its {name} is missing, or not https"))
         self._metadata, self._keys = found, None
@@ -105,10 +118,10 @@ class OidcClient:
             self._keys = KeySet.import_key_set(plain)
         return self._keys
 
-    async def _get(self, url: str) -> dict[str, Any]:
+    async def _get(self, url: str, headers: Mapping[str, str] | None = None) -> dict[str, Any]:
         try:
             async with httpx.AsyncClient(timeout=self._settings.timeout_s) as client:
-                answer = await client.get(url)
+                answer = await client.get(url, headers=headers)
                 found = answer.raise_for_status().json()
         except (httpx.HTTPError, httpx.InvalidURL, ValueError) as error:
             raise self._problem(error) from None
