@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 import warnings
 from collections.abc import Mapping
@@ -30,6 +31,7 @@ with warnings.catch_warnings(record=True):
 ALGORITHMS = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "EdDSA", "Ed25519")
 LEEWAY_S = 60.0  # by which clocks may differ
 METADATA_S = 3600.0  # after which addresses and keys are asked for again
+RETRY_S = 5.0  # after which a provider that did not answer is asked again
 KEYS_S = 60.0  # least time between two looks for a key that is unknown
 ENDPOINTS = ("authorization_endpoint", "token_endpoint", "jwks_uri")
 
@@ -45,7 +47,9 @@ class OidcClient:
         self._settings, self._secret = settings, secret
         self._metadata: dict[str, Any] = {}
         self._keys: KeySet | None = None
-        self._metadata_until = self._keys_after = 0.0  # by the monotonic clock
+        self._metadata_until = self._keys_after = self._failed_until = 0.0  # by the monotonic clock
+        self._failure = ""  # of the last look for the metadata
+        self._loading = asyncio.Lock()
 
     async def authorization_url(self, state: str, nonce: str, verifier: str) -> str:
         """Return where a browser is sent to log in; raises ProviderError."""
@@ -98,8 +102,20 @@ class OidcClient:
         return found
 
     async def _load_metadata(self) -> dict[str, Any]:
-        if self._metadata and time.monotonic() < self._metadata_until:
+        async with self._loading:  # nobody has logged in yet: many who ask must not become many requests to a provider
+            now = time.monotonic()
+            if not self._metadata or now >= self._metadata_until:
+                if now < self._failed_until:
+                    raise ProviderError(self._failure)
+                try:
+                    self._metadata, self._keys = await self._fetch_metadata(), None
+                except ProviderError as error:
+                    self._failure, self._failed_until = str(error), time.monotonic() + RETRY_S
+                    raise
+                self._metadata_until = time.monotonic() + METADATA_S
             return self._metadata
+
+    async def _fetch_metadata(self) -> dict[str, Any]:
         found = await self._get(self._settings.issuer.rstrip("/") + "/.well-known/openid-configuration")
         if found.get("issuer") != self._settings.issuer:
             raise self._problem(ValueError("it names itself otherwise: issuer must be written as it does"))
@@ -107,8 +123,6 @@ class OidcClient:
         for name in (*ENDPOINTS, *({"userinfo_endpoint"} & found.keys())):
             if not str(found.get(name, "")).startswith(("https://", f"{secure}://")):
                 raise self._problem(ValueError(f"its {name} is missing, or not https"))
-        self._metadata, self._keys = found, None
-        self._metadata_until = time.monotonic() + METADATA_S
         return found
 
     async def _load_keys(self, *, renew: bool = False) -> KeySet:
