@@ -1,19 +1,28 @@
-"""A provider of OpenID Connect as a process: oidc-provider-mock, which also checks the verifier (RFC 7636)."""
+"""Providers of OpenID Connect as processes: oidc-provider-mock, which also checks the verifier (RFC 7636) here, and
+oidc-provider, which the OpenID Foundation has certified."""
 
 from __future__ import annotations
 
 import io
 import json
+import shutil
 import subprocess
 import sys
 import warnings
 from base64 import b64decode, urlsafe_b64encode
 from hashlib import sha256
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 from urllib.parse import parse_qs, unquote_plus, urlsplit
 
+import pytest
+
+from servoscope.service.access.oidc import CALLBACK
+
 SECRET = "hush0 of the client"
+ADDRESS = "http://localhost:8080"  # of the pages
+SERVER = Path(__file__).with_name("oidc_server") / "provider.mjs"
 
 
 class Provider:
@@ -23,11 +32,13 @@ class Provider:
         self._users, self.url = users, ""
 
     def __enter__(self) -> Provider:
-        command = [sys.executable, __file__, json.dumps(self._users)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self._process = subprocess.Popen(self._command(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         assert self._process.stdout is not None
         self.url = self._process.stdout.readline().strip()
         return self
+
+    def _command(self) -> list[str]:
+        return [sys.executable, __file__, json.dumps(self._users)]
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -36,6 +47,21 @@ class Provider:
         assert self._process.stdout is not None
         self._process.stdout.close()
         self._process.wait(10)
+
+
+class CertifiedProvider(Provider):
+    """A provider whose ID tokens hold what the standard demands, and no names and groups."""
+
+    def _command(self) -> list[str]:
+        return [found_node(), str(SERVER), json.dumps(self._users), SECRET, ADDRESS + CALLBACK]
+
+
+def found_node() -> str:
+    """Return Node.js; skip the test without it or the provider."""
+    node = shutil.which("node")
+    if node is None or not SERVER.with_name("node_modules").is_dir():
+        pytest.skip("oidc-provider is not on this machine: scripts/install-test-servers installs it")
+    return node
 
 
 def _challenges(app: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import re
 import subprocess
+from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -202,11 +203,21 @@ def test_coefficients_alone_are_those_of_the_whole_monitor(tmp_path: Path) -> No
     assert not row[:, 2].any() and trace.level.any()
 
 
-def test_coefficients_alone_behind_a_valve_law(tmp_path: Path) -> None:
-    """The caller hands u over as it is behind the valve."""
+def behind_a_valve_law() -> Baseline:
     settings = demo().loop.to_dict()
     settings["plant"] |= {"valve_law": "square-root"}
-    baseline = fresh(demo().model_copy(update={"loop_settings": settings}))
+    return fresh(demo().model_copy(update={"loop_settings": settings}))
+
+
+def behind_two_stages() -> Baseline:
+    loop = Loop.from_dict(Loop.load(RIG).to_dict() | {"monitor": {"two_stage": "adaptive"}})
+    return learn_baseline(loop, [simulate(loop, reference("multisine", 60.0, 100.0), seed=1)[0]])
+
+
+@pytest.mark.parametrize("made", [behind_a_valve_law, pytest.param(behind_two_stages, marks=pytest.mark.slow)])
+def test_coefficients_alone_behind_a_stage_of_the_input(tmp_path: Path, made: Callable[[], Baseline]) -> None:
+    """The caller hands u over as it is behind the stage."""
+    baseline = made()
     r, u, y, restart = golden_signals(baseline, 20_000)
     monitor = Monitor(baseline)
     _, trace = monitor.run(monitor.init(), r, u, y, restart)

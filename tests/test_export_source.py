@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import platform
 import re
 import subprocess
 from pathlib import Path
 
+import export as benchmark
 import numpy as np
 import pytest
 from hypothesis import given
@@ -26,7 +28,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
     [
         ("clang", ""),
         ("aarch64-linux-gnu-gcc", "qemu-aarch64"),
-        ("arm-linux-gnueabihf-gcc", "qemu-arm"),  # with fused multiply-adds: in software they take forever there
+        ("arm-linux-gnueabihf-gcc", "qemu-arm"),  # with fused multiply-adds: in software they take long
     ],
 )
 def test_self_test_of_other_compilers_and_processors(tmp_path: Path, name: str, emulator: str, level: str) -> None:
@@ -38,6 +40,19 @@ def test_self_test_of_other_compilers_and_processors(tmp_path: Path, name: str, 
     command = ["make", "-s", "-C", tmp_path, "check", *filter(None, settings)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_hundred_thousand_samples_by_other_compilers_and_processors(tmp_path: Path) -> None:
+    """The benchmark itself, short: its state goes through an image on the way."""
+    for _, name, _, emulator in benchmark.PROCESSORS:
+        for needed in (name, *emulator):
+            compiler(needed)
+    exported = export_c(demo())
+    exported.save(tmp_path)
+    made = benchmark.builds(tmp_path, 100_000, 100_000, levels=("-O2",))
+    benchmark.compare(demo(), made, exported.mark)
+    assert [(one.samples, one.different) for one in made] == [(100_000, 0)] * 4 + [(10_000, 0)]
 
 
 def cppcheck(folder: Path, *options: str) -> str:
@@ -82,6 +97,7 @@ def test_self_test(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "ok: " in done.stdout and "bytes" in done.stdout and "ns per sample" in done.stdout
+    assert platform.machine() != "x86_64" or re.search(r"[1-9]\d* cycles per sample", done.stdout)
 
 
 def test_the_stack_is_bounded_and_printed(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """The exported function block, translated back to Python and run beside the monitor.
 
-No compiler of Structured Text is among Debian's packages, so that its grammar is checked by the
+Neither Debian nor PyPI nor npm has a compiler of Structured Text, so that its grammar is checked by the
 translation alone, which knows few statements, and demands that every name is declared.
 """
 

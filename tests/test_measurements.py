@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import struct
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -83,6 +84,18 @@ def test_memory_does_not_grow_with_the_file(
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert rows == 200 * N and peak < 10e6
+
+
+def test_a_count_of_rows_that_is_damaged_is_not_believed(tmp_path: Path) -> None:
+    """Broken input once named 2^63 rows, and was read without end."""
+    path = tmp_path / "log.mf4"
+    write_mdf(path)
+    data = bytearray(path.read_bytes())
+    count = data.index(struct.pack("<Q", N), data.index(b"##CG"))
+    data[count : count + 8] = struct.pack("<Q", 2**63 + N)
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="damaged MDF file"):
+        readers.list_channels(path)
 
 
 def test_a_file_that_was_never_finished_says_so(tmp_path: Path) -> None:

@@ -23,12 +23,13 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from pydantic import ValidationError
 
 import halls
-from servoscope.core.errors import ConfigError
+from servoscope.core.errors import ConfigError, StoreUnavailableError
 from servoscope.service.actions import ActionSettings, OutboxEntry, deliver
 from servoscope.service.config import ServiceFile
 from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
 from servoscope.service.network import NetworkSettings
 from servoscope.service.opcua.source import OpcuaSourceSettings, create_opcua_client
+from servoscope.service.store import Store
 
 NAME = "hook.example"  # which is nobody's
 REFUSED = {"refused": ["internal"]}
@@ -243,6 +244,20 @@ def test_a_broker_and_a_server_are_held_to_the_rules_too(names: Names) -> None:
         with pytest.raises(PermissionError, match="refuses"):
             asyncio.run(connect(REFUSED))
         asyncio.run(connect(LOOPBACK_ONLY))
+
+
+def test_a_database_is_held_to_the_rules_of_its_store(names: Names) -> None:
+    names.addresses[NAME] = [["127.0.0.1"]]
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        listening.settimeout(10.0)
+        url = f"postgresql://us@{NAME}:{listening.getsockname()[1]}/history"
+        with pytest.raises(StoreUnavailableError, match=r"hook\.example.*127\.0\.0\.1 is in a network.*refuses"):
+            Store.open(url, network=NetworkSettings(**REFUSED))
+        hanging_up = threading.Thread(target=lambda: listening.accept()[0].close())
+        hanging_up.start()
+        with pytest.raises(StoreUnavailableError, match=r"^(?!.*refuses)"):
+            Store.open(url, network=NetworkSettings(**LOOPBACK_ONLY))
+        hanging_up.join()  # it was reached, under the address that was checked: nobody else knows the name
 
 
 def test_the_section_holds_for_all_that_have_no_rules_of_their_own(tmp_path: Path) -> None:

@@ -20,10 +20,10 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from reliability.carrying import Carrier
 from reliability.servers import Postgres
 
 import halls
-from carrying import Carrier
 from halls import RESULTS, asked, hall
 from servoscope.core.errors import StoreError
 from servoscope.service.build import build_components

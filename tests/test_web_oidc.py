@@ -22,8 +22,8 @@ from joserfc.jwk import KeySet, OctKey, RSAKey
 
 from browsing import Served
 from commands import one_line, run
-from oidc_provider import SECRET, Provider
-from oidc_steps import ADDRESS, browse, confirm, go_to_provider, log_in
+from oidc_provider import ADDRESS, SECRET, CertifiedProvider, Provider
+from oidc_steps import browse, confirm, confirm_by_forms, go_to_provider, log_in
 from pages_context import open_context
 from screens import BROWSERS
 from servoscope.core.errors import ConfigError
@@ -173,6 +173,27 @@ def test_a_login_leads_to_pages_of_ours_alone(context: Context, target: str) -> 
         return (await log_in(browser, target=target)).headers["location"]
 
     assert browse(context, visit) == "/"
+
+
+@pytest.mark.parametrize(
+    ("sub", "target", "user"),
+    [("7", "/alarms", ("otto", "operator")), ("8", "/login?refused=role", None), ("9", "/login?refused=role", None)],
+)
+def test_names_and_groups_that_a_certified_provider_tells_beside_its_token(
+    tmp_path: Path, sub: str, target: str, user: tuple[str, str] | None
+) -> None:
+    async def visit(browser: httpx.AsyncClient) -> None:
+        answer = await browser.get(await confirm_by_forms(await go_to_provider(browser), sub))
+        assert answer.headers["location"] == target
+        session = (await browser.get("/api/v1/session")).json()
+        assert (session["user"], session["role"]) == user if user else (await browser.get("/api/v1/assets")).is_error
+
+    with CertifiedProvider(OTTO, NOBODY, ODD) as other:
+        settings = web_settings(other.url)
+        assert settings.oidc is not None
+        sign_on = SingleSignOn(OidcClient(settings.oidc, SECRET))
+        with open_context(tmp_path, settings, Users(tmp_path / "users.json"), single_sign_on=sign_on) as opened:
+            browse(opened, visit)
 
 
 KEY, OTHER_KEY = RSAKey.generate_key(2048, {"kid": "a"}), RSAKey.generate_key(2048, {"kid": "a"})

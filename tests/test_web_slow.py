@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import socket
+import ssl
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -145,6 +148,28 @@ def test_who_waits_longest_gives_way_and_who_is_answered_does_not(limit: str) ->
         first, second, third = (stack.enter_context(opened(address)) for _ in range(3))
         assert third.sendall(WHOLE) is None and third.recv(12) == b"HTTP/1.1 200"
         assert is_closed(first) and not is_closed(second) and not is_closed(stream)
+
+
+def test_handshakes_are_bounded_and_the_oldest_gives_way(tmp_path: Path) -> None:
+    """TLS has ten seconds; until then clients that say nothing must not use up the files of the server."""
+    make = "openssl req -x509 -newkey rsa:2048 -nodes -keyout key.pem -out cert.pem -days 2 -subj /CN=localhost"
+    subprocess.run(make.split(), cwd=tmp_path, check=True, capture_output=True)
+    text = '[sources.s]\nkind = "replay"\n[assets.a]\nbaseline = "b"\nsource = "s"\nfiles = ["f"]\n[web]\n'
+    text += 'listen = "127.0.0.1:0"\ncertificate = "cert.pem"\nkey = "key.pem"\nconnections_per_address = 5\n'
+    (tmp_path / "hall.toml").write_text(text)
+    trusted = ssl.create_default_context(cafile=str(tmp_path / "cert.pem"))
+    with Served(tmp_path, "serve", "hall.toml") as served, contextlib.ExitStack() as stack:
+        parts = urlsplit(served.url)
+        address = (str(parts.hostname), int(parts.port or 0))
+        silent = [stack.enter_context(opened(address, b"\x16\x03\x01")) for _ in range(40)]
+        with httpx.Client(
+            base_url=f"https://localhost:{parts.port}", verify=trusted, timeout=9.0
+        ) as client:  # before the first deadline
+            assert client.get("/health/live").status_code == 200
+            text = client.get("/metrics").text
+        assert sum(is_closed(one) for one in silent) >= 35
+        found = re.search(r'servoscope_http_connections_cut_total\{why="handshake"\} ([0-9.]+)', text)
+        assert found and float(found[1]) >= 35
 
 
 def test_where_nobody_waits_only_health_is_told() -> None:

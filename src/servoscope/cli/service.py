@@ -213,7 +213,7 @@ def open_store(text: str) -> Store:
         from servoscope.service.config import ServiceFile
 
         config = ServiceFile.load(text)
-        return Store.open(config.store.url, config.folder, lock_timeout_s=5.0)
+        return Store.open(config.store.url, config.folder, lock_timeout_s=5.0, network=config.store.rules)
     return Store.open(text, lock_timeout_s=5.0)
 
 

@@ -50,7 +50,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
     assets = _build_assets(config)
     check_actions(config, assets)
     sources, publishers = _build_sources(config, assets), _build_publishers(config)
-    store = Store.open(config.store.url, config.folder, write=True)
+    store = Store.open(config.store.url, config.folder, write=True, network=config.store.rules)
     try:
         store.acquire_lock([config.name, *assets])
         rows = store.checkpoints([config.name, *assets])

@@ -13,7 +13,7 @@ from servoscope.service.actions import ActionSettings
 from servoscope.service.alarms import AlarmSettings
 from servoscope.service.config_types import Address, FileSettings, Name, Seconds
 from servoscope.service.kinds import PUBLISHERS, SOURCES, parse_tables
-from servoscope.service.network import NetworkSettings, apply_network
+from servoscope.service.network import ConnectionSettings, NetworkSettings, apply_network
 from servoscope.service.opcua.settings import OpcuaNodes
 from servoscope.service.publishers.base import PublisherSettings
 from servoscope.service.sources.base import SourceSettings
@@ -36,7 +36,7 @@ class ServiceSettings(Settings):
     log: Literal["debug", "info", "warning", "error"] = "info"  # what is logged, at least
 
 
-class StoreSettings(Settings):
+class StoreSettings(ConnectionSettings):
     """Where history goes, and for how long."""
 
     # A file for SQLite, relative to the service file, or ``postgresql://user@host/database``

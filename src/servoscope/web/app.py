@@ -31,7 +31,7 @@ ROUTE_MODULES = (session, assets, alarms, events, diagnoses, uploads, baselines,
 
 def create_app(context: Context) -> ASGIApp:
     """Return the application that uvicorn serves."""
-    metrics = WebMetrics(context.event_hub)
+    metrics = WebMetrics(context.event_hub, context.connections.cut)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

@@ -1,15 +1,17 @@
 """Connections of clients that are slow, silent or many: deadlines, limits, and room for who asks for health.
 
 A connection waits for a request, receives one, or is being answered. What waits too long, or sends or reads too slowly,
-is closed. Where there is no more room, the connection that has waited longest gives way to a new one; where none waits,
-the new one is told of health and of nothing else.
+is closed and counted. Where there is no more room, the connection that has waited longest gives way to a new one; where
+none waits, the new one is told of health and of nothing else.
 """
 
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -36,18 +38,36 @@ class ConnectionTable:
 
     def __init__(self, most: int, most_per_address: int, proxies: Sequence[str] = ()) -> None:
         self._most, self._most_per_address, self._proxies = most, most_per_address, proxies
+        self.cut: Counter[str] = Counter()  # connections that were closed, by the reason
         self._hosts: dict[LimitedProtocol, str] = {}  # of all that are open
         self._counts: Counter[str] = Counter()
+        self._handshakes: dict[tuple[str, int], socket.socket] = {}  # that TLS has not ended, by client; oldest first
         self._waiting: dict[LimitedProtocol, None] = {}  # for a request; who has waited longest stands first
 
-    def add(self, connection: LimitedProtocol, host: str) -> bool:
+    def begin_handshake(self, connection: socket.socket, client: tuple[str, int]) -> None:
+        """Count a connection that has to agree on TLS first; where there are too many, the oldest gives way."""
+        self._handshakes = {key: one for key, one in self._handshakes.items() if one.fileno() >= 0}
+        own = [key for key in self._handshakes if key[0] == client[0] and not is_member(key[0], self._proxies)]
+        everybody = list(self._handshakes)
+        for some, most in ((own, self._most_per_address), (everybody, self._most - len(self._hosts))):
+            if some and len(some) >= most:
+                with suppress(OSError):  # it may have ended meanwhile
+                    self._handshakes[some[0]].shutdown(socket.SHUT_RDWR)
+                del self._handshakes[some[0]]
+                self.cut["handshake"] += 1
+                break
+        self._handshakes[client] = connection
+
+    def add(self, connection: LimitedProtocol, client: tuple[str, int]) -> bool:
         """Count a new connection; return whether there is room for it."""
-        host = "" if is_member(host, self._proxies) else host
+        self._handshakes.pop(client, None)
+        host = "" if is_member(client[0], self._proxies) else client[0]
         has_room = True
         if host and self._counts[host] >= self._most_per_address:
             has_room = self._close_oldest(host)
         if len(self._hosts) >= self._most:
             has_room = self._close_oldest(None) and has_room
+        self.cut["refused"] += not has_room
         self._hosts[connection] = host
         self._counts[host] += 1
         return has_room
@@ -72,8 +92,20 @@ class ConnectionTable:
         if oldest is None:
             return False
         self.remove(oldest)
-        oldest.abort()
+        oldest.abort("room")
         return True
+
+
+class TlsListener(socket.socket):
+    """A listening socket that tells the table of each connection before TLS begins."""
+
+    table: ConnectionTable
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept a connection."""
+        connection, client = super().accept()
+        self.table.begin_handshake(connection, client[:2])
+        return connection, client
 
 
 class LimitedProtocol(H11Protocol):
@@ -95,7 +127,7 @@ class LimitedProtocol(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as the base class
         """Begin to wait for a request."""
         super().connection_made(transport)
-        if not self._table.add(self, self.client[0] if self.client else ""):
+        if not self._table.add(self, self.client or ("", 0)):
             self.app = partial(_serve_health, self.app)
         self._follow_phase()
 
@@ -121,7 +153,7 @@ class LimitedProtocol(H11Protocol):
     def pause_writing(self) -> None:
         """Give the client time to read."""
         super().pause_writing()
-        self._drain_timer = self.loop.call_later(self.DRAIN_S, self.abort)
+        self._drain_timer = self.loop.call_later(self.DRAIN_S, self.abort, "answer")
 
     def resume_writing(self) -> None:
         """Go on: the client has read."""
@@ -129,8 +161,9 @@ class LimitedProtocol(H11Protocol):
         if self._drain_timer is not None:
             self._drain_timer.cancel()
 
-    def abort(self) -> None:
-        """Close the connection without waiting for the client."""
+    def abort(self, why: str) -> None:
+        """Close the connection without waiting for the client, and count it."""
+        self._table.cut[why] += 1
         self.transport.abort()
 
     def _follow_phase(self) -> None:
@@ -154,7 +187,7 @@ class LimitedProtocol(H11Protocol):
         if now < self._deadline:
             self._phase_timer = self.loop.call_at(self._deadline, self._check_deadline)
         else:
-            self.abort()
+            self.abort(self._phase)
 
 
 async def _serve_health(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:

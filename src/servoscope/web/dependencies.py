@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 from servoscope.service.access import Role, Session, Sessions, Users, WebSettings, is_permitted
 from servoscope.service.config import ServiceFile
 from servoscope.service.store import Store
+from servoscope.web.connections import ConnectionTable
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
 from servoscope.web.login_gate import LoginGate
@@ -46,6 +47,7 @@ class Context:
     sessions: Sessions
     login_gate: LoginGate = field(default_factory=LoginGate)
     single_sign_on: SingleSignOn | None = None
+    connections: ConnectionTable = field(default_factory=lambda: ConnectionTable(100, 100))
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
-from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from starlette.types import Scope
 
 from servoscope.service.health import status_gauges
@@ -13,14 +13,15 @@ from servoscope.web.event_hub import EventHub
 from servoscope.web.statuses import asset_statuses
 
 BUCKETS_S = tuple(base * 10.0**power for power in (-3, -2, -1, 0, 1) for base in (1.0, 2.0, 5.0))
+CUT_REASONS = ("handshake", "header", "body", "answer", "room", "refused")
 METHODS = ("GET", "HEAD", "POST", "DELETE", "OPTIONS", "PUT", "PATCH")
 
 
 class WebMetrics:
-    """The metrics of one server, whose hub knows the assets."""
+    """The metrics of one server, whose hub knows the assets; `cut` counts connections that were closed, by reason."""
 
-    def __init__(self, hub: EventHub) -> None:
-        self._hub = hub
+    def __init__(self, hub: EventHub, cut: Mapping[str, int]) -> None:
+        self._hub, self._cut = hub, cut
         self._registry = registry = CollectorRegistry()
         labels = ["method", "route", "status"]
         self._requests = Counter("servoscope_http_requests", "Requests that were answered", labels, registry=registry)
@@ -43,7 +44,12 @@ class WebMetrics:
         return generate_latest(self._registry)
 
     def collect(self) -> Iterator[Metric]:
-        """Yield what is read from the hub."""
+        """Yield what is read from elsewhere."""
+        text = "Connections that were closed because the client was slow, or because there was no room"
+        cut = CounterMetricFamily("servoscope_http_connections_cut", text, labels=["why"])
+        for why in CUT_REASONS:
+            cut.add_metric([why], self._cut.get(why, 0))
+        yield cut
         up = float(not self._hub.error)
         yield GaugeMetricFamily("servoscope_store_up", "Whether the store answered at the last look", value=up)
         assets = list(asset_statuses(list(self._hub.statuses.values())))

@@ -137,7 +137,7 @@ def authenticate(headers: Headers, settings: WebSettings, users: Users | None, s
     if not settings.login:
         return LOCAL_PRINCIPAL
     secret = _read_cookie(headers.getlist("cookie"), cookie_name(settings.secure))
-    session = sessions.find(secret, time.time())
+    session = sessions.find(secret, time.monotonic())
     role = _current_role(session, users) if session is not None else None
     if session is None or role is None:
         return None

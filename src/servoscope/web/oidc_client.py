@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 import warnings
 from collections.abc import Mapping
@@ -30,6 +31,7 @@ with warnings.catch_warnings(record=True):
 ALGORITHMS = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "EdDSA", "Ed25519")
 LEEWAY_S = 60.0  # by which clocks may differ
 METADATA_S = 3600.0  # after which addresses and keys are asked for again
+RETRY_S = 5.0  # after which a provider that did not answer is asked again
 KEYS_S = 60.0  # least time between two looks for a key that is unknown
 ENDPOINTS = ("authorization_endpoint", "token_endpoint", "jwks_uri")
 
@@ -45,7 +47,9 @@ class OidcClient:
         self._settings, self._secret = settings, secret
         self._metadata: dict[str, Any] = {}
         self._keys: KeySet | None = None
-        self._metadata_until = self._keys_after = 0.0  # by the monotonic clock
+        self._metadata_until = self._keys_after = self._failed_until = 0.0  # by the monotonic clock
+        self._failure = ""  # of the last look for the metadata
+        self._loading = asyncio.Lock()
 
     async def authorization_url(self, state: str, nonce: str, verifier: str) -> str:
         """Return where a browser is sent to log in; raises ProviderError."""
@@ -62,7 +66,10 @@ class OidcClient:
         try:
             async with self._session() as session:
                 token = await session.fetch_token(metadata["token_endpoint"], code=code, code_verifier=verifier)
-            return await self._check(dict(token), nonce)
+            claims = await self._check(dict(token), nonce)
+            if self._settings.user_name(claims) is None or self._settings.role(claims) is None:
+                claims = {**await self._load_userinfo(token, claims["sub"]), **claims}
+            return claims
         except (httpx.HTTPError, httpx.InvalidURL, AuthlibBaseError, JoseError) as error:
             raise self._problem(error) from None
         except (ValueError, KeyError, TypeError, AttributeError) as error:  # of answers that are no tokens
@@ -84,18 +91,38 @@ class OidcClient:
         claims.validate(leeway=LEEWAY_S)
         return dict(claims)
 
+    async def _load_userinfo(self, token: Mapping[str, Any], subject: str) -> dict[str, Any]:
+        """Return what the provider tells of a user beside the ID token (Core 5.3); nothing if it tells no more."""
+        url = (await self._load_metadata()).get("userinfo_endpoint")
+        if url is None:
+            return {}
+        found = await self._get(url, {"Authorization": f"Bearer {token['access_token']}"})
+        if found.get("sub") != subject:  # else the token of one user could bring the groups of another
+            raise self._problem(ValueError("its userinfo is of another user than its ID token"))
+        return found
+
     async def _load_metadata(self) -> dict[str, Any]:
-        if self._metadata and time.monotonic() < self._metadata_until:
+        async with self._loading:  # nobody has logged in yet: many who ask must not become many requests to a provider
+            now = time.monotonic()
+            if not self._metadata or now >= self._metadata_until:
+                if now < self._failed_until:
+                    raise ProviderError(self._failure)
+                try:
+                    self._metadata, self._keys = await self._fetch_metadata(), None
+                except ProviderError as error:
+                    self._failure, self._failed_until = str(error), time.monotonic() + RETRY_S
+                    raise
+                self._metadata_until = time.monotonic() + METADATA_S
             return self._metadata
+
+    async def _fetch_metadata(self) -> dict[str, Any]:
         found = await self._get(self._settings.issuer.rstrip("/") + "/.well-known/openid-configuration")
         if found.get("issuer") != self._settings.issuer:
             raise self._problem(ValueError("it names itself otherwise: issuer must be written as it does"))
         secure = urlsplit(self._settings.issuer).scheme
-        for name in ENDPOINTS:
+        for name in (*ENDPOINTS, *({"userinfo_endpoint"} & found.keys())):
             if not str(found.get(name, "")).startswith(("https://", f"{secure}://")):
                 raise self._problem(ValueError(f"its {name} is missing, or not https"))
-        self._metadata, self._keys = found, None
-        self._metadata_until = time.monotonic() + METADATA_S
         return found
 
     async def _load_keys(self, *, renew: bool = False) -> KeySet:
@@ -105,10 +132,10 @@ class OidcClient:
             self._keys = KeySet.import_key_set(plain)
         return self._keys
 
-    async def _get(self, url: str) -> dict[str, Any]:
+    async def _get(self, url: str, headers: Mapping[str, str] | None = None) -> dict[str, Any]:
         try:
             async with httpx.AsyncClient(timeout=self._settings.timeout_s) as client:
-                answer = await client.get(url)
+                answer = await client.get(url, headers=headers)
                 found = answer.raise_for_status().json()
         except (httpx.HTTPError, httpx.InvalidURL, ValueError) as error:
             raise self._problem(error) from None

@@ -21,7 +21,7 @@ from servoscope.service.access.allowed_hosts import split_address
 from servoscope.service.config import ServiceFile
 from servoscope.service.store import Store
 from servoscope.web.app import create_app
-from servoscope.web.connections import ConnectionTable, LimitedProtocol
+from servoscope.web.connections import ConnectionTable, LimitedProtocol, TlsListener
 from servoscope.web.dependencies import Context, SingleSignOn
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
@@ -82,6 +82,7 @@ def run_server(
         users=users,
         sessions=Sessions(settings.session_hours * 3600.0),
         single_sign_on=_create_single_sign_on(settings, folder),
+        connections=ConnectionTable(_available_connections(), settings.connections_per_address, settings.proxies),
     )
     tls = {}
     if settings.certificate is not None and settings.key is not None:
@@ -90,6 +91,9 @@ def run_server(
             if not path.is_file():
                 raise ConfigError(f"{path}: no such file, see [web] certificate and key")
     listening = _bind_socket(settings.listen)
+    if tls:
+        listening = TlsListener(fileno=listening.detach())
+        listening.table = context.connections
     try:
         server = WebServer(_uvicorn_config(context, tls), hub)
         if with_parent:
@@ -112,11 +116,11 @@ def _create_single_sign_on(settings: WebSettings, folder: Path) -> SingleSignOn 
 
 def _uvicorn_config(context: Context, tls: dict[str, Any]) -> uvicorn.Config:
     settings = context.settings
-    table = ConnectionTable(_available_connections(), settings.connections_per_address, settings.proxies)
-    protocol: Any = partial(LimitedProtocol, table)  # uvicorn calls it as it calls a class
+    protocol: Any = partial(LimitedProtocol, context.connections)  # uvicorn calls it as it calls a class
     return uvicorn.Config(
         create_app(context),
         http=protocol,
+        loop="asyncio",  # another one would not accept by the listening socket's own method
         ws="none",  # there are no web sockets here
         log_level="warning",
         access_log=False,

@@ -1,7 +1,8 @@
 /*
  * Self-test of @{prefix}.c: the golden samples have to lead to the golden results, bit by bit. Run it with `make check`.
  *
- * It prints the bytes of state and constants and the time of a sample, and returns 0 if all is as it should be.
+ * It prints the bytes of state and constants and the time of a sample, in cycles too where it knows a counter of them,
+ * and returns 0 if all is as it should be.
  */
 #include "@{prefix}.h"
 #include "@{prefix}_golden.h"
@@ -9,6 +10,12 @@
 #include <stdio.h>
 #include <string.h>
 #include <time.h>
+
+#ifndef CYCLES /* a counter of the processor, as "-DCYCLES=(*(volatile uint32_t *)0xE0001004)" on a Cortex-M7 */
+#if defined(__GNUC__) && defined(__x86_64__)
+#define CYCLES __builtin_ia32_rdtsc()
+#endif
+#endif
 
 #define MAX_PASSES 50 /* over the golden samples, to measure the time; they end after a second */
 
@@ -56,6 +63,9 @@ int main(void)
     int pass;
     int intact;
     clock_t begin;
+#ifdef CYCLES
+    uint32_t cycles;
+#endif
 
     for (k = 0; k < GOLDEN_SAMPLES; k++) {
         r[k] = from_bits(golden_samples[k][0]);
@@ -103,6 +113,12 @@ int main(void)
            (unsigned long)@{upper}_IMAGE_BYTES, (unsigned long)@{upper}_CONSTANT_BYTES);
     printf("%.0f ns per sample\n",
            (1e9 * (double)(clock() - begin)) / (double)CLOCKS_PER_SEC / (double)pass / (double)GOLDEN_SAMPLES);
+#ifdef CYCLES
+    cycles = (uint32_t)CYCLES;
+    evaluations += @{prefix}_block(&state, GOLDEN_SAMPLES, r, u, y, golden_restart, &q, 1);
+    cycles = (uint32_t)CYCLES - cycles; /* right though the counter begins anew in between */
+    printf("%.0f cycles per sample\n", (double)cycles / (double)GOLDEN_SAMPLES);
+#endif
     if ((wrong != 0u) || (evaluations == 0u)) {
         printf("WRONG: %lu results differ, the first at sample %lu\n", (unsigned long)wrong, (unsigned long)first);
         return 1;

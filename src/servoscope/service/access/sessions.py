@@ -21,7 +21,7 @@ class Session:
     user: str
     stamp: str  # of the user's password; empty where there is none
     csrf: str  # what a request that changes something must repeat: a foreign page cannot know it
-    expires: float  # by the clock of the machine [UTC s]
+    expires: float  # by the monotonic clock [s]: one that is set must neither end nor prolong it
     role: Role | None = None  # that a provider has given for as long as it lasts; None: that of the file of users
 
 
@@ -33,7 +33,7 @@ class Sessions:
         self._of: dict[str, Session] = {}
 
     def begin(self, user: str, stamp: str, now: float, role: Role | None = None) -> tuple[str, Session]:
-        """Return the secret of a new session, and the session."""
+        """Return the secret of a new session, and the session; `now` is by the monotonic clock [s]."""
         self._of = {key: one for key, one in self._of.items() if one.expires > now}
         while len(self._of) >= MAX_ENTRIES:
             del self._of[next(iter(self._of))]

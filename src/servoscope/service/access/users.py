@@ -64,7 +64,7 @@ class Users:
             )
         except OSError as error:
             raise AccessError(f"{self._path}: cannot be read ({error.strerror or error})") from None
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             sound = False
         if not sound:
             raise AccessError(f"{self._path}: is not a file of users, servoscope users add makes one")

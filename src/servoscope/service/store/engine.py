@@ -19,6 +19,7 @@ from sqlalchemy.engine import URL, make_url
 
 from servoscope.core.addresses import hide_secrets, show_address
 from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.service.network import NetworkSettings
 
 LOCK_TIMEOUT_S = 0.5  # s: for a locked SQLite file; samples keep coming meanwhile
 TRANSIENT_ERRORS = {  # of SQLite, where a retry may help
@@ -70,7 +71,9 @@ def display_url(url: URL) -> str:
     return show_address(url.set(drivername="postgresql").render_as_string())
 
 
-def create_store_engine(url: URL, *, lock_timeout_s: float = LOCK_TIMEOUT_S) -> sa.Engine:
+def create_store_engine(
+    url: URL, network: NetworkSettings | None = None, *, lock_timeout_s: float = LOCK_TIMEOUT_S
+) -> sa.Engine:
     """Return an engine that has opened nothing yet; raises StoreError if the driver is missing."""
     if url.get_backend_name() == "sqlite":
         engine = sa.create_engine(url, connect_args={"timeout": lock_timeout_s}, hide_parameters=True)
@@ -81,10 +84,20 @@ def create_store_engine(url: URL, *, lock_timeout_s: float = LOCK_TIMEOUT_S) -> 
     options = "-c statement_timeout=60s -c lock_timeout=5s"
     arguments = {"connect_timeout": 5, "application_name": "servoscope", "options": options, "tcp_user_timeout": 10000}
     try:
-        return sa.create_engine(url, connect_args=arguments, pool_pre_ping=True, hide_parameters=True)
+        engine = sa.create_engine(url, connect_args=arguments, pool_pre_ping=True, hide_parameters=True)
     except ModuleNotFoundError:
         where = display_url(url)
         raise StoreError(f"{where}: the driver psycopg is missing, pip install 'servoscope[service]'") from None
+    if network is not None:
+        sa.event.listen(engine, "do_connect", lambda *given: _resolve_host(network, given[-1]))
+    return engine
+
+
+def _resolve_host(network: NetworkSettings, arguments: dict[str, Any]) -> None:
+    """Let PostgreSQL's driver connect to the address that was checked; a folder of sockets is on this machine."""
+    host = str(arguments.get("hostaddr") or arguments.get("host") or "")
+    if network.refused and host and not host.startswith("/"):
+        arguments["hostaddr"] = network.resolve(host, int(arguments.get("port") or 5432))
 
 
 def _set_up_sqlite(connection: sqlite3.Connection, _: object) -> None:
@@ -105,6 +118,8 @@ def translate_errors(url: URL) -> Iterator[None]:
         raise kind(f"{display_url(url)}: {text}") from error
     except json.JSONDecodeError as error:
         raise StoreError(f"{display_url(url)}: a document in it is torn ({error}), restore it from a copy") from None
+    except OSError as error:  # of a host that has no address, or none that may be reached
+        raise StoreUnavailableError(f"{display_url(url)}: {error.strerror or error}") from error
     except exc.SQLAlchemyError as error:  # for example a timeout of the pool
         raise StoreUnavailableError(f"{display_url(url)}: {' '.join(str(error).split())}") from error
 

@@ -15,6 +15,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
 
 from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.service.network import NetworkSettings
 from servoscope.service.store import engine, schema, tables
 from servoscope.service.store.rows import CheckpointRow, CommandDocument, CommandOutcome, CommandRow, OutboxRow, Row
 
@@ -79,16 +80,23 @@ class Store:
 
     @classmethod
     def open(
-        cls, url: str, folder: Path | None = None, *, write: bool = False, lock_timeout_s: float = engine.LOCK_TIMEOUT_S
+        cls,
+        url: str,
+        folder: Path | None = None,
+        *,
+        write: bool = False,
+        lock_timeout_s: float = engine.LOCK_TIMEOUT_S,
+        network: NetworkSettings | None = None,
     ) -> Store:
         """Open a store by its URL, or a path for SQLite, relative to `folder` or else the working directory.
 
         With `write` tables may be created and migrated; otherwise the store must exist. A locked SQLite file is
-        waited for `lock_timeout_s`. Raises StoreError if it cannot be used.
+        waited for `lock_timeout_s`; `network` says which addresses a server may have. Raises StoreError if it cannot be
+        used.
         """
         try:
             found = engine.parse_store_url(url, folder or Path.cwd())
-            store = cls(found, engine.create_store_engine(found, lock_timeout_s=lock_timeout_s))
+            store = cls(found, engine.create_store_engine(found, network, lock_timeout_s=lock_timeout_s))
         except ModuleNotFoundError as error:
             raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
         if found.get_backend_name() == "sqlite":

@@ -30,6 +30,8 @@ class _Raster:
 # takes file, raster, names, first row, number of rows
 _ReadChannels = Callable[[Any, _Raster, Sequence[str], int, int], Mapping[str, Any]]
 
+MAX_RATIO = 1100  # rows per byte: of a byte each, deflated as far as deflate goes
+
 
 def open_mdf(path: Path) -> TableFile:
     """Open an MDF file, version 3 or 4."""
@@ -47,6 +49,8 @@ def open_mdf(path: Path) -> TableFile:
             names: dict[str, Any] = {}
             for i, channel in enumerate(group.channels):
                 names.setdefault((channel.name or DEFAULT_TIME_NAME) if i == master else channel.name, (None, g, i))
+            if group.channel_group.cycles_nr > MAX_RATIO * path.stat().st_size:  # the library would read for ever
+                raise ValueError("names more rows than it can hold")
             found.append(_Raster(int(group.channel_group.cycles_nr), names))
         return found
 

@@ -86,7 +86,7 @@ async def end_login(context: ContextDep, request: Request, state: Text = "", cod
     user, role = settings.user_name(claims), settings.role(claims)
     if user is None or role is None:
         return await _refuse_user(context, user or "", address, "role")
-    secret, _ = context.sessions.begin(user, "", time.time(), role)
+    secret, _ = context.sessions.begin(user, "", time.monotonic(), role)
     # names may be given away at the provider, its subjects not
     document: dict[str, Any] = {"from": address, "by": "oidc", "subject": str(claims["sub"])[:255]}
     await asyncio.to_thread(context.store.add_audit, user, "", "login", document)

@@ -28,7 +28,7 @@ def _session_response(context: Context, who: Principal | None) -> SessionRespons
         user=who.user if who is not None else None,
         role=who.role if who is not None else None,
         csrf=session.csrf if session is not None else None,
-        expires=session.expires if session is not None else None,
+        expires=time.time() + session.expires - time.monotonic() if session is not None else None,
         version=__version__,
     )
 
@@ -42,7 +42,7 @@ async def get_session(context: ContextDep, who: OptionalPrincipal) -> SessionRes
 @router.post("/session")
 async def log_in(context: ContextDep, login: LoginRequest, request: Request, response: Response) -> SessionResponse:
     """Log in; the answer sets the cookie of a session."""
-    users, now = context.users, time.time()
+    users = context.users
     if users is None:
         raise HTTPException(409, "there is no login by password here")
     address = request.client.host if request.client is not None else ""
@@ -56,7 +56,7 @@ async def log_in(context: ContextDep, login: LoginRequest, request: Request, res
     if role is None or stamp is None:
         await asyncio.to_thread(context.store.add_audit, login.user[:64], "", "login refused", {"from": address})
         raise HTTPException(401, "name or password is wrong")
-    secret, session = context.sessions.begin(login.user, stamp, now)
+    secret, session = context.sessions.begin(login.user, stamp, time.monotonic())
     await asyncio.to_thread(context.store.add_audit, login.user, "", "login", {"from": address})
     set_session_cookie(context, response, secret)
     return _session_response(context, Principal(login.user, role, session, secret))
