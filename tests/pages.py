@@ -15,8 +15,8 @@ from servoscope.detection.result import (
     FaultEstimate,
     FinalCoefficient,
     ResponsePoint,
-    Trace,
 )
+from servoscope.detection.trace import Trace
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording

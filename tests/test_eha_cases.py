@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.result import Diagnosis, Trace
+from servoscope.detection.result import Diagnosis
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop

@@ -11,7 +11,7 @@ import pytest
 
 from servoscope.core.errors import BaselineError
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.result import Trace
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.estimation.kernel.buffers import BufferPool
 from servoscope.estimation.recursion import LANE_COUNT

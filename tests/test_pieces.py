@@ -14,7 +14,8 @@ from logs import lines, written
 from servoscope.core import outofcore
 from servoscope.core.errors import RecordingError
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.result import Diagnosis, Trace
+from servoscope.detection.result import Diagnosis
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose, diagnose_with_trace
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.operating_points import learn

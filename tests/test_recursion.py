@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import naive
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.result import Trace
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.estimation.pipeline import Estimates, Pipeline, Tuning
 from servoscope.estimation.recursion import EvaluationConstants, Recursion

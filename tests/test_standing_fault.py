@@ -97,6 +97,6 @@ def test_a_damaged_newest_file_does_not_hide_the_fault_of_yesterday() -> None:
     found = {one.asset: (one.day, one.state) for one in fleet.assets}
     assert fleet.count("fault") == 3 and {found[name][1] for name in "abc"} == {"fault"}
     assert found["a"][0] == "2026-01-02"  # and says of which day that is
-    assert found["d"] == ("2026-01-02", "healthy") and found["f"] == ("2026-01-03", "undetermined")
+    assert found["d"] == ("2026-01-03", "failed") and found["f"] == ("2026-01-03", "undetermined")
     assert found["e"][1] == "failed"
     assert len(fleet.failed) == 5  # each is told besides

@@ -333,9 +333,12 @@ def _asset(loop: Loop) -> Target:
         unpack_state(pack_state(asset.state), "press")
         after = asset.state.position
         if before is not None and after.blocks == before.blocks:
-            if after.repeated != before.repeated + 1:
-                raise AssertionError("a block was left out, and not counted as repeated")
-            raise MessageError("repeated", "it was counted before, or its place has passed")
+            counted = [
+                name for name in ("repeated", "late", "future") if getattr(after, name) == getattr(before, name) + 1
+            ]
+            if len(counted) != 1:
+                raise AssertionError("a block was left out, and not counted as repeated, late or future")
+            raise MessageError(counted[0], "it was counted before, or its time stamps do not fit")
         state["number"], state["t"] = number + 1 if number < 2**61 else 0, float(t.max()) + 0.01
         if state["t"] > BEGAN + 1e9:
             state["t"] = BEGAN

@@ -39,7 +39,8 @@ aliases.install()
 if TYPE_CHECKING:
     from servoscope.design import design_study
     from servoscope.detection.baseline import Baseline
-    from servoscope.detection.result import Diagnosis, Trace
+    from servoscope.detection.result import Diagnosis
+    from servoscope.detection.trace import Trace
     from servoscope.diagnosis.diagnose import diagnose
     from servoscope.diagnosis.monitor import Monitor
     from servoscope.diagnosis.operating_points import learn
@@ -55,7 +56,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "Loop": "models.loop",
         "Monitor": "diagnosis.monitor",
         "Recording": "signals.recording",
-        "Trace": "detection.result",
+        "Trace": "detection.trace",
         "design_study": "design",
         "diagnose": "diagnosis.diagnose",
         "inspect": "learning.inspection",

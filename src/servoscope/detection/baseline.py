@@ -255,7 +255,10 @@ class Baseline(ShortRepr, _BaselineModel):
         So it does where the plant of the loop file explains them down to their noise as it stands. A plant that is not
         linear, or a file that is wrong, asks for further parameters, or leaves no sequential test.
         """
-        return bool(self.members) and set(self.ratios) == set(self.loop.plant.parameters)
+        exact = self.exact is not None and self.exact.misfit <= 1.0
+        as_it_stands = set(self.ratios) <= set(self.loop.plant.parameters)
+        # a baseline of nominal parameters has no ratios, and its motion was simulated
+        return as_it_stands and (bool(self.members) or (exact and not self.ratios))
 
     @property
     def limited_motion(self) -> MotionRange | None:

@@ -1,19 +1,14 @@
-"""The result of a diagnosis as data: verdict, intervals with faults and candidates, warnings; and a monitor's trace."""
+"""The result of a diagnosis as data: verdict, intervals with faults and candidates, warnings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, computed_field, model_validator
 
-from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.messages import Message, MessageField, message, read_messages, render, text_message
 from servoscope.core.short_repr import ShortRepr
-from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.signals import Defect
 
 Verdict = Literal["healthy", "fault", "undetermined"]
@@ -312,6 +307,8 @@ class Diagnosis(ShortRepr, _ResultModel):
 
         `onset`: of a change that is older than the recording, where it is known [UTC s].
         """
+        if self.headline.key == "diagnosis.timeline":
+            return _dated_timeline(self.headline, began)
         since = self.headline.values.get("since")
         if self.current.onset_s is None or not isinstance(since, Message):
             return self.headline
@@ -323,78 +320,26 @@ class Diagnosis(ShortRepr, _ResultModel):
         return self.headline.model_copy(update={"values": {**self.headline.values, "since": since}})
 
 
-@dataclass(frozen=True, eq=False)
-class Statistic:
-    """One of the statistics that raise the alarm, over K evaluations."""
-
-    name: str  # ``t2``; ``cusum``, the sequential test; ``features``, what the loop shows besides its coefficients
-    value: FloatArray  # shape (K,)
-    limit: float | FloatArray
-    exceeded: BoolArray  # shape (K,)
-
-
-def detection_statistics(
-    t2: FloatArray, limit: float | FloatArray, cusum: FloatArray, ready: BoolArray, features: FloatArray | None = None
-) -> tuple[Statistic, ...]:
-    """Return the statistics that raise the alarm, each with where it is above its limit."""
-    found = Statistic("t2", t2, limit, ready & (t2 > limit)), Statistic("cusum", cusum, 1.0, ready & (cusum >= 1.0))
-    return found if features is None else (*found, Statistic("features", features, 1.0, features > 1.0))
+DATED = {  # parts of the headline of a timeline: in seconds, and as dates
+    "diagnosis.healed": "diagnosis.healed_date",
+    "diagnosis.stretch_when": "diagnosis.stretch_when_date",
+    "diagnosis.stretch_since": "diagnosis.stretch_since_date",
+    "diagnosis.stretch_until": "diagnosis.stretch_until_date",
+    "diagnosis.stretch_start": "diagnosis.stretch_start_date",
+}
 
 
-def any_exceeded(statistics: tuple[Statistic, ...]) -> BoolArray:
-    """Return where one of the statistics is above its limit, shape (K,)."""
-    return np.logical_or.reduce([statistic.exceeded for statistic in statistics])  # type: ignore[no-any-return]
+def _dated_timeline(headline: Message, began: float) -> Message:
+    """Return the headline of a timeline with dates instead of seconds since `began` [UTC s]."""
 
+    def dated(given: Message) -> Message:
+        times = {name: began + given.values[name] for name in ("t", "from_s", "to_s") if given.values.get(name)}
+        return message(DATED[given.key], began=began, **times)
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Trace(ShortRepr):
-    """The output of a monitor over time, K evaluations; for a fleet all shapes begin with the assets."""
-
-    t: FloatArray  # in s, shape (K,)
-    names: tuple[str, ...]  # of the n coefficients
-    # theta, covariance: the estimate, shapes (K, n) and (K, n, n); where the loop can be simulated, without the biases
-    # of the regression by intersample behaviour and by noise in the regressors
-    theta: FloatArray
-    covariance: FloatArray
-    expected: FloatArray  # what a healthy loop would show under the same reference, shape (K, n)
-    statistic: FloatArray  # T^2, shape (K,)
-    threshold: float | FloatArray  # of the statistic; for a fleet one per asset, shape (assets, 1)
-    level: FloatArray  # largest CUSUM since the evaluation before, as a multiple of its limit, shape (K,); 0: no CUSUM
-    crossed: FloatArray  # when a CUSUM passed its limit [s], NaN where none is above it, shape (K,)
-    ifrf: FrequencyResponse  # at the monitored frequencies, of `theta`
-    ifrf_expected: FrequencyResponse  # and of `expected`
-    ready: BoolArray  # whether the estimator had learned anything by then, shape (K,)
-    # score of the features of the spans so far, as a multiple of its limit, shape (K,); None where none were learned
-    features: FloatArray | None = None
-
-    def _shown_facts(self) -> dict[str, object]:
-        span = f"{self.t[0]:.4g} to {self.t[-1]:.4g} s" if self.t.size else "none"
-        return {"evaluations": self.t.size, "span": span, "coefficients": ", ".join(self.names)}
-
-    @cached_property
-    def statistics(self) -> tuple[Statistic, ...]:
-        """The statistics that raise the alarm: T^2, the sequential test and, where they were learned, the features."""
-        return detection_statistics(self.statistic, self.threshold, self.level, self.ready, self.features)
-
-    @cached_property
-    def exceeded(self) -> BoolArray:
-        """Whether any of the statistics is above its limit, without on-delay and off-delay, shape (K,)."""
-        return any_exceeded(self.statistics)
-
-    def table(self) -> dict[str, FloatArray]:
-        """Return the columns of ``diagnose --trace``: t, theta_0 ..., ifrf_1Hz_real ..., statistic, threshold, level.
-
-        Level and features are the sequential test's and the features', which alarm at 1.
-        """
-        columns = {"t": self.t}
-        for i in range(self.theta.shape[1]):
-            columns[f"theta_{i}"] = self.theta[:, i]
-        for i, f in enumerate(self.ifrf.frequencies):
-            columns[f"ifrf_{f:g}Hz_real"] = self.ifrf.H[:, i].real
-            columns[f"ifrf_{f:g}Hz_imag"] = self.ifrf.H[:, i].imag
-        columns["statistic"] = self.statistic
-        columns["threshold"] = np.full(len(self.t), self.threshold)
-        columns["level"] = self.level
-        if self.features is not None:
-            columns["features"] = self.features
-        return columns
+    stretches = tuple(
+        one.model_copy(update={"values": {**one.values, "when": dated(one.values["when"])}})
+        for one in headline.values["stretches"]
+    )
+    now = headline.values["now"]
+    values = {**headline.values, "stretches": stretches, "now": None if now is None else dated(now)}
+    return headline.model_copy(update={"values": values})

@@ -12,7 +12,8 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.detection.chi2_test import Onset
 from servoscope.detection.expectation import Expectation
-from servoscope.detection.result import UNKNOWN, Candidate, Trace
+from servoscope.detection.result import UNKNOWN, Candidate
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
 from servoscope.estimation import frequency_response
 from servoscope.estimation.filter_bank import nominal_theta

@@ -22,10 +22,10 @@ from servoscope.detection.result import (
     FaultInterval,
     FinalCoefficient,
     ResponsePoint,
-    Trace,
     Verdict,
 )
 from servoscope.detection.signal_defects import find_signal_defect
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
 from servoscope.diagnosis.examine import UNSEEN, Examination

@@ -24,7 +24,7 @@ from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
 from servoscope.detection.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.detection.motion import RecordedMotion
-from servoscope.detection.result import Statistic, any_exceeded, detection_statistics
+from servoscope.detection.trace import Statistic, any_exceeded, detection_statistics
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, RegressionRunner, Tuning

@@ -17,9 +17,9 @@ from servoscope.detection.result import (
     FaultEstimate,
     FaultInterval,
     RefitSummary,
-    Trace,
     Verdict,
 )
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.models.plants import Plant

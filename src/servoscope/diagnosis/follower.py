@@ -14,7 +14,7 @@ import numpy as np
 from servoscope.core.arrays import FloatArray, IndexArray
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import consecutive_exceedances
-from servoscope.detection.result import Trace
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.signals.samples import Samples
 

@@ -13,7 +13,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.feature_monitor import FeatureMonitor, hold
-from servoscope.detection.result import Trace
+from servoscope.detection.trace import Trace
 from servoscope.estimation import frequency_response
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.pipeline import Pipeline

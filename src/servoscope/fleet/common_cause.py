@@ -24,7 +24,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import whiten
 from servoscope.detection.plant_fit import fault_directions
-from servoscope.detection.result import Trace
+from servoscope.detection.trace import Trace
 
 ACCEPTANCE_PROBABILITY = 0.95  # probability from which a common cause is named and its members are explained
 MIN_MEMBERS = 3  # members of a group: two may coincide

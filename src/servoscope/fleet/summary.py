@@ -121,9 +121,7 @@ def _last_known_day(states: Mapping[str, str]) -> str:
     """
     days = sorted(states, reverse=True)
     told = next((day for day in days if states[day] not in ("undetermined", FAILED)), days[0])
-    if states[told] in ("fault", COMMON):
-        return told
-    return next((day for day in days if states[day] != FAILED), days[0])
+    return told if states[told] in ("fault", COMMON) else days[0]
 
 
 def _common_causes(entries: Iterable[Entry], groups: Mapping[str, Mapping[str, str]], prior: Prior) -> list[Cause]:

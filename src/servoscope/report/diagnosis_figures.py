@@ -11,7 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.detection.result import Candidate, Diagnosis, FaultEstimate, Trace
+from servoscope.detection.result import Candidate, Diagnosis, FaultEstimate
+from servoscope.detection.trace import Trace
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, FrequencyResponse
 from servoscope.report.format_values import axis_scale, text_symbol, time_axis_unit
 from servoscope.report.plotting import COLOURS, envelope, plot_style, robust_range, visible_spans

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint, Trace
+from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
 from servoscope.models.loop import Loop
 from servoscope.report.format_values import (

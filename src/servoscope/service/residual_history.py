@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.result import Trace
+from servoscope.detection.trace import Trace
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 
 ResidualRow = tuple[float, float | None, float | None, float | None]

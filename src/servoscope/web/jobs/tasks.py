@@ -19,7 +19,7 @@ from servoscope.core.settings import parse_toml
 from servoscope.core.workers import Progress
 from servoscope.design import design_study
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.result import Trace
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis import operating_points
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
