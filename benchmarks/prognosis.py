@@ -127,7 +127,12 @@ def progpy_forecaster() -> Forecaster:
         Q = np.diag([1e-8, (0.5 * rate) ** 2 * step / max(t[-1], 1.0)])
         filter_ = KalmanFilter(model, start, t0=0.0, dt=1e9, Q=Q, R=np.array([[float(series.std[0]) ** 2]]))
         for time, value in zip(t[1:], level[1:], strict=True):
-            filter_.estimate(float(time), model.InputContainer({}), model.OutputContainer({"size": float(value)}))
+            # its clock adds up the steps, and runs ahead by their rounding
+            filter_.estimate(
+                max(float(time), filter_.t + 1e-9),
+                model.InputContainer({}),
+                model.OutputContainer({"size": float(value)}),
+            )
         mean = np.array([filter_.x.mean["level"], filter_.x.mean["rate"]])
         rng = np.random.default_rng(0)
         draws = rng.multivariate_normal(mean, np.atleast_2d(filter_.x.cov), 2000)

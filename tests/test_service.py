@@ -64,7 +64,7 @@ def test_an_uninterrupted_run_says_what_is_there(whole: dict[str, list[object]],
     assert {row[:3] for row in diagnoses if row[0] == "lift"} == {("lift", "examination", "healthy")}
     full, again = [row for row in diagnoses if row[1] == "full"]
     assert full[0] == "press" and full[2] == "fault" and "leakage" in full[3]
-    assert again[0] == "press" and "unknown" in again[3]  # the leak ends in its window
+    assert again[0] == "press" and "healthy again since" in again[3]  # the leak ends in its window
     began = ServiceFile.load(config).sources["line"].start
     assert began is not None and full[4] - began.timestamp() == pytest.approx(60.02 + 30.0, abs=0.6)
     (alarm,) = asked(config, "SELECT asset, alarm, t FROM transitions WHERE after = 'unacknowledged'")

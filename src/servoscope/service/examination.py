@@ -39,10 +39,25 @@ class StoredDiagnosis(BaseModel):
 
     def with_onset(self, onset: float | None) -> StoredDiagnosis:
         """Return it with the onset [UTC s] that an earlier window has found, if its own window begins after that."""
+        if onset is not None and self.headline.key == "diagnosis.timeline":
+            return self._with_timeline_from(onset)
         since = self.headline.values.get("since")
         if onset is None or since is None or since.key != "diagnosis.since_start_date":
             return self
         values = {**self.headline.values, "since": message("diagnosis.since_date", t=onset, growth=None)}
+        return self.model_copy(update={"headline": message(self.headline.key, **values), "onset": onset})
+
+    def _with_timeline_from(self, onset: float) -> StoredDiagnosis:
+        first, *others = self.headline.values["stretches"]
+        when = first.values["when"]
+        if when.key == "diagnosis.stretch_until_date":
+            when = message("diagnosis.stretch_when_date", from_s=onset, to_s=when.values["to_s"])
+        elif when.key == "diagnosis.stretch_start_date":
+            when = message("diagnosis.stretch_since_date", from_s=onset)
+        else:
+            return self
+        first = first.model_copy(update={"values": {**first.values, "when": when}})
+        values = {**self.headline.values, "stretches": (first, *others)}
         return self.model_copy(update={"headline": message(self.headline.key, **values), "onset": onset})
 
 
