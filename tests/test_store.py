@@ -336,3 +336,14 @@ def test_a_writer_waits_for_another_that_prepares_the_file(tmp_path: Path) -> No
     timer.start()
     Store.open("history.sqlite", tmp_path, write=True).close()
     timer.join()
+
+
+def test_a_reader_waits_for_the_tables_of_a_store_that_is_being_made(tmp_path: Path) -> None:
+    """`run` and `serve` are started together: the file is there before its tables."""
+    path = tmp_path / "history.sqlite"
+    sqlite3.connect(path).close()
+    path.touch()
+    maker = threading.Timer(0.3, lambda: Store.open(str(path), write=True).close())
+    maker.start()
+    Store.open(str(path)).close()
+    maker.join()

@@ -69,6 +69,10 @@ class StoreError(ServoscopeError):
     """A store cannot be used."""
 
 
+class EmptyStoreError(StoreError):
+    """A store holds no tables yet: it is none, or another process is making it."""
+
+
 class StoreUnavailableError(StoreError):
     """A store cannot be used for now: it is full, locked or down."""
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import sqlalchemy as sa
 
-from servoscope.core.errors import StoreError
+from servoscope.core.errors import EmptyStoreError, StoreError
 from servoscope.service.store.tables import METADATA, meta
 
 Migration = Callable[[sa.Connection], None]
@@ -30,7 +30,7 @@ def create_or_migrate(connection: sa.Connection, name: str, *, write: bool) -> N
         if strange := present & set(METADATA.tables):
             raise StoreError(f"{name}: has a table {min(strange)} that is not servoscope's, give another database")
         if not write:
-            raise StoreError(f"{name}: holds no history yet, start it with servoscope run")
+            raise EmptyStoreError(f"{name}: holds no history yet, start it with servoscope run")
         METADATA.create_all(connection)
         connection.execute(meta.insert(), [{"key": "schema", "value": schema_version()}])
         return

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
 
-from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.core.errors import EmptyStoreError, StoreError, StoreUnavailableError
 from servoscope.service.network import NetworkSettings
 from servoscope.service.store import engine, schema, tables
 from servoscope.service.store.rows import CheckpointRow, CommandDocument, CommandOutcome, CommandRow, OutboxRow, Row
@@ -103,7 +103,8 @@ class Store:
             if not write and not Path(found.database or "").exists():
                 raise StoreError(f"{store.name}: no such store, servoscope run makes it")
             engine.check_folder(Path(str(found.database)))
-        end = time.monotonic() + (OPENING_S if write and found.get_backend_name() == "sqlite" else 0.0)
+        is_file = found.get_backend_name() == "sqlite"
+        end = time.monotonic() + (OPENING_S if is_file and (write or _is_new(found.database)) else 0.0)
         try:
             store._prepare(write, end)
         except BaseException:
@@ -112,16 +113,17 @@ class Store:
         return store
 
     def _prepare(self, write: bool, end: float) -> None:
-        """Create or migrate the tables; two processes that begin with an empty file lock each other out for a moment.
+        """Create or migrate the tables.
 
-        SQLite does not wait there, as one of them would wait for the other for ever.
+        Two processes that begin with an empty file lock each other out for a moment, and a reader may see the file
+        before its tables. SQLite does not wait there, as one of them would wait for the other for ever.
         """
         while True:
             try:
                 with self._transaction() as connection:
                     schema.create_or_migrate(connection, self.name, write=write)
                 return
-            except StoreUnavailableError:
+            except (StoreUnavailableError, EmptyStoreError):
                 if time.monotonic() >= end:
                     raise
             time.sleep(0.05)
@@ -246,3 +248,8 @@ class Store:
         """Return the rows of a query."""
         with self._transaction() as connection:
             return [dict(row) for row in connection.execute(query).mappings()]
+
+
+def _is_new(path: str | None) -> bool:
+    """Return whether a file was written just now."""
+    return path is not None and time.time() - Path(path).stat().st_mtime < OPENING_S
