@@ -250,6 +250,9 @@ class Asset:
             if examination.verdict == "fault" or examination.fault_at is not None:
                 onset = diagnosis.onset if first and diagnosis.onset is not None else examination.onset
                 examination = replace(examination, faults=faults or examination.faults, onset=onset)
+        elif diagnosis.verdict == "undetermined" and not examination.named:
+            # a sensor that is stuck, for example: nothing that would stand was found
+            examination = replace(examination, fault_at=None)
         pending = tuple(one for one in state.pending_diagnoses if one != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
