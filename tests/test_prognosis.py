@@ -153,6 +153,8 @@ class TestSeries:
             ("time,size\n1,2\n", "has no column 'leakage'"),
             ("time,leakage\n2026-01-01,1\nyesterday,2\n", "row 3, column time: 'yesterday'"),
             ("time,leakage\n2026-01-01,1\n2026-01-02,1.2x\n", "row 3, column leakage: '1.2x'"),
+            ("time,leakage\n2026-01-01,1\n\nyesterday,2\n", "row 4, column time: 'yesterday'"),
+            ("leakage,time\n1,2026-01-01\n2\n", "row 3, column time: ''"),
             ("time,leakage\n2026-01-01,\n", "has no row in which all values are numbers"),
         ],
     )

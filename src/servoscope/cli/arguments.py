@@ -7,7 +7,6 @@ import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,8 +37,10 @@ def parse_time(text: str | None, option: str) -> float | None:
     """Read a date and time after ISO 8601, UTC unless it says otherwise, or how long ago; return UTC s."""
     if text is None:
         return None
+    from servoscope.prognosis.series import parse_date
+
     try:
-        moment = datetime.fromisoformat(text)
+        return parse_date(text)
     except ValueError:
         try:
             return time.time() - parse_duration(text, option)
@@ -47,7 +48,6 @@ def parse_time(text: str | None, option: str) -> float | None:
             raise typer.BadParameter(
                 f"{option} {text!r}: write a date or time, as in 2026-01-31T12:00, or how long ago, as in 8h"
             ) from None
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 MOST_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once

@@ -117,7 +117,8 @@ def read_sizes(
 
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            head, *rows = [row for row in csv.reader(file) if row]
+            lines = csv.reader(file)
+            (_, head), *rows = [(lines.line_num, row) for row in lines if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise PrognosisError(f"{path}: cannot be read: {error}") from None
     except ValueError:
@@ -130,11 +131,12 @@ def read_sizes(
     for name in wanted:
         k, parse = head.index(name), _seconds if name == time else _number
         numbers: list[float] = []
-        for i, row in enumerate(rows, start=2):
+        for line, row in rows:
+            text = row[k] if k < len(row) else ""
             try:
-                numbers.append(parse(row[k] if k < len(row) else ""))
+                numbers.append(parse(text))
             except ValueError:
-                raise PrognosisError(f"{path}: row {i}, column {name}: {row[k]!r} cannot be read") from None
+                raise PrognosisError(f"{path}: row {line}, column {name}: {text!r} cannot be read") from None
         columns.append(np.array(numbers))
     t, values, *others = columns
     spread = None
@@ -154,12 +156,12 @@ def _seconds(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        return parse_date(text)
+        return parse_date(text.strip())
 
 
 def parse_date(text: str) -> float:
     """Return a date and time of ISO 8601 as UTC seconds; UTC where it names no zone. Raises ValueError."""
     from datetime import UTC
 
-    date = datetime.fromisoformat(text.strip())
+    date = datetime.fromisoformat(text)
     return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()

@@ -12,8 +12,8 @@ from typing import NamedTuple
 from servoscope.core.errors import RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.archives import ARCHIVES, archive_of, unpack
-from servoscope.signals.readers.bounded import open_bounded
 from servoscope.signals.readers.csv import is_utf16, open_csv
+from servoscope.signals.readers.reader_process import open_bounded
 from servoscope.signals.readers.table import TableFile
 
 ENTRY_POINTS = "servoscope.readers"  # of other packages: name is the suffix without its dot, object the function

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.bounded import open_bounded
+from servoscope.signals.readers.reader_process import open_bounded
 from servoscope.signals.readers.table import Table, TableFile, shorten_error
 
 HEADER_BYTES = 128  # bytes of text, version and byte order

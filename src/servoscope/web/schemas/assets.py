@@ -12,13 +12,13 @@ from pydantic import Field
 
 from servoscope.detection.result import Verdict
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
+from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
 from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
 from servoscope.service.asset_status import AlarmStatus, AssetStatus, FloodCounts, ServiceStatus
 from servoscope.web.schemas.requests import CommandName
 from servoscope.web.schemas.responses import ApiResponse, DiagnosisRow, NullableFloats, SignalColumns
 
-TWO_SIDED_95 = 1.959963984540054  # standard deviations that hold 95 %
 COMMAND_NAMES: tuple[CommandName, ...] = get_args(CommandName)
 NE107_RANKS: tuple[Ne107, ...] = get_args(Ne107)
 MAX_EXCESS = 3.9  # of a statistic over its limit, in the severity: less than one step of alarm priority
@@ -306,7 +306,7 @@ def coefficient_intervals(status: AssetStatus) -> list[CoefficientInterval]:
     """Return the coefficients of the newest evaluation."""
     units, rows = status.metadata.coefficient_units, []
     for i, (name, value, std, nominal) in enumerate(status.parameters):
-        low, high = value - TWO_SIDED_95 * std, value + TWO_SIDED_95 * std
+        low, high = value - NORMAL_95 * std, value + NORMAL_95 * std
         unit = units[i] if i < len(units) else ""
         rows.append(
             CoefficientInterval(name=name, value=value, std=std, low=low, high=high, nominal=nominal, unit=unit)

@@ -18,7 +18,7 @@ from servoscope.signals.readers.table import Table, TableFile
 START_S = 60.0  # that a process and the libraries may take to start, on a machine that is busy
 BASE_S, BYTES_PER_S = 15.0, 5e5  # that a small file may take, and what is larger, by the clock on the wall
 LIMITS = ProcessLimits(cpu_s=1e6, memory_mb=8000.0, file_mb=1e6)  # a task's time is bound, not the process's
-TASKS = "servoscope.signals.readers.bounded"
+TASKS = "servoscope.signals.readers.reader_process"
 
 _idle: list[Worker] = []  # kept, because starting one and loading its libraries takes a second
 _lock = threading.Lock()
