@@ -280,7 +280,7 @@ class TestAsset:
             followed.process(replace(block, y=y) if 10 < k < 20 else block)
         assert followed.state is not None
         checkpoint.unpack_state(checkpoint.pack_state(followed.state), "press")
-        assert math.isfinite(followed.state.evaluation.statistic or math.nan)
+        assert math.isfinite(followed.state.evaluation.status.statistic or math.nan)
 
     def test_silence_is_an_alarm_and_no_verdict(self) -> None:
         followed = asset()

@@ -146,6 +146,11 @@ class Mosquitto:
             time.sleep(0.02)
         raise RuntimeError(f"mosquitto does not answer, see {self._folder / 'log'}")
 
+    @property
+    def pid(self) -> int:
+        """Its process, while it runs."""
+        return self._process.pid
+
     def stop(self, how: signal.Signals = signal.SIGTERM) -> None:
         """Stop it, or kill it."""
         self._process.send_signal(how)

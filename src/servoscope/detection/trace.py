@@ -35,6 +35,9 @@ def any_exceeded(statistics: tuple[Statistic, ...]) -> BoolArray:
     return np.logical_or.reduce([statistic.exceeded for statistic in statistics])  # type: ignore[no-any-return]
 
 
+ASSET_COLUMNS = "theta", "covariance", "expected", "statistic", "level", "crossed", "ready"
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Trace(ShortRepr):
     """The output of a monitor over time, K evaluations; for a fleet all shapes begin with the assets."""
@@ -59,6 +62,14 @@ class Trace(ShortRepr):
     def _shown_facts(self) -> dict[str, object]:
         span = f"{self.t[0]:.4g} to {self.t[-1]:.4g} s" if self.t.size else "none"
         return {"evaluations": self.t.size, "span": span, "coefficients": ", ".join(self.names)}
+
+    def lane(self, asset: int) -> Trace:
+        """Return that of one asset of a fleet."""
+        part = {name: getattr(self, name)[asset] for name in ASSET_COLUMNS}
+        responses = {name: getattr(self, name) for name in ("ifrf", "ifrf_expected")}
+        for name, one in responses.items():
+            part[name] = FrequencyResponse(one.frequencies, one.H[asset], one.covariance[asset])
+        return Trace(self.t, self.names, threshold=float(np.asarray(self.threshold)[asset, 0]), **part)
 
     @cached_property
     def statistics(self) -> tuple[Statistic, ...]:

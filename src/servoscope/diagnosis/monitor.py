@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -74,11 +75,15 @@ class Monitor:
                 "the baselines of one monitor must share sample rate, evaluation rate, coefficients and frequencies: "
                 "make one monitor for each kind of loop"
             )
-        self.loop = self.baselines[0].loop
         constants = {key: MonitorConstants.from_baseline(each) for key, each in distinct.items()}
-        self._constants_of = tuple(constants[id(each)] for each in self.baselines)
-        self.pipeline = self._constants_of[0].pipeline
         self._single_precision = precision == "single"
+        self._assemble([constants[id(each)] for each in self.baselines])
+
+    def _assemble(self, constants: Sequence[MonitorConstants]) -> None:
+        """Take the constants of each asset."""
+        self.loop = self.baselines[0].loop
+        self._constants_of = tuple(constants)
+        self.pipeline = self._constants_of[0].pipeline
         self._groups = self._group_assets()
         self._shared_columns = {
             "expected": _deduplicate([each.expected_theta for each in self._constants_of]),
@@ -93,6 +98,49 @@ class Monitor:
         self._size = self._features_at + (self._features.size if self._features is not None else 0)
         self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
         self._step_constants = np.zeros(0)
+
+    @classmethod
+    def join(cls, monitors: Sequence[Monitor]) -> Self:
+        """Return a fleet of assets that have these monitors, of one `lane_key`; they share what was computed for them.
+
+        A row of its state is a state of the asset's own monitor, bit by bit.
+        """
+        # of one alone, the recursion would not run in lanes
+        monitors = [*monitors, *monitors][: max(2, len(monitors))]
+        fleet = cls.__new__(cls)
+        fleet.baselines, fleet.fleet = tuple(each.baselines[0] for each in monitors), True
+        fleet._single_precision = False
+        fleet._assemble([each._constants_of[0] for each in monitors])
+        return fleet
+
+    def select(self, assets: npt.NDArray[np.intp]) -> Self:
+        """Return a fleet of some assets of this one, which has been made by `join`, in this order."""
+        ((_, recursion),) = self._groups
+        part = copy.copy(self)
+        part.baselines = tuple(map(self.baselines.__getitem__, assets.tolist()))
+        part._groups = [(np.arange(len(assets)), recursion.select(assets))]
+        part._shared_columns = {
+            name: values if len(values) == 1 else values[assets] for name, values in self._shared_columns.items()
+        }
+        part._limits = self._limits[assets]
+        return part
+
+    @property
+    def lane_key(self) -> Hashable | None:
+        """What assets must have in common to be followed side by side by `join`; None: this one cannot be.
+
+        Features cut windows of their own, valve laws and stage 1 run one asset after the other.
+        """
+        ((_, recursion), *others) = self._groups
+        if self.fleet or others or self._prefix_size or self._features is not None or not recursion.has_lanes:
+            return None
+        return recursion.layout, *compatibility_key(self.baselines[0])
+
+    def phase(self, state: FloatArray) -> npt.NDArray[np.int64]:
+        """Return where between two evaluations each asset is, shape (assets,): those of one phase go together."""
+        from servoscope.estimation.kernel.sample_steps import SAMPLE
+
+        return self._groups[0][1].phase(np.atleast_2d(state)[:, self._prefix_size + SAMPLE])
 
     def _group_assets(self) -> list[tuple[npt.NDArray[np.intp], Recursion]]:
         """Return the assets of each structure, which go through one recursion together."""
@@ -295,7 +343,7 @@ def _deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
     return np.array(values if len({id(value) for value in values}) > 1 else values[:1])
 
 
-def compatibility_key(baseline: Baseline) -> Hashable:
+def compatibility_key(baseline: Baseline) -> tuple[Hashable, ...]:
     """Return the properties that all assets of one monitor must share."""
     loop = baseline.loop
     return loop.sample_rate, loop.monitor.evaluation_rate, baseline.names, loop.monitor.frequencies

@@ -8,13 +8,15 @@ that is carried from sample to sample is in that row.
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import itertools
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -138,6 +140,30 @@ class Recursion:
         self._code = build_kernels(
             self._spec, self._lanes, min(self._lanes, VECTOR_WIDTH[self._type.name]), int(self._per_asset)
         )
+
+    @property
+    def layout(self) -> Hashable:
+        """What decides how a state is laid out, and which code runs."""
+        return self._spec
+
+    @property
+    def has_lanes(self) -> bool:
+        """Whether assets run side by side; one with a private state of its estimator runs alone."""
+        return not self.constants[0].extra
+
+    def select(self, assets: npt.NDArray[np.intp]) -> Self:
+        """Return the recursion of some of the assets, in this order."""
+        part = copy.copy(self)
+        part.constants = tuple(map(self.constants.__getitem__, assets.tolist()))
+        part._blocks = -(-len(assets) // self._lanes)
+        if self._per_asset:
+            part._table = self._table[assets]
+            part._block_constants = part._arrange_constants()
+        return part
+
+    def phase(self, samples: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+        """Return where between two evaluations assets are that have processed so many samples."""
+        return samples.astype(np.int64) % math.lcm(self.constants[0].every, self.constants[0].stride)
 
     @property
     def number(self) -> np.dtype[Any]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import zlib
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -14,36 +15,38 @@ from servoscope.core.errors import AlarmError, StateError
 from servoscope.core.messages import message, render
 from servoscope.core.settings_errors import suggest_name
 from servoscope.detection.baseline import Baseline
-from servoscope.diagnosis.follower import DiagnosisSchedule, Follower
+from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.alarms import (
     AlarmSettings,
+    AlarmStandstill,
     AlarmTransition,
     AssetSnapshot,
     OperatorCommand,
     advance_alarms,
     initial_alarm_state,
+    next_event_time,
     step_alarm,
 )
 from servoscope.service.asset_status import AssetStatus, asset_metadata, asset_status, asset_summary
-from servoscope.service.checkpoint import AssetState, StreamPosition
+from servoscope.service.block_lanes import BlockLanes, LaneInput, LaneOutput
+from servoscope.service.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.examination import StoredDiagnosis, examine_blocks
 from servoscope.service.examination_schedule import (
     ExaminationState,
     PendingDiagnosis,
+    accept_diagnosis,
     examination_phase,
+    fault_names,
     schedule_full_diagnosis,
     update_examination,
 )
 from servoscope.service.reception import FOLLOWED
 from servoscope.service.records import BlockRefusal, StepResult, TableRow, transition_row
-from servoscope.service.residual_history import evaluation_status, update_history
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.continuity import BlockContinuity, check_continuity
 from servoscope.signals import quality
-from servoscope.signals.samples import Samples
-from servoscope.signals.timebase import Timebase
 
 
 @dataclass(frozen=True)
@@ -65,30 +68,38 @@ class Asset:
 
     def __init__(self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "") -> None:
         self.name, self.baseline, self.policy = name, baseline, policy
-        self._follower, self._rate = Follower(baseline, monitor), baseline.loop.sample_rate
-        self._timebase = Timebase(1.0 / self._rate)
+        self.monitor, self._rate = monitor, baseline.loop.sample_rate
+        self._phase = examination_phase(name)
         self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
         self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s)
         self._limits = policy.quality.limits(self._rate)
+        self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
         self._definitions = policy.alarms.asset_alarms
         self._window: deque[Block] = deque()
+        self._window_samples = 0
+        self._accepted: tuple[Block, BlockContinuity] | None = None
+        self._settled: AlarmStandstill | None = None
+        self._by_numbers = any(one.source in ("statistic", "level") for one in self._definitions.values())
         self._result = StepResult([], [])
         self.state: AssetState | None = None
         self.reception = FOLLOWED
+        # is_repeatable: whether the last block leads from the state before it to that after it, and to nothing else
+        self.is_repeatable = self._ticked = False  # _ticked: whether silence has changed the state since then
 
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
         nothing = np.full(2, np.nan)
-        monitor = self._follower.monitor
+        monitor = self.monitor
         monitor.run(monitor.init(), nothing, nothing, nothing)
         quality.check_block(self._limits, quality.init_state(), np.arange(2.0), nothing, nothing, nothing)
 
-    def resume(self, state: AssetState, window: Iterable[Block]) -> None:
-        """Continue from a checkpoint.
+    def resume(self, state: AssetState, stored: Iterable[Block]) -> list[Block]:
+        """Continue from a checkpoint; `stored`: the blocks in the store, under the store's numbers.
 
-        Raises StateError if it belongs to another baseline.
+        Returns those that were counted after the checkpoint, for `process`: they lead to nothing but the state after
+        them. Raises StateError if it belongs to another baseline.
         """
-        if state.baseline != self.baseline.hash or state.monitor.shape != self._follower.init().shape:
+        if state.baseline != self.baseline.hash or state.monitor.shape != self.monitor.init().shape:
             raise StateError(
                 f"{self.name}: its saved state belongs to another baseline ({state.baseline}, now "
                 f"{self.baseline.hash}): run --anew {self.name} begins with a new state, behind the samples counted"
@@ -96,17 +107,26 @@ class Asset:
         t = state.position.t
         alarms = {name: state.alarms.get(name) or initial_alarm_state(self.name, name, t) for name in self._definitions}
         self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
-        self._window = deque(window)
+        position, blocks = state.position, list(stored)
+        self._window = deque(one for one in blocks if one.sequence < position.blocks)
+        self._window_samples = sum(one.t.size for one in self._window)
+        ahead = position.sequence - position.blocks + 1  # of the sender's numbers; all are of one stream
+        return [
+            replace(one, sequence=one.sequence + ahead, stream=position.stream)
+            for one in blocks
+            if one.sequence >= position.blocks
+        ]
 
     def begin(self, position: StreamPosition) -> None:
         """Begin with a new state, before the first sample or behind those that were counted."""
-        before = {} if self.heard or self.state is None else self.state.alarms
-        due = position.t + self.policy.diagnosis.window_s * (1.0 + examination_phase(self.name))
+        self._settled = None
+        before = {} if self.heard or self.state is None else self.state.alarms_now
+        due = position.t + self.policy.diagnosis.window_s * (1.0 + self._phase)
         self.state = AssetState(
             asset=self.name,
             baseline=self.baseline.hash,
             position=position,
-            monitor=self._follower.init(),
+            monitor=self.monitor.init(),
             quality=quality.init_state(),
             examination=ExaminationState(due=due, since=position.t),
             # those that stand since before the first block go on
@@ -141,10 +161,21 @@ class Asset:
 
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
+        accepted = self.accept(block, latest)
+        return (
+            accepted if isinstance(accepted, StepResult) else self.conclude(self.lanes.follow(self.monitor, accepted))
+        )
+
+    def accept(self, block: Block, latest: float = math.inf) -> LaneInput | StepResult:
+        """Begin to process a block: return what is to be followed, and then concluded, or that it has no effect.
+
+        Raises RecordingError as `process` does.
+        """
+        self.is_repeatable = False
         start, credible = block.start_time(), block.until(latest)
         if credible is None:
             return self._leave_out(block, "future", ahead_s=start - latest)
-        block, start = credible, credible.start_time()
+        block, start = credible, start if credible is block else credible.start_time()
         continuity = check_continuity(self._current.position if self.heard else None, block, latest)
         if not self.heard:
             rows = self.state.position.rows if self.state is not None else 0
@@ -156,18 +187,22 @@ class Asset:
                 self.state = replace(self._current, position=replace(position, repeated=position.repeated + 1))
                 return self._result
             return self._leave_out(block, "late", behind_s=position.t - start)
-        # stored under a number of our own, because the sender's may begin anew
-        self._window.append(replace(block, sequence=position.blocks))
-        self._result.rows.append(TableRow("recent", {"sequence": position.blocks, "samples": block.pack()}))
-        if continuity.lost or continuity.anew:
-            what = "blocks lost" if continuity.lost else "stream began anew"
-            streams = {"after": [position.stream, position.sequence], "before": [block.stream, block.sequence]}
-            document = {"blocks": continuity.lost, **streams}
-            self._result.rows.append(TableRow("audit", {"who": "servoscope", "what": what, "document": document}))
-        self._process_samples(block, continuity)
+        self._accepted = block, continuity
+        return LaneInput(self._current, block.signals, continuity.is_broken)
+
+    def conclude(self, followed: LaneOutput) -> StepResult:
+        """Take what the accepted block has led to."""
+        assert self._accepted is not None, "accept comes first"
+        (block, continuity), self._accepted = self._accepted, None
+        examination, alarms = self._current.examination, self._current.alarms
+        self._count(block, continuity, followed)
         self._examine()
         self._advance_alarms(self._current.position.t)
         self._trim_window()
+        nothing_else = len(self._result.rows) == 1 and self._current.alarms is alarms
+        undisturbed = self.reception == FOLLOWED and not self._ticked
+        self.is_repeatable = nothing_else and undisturbed and self._current.examination is examination
+        self._ticked = False
         return self._result
 
     def _leave_out(self, block: Block, kind: Literal["late", "future"], **seconds: float) -> StepResult:
@@ -193,6 +228,7 @@ class Asset:
         quality_state, changed = self.state.quality, tuple[quality.QualityFinding, ...]()
         if self.heard:
             quality_state, changed = quality.tick(self._limits, self.state.quality, now)
+            self._ticked |= bool(changed)
         self.state = replace(self.state, quality=quality_state)
         if changed or not self.heard or "silent" in quality.active_findings(quality_state):
             self._advance_alarms(now)
@@ -205,10 +241,11 @@ class Asset:
         """
         if self.state is None or alarm not in self._definitions:
             raise AlarmError(f"{self.name}: has no alarm {alarm!r}, {suggest_name(alarm, self._definitions)}")
-        self._result, before = StepResult([], []), self.state.alarms[alarm]
+        alarms = self.state.alarms_now
+        self._result, before, self._settled = StepResult([], []), alarms[alarm], None
         t = max(before.at, self.state.position.t)
         after, transitions = step_alarm(self._definitions[alarm], before, command, t)
-        self.state = replace(self.state, alarms={**self.state.alarms, alarm: after})
+        self.state = replace(self.state, alarms={**alarms, alarm: after}, alarms_at=None)
         self._add_transitions(transitions)
         return self._result
 
@@ -239,20 +276,9 @@ class Asset:
         state = self._current
         if window not in state.pending_diagnoses:
             return StepResult([], [])
-        examination, first = state.examination, self._is_first_diagnosis(window)
-        if not first:
-            diagnosis = diagnosis.with_onset(examination.onset)
-        # not of a fault before this one; a later window that names nothing keeps the name
-        if diagnosis.verdict == "fault" and (examination.verdict != "fault" or window.until > examination.since):
-            faults = diagnosis.document.get("faults", [])
-            if faults or not examination.named:
-                examination = replace(examination, named=diagnosis.summary, diagnosed=window.until)
-            if examination.verdict == "fault" or examination.fault_at is not None:
-                onset = diagnosis.onset if first and diagnosis.onset is not None else examination.onset
-                examination = replace(examination, faults=faults or examination.faults, onset=onset)
-        elif diagnosis.verdict == "undetermined" and not examination.named:
-            # a sensor that is stuck, for example: nothing that would stand was found
-            examination = replace(examination, fault_at=None)
+        examination, diagnosis = accept_diagnosis(
+            state.examination, window, diagnosis, first=self._is_first_diagnosis(window)
+        )
         pending = tuple(one for one in state.pending_diagnoses if one != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
@@ -272,69 +298,76 @@ class Asset:
     def _add_row(self, table: str, **values: Any) -> None:
         self._result.rows.append(TableRow(table, {"number": self._next_row_number(), **values}))
 
-    def _process_samples(self, block: Block, continuity: BlockContinuity) -> None:
-        """Update monitor, data quality and the history of residuals."""
-        state = self._current
-        order = self._timebase.order_block(block.t, np.nan if state.last_t is None else state.last_t)
-        order.restart[:1] |= continuity.lost > 0 or continuity.anew
-        t, signals = block.t[order.rows], block.signals[1:, order.rows]
-        r, u, y = np.where(np.isfinite(signals), signals, np.nan)
-        followed, evaluations = self._follower.follow(state, Samples(t, r, u, y, order.restart))
-        last_t = order.t if np.isfinite(order.t) else None
-        quality_state, _ = quality.check_block(self._limits, state.quality, *block.signals[:, order.order])
-        quality_state, _ = quality.tick(self._limits, quality_state, state.position.t if last_t is None else last_t)
-        times = t[evaluations.sample]
-        history, rows = update_history(state.history, evaluations.trace, times, self.policy.residual_every_s)
-        position = state.position
-        self.state = replace(
-            followed,
-            quality=quality_state,
-            history=history,
-            evaluation=evaluation_status(evaluations.trace, float(times[-1])) if times.size else state.evaluation,
-            last_t=last_t,
-            position=replace(
+    def _count(self, block: Block, continuity: BlockContinuity, followed: LaneOutput) -> None:
+        """Keep a block and the state after it."""
+        state, position, packed = self._current, self._current.position, block.pack()
+        # stored under a number of our own, because the sender's may begin anew
+        self._window.append(evolve(block, sequence=position.blocks))
+        self._window_samples += block.t.size
+        self._result.rows.append(TableRow("recent", {"sequence": position.blocks, "samples": packed}))
+        if continuity.is_broken:
+            self._result.rows.append(continuity.audit_row(position, block))
+        self.state = evolve(
+            state,
+            monitor=followed.monitor,
+            samples=followed.samples,
+            quality=followed.quality,
+            history=followed.history,
+            evaluation=followed.evaluation or state.evaluation,
+            last_t=followed.last_t,
+            position=evolve(
                 position,
-                t=position.t if last_t is None else last_t,
+                t=position.t if followed.last_t is None else followed.last_t,
                 sequence=block.sequence,
                 stream=block.stream,
                 blocks=position.blocks + 1,
                 samples=position.samples + block.t.size,
                 lost=position.lost + continuity.lost,
-                digest=block.digest(position.digest),
+                digest=zlib.crc32(packed, position.digest),
             ),
         )
-        for row in rows:
+        for row in followed.rows:
             self._add_row("residuals", **row)
 
     def _examine(self) -> None:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self._current, self.policy.diagnosis
         t = state.position.t
-        recent = [block for block in self._window if block.t[-1] > t - settings.window_s]
+
+        def recent() -> list[Block]:
+            return [block for block in self._window if block.t[-1] > t - settings.window_s]
+
         examination, result = update_examination(
             state.examination,
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, recent, state.evaluation.features),
-            examination_phase(self.name),
+            lambda: examine_blocks(self.baseline, self.name, recent(), state.evaluation.features),
+            self._phase,
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )
-        self.state = replace(state, examination=examination)
+        if examination is not state.examination:
+            self.state = replace(state, examination=examination)
         if result is None:
             return
         if result.verdict != state.examination.verdict:
             self._add_row("diagnoses", t=t, grounds="examination", **result.columns())
         examination, in_full = schedule_full_diagnosis(examination, self._schedule, t)
         if in_full:
-            window = PendingDiagnosis(self._next_row_number(), recent[0].sequence, self._schedule.end(t), "full")
+            window = PendingDiagnosis(self._next_row_number(), recent()[0].sequence, self._schedule.end(t), "full")
             pending = (*self._current.pending_diagnoses, window)
             self.state = replace(self._current, examination=examination, pending_diagnoses=pending)
 
     def _advance_alarms(self, t: float) -> None:
         """Update the alarms at time `t` [UTC s]."""
         state = self._current
-        findings = tuple(quality.active_findings(state.quality))
+        findings, settled = tuple(quality.active_findings(state.quality)), self._settled
+        known = state.examination, findings, self.reception
+        if settled is not None and settled.known == known:
+            at = settled.at if state.alarms_at is None else state.alarms_at
+            if at <= t < settled.until:
+                self.state = evolve(state, alarms_at=t)
+                return
         statistic, level = state.evaluation.peaks
         snapshot = AssetSnapshot(
             verdict=quality.limit_verdict(state.examination.verdict, findings),
@@ -344,8 +377,11 @@ class Asset:
             reception=self.reception,
             cause=asset_summary(state.examination, findings),
         )
-        alarms, transitions = advance_alarms(self._definitions, state.alarms, snapshot, t)
-        self.state = replace(state, alarms=alarms)
+        alarms, transitions = advance_alarms(self._definitions, state.alarms_now, snapshot, t)
+        self.state = replace(state, alarms=alarms, alarms_at=None)
+        # after transitions a second step may do more, because alarms suppress each other
+        still = not transitions and not self._by_numbers
+        self._settled = AlarmStandstill(known, t, next_event_time(self._definitions, alarms)) if still else None
         self._add_transitions(transitions)
 
     def _add_transitions(self, transitions: Sequence[AlarmTransition]) -> None:
@@ -357,14 +393,8 @@ class Asset:
         """Drop samples that no examination needs any more; also where the clock was set back."""
         state, window_s = self._current, self.policy.diagnosis.window_s
         first = min((window.first for window in state.pending_diagnoses), default=None)
-        size = sum(block.t.size for block in self._window)
         while self._window and (first is None or self._window[0].sequence < first):
             old = self._window[0].t[-1] <= state.position.t - window_s
-            if not old and size <= 2.0 * window_s * self._rate:
+            if not old and self._window_samples <= 2.0 * window_s * self._rate:
                 return
-            size -= self._window.popleft().t.size
-
-
-def fault_names(faults: Iterable[Mapping[str, Any]]) -> set[str]:
-    """Return which faults are named."""
-    return {str(fault["name"]) for fault in faults}
+            self._window_samples -= self._window.popleft().t.size

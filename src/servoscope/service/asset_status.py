@@ -170,6 +170,6 @@ def asset_status(
             **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
             **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
             **({} if reception == FOLLOWED else {"reception": reception.state}),
-            **state.evaluation.model_dump(exclude_unset=True),
+            **state.evaluation.status.model_dump(exclude_unset=True),
         }
     )

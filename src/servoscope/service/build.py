@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import bisect
+import math
 import shutil
 import time
+from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +18,7 @@ from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.actions import CommandSettings, WebhookSettings, load_secret
 from servoscope.service.actions.settings import Sink
 from servoscope.service.asset import Asset, AssetPolicy
+from servoscope.service.asset_groups import AssetGroups, BlockOffer
 from servoscope.service.checkpoint import StreamPosition, unpack_state
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
@@ -30,6 +34,7 @@ class ServiceComponents:
     """The parts of a service; sources and publishers are open."""
 
     assets: dict[str, Asset]
+    groups: AssetGroups
     notifier: Notifier
     sources: dict[str, BlockSource]
     publishers: dict[str, StatusPublisher]
@@ -59,15 +64,21 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
             notifier.begin(rows[config.name]["sequence"])
         elif config.name in rows:
             notifier.resume(rows[config.name]["state"])
+        groups, uncounted = AssetGroups(assets), list[Block]()
         for name, asset in assets.items():
+            blocks = [Block.unpack(name, *one) for one in store.recent_samples(name)] if name in rows else []
             if name in restarted and name in rows:
-                asset.begin(StreamPosition(**rows[name]["status"]["counted"]))
+                position = StreamPosition(**rows[name]["status"]["counted"])
+                for block in blocks[bisect.bisect_left(blocks, position.blocks, key=lambda one: one.sequence) :]:
+                    position = position.skip(block.t, block.pack())
+                asset.begin(position)
             elif name in rows:
-                window = [Block.unpack(name, *one) for one in store.recent_samples(name)]
-                asset.resume(unpack_state(rows[name]["state"], name), window)
+                uncounted += asset.resume(unpack_state(rows[name]["state"], name), blocks)
             if not asset.heard:
                 asset.expect(time.time())
                 asset.reception = UNHEARD
+        # their checkpoints waited; all that they lead to is the state after them
+        deque(groups.process(BlockOffer(block, math.inf) for block in uncounted), maxlen=0)
         for name, source in sources.items():
             source.open(_resume_positions(config, name, assets))
         for publisher in publishers.values():
@@ -76,7 +87,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
         store.close()
         raise
     order = tuple(name for name in known if name in restarted)
-    return ServiceComponents(assets, notifier, sources, publishers, store, order)
+    return ServiceComponents(assets, groups, notifier, sources, publishers, store, order)
 
 
 def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, BlockSource]]:

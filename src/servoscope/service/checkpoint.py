@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from dataclasses import asdict, dataclass, field
+import zlib
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,12 +16,22 @@ from servoscope.core.errors import StateError
 from servoscope.diagnosis.follower import FollowerState
 from servoscope.service.alarms import AlarmState
 from servoscope.service.examination_schedule import ExaminationState, PendingDiagnosis
-from servoscope.service.residual_history import EvaluationStatus, HistoryState
+from servoscope.service.residual_history import EvaluationStatus, HistoryState, LatestEvaluation
 
 MAGIC = b"servoscope state"
 VERSION = 1  # of this format and of all states in it: raised when one of them changes its meaning
 HEADER = struct.Struct("<16sHIII")  # magic, version, length of the JSON text, sizes of the two arrays of numbers
 DIGEST_BYTES = 16
+
+
+Record = TypeVar("Record")
+
+
+def evolve(record: Record, **changes: Any) -> Record:
+    """Return what `dataclasses.replace` does, in a tenth of its time, for records that check nothing when made."""
+    new = object.__new__(type(record))
+    new.__dict__.update(record.__dict__, **changes)
+    return new
 
 
 @dataclass(frozen=True)
@@ -40,6 +52,17 @@ class StreamPosition:
     late: int = 0
     future: int = 0
 
+    def skip(self, t: FloatArray, packed: bytes) -> StreamPosition:
+        """Return the position after a block, with times `t` [UTC s] and packed like this, that no state follows."""
+        return replace(
+            self,
+            t=float(t[np.isfinite(t)][-1]),
+            sequence=self.sequence + 1,
+            blocks=self.blocks + 1,
+            samples=self.samples + t.size,
+            digest=zlib.crc32(packed, self.digest),
+        )
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AssetState(FollowerState):
@@ -57,7 +80,16 @@ class AssetState(FollowerState):
     history: HistoryState = field(default_factory=HistoryState)
     pending_diagnoses: tuple[PendingDiagnosis, ...] = ()
     alarms: dict[str, AlarmState] = field(default_factory=dict)
-    evaluation: EvaluationStatus = field(default_factory=EvaluationStatus)
+    evaluation: LatestEvaluation = field(default_factory=LatestEvaluation)
+    # up to when `alarms` have been advanced, where nothing but that has changed since [UTC s]; None: as they say
+    alarms_at: float | None = None
+
+    @property
+    def alarms_now(self) -> dict[str, AlarmState]:
+        """The alarms, each with the time of its last step."""
+        if self.alarms_at is None:
+            return self.alarms
+        return {name: evolve(one, at=self.alarms_at) for name, one in self.alarms.items()}
 
 
 def pack_state(state: AssetState) -> bytes:
@@ -65,14 +97,14 @@ def pack_state(state: AssetState) -> bytes:
     document = {
         "asset": state.asset,
         "baseline": state.baseline,
-        "counted": asdict(state.position),
-        "judged": asdict(state.examination),
+        "counted": vars(state.position),
+        "judged": vars(state.examination),
         "last": state.last_t,
         "fed": state.samples,
-        "thinned": asdict(state.history),
-        "windows": [asdict(window) for window in state.pending_diagnoses],
-        "alarms": {name: alarm.to_dict() for name, alarm in state.alarms.items()},
-        "shown": state.evaluation.to_json(),
+        "thinned": vars(state.history),
+        "windows": [vars(window) for window in state.pending_diagnoses],
+        "alarms": {name: alarm.to_dict() for name, alarm in state.alarms_now.items()},
+        "shown": state.evaluation.status.to_json(),
     }
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     numbers = state.monitor.astype("<f8").tobytes() + state.quality.astype("<f8").tobytes()
@@ -117,5 +149,5 @@ def unpack_state(packed: bytes, asset: str) -> AssetState:
         history=HistoryState(**document["thinned"]),
         pending_diagnoses=tuple(PendingDiagnosis(**window) for window in document["windows"]),
         alarms=alarms,
-        evaluation=EvaluationStatus.model_validate(document["shown"]),
+        evaluation=LatestEvaluation.from_status(EvaluationStatus.model_validate(document["shown"])),
     )

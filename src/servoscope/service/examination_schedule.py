@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -77,7 +77,7 @@ def update_examination(
     if state.examined is not None and t < state.examined:  # the clock was set back
         state = replace(state, due=t, retry=t, again=t)
     disagrees = exceeded != (state.verdict == "fault")
-    if not disagrees:
+    if not disagrees and state.doubts:
         state = replace(state, doubts=0)
     if t < state.due and not (disagrees and t >= state.retry):
         return state, None
@@ -120,3 +120,28 @@ def schedule_full_diagnosis(
     if state.verdict != "fault" or (t < state.again and t != state.since):
         return state, False
     return replace(state, again=schedule.next_alarm(state.since, t, DAY_S)), True
+
+
+def accept_diagnosis(
+    examination: ExaminationState, window: PendingDiagnosis, diagnosis: StoredDiagnosis, *, first: bool
+) -> tuple[ExaminationState, StoredDiagnosis]:
+    """Return the state with a full diagnosis, and that with the onset that is known; `first`: of this fault."""
+    if not first:
+        diagnosis = diagnosis.with_onset(examination.onset)
+    # not of a fault before this one; a later window that names nothing keeps the name
+    if diagnosis.verdict == "fault" and (examination.verdict != "fault" or window.until > examination.since):
+        faults = diagnosis.document.get("faults", [])
+        if faults or not examination.named:
+            examination = replace(examination, named=diagnosis.summary, diagnosed=window.until)
+        if examination.verdict == "fault" or examination.fault_at is not None:
+            onset = diagnosis.onset if first and diagnosis.onset is not None else examination.onset
+            examination = replace(examination, faults=faults or examination.faults, onset=onset)
+    elif diagnosis.verdict == "undetermined" and not examination.named:
+        # a sensor that is stuck, for example: nothing that would stand was found
+        examination = replace(examination, fault_at=None)
+    return examination, diagnosis
+
+
+def fault_names(faults: Iterable[Mapping[str, Any]]) -> set[str]:
+    """Return which faults are named."""
+    return {str(fault["name"]) for fault in faults}

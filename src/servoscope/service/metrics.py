@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter as TotalCounter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
@@ -10,6 +11,7 @@ from servoscope.core.errors import ConfigError
 from servoscope.service.asset import Asset
 from servoscope.service.config import ServiceFile
 from servoscope.service.health import status_gauges
+from servoscope.service.layer_times import LayerTimes
 from servoscope.service.sources.base import BlockSource, Rejection
 from servoscope.service.writer import StoreWriter
 
@@ -35,6 +37,7 @@ class MetricsContext(Protocol):
     assets: dict[str, Asset]
     sources: dict[str, BlockSource]
     writer: StoreWriter
+    layers: LayerTimes
     buffer: int  # how many blocks may wait to be stored
     last_turn: float  # when it last polled its sources, by the monotonic clock [s]
 
@@ -114,10 +117,17 @@ class ServiceMetrics:
                 intervals.add_metric([name, asset_name, signal], interval)
         for name, why in service.troubles.items():
             trouble.add_metric([name], float(bool(why)))
+        layers = CounterMetricFamily("servoscope_processor_seconds", "Processor time by layer", labels=["layer"])
+        shares = TotalCounter(service.layers.seconds)
+        for source in service.sources.values():
+            shares.update(source.layer_seconds)
+        for layer, seconds in shares.items():
+            layers.add_metric([layer], seconds)
         up = GaugeMetricFamily("servoscope_source_up", "Whether a source is connected", labels=["source"])
         for name, source in service.sources.items():
             up.add_metric([name], float(source.connected))
         yield from (
+            layers,
             receptions,
             trouble,
             intervals,

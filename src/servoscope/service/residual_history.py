@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +39,7 @@ class EvaluationStatus(BaseModel):
 
 
 def evaluation_status(trace: Trace, t: float) -> EvaluationStatus:
-    """Return the status after a block with evaluations, the last of which was at `t` [UTC s]."""
+    """Return the status after a block of one asset with evaluations, the last of which was at `t` [UTC s]."""
     excess = np.nan_to_num(trace.statistic / trace.threshold)
     std = np.sqrt(np.maximum(np.diagonal(trace.covariance[-1]), 0.0))
     values = zip(trace.names, trace.theta[-1].tolist(), std.tolist(), trace.expected[-1].tolist(), strict=True)
@@ -55,6 +56,35 @@ def evaluation_status(trace: Trace, t: float) -> EvaluationStatus:
         responses=tuple(ResponseRow(*row) for row in responses if all(map(math.isfinite, row))),
         parameters=tuple(row for row in values if ready and all(map(math.isfinite, row[1:]))),
     )
+
+
+class LatestEvaluation:
+    """What is judged of the newest evaluation; what is only shown is written down when somebody asks for it.
+
+    That takes longer than everything else of a block, and most evaluations are replaced before anybody looks.
+    """
+
+    def __init__(
+        self,
+        exceeded: bool = False,
+        peaks: tuple[float | None, float | None] = (None, None),
+        features: float | None = None,
+        write: Callable[[], EvaluationStatus] = EvaluationStatus,
+    ) -> None:
+        self.exceeded, self.peaks, self.features = exceeded, peaks, features
+        self._write = write
+
+    @classmethod
+    def from_status(cls, status: EvaluationStatus) -> LatestEvaluation:
+        """Return the evaluation that a checkpoint has written down."""
+        return cls(status.exceeded, status.peaks, status.features, lambda: status)
+
+    @property
+    def status(self) -> EvaluationStatus:
+        """As it is stored."""
+        status = self._write()
+        self._write = lambda: status  # the trace of a whole fleet is let go
+        return status
 
 
 @dataclass(frozen=True)

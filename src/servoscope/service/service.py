@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from concurrent.futures import Future
 
 from servoscope import __version__
@@ -11,6 +12,7 @@ from servoscope.core.errors import ServoscopeError, StoreUnavailableError
 from servoscope.core.messages import message, render
 from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.asset import Asset
+from servoscope.service.asset_groups import BlockOffer
 from servoscope.service.build import ServiceComponents
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile
@@ -23,10 +25,11 @@ from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.publishers.base import publisher_trouble
 from servoscope.service.reception import FOLLOWED, ReceptionLog
 from servoscope.service.records import StepResult, audit_row
+from servoscope.service.sources.base import BlockSource
 from servoscope.service.sources.block import Block
 from servoscope.service.writer import StoreWriter
 
-MAX_BLOCKS_PER_POLL = 256  # blocks of one source that are processed before it is another one's turn
+MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
 MAX_PAUSE_S = 0.05
 HOUSEKEEPING_EVERY_S = 1.0
 
@@ -37,6 +40,7 @@ class Service:
     def __init__(self, config: ServiceFile, components: ServiceComponents) -> None:
         self.config, self.sources, self.store = config, components.sources, components.store
         self.assets, self.notifier = components.assets, components.notifier
+        self._groups = components.groups
         self._publishers, self._restarted = components.publishers, components.restarted
         self.buffer, self.residual_days = config.service.buffer, config.store.residual_days
         self.writer = StoreWriter(self.store, config.name, self.buffer)
@@ -52,6 +56,7 @@ class Service:
         self._housekeeping = Housekeeping(self)
         self._next_commit = self._next_housekeeping = 0.0
         self._stopping = False
+        self.layers = components.groups.layers
         self.last_turn = time.monotonic()  # a service that hangs is not alive
 
     def stop(self) -> None:
@@ -105,35 +110,37 @@ class Service:
         if self.writer.free:
             self._listening_s += min(now - before, 2.0 * MAX_PAUSE_S)
         for source in self.sources.values():
-            for block in source.poll(min(MAX_BLOCKS_PER_POLL, self.writer.free)):
-                self._process_block(block)
+            self.layers.enter("assemble")
+            self._process_blocks(source, source.poll(min(MAX_BLOCKS_PER_POLL, self.writer.free)))
         self._run_diagnoses(ended=self._exhausted)
+        self.layers.enter("other")
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + HOUSEKEEPING_EVERY_S
             self._check_reception()
             self._housekeeping.run_due()
+        if self._exhausted:
+            self.writer.finish()
         if now >= self._next_commit:
             self._next_commit = now + self.config.service.commit_every_s
             self._commit()
 
-    def _process_block(self, block: Block) -> None:
-        asset = self.assets[block.asset]
-        source = self.sources[self.config.assets[block.asset].source]
+    def _process_blocks(self, source: BlockSource, blocks: Sequence[Block]) -> None:
         # recordings are dated as they like
         latest = self.clock.latest() + self.config.service.ahead_s if source.clock_rate == 1.0 else math.inf
-        try:
-            result = asset.process(block, latest)
-            if result.refusal is None:
+        for block, result in self._groups.process([BlockOffer(block, latest) for block in blocks]):
+            asset = self.assets[block.asset]
+            if isinstance(result, ServoscopeError):
+                log("error", "block refused", asset=block.asset, sequence=block.sequence, why=str(result))
+                self.note_refusal(block.asset, str(result))
+                document = {"sequence": block.sequence, "why": str(result)}
+                result = StepResult([audit_row("block refused", document)], [])
+            elif result.refusal is None:
                 self._receptions[block.asset].hear(self._listening_s)
                 asset.reception = FOLLOWED
             else:
                 source.rejections.add(block.asset, *result.refusal)
-        except ServoscopeError as error:  # one asset's trouble must not stop the others
-            log("error", "block refused", asset=block.asset, sequence=block.sequence, why=str(error))
-            self.note_refusal(block.asset, str(error))
-            result = StepResult([audit_row("block refused", {"sequence": block.sequence, "why": str(error)})], [])
-        self.handle_result(asset, result)
-        self.writer.set_checkpoint(asset, block.completed_at)
+            self.handle_result(asset, result)
+            self.writer.set_checkpoint(asset, block.completed_at, can_wait=asset.is_repeatable)
 
     def handle_result(self, asset: Asset, result: StepResult) -> None:
         """Store and announce what a step of an asset has led to."""
@@ -208,6 +215,7 @@ class Service:
 
     def _commit(self) -> None:
         """Write what was gathered; what cannot be written waits."""
+        self.layers.enter("store")
         if not self.writer.empty:
             self.writer.add_checkpoint(self.notifier.checkpoint())
         start, unavailable_since = time.monotonic(), self.writer.unavailable_since
@@ -225,12 +233,14 @@ class Service:
             log("info", "store available again", seconds=seconds, waiting=self.writer.waiting)
             document = {"from": unavailable_since, "seconds": seconds}
             self.writer.add(self.config.name, [audit_row("store was unavailable", document)])
+        self.layers.enter("publish")
         for publisher in self._publishers.values():
             publisher.publish({name: row["status"] for name, row in stored.batch.checkpoints.items()})
         self.dispatcher.wake()
         now = time.monotonic()
         for name, blocks in stored.blocks.items():
             self.sources[self.config.assets[name].source].acknowledge(name, blocks)
+        self.layers.enter("other")
         latencies = [now - completed for completed in stored.completion_times]
         self.metrics.record_commit(latencies, now - start)
         latest = round(max(latencies, default=0.0), 4)
@@ -254,6 +264,7 @@ class Service:
     def _commit_all(self) -> None:
         """Commit what is in hand, with the end in the audit."""
         self.writer.add(self.config.name, [audit_row("stopped", {"why": self._stop_reason})])
+        self.writer.finish()
         deadline = time.monotonic() + self.config.service.stop_within_s
         while not self.writer.empty:
             self._commit()

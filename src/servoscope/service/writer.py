@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 from servoscope.core.errors import StoreUnavailableError
@@ -15,6 +16,8 @@ from servoscope.service.records import TableRow
 from servoscope.service.store import Batch, Store
 
 MIN_RETRY_S, MAX_RETRY_S = 0.1, 2.0  # between two attempts at a store that is unavailable
+MIN_CHECKPOINTS = 32  # that a commit writes at least, if there are so many
+CHECKPOINT_SHARE = 20  # beyond, each commit writes one of so many that can wait
 
 
 @dataclass
@@ -31,6 +34,9 @@ class StoreWriter:
 
     A commit whose end was not confirmed may have been made: before it is tried again, the number of the owner's last
     commit is read from the store.
+
+    Samples are in the store with the first commit after them. Where they have led to nothing else, the state after them
+    may wait some commits: a restart computes it again from the last one and the samples since then.
     """
 
     def __init__(self, store: Store, owner: str, capacity: int) -> None:
@@ -39,6 +45,7 @@ class StoreWriter:
         self._gathered = PendingCommit()
         self._sealed: PendingCommit | None = None  # on its way: nothing is added to it any more
         self._checkpoints: dict[str, Callable[[], tuple[Mapping[str, Any], int]]] = {}
+        self._urgent: set[str] = set()  # assets whose checkpoint cannot wait
         self._in_doubt = False
         self._retry_s = self._retry_at = 0.0
         self.unavailable_since: float | None = None  # [UTC s]
@@ -76,8 +83,11 @@ class StoreWriter:
             at = {"at": time.time()} if table == "audit" else {}
             self._gathered.batch.rows[table].append({"asset": owner, **at, **values})
 
-    def set_checkpoint(self, asset: Asset, completed_at: float | None = None) -> None:
-        """Take the state of an asset, after a block that had been complete at `completed_at`, if there was one."""
+    def set_checkpoint(self, asset: Asset, completed_at: float | None = None, *, can_wait: bool = False) -> None:
+        """Take the state of an asset, after a block that had been complete at `completed_at`, if there was one.
+
+        `can_wait`: whether the samples in the store lead to it.
+        """
         if completed_at is not None:
             self._gathered.blocks[asset.name] += 1
             self._gathered.completion_times.append(completed_at)
@@ -90,6 +100,12 @@ class StoreWriter:
             return {**row, "status": status(state).to_json(), "at": time.time()}, first_needed
 
         self._checkpoints[state.asset] = checkpoint  # called when it is written: of many blocks, only the last counts
+        if not can_wait:
+            self._urgent.add(state.asset)
+
+    def finish(self) -> None:
+        """Let no checkpoint wait any longer: nothing follows."""
+        self._urgent |= self._checkpoints.keys()
 
     def add_checkpoint(self, row: Mapping[str, Any]) -> None:
         """Take a checkpoint that is no asset's."""
@@ -121,8 +137,9 @@ class StoreWriter:
         return stored
 
     def _seal(self) -> PendingCommit:
-        batch = self._gathered.batch
-        for name, checkpoint in self._checkpoints.items():
-            batch.checkpoints[name], batch.first_needed[name] = checkpoint()
-        self._checkpoints = {}
+        batch, count = self._gathered.batch, max(MIN_CHECKPOINTS, len(self._checkpoints) // CHECKPOINT_SHARE)
+        waiting = (name for name in self._checkpoints if name not in self._urgent)  # the oldest first
+        for name in [*self._urgent, *islice(waiting, count)]:
+            batch.checkpoints[name], batch.first_needed[name] = self._checkpoints.pop(name)()
+        self._urgent = set()
         return self._gathered

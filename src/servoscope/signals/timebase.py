@@ -67,15 +67,20 @@ class Timebase(NamedTuple):
             first=1,
         )
 
+    def is_regular(self, t: FloatArray, last: FloatArray) -> BoolArray:
+        """Tell which blocks, shape (assets, N), follow their `last` sample (assets,), and are in order, as they are."""
+        steps = np.empty(t.shape)
+        steps[:, 0], steps[:, 1:] = t[:, 0] - last, t[:, 1:] - t[:, :-1]
+        return np.asarray(~(self.is_gap(steps) | self.is_repeat(steps) | np.isnan(steps)).any(axis=1))
+
     def order_block(self, t: FloatArray, last: float) -> BlockOrder:
         """Sort the rows of a block of a stream as those of a file, behind the rows that have been processed.
 
         `t`: time stamps, shape (N,), NaN where there is none; `last`: that of the last row processed; NaN: there was
         none.
         """
-        steps = np.diff(t, prepend=last)
-        rows = np.arange(t.size)
-        if not (self.is_gap(steps) | self.is_repeat(steps) | np.isnan(steps)).any():
+        if self.is_regular(t[None, :], np.array([last]))[0]:
+            rows = np.arange(t.size)
             return BlockOrder(rows, rows, np.zeros(t.size, dtype=np.bool_), float(t[-1]))
         known = np.flatnonzero(np.abs(t) < MAX_TIME_S)
         if np.isfinite(last):  # row 0 is the one processed last: it stays where it is

@@ -10,7 +10,13 @@ flood, notices = notify_transition(settings.flood, flood, transition, settings.d
 
 from servoscope.service.alarms.conditions import AssetSnapshot, Condition, evaluate_condition
 from servoscope.service.alarms.flood import FloodState, HeldAlarm, Notification, advance_flood, notify_transition
-from servoscope.service.alarms.lifecycle import advance_alarms, initial_alarm_state, step_alarm
+from servoscope.service.alarms.lifecycle import (
+    AlarmStandstill,
+    advance_alarms,
+    initial_alarm_state,
+    next_event_time,
+    step_alarm,
+)
 from servoscope.service.alarms.ne107 import Ne107Status, evaluate_ne107
 from servoscope.service.alarms.records import AlarmState, AlarmTransition, OperatorCommand
 from servoscope.service.alarms.settings import (
@@ -27,9 +33,35 @@ from servoscope.service.alarms.settings import (
 from servoscope.service.alarms.state_table import COMMANDS, TRANSITION_TABLE, LifecycleEvent, LifecycleState
 
 __all__ = [
-    "COMMANDS", "DEFAULT_ALARMS", "FAULT_ALARM", "PRIORITIES", "TRANSITION_TABLE", "AlarmDefinition", "AlarmSettings",
-    "AlarmState", "AlarmTransition", "AssetSnapshot", "Condition", "FloodSettings", "FloodState", "HeldAlarm",
-    "LifecycleEvent", "LifecycleState", "Ne107", "Ne107Status", "Notification", "OperatorCommand", "Priority",
-    "advance_alarms", "advance_flood", "alarm_kind", "evaluate_condition", "evaluate_ne107", "initial_alarm_state",
-    "notify_transition", "step_alarm",
+    "COMMANDS",
+    "DEFAULT_ALARMS",
+    "FAULT_ALARM",
+    "PRIORITIES",
+    "TRANSITION_TABLE",
+    "AlarmDefinition",
+    "AlarmSettings",
+    "AlarmStandstill",
+    "AlarmState",
+    "AlarmTransition",
+    "AssetSnapshot",
+    "Condition",
+    "FloodSettings",
+    "FloodState",
+    "HeldAlarm",
+    "LifecycleEvent",
+    "LifecycleState",
+    "Ne107",
+    "Ne107Status",
+    "Notification",
+    "OperatorCommand",
+    "Priority",
+    "advance_alarms",
+    "advance_flood",
+    "alarm_kind",
+    "evaluate_condition",
+    "evaluate_ne107",
+    "initial_alarm_state",
+    "next_event_time",
+    "notify_transition",
+    "step_alarm",
 ]  # fmt: skip

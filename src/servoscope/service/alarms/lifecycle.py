@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from servoscope.core.errors import AlarmError
 from servoscope.core.messages import message, render
@@ -73,6 +73,23 @@ def advance_alarms(
         new[name], transitions = step_alarm(definition, new[name], update, time)
         found += transitions
     return new, tuple(sorted(found, key=lambda one: one.time))
+
+
+def next_event_time(definitions: Mapping[str, AlarmDefinition], states: Mapping[str, AlarmState]) -> float:
+    """Return when the first delay ends that is running, infinite where none is (epoch, s).
+
+    Until then steps with the same observation change nothing but the time of the last step.
+    """
+    steps = (_LifecycleStep(definitions[name], state) for name, state in states.items())
+    return min((when for step in steps for when, _ in step._due_events()), default=math.inf)
+
+
+class AlarmStandstill(NamedTuple):
+    """Until when alarms stay as they are, if nothing else becomes known than at their last step, at `at` (epoch, s)."""
+
+    known: Hashable
+    at: float
+    until: float
 
 
 class _LifecycleStep:

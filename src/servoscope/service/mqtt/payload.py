@@ -108,7 +108,7 @@ def _decode_binary(asset: str, message: bytes, received_at: float) -> DecodedBlo
 
 def _decode_json(asset: str, message: bytes, received_at: float) -> DecodedBlock:
     try:
-        plain = json.loads(message)
+        plain = _parse_json(message)
     except (ValueError, RecursionError) as error:
         raise MessageError("not a block", f"no JSON: {' '.join(str(error).split())[:100]}") from None
     if not isinstance(plain, dict):
@@ -125,6 +125,15 @@ def _decode_json(asset: str, message: bytes, received_at: float) -> DecodedBlock
     else:
         t = _uniform_times(_parse_number(plain, "t0"), _parse_number(plain, "dt"), numbers.shape[1])
     return _build_block(asset, stream, sequence, oldest, t, numbers, received_at)
+
+
+def _parse_json(message: bytes) -> Any:
+    import msgspec
+
+    try:
+        return msgspec.json.decode(message)
+    except msgspec.DecodeError:  # json takes more, NaN for example, and says what is wrong
+        return json.loads(message)
 
 
 def _parse_int(plain: dict[str, Any], name: str, otherwise: int | None) -> int:
@@ -151,7 +160,7 @@ def _parse_columns(plain: dict[str, Any], names: tuple[str, ...]) -> list[FloatA
         if not isinstance(values, list) or not set(map(type, values)) <= {int, float, type(None)}:
             raise MessageError("wrong type", f"{name}: missing, or no list of numbers and nulls")
         try:
-            found.append(np.array([math.nan if x is None else x for x in values], dtype=np.float64))
+            found.append(np.array(values, dtype=np.float64))  # None becomes NaN
         except OverflowError:
             raise MessageError("wrong type", f"{name}: holds a number that no computer can hold") from None
     if len({column.size for column in found}) > 1:

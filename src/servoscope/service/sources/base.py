@@ -87,6 +87,11 @@ class BlockSource(ABC):
         """Time between two updates of single values, as measured, by asset and signal [s]; empty where blocks come."""
         return {}
 
+    @property
+    def layer_seconds(self) -> Mapping[str, float]:
+        """Processor time of threads of its own so far, by layer [s]: receive, decode."""
+        return {}
+
     @abstractmethod
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Start; assets in `resume` continue behind that sequence, others start at their beginning."""

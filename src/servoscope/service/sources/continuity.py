@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 from servoscope.service.checkpoint import StreamPosition
+from servoscope.service.records import TableRow, audit_row
 from servoscope.service.sources.block import Block
 
 
@@ -14,6 +15,16 @@ class BlockContinuity(NamedTuple):
 
     lost: int
     anew: bool
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether the block does not follow what was counted."""
+        return self.lost > 0 or self.anew
+
+    def audit_row(self, counted: StreamPosition, block: Block) -> TableRow:
+        """Return the line of the audit for a block that does not follow what was counted."""
+        streams = {"after": [counted.stream, counted.sequence], "before": [block.stream, block.sequence]}
+        return audit_row("blocks lost" if self.lost else "stream began anew", {"blocks": self.lost, **streams})
 
 
 def check_continuity(counted: StreamPosition | None, block: Block, latest: float = math.inf) -> BlockContinuity | None:

@@ -8,7 +8,14 @@ verdict = limit_verdict(verdict, active_findings(state))              # never he
 """
 
 from servoscope.signals.quality.findings import KINDS, QualityFinding, describe_findings, limit_verdict
-from servoscope.signals.quality.monitor import active_findings, check_block, init_state, restart_silence, tick
+from servoscope.signals.quality.monitor import (
+    active_findings,
+    check_block,
+    check_lanes,
+    init_state,
+    restart_silence,
+    tick,
+)
 from servoscope.signals.quality.settings import QualityLimits, QualitySettings
 
 __all__ = [
@@ -18,6 +25,7 @@ __all__ = [
     "QualitySettings",
     "active_findings",
     "check_block",
+    "check_lanes",
     "describe_findings",
     "init_state",
     "limit_verdict",

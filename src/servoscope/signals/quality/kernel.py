@@ -62,6 +62,16 @@ def check_samples(
     return len(t), n
 
 
+@kernel
+def check_rows(limits: QualityLimits, states: Any, t: FloatArray, signals: FloatArray, out: FloatArray) -> None:
+    """Check a block of each asset: `states` (assets,), t (assets, N), r, u and y (assets, 3, N); findings are lost."""
+    for a in range(len(t)):
+        begin = 0
+        while begin < t.shape[1]:
+            x = signals[a]
+            begin, _ = check_samples(limits, states[a : a + 1], t[a], x[0], x[1], x[2], begin, out)
+
+
 @inline
 def _check_step(limits: QualityLimits, s: Any, t: float, out: FloatArray, n: int) -> int:
     """Judge the step to a time stamp."""

@@ -47,6 +47,28 @@ def check_block(
     return new, tuple(findings)
 
 
+def check_lanes(limits: QualityLimits, states: FloatArray, t: FloatArray, signals: FloatArray) -> FloatArray:
+    """Do what `check_block` and a `tick` at its last sample do, for a block of each of several assets.
+
+    `states`: shape (assets, size); `t`: finite, shape (assets, N); `signals`: r, u and y, shape (assets, 3, N). Returns
+    the new states.
+    """
+    from servoscope.signals.quality.kernel import check_rows
+
+    new = np.array(states)
+    named = new.view(STATE_DTYPE)[:, 0]
+    check_rows(limits, named, t, signals, np.empty((BUFFER, 5)))
+    now = t[:, -1]
+    anew = (named["seen_count"] != named["count"]) | (named["is_running"] == 0.0) | (now < named["seen_at"])
+    for name, values in (("seen_count", named["count"]), ("seen_at", now), ("is_running", 1.0)):
+        named[name] = np.where(anew, values, named[name])
+    silent = named["active"][:, SILENT] != 0.0
+    changed = silent != (now - named["seen_at"] > limits.silent_s)
+    named["active"][:, SILENT] = silent != changed
+    named["since"][:, SILENT] = np.where(changed, now, named["since"][:, SILENT])
+    return new
+
+
 def tick(limits: QualityLimits, state: FloatArray, now: float) -> tuple[FloatArray, tuple[QualityFinding, ...]]:
     """Check for silence by the clock of the service, about once a second and with each block.
 
@@ -72,6 +94,8 @@ def restart_silence(state: FloatArray, now: float) -> FloatArray:
 
 def active_findings(state: FloatArray) -> dict[str, float]:
     """Return what is wrong at the moment, and since when (epoch, s); ``waiting`` until the first window is complete."""
+    if not state[ACTIVE].any():
+        return {}
     named = _state_record(state)
     since = named["since"].tolist()
     return {kind: since[i] for i, kind in enumerate(KINDS) if named["active"][i]}
@@ -139,3 +163,4 @@ STATE_DTYPE = np.dtype(
     ]
 )
 STATE_SIZE = STATE_DTYPE.itemsize // 8
+ACTIVE = slice((_begin := STATE_DTYPE.fields["active"][1] // 8), _begin + len(KINDS))  # type: ignore[index]

@@ -1,0 +1,211 @@
+"""What a sample costs on its way through the service: over MQTT, JSON, blocks of a second, SQLite; by layer.
+
+    python benchmarks/service.py [--assets 1000] [--blocks 60] [--speed 0] [--json]
+
+`--speed 1` sends in true time and shows the latency; 0 sends as fast as broker and service take it. Broker and sender
+run on the same cores, and are reported apart.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+import urllib.request
+from collections import Counter
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from reliability.servers import Mosquitto, mosquitto
+from tables import Table, parser, show
+
+import servoscope as ss
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
+from servoscope.service.mqtt.payload import encode_json
+from servoscope.service.mqtt.topics import data_topic
+from servoscope.service.sources.block import Block
+from servoscope.simulation import reference, simulate
+
+RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
+WARM_BLOCKS = 10  # of each asset, before anything is counted: filters, first verdicts, memory
+TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
+
+
+def make_hall(folder: Path, assets: int, port: int, listen: int) -> tuple[Monitor, ss.Recording]:
+    """Write baseline and service file; return a monitor of the baseline and a healthy recording."""
+    loop = ss.Loop.load(RIG)
+    recordings = [simulate(loop, reference("multisine", 120.0, loop.sample_rate), seed=seed)[0] for seed in range(3)]
+    baseline = ss.learn(loop, recordings[:2])
+    baseline.save(folder / "baseline.json")
+    lines = [
+        f'name = "hall"\n[service]\nlisten = "127.0.0.1:{listen}"\nlog = "error"\n[sources.line]\nkind = "mqtt"',
+        f'host = "127.0.0.1"\nport = {port}\nin_flight = 65535',
+        *(f'[assets.axis{i:05d}]\nbaseline = "baseline.json"\nsource = "line"' for i in range(assets)),
+    ]
+    text = "\n".join(lines) + "\n"
+    tomllib.loads(text)
+    (folder / "hall.toml").write_text(text, encoding="utf-8")
+    return Monitor(baseline), recordings[2]
+
+
+class Sender:
+    """Sends the same recording for all assets, block by block."""
+
+    def __init__(self, port: int, assets: int, recording: ss.Recording, blocks: int) -> None:
+        self._client = create_mqtt_client(BrokerSettings(host="127.0.0.1", port=port), Path(), "sender")
+        self._client.max_inflight_messages_set(2000)
+        self._client.connect("127.0.0.1", port)
+        self._client.loop_start()
+        self._assets, self._blocks, self._began = assets, blocks, 0.0
+        self._recording, self._n = recording, round(recording.sample_rate)
+
+    def send(self, speed: float) -> None:
+        """Send all blocks, at so many times the true speed; 0: as they are taken."""
+        start = time.monotonic()
+        self._began = time.time() - (0.0 if speed else self._blocks)
+        for k in range(self._blocks):
+            rows = np.arange(k * self._n, (k + 1) * self._n) % self._recording.samples
+            t = self._began + k + np.arange(self._n) / self._n
+            signals = (getattr(self._recording, name)[rows] for name in "ruy")
+            message = encode_json(Block("", k, t, *signals))
+            for i in range(self._assets):
+                if speed:
+                    due = start + (k + (i + 1) / self._assets) / speed
+                    time.sleep(max(0.0, due - time.monotonic()) if i % 50 == 0 else 0.0)
+                sent = self._client.publish(data_topic("servoscope", f"axis{i:05d}"), message, qos=1)
+                if not speed and i % 1000 == 999:
+                    sent.wait_for_publish(600.0)
+
+
+def scrape(port: int) -> Counter[str]:
+    """Return the service's metrics, those of assets added up."""
+    found: Counter[str] = Counter()
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=120.0) as answer:
+        for line in answer.read().decode().splitlines():
+            if not line.startswith("#"):
+                key, _, value = line.rpartition(" ")
+                name, _, labels = key.partition("{")
+                found[name if "asset=" in labels else key] += float(value)
+    return found
+
+
+def processor_time(pid: int) -> float:
+    """Return the processor time of a process, all threads [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return TICK_S * (int(fields[11]) + int(fields[12]))
+
+
+def quantile(before: Counter[str], after: Counter[str], share: float) -> float:
+    """Return a quantile of the latencies between two scrapes: the upper end of its bin [s]."""
+    edges = sorted(
+        (float(key.split('"')[1]), after[key] - before[key])
+        for key in after
+        if key.startswith("servoscope_latency_seconds_bucket")
+    )
+    return next(edge for edge, count in edges if count >= share * edges[-1][1])
+
+
+def wait_for_blocks(port: int, blocks: float, seconds: float = 3600.0) -> Counter[str]:
+    """Wait until so many blocks are counted and stored."""
+    deadline = time.monotonic() + seconds
+    while True:
+        found = scrape(port)
+        if found["servoscope_blocks_total"] >= blocks and found["servoscope_buffered_blocks"] == 0.0:
+            return found
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{found['servoscope_blocks_total']:.0f} of {blocks:.0f} blocks came")
+        time.sleep(1.0)
+
+
+def kernel_time(monitor: Monitor, recording: ss.Recording) -> float:
+    """Return the processor time of a sample of one log [s]."""
+    signals = recording.r[:6000], recording.u[:6000], recording.y[:6000]
+    best = float("inf")
+    for _ in range(20):
+        start = time.thread_time()
+        monitor.run(monitor.init(), *signals)
+        best = min(best, time.thread_time() - start)
+    return best / 6000
+
+
+def measure(assets: int, blocks: int, speed: float) -> tuple[Table, dict[str, str]]:
+    """Run broker, service and sender, and return the table and its figures."""
+    program = mosquitto()
+    if program is None:
+        raise SystemExit("mosquitto is not on this machine: scripts/install-test-servers installs it")
+    with tempfile.TemporaryDirectory() as name, socket.socket() as free:
+        folder = Path(name)
+        more = ("allow_anonymous true", "max_inflight_messages 65535", "max_queued_messages 0", "max_queued_bytes 0")
+        broker = Mosquitto(folder, program, *more)
+        free.bind(("127.0.0.1", 0))
+        listen = int(free.getsockname()[1])
+        monitor, recording = make_hall(folder, assets, broker.port, listen)
+        free.close()
+        broker.start()
+        service = subprocess.Popen([sys.executable, "-m", "servoscope", "run", str(folder / "hall.toml")])
+        try:
+            time.sleep(3.0)
+            while True:
+                try:
+                    if scrape(listen)['servoscope_source_up{source="line"}']:
+                        break
+                except OSError:
+                    pass
+                time.sleep(0.5)
+            sender = Sender(broker.port, assets, recording, WARM_BLOCKS)
+            sender.send(speed)
+            before, used = wait_for_blocks(listen, assets * WARM_BLOCKS), processor_time(service.pid)
+            broker_used, own, begin = processor_time(broker.pid), time.process_time(), time.monotonic()
+            kernel = kernel_time(monitor, recording)
+            own_kernel = time.process_time() - own
+            sender = Sender(broker.port, assets, recording, blocks)
+            sender.send(speed)
+            after = wait_for_blocks(listen, assets * (WARM_BLOCKS + blocks))
+            seconds, used = time.monotonic() - begin, processor_time(service.pid) - used
+            broker_used, own = processor_time(broker.pid) - broker_used, time.process_time() - own - own_kernel
+        finally:
+            service.send_signal(signal.SIGTERM)
+            service.wait(120)
+            broker.stop()
+    samples = after["servoscope_samples_total"] - before["servoscope_samples_total"]
+    prefix = 'servoscope_processor_seconds_total{layer="'
+    layers = {key.split('"')[1]: after[key] - before[key] for key in after if key.startswith(prefix)}
+    receive = layers.pop("receive", 0.0)
+    rows = [(layer, spent) for layer, spent in layers.items()]
+    rows += [
+        ("the client, with its acknowledgements", receive),
+        ("the service, without the client", used - receive),
+        ("the service, all of it", used),
+        ("the broker", broker_used),
+        ("the sender", own),
+    ]
+    cells = [(words, f"{1e6 * spent / samples:.3f} us", f"{spent / samples / kernel:.1f}") for words, spent in rows]
+    cells.append(("one log's kernel, in the same minute", f"{1e6 * kernel:.3f} us", "1"))
+    load = os.getloadavg()[0]
+    note = (
+        f"{assets} assets at 100 Hz, blocks of a second as JSON, {blocks} of each after {WARM_BLOCKS} that are not "
+        f"counted, in {seconds:.0f} s; {f'{speed:g} times the true speed' if speed else 'as fast as they are taken'}; "
+        f"latency p50 and p99 {quantile(before, after, 0.5):g} and {quantile(before, after, 0.99):g} s at most. "
+        f"Load of the machine at the end: {load:.1f}."
+    )
+    values = {"all": f"{1e6 * used / samples:.2f} us", "kernel": f"{used / samples / kernel:.0f}"}
+    return Table(
+        "A sample through the service", note, ("layer", "processor time per sample", "over the kernel"), tuple(cells)
+    ), values
+
+
+if __name__ == "__main__":
+    command = parser(__doc__)
+    command.add_argument("--assets", type=int, default=1000)
+    command.add_argument("--blocks", type=int, default=60, help="of each asset")
+    command.add_argument("--speed", type=float, default=0.0, help="over true time; 0: as fast as they are taken")
+    given = command.parse_args()
+    table, values = measure(given.assets, given.blocks, given.speed)
+    show([table], given.json, values)

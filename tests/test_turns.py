@@ -1,0 +1,131 @@
+"""Assets that are followed together: as if each were alone, and as if every state had been stored."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import halls
+from halls import RESULTS, asked, hall
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.learning.learn import nominal_baseline
+from servoscope.models.loop import Loop
+from servoscope.service import service as service_module
+from servoscope.service import writer
+from servoscope.service.alarms import AlarmSettings
+from servoscope.service.asset import Asset, AssetPolicy
+from servoscope.service.asset_groups import AssetGroups, BlockOffer
+from servoscope.service.build import build_components
+from servoscope.service.checkpoint import pack_state
+from servoscope.service.config import DiagnosisSettings, ServiceFile
+from servoscope.service.records import StepResult
+from servoscope.service.service import Service
+from servoscope.service.sources.block import Block
+from servoscope.signals.quality import QualitySettings
+
+BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
+POLICY = AssetPolicy(
+    DiagnosisSettings(window_s=20.0, every_s=30.0), QualitySettings(), AlarmSettings.model_validate({}), 2.0
+)
+
+
+@pytest.fixture(scope="module")
+def monitors() -> list[Monitor]:
+    """Two baselines of one structure, and one that stands alone."""
+    content = Loop.load(halls.LOOP).to_dict()
+    slow = Loop.from_dict(content | {"monitor": content["monitor"] | {"evaluation_rate": 2.0}})
+    leaky = Loop.from_dict(content | {"plant": content["plant"] | {"C_ie": 7e-12}})
+    return [Monitor(one) for one in (halls.baseline(), *map(nominal_baseline, (leaky, slow)))]
+
+
+def streams() -> dict[str, list[Block]]:
+    """Blocks of six assets: in step, seven samples ahead, in other lengths, with gaps, NaN, disorder and a leak."""
+    found = {}
+    for i, lengths in enumerate(((50,), (50,), (7, 50, 50, 50), (50, 30, 20), (50,), (50,))):
+        x, blocks, k = halls.recorded(i + 1, *([halls.LEAK] if i == 1 else []), seconds=45.0), list[Block](), 0
+        while k < 4400:
+            n = lengths[len(blocks) % len(lengths)] if i != 2 or not blocks else 50
+            n = 7 if i == 2 and not blocks else n
+            rows = slice(k, k + n)
+            t = BEGAN + np.arange(k, k + n) / 100.0
+            blocks.append(Block(f"asset{i}", len(blocks), t, x.r[rows], x.u[rows], x.y[rows].copy()))
+            k += n
+        found[f"asset{i}"] = blocks
+    found["asset3"] = [one for one in found["asset3"] if one.sequence not in (20, 21)]
+    found["asset4"][30].y[10:20] = np.nan
+    turned = found["asset4"][40]
+    found["asset4"][40] = replace(turned, **{name: getattr(turned, name)[::-1] for name in "truy"})
+    return found
+
+
+def assets(monitors: list[Monitor]) -> dict[str, Asset]:
+    """Return them: the first, second and fourth share a baseline, the last has a structure of its own."""
+    kinds = [0, 0, 1, 0, 1, 2]
+    return {f"asset{i}": Asset(f"asset{i}", monitors[k].baselines[0], monitors[k], POLICY) for i, k in enumerate(kinds)}
+
+
+def test_assets_of_one_structure_go_together_to_the_bits_that_each_has_alone(monitors: list[Monitor]) -> None:
+    assert monitors[0].lane_key == monitors[1].lane_key != monitors[2].lane_key
+    alone, together, chance = assets(monitors), assets(monitors), random.Random(1)
+    groups, expected, found = AssetGroups(together), dict[str, list[Any]](), dict[str, list[Any]]()
+    waiting = {name: list(blocks) for name, blocks in streams().items()}
+    for name, blocks in waiting.items():
+        expected[name] = [row for block in blocks for row in alone[name].process(block).rows]
+    assert sum(row.table == "residuals" for row in expected["asset1"]) > 10
+    assert any(row.table == "transitions" for row in expected["asset1"])  # its leak is alarmed
+    while any(waiting.values()):
+        turn = [blocks.pop(0) for blocks in waiting.values() for _ in range(min(chance.randrange(4), len(blocks)))]
+        for block, result in groups.process([BlockOffer(one, np.inf) for one in turn]):
+            assert isinstance(result, StepResult)
+            found.setdefault(block.asset, []).extend(result.rows)
+    assert found == expected
+    for name, asset in alone.items():
+        other = together[name]
+        assert asset.state is not None and other.state is not None
+        assert pack_state(other.state) == pack_state(asset.state), name
+        assert other.status(other.state) == asset.status(asset.state)
+
+
+@pytest.mark.slow
+def test_states_that_waited_are_computed_again_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    halls.files(tmp_path)
+
+    def service(name: str) -> Service:
+        config = hall(tmp_path, name)
+        config.write_text(config.read_text().replace("commit_every_s = 0.01", "commit_every_s = 0.0"))
+        settings = ServiceFile.load(config)
+        return Service(settings, build_components(settings))
+
+    service("whole").run()
+    monkeypatch.setattr(writer, "MIN_CHECKPOINTS", 0)  # only what cannot wait is written before the end
+    monkeypatch.setattr(writer, "CHECKPOINT_SHARE", 10**9)
+    monkeypatch.setattr(service_module, "MAX_BLOCKS_PER_POLL", 3)
+    chance, behind, config = random.Random(5), 0, tmp_path / "cut.toml"
+    for _ in range(6):
+        killed = service("cut")
+        monkeypatch.setattr(killed, "_commit_all", lambda: None)  # what was not committed is lost
+        turns, turn = iter(range(chance.randrange(1, 60))), killed._run_once
+
+        def run_once(one: Service = killed, left: Iterator[int] = turns, run: Any = turn) -> None:
+            run()
+            if next(left, None) is None:
+                one.stop()
+
+        monkeypatch.setattr(killed, "_run_once", run_once)
+        killed.run()
+        newest = dict(asked(config, "SELECT asset, max(sequence) FROM recent GROUP BY asset"))
+        stored = dict(asked(config, "SELECT asset, sequence FROM checkpoints"))
+        behind = max(behind, *(newest[name] - stored[name] for name in newest))
+    assert behind > 1  # blocks that were acknowledged, without their states
+    service("cut").run()
+    whole, cut = (
+        {table: asked(tmp_path / f"{name}.toml", query) for table, query in RESULTS.items()}
+        for name in ("whole", "cut")
+    )
+    assert cut == whole
