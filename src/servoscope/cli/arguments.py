@@ -16,6 +16,7 @@ import typer
 from servoscope.core.errors import ServoscopeError
 
 if TYPE_CHECKING:
+    from servoscope.cli.options import ReadingOptions
     from servoscope.models.loop import Columns, Loop, TextLayout
     from servoscope.signals import Recording
     from servoscope.signals.readers import ChannelInfo
@@ -134,7 +135,7 @@ UNBOUNDED = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class RecordingReader:
-    """How a command reads recordings: the loop, ``--columns``, ``--where``, ``--by``, ``--from``, ``--to``, layout."""
+    """How a command reads recordings: the loop, and what the options say."""
 
     loop: Loop | None
     columns: Columns | None
@@ -142,34 +143,33 @@ class RecordingReader:
     by: str | None
     span: tuple[float, float]
     text: TextLayout | None = None
+    resample: bool = False
+    axis: str | None = None
 
     @classmethod
-    def from_options(
-        cls,
-        loop: Loop | None,
-        columns: str | None,
-        where: Sequence[str] | None,
-        by: str | None,
-        span: tuple[float | None, float | None],
-        layout: tuple[int | None, int, str | None] = (None, 0, None),
-    ) -> RecordingReader:
-        """Read the options; typer.BadParameter if one of them cannot be read.
-
-        `layout`: ``--header-row``, ``--skip``, ``--comment``.
-        """
+    def from_options(cls, loop: Loop | None, reading: ReadingOptions) -> RecordingReader:
+        """Read the options; typer.BadParameter if one of them cannot be read."""
         from servoscope.models.loop import Columns, TextLayout
 
         base = loop.columns if loop is not None else None
-        mapping = parse_mapping(columns, base)
-        header_row, skip_rows, comment = layout
-        given = header_row is not None or skip_rows or comment
-        text = TextLayout(header_row=header_row, skip_rows=skip_rows, comment=comment or None) if given else None
-        if text is not None and (mapping is not None or base is not None):
-            mapping = (mapping or base or Columns()).model_copy(update={"text": text})
+        mapping = parse_mapping(reading.columns, base)
+        given = reading.header_row is not None or reading.skip or reading.comment
+        text = (
+            TextLayout(header_row=reading.header_row, skip_rows=reading.skip, comment=reading.comment or None)
+            if given
+            else None
+        )
+        changes: dict[str, object] = {"text": text} if text is not None else {}
+        if reading.resample:
+            changes |= {"resample": True}
+        if changes and (mapping is not None or base is not None):
+            mapping = (mapping or base or Columns()).model_copy(update=changes)
+        span = reading.from_s, reading.to_s
         start, end = (bound if bound is not None else limit for bound, limit in zip(span, UNBOUNDED, strict=True))
         if not start < end:
             raise typer.BadParameter(f"--from {start:g} must be before --to {end:g}")
-        return cls(loop, mapping, parse_conditions(where or ()), by, (start, end), text)
+        where = parse_conditions(reading.where or ())
+        return cls(loop, mapping, where, reading.by, (start, end), text, reading.resample, reading.axis)
 
     def read(self, path: Path) -> list[Recording]:
         """Return the recordings in a file: one, or one per value of the column in ``--by``."""
@@ -177,8 +177,15 @@ class RecordingReader:
         from servoscope.signals import readers
 
         columns = self.columns
-        if columns is None and self.text is not None:  # nobody says where the signals stand
-            columns = Columns(text=self.text)
+        if columns is None and self.axis is not None:
+            from servoscope.learning.proposal import propose_columns
+
+            columns = propose_columns(path, readers.list_channels(path, self.text), self.axis)
+        if columns is None and (self.text is not None or self.resample):  # nobody says where the signals stand
+            columns = Columns()
+        if columns is not None:
+            columns = columns.model_copy(update={"text": self.text or columns.text})
+            columns = columns.model_copy(update={"resample": self.resample or columns.resample})
         parts = readers.read_parts(path, self.loop, columns=columns, where=self.where, by=self.by)
         if self.span == UNBOUNDED:
             return parts
@@ -192,7 +199,7 @@ class RecordingReader:
         """Return a file's columns if it lacks one of t, r, u, y and nobody gave a mapping; else none."""
         from servoscope.signals import readers
 
-        if self.loop is not None or self.columns is not None:
+        if self.loop is not None or self.columns is not None or self.axis is not None:
             return []
         channels = readers.list_channels(path, self.text)
         return channels if {"t", "r", "u", "y"} - {channel.name for channel in channels} else []

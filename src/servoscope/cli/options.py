@@ -1,9 +1,13 @@
-"""Arguments and options that several commands share."""
+"""Arguments and options that several commands share, and how recordings are read, as one parameter of a command."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
@@ -32,6 +36,15 @@ FromOption = Annotated[
 ToOption = Annotated[
     float | None, typer.Option("--to", metavar="S", help="Leave out this time, in s, and what is after it.")
 ]
+ResampleOption = Annotated[
+    bool,
+    typer.Option(
+        "--resample", help="Put irregular rows, or those of another rate, on the loop's sample rate; the error is told."
+    ),
+]
+AxisOption = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Of a file with several axes: the one to take, 2 or X for example.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
 ReportOption = Annotated[
     Path | None,
@@ -41,3 +54,47 @@ TraceOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE.parquet", help="Write the course over time; for several, one each."),
 ]
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """How a command reads its recordings: which columns, rows and lines, as its options say."""
+
+    columns: ColumnsOption = None
+    axis: AxisOption = None
+    where: WhereOption = None
+    by: ByOption = None
+    header_row: HeaderRowOption = None
+    skip: SkipOption = 0
+    comment: CommentOption = None
+    resample: ResampleOption = False
+    from_s: FromOption = None
+    to_s: ToOption = None
+
+
+def with_reading_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of `ReadingOptions`, in the place of its parameter ``reading``, but for some."""
+    hints = get_type_hints(ReadingOptions, include_extras=True)
+    given = [each for each in fields(ReadingOptions) if each.name not in left_out]
+    options = [
+        inspect.Parameter(each.name, inspect.Parameter.KEYWORD_ONLY, default=each.default, annotation=hints[each.name])
+        for each in given
+    ]
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        own = get_type_hints(command, include_extras=True)
+        parameters: list[inspect.Parameter] = []
+        for name, parameter in inspect.signature(command).parameters.items():
+            keyword = parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=own[name])
+            parameters += options if name == "reading" else [keyword]
+
+        @functools.wraps(command)
+        def run(**values: Any) -> None:
+            reading = ReadingOptions(**{each.name: values.pop(each.name) for each in given})
+            command(reading=reading, **values)
+
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return run
+
+    return decorate

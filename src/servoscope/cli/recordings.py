@@ -12,18 +12,12 @@ from servoscope.cli.app import app
 from servoscope.cli.arguments import RecordingReader
 from servoscope.cli.exit import EXIT_FAULT, EXIT_INPUT, FailureCounter, print_json
 from servoscope.cli.options import (
-    ByOption,
-    ColumnsOption,
-    CommentOption,
-    FromOption,
-    HeaderRowOption,
     JsonOption,
     LoopArgument,
+    ReadingOptions,
     ReportOption,
-    SkipOption,
-    ToOption,
     TraceOption,
-    WhereOption,
+    with_reading_options,
 )
 from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output, recording_stem
 
@@ -32,17 +26,12 @@ if TYPE_CHECKING:
 
 
 @app.command()
+@with_reading_options()
 def inspect(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Recordings.")],
     loop: Annotated[Path | None, typer.Option(metavar="LOOP", help="Loop file: columns, sample rate, plant.")] = None,
-    columns: ColumnsOption = None,
-    where: WhereOption = None,
-    by: ByOption = None,
-    header_row: HeaderRowOption = None,
-    skip: SkipOption = 0,
-    comment: CommentOption = None,
-    from_s: FromOption = None,
-    to_s: ToOption = None,
+    *,
+    reading: ReadingOptions,
     as_json: JsonOption = False,
     report: ReportOption = None,
 ) -> None:
@@ -57,8 +46,7 @@ def inspect(
     from servoscope.report import inspection_page, plain_values
 
     settings = Loop.load(loop) if loop is not None else None
-    layout = header_row, skip, comment
-    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s), layout)
+    reader = RecordingReader.from_options(settings, reading)
     several = reader.expects_several(logs)
     pages = OutputPaths.from_option(report, ".html", several, logs)
     out, failures = results.create_console(), FailureCounter()
@@ -90,6 +78,7 @@ def inspect(
 
 
 @app.command()
+@with_reading_options("axis")
 def learn(
     loop: LoopArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="BASELINE", help="Baseline to write (JSON).")],
@@ -108,18 +97,15 @@ def learn(
     accept_delay: Annotated[
         bool, typer.Option("--accept-delay", help="Learn although u and y are out of step, and note it.")
     ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Learn although the coefficients are implausible, and note it.")
+    ] = False,
     fault: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=FILE", help="Recording of a known fault to learn too, NAME@POINT=FILE; repeatable."),
     ] = None,
-    columns: ColumnsOption = None,
-    where: WhereOption = None,
-    by: ByOption = None,
-    header_row: HeaderRowOption = None,
-    skip: SkipOption = 0,
-    comment: CommentOption = None,
-    from_s: FromOption = None,
-    to_s: ToOption = None,
+    *,
+    reading: ReadingOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Learn from healthy recordings what healthy looks like, and from labelled ones what faults look like."""
@@ -145,8 +131,7 @@ def learn(
     from servoscope.report import plain_values
 
     settings = Loop.load(loop)
-    layout = header_row, skip, comment
-    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s), layout)
+    reader = RecordingReader.from_options(settings, reading)
     if reader.columns is not None:  # they become part of the baseline, so that diagnose need not be told again
         settings = settings.model_copy(update={"columns": reader.columns})
     earlier = Baseline.load(compare) if compare is not None else None
@@ -177,6 +162,7 @@ def learn(
                 accept_change=accept_change,
                 faults=known,
                 accept_delay=accept_delay,
+                force=force,
             )
         baseline.save(output)
     if as_json:
@@ -188,17 +174,15 @@ def learn(
 
 
 @app.command()
+@with_reading_options("axis")
 def diagnose(
     baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="What learn wrote.")],
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING", help="Recordings to judge.")],
     point: Annotated[
         str | None, typer.Option(metavar="NAME", help="Operating point that they were taken at; else any.")
     ] = None,
-    columns: ColumnsOption = None,
-    where: WhereOption = None,
-    by: ByOption = None,
-    from_s: FromOption = None,
-    to_s: ToOption = None,
+    *,
+    reading: ReadingOptions,
     as_json: JsonOption = False,
     report: ReportOption = None,
     trace: TraceOption = None,
@@ -222,7 +206,7 @@ def diagnose(
     whole = learned = Baseline.load(baseline)
     if point is not None:
         learned = whole.at(point)
-    reader = RecordingReader.from_options(learned.loop, columns, where, by, (from_s, to_s))
+    reader = RecordingReader.from_options(learned.loop, reading)
     several = reader.expects_several(recordings)
     pages = OutputPaths.from_option(report, ".html", several, inputs)
     traces = OutputPaths.from_option(trace, ".parquet", several, inputs)
@@ -263,14 +247,13 @@ def diagnose(
 
 
 @app.command()
+@with_reading_options("axis", "by")
 def verify(
     diagnosis: Annotated[Path, typer.Argument(metavar="DIAGNOSIS", help="What diagnose --json printed.")],
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="The recording that it judged.")],
     baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="The baseline that it was judged with.")],
-    columns: ColumnsOption = None,
-    where: WhereOption = None,
-    from_s: FromOption = None,
-    to_s: ToOption = None,
+    *,
+    reading: ReadingOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Repeat a diagnosis from its file and say whether the verdict is the same; if not, exit with 1."""
@@ -283,7 +266,7 @@ def verify(
 
     told = verification.load_diagnosis(diagnosis)
     learned = Baseline.load(baseline)
-    reader = RecordingReader.from_options(learned.loop, columns, where, None, (from_s, to_s))
+    reader = RecordingReader.from_options(learned.loop, reading)
     read = reader.read(recording)
     if len(read) != 1:
         raise RecordingError(f"{recording}: holds {len(read)} recordings, choose one with --where")

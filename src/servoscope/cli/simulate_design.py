@@ -11,7 +11,12 @@ from servoscope.cli import arguments
 from servoscope.cli.app import app
 from servoscope.cli.arguments import RecordingReader
 from servoscope.cli.exit import print_json
-from servoscope.cli.options import ByOption, ColumnsOption, FromOption, JsonOption, LoopArgument, ToOption, WhereOption
+from servoscope.cli.options import (
+    JsonOption,
+    LoopArgument,
+    ReadingOptions,
+    with_reading_options,
+)
 from servoscope.cli.output_paths import RECORDINGS, REPORTS, check_output
 
 
@@ -70,6 +75,7 @@ def simulate(
 
 
 @app.command()
+@with_reading_options("axis")
 def design(
     loop: LoopArgument,
     healthy: Annotated[
@@ -82,11 +88,8 @@ def design(
     after: Annotated[float, typer.Option(metavar="S", help="Time since the onset that may be used, in s.")] = 30.0,
     noise_u: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on u, std. dev.")] = 1e-4,
     noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on y, std. dev.")] = 3.162e-4,
-    columns: ColumnsOption = None,
-    where: WhereOption = None,
-    by: ByOption = None,
-    from_s: FromOption = None,
-    to_s: ToOption = None,
+    *,
+    reading: ReadingOptions,
     as_json: JsonOption = False,
     report: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Write a page with plots.")] = None,
 ) -> None:
@@ -103,7 +106,7 @@ def design(
 
     settings = Loop.load(loop)
     arguments.check_length(after, settings.sample_rate)
-    reader = RecordingReader.from_options(settings, columns, where, by, (from_s, to_s))
+    reader = RecordingReader.from_options(settings, reading)
     with show_steps(1, 4 + 2 * len(settings.plant.faults)) as steps:
         steps.begin("reading" if healthy else "simulating")
         recordings = [recording for path in healthy or [] for recording in reader.read(path)]

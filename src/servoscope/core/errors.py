@@ -5,6 +5,7 @@
         LoopError                a loop file or a setting is wrong
         RecordingError           a recording cannot be used
           NotEnoughError         it is usable as a file, but too short or too still to learn from
+          IrregularTimeError     its rows come at no fixed rate, and nobody said that they are to be resampled
         BaselineError            a baseline file is unusable, or of another version
         SimulationError          a simulation is impossible
         OutputError              a result cannot be written
@@ -35,6 +36,10 @@ class RecordingError(ServoscopeError):
 
 class NotEnoughError(RecordingError):
     """A recording is too short, or excites too little, for what was asked."""
+
+
+class IrregularTimeError(RecordingError):
+    """The rows of a recording come at no fixed rate."""
 
 
 class BaselineError(ServoscopeError):

@@ -38,3 +38,9 @@ def format_share(share: float) -> str:
     left = 1.0 - share
     digits = 1 if left > 0.01 or left <= 0.0 else min(math.ceil(-math.log10(left)) - 1, 6)
     return f"{100.0 * max(share, 0.0):.{digits}f} %"
+
+
+def round_down(x: float, digits: int = 2) -> float:
+    """Return the largest number of so many digits that is not above x > 0."""
+    decimals = digits - 1 - math.floor(math.log10(x))
+    return float(f"{math.floor(round(x * 10.0**decimals, 6)) * 10.0**-decimals:.{digits}g}")

@@ -13,6 +13,7 @@ from servoscope.diagnosis.diagnose import diagnose
 from servoscope.diagnosis.learn_faults import LabelledRecordings
 from servoscope.learning import learn as learning
 from servoscope.learning.learn import Progress
+from servoscope.learning.plausibility import check_plausibility, check_wraps
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
@@ -30,6 +31,7 @@ def learn(
     accept_change: bool = False,
     faults: LabelledRecordings | Mapping[str, LabelledRecordings] | None = None,
     accept_delay: bool = False,
+    force: bool = False,
 ) -> Baseline:
     """Learn a baseline from healthy recordings, at one operating point or at several.
 
@@ -55,6 +57,9 @@ def learn(
         operating points are named, by point first, ``{"cold": {"backlash": [...]}}``.
     accept_delay
         Learn although u and y are out of step by more than the loop file says; the notes then say so.
+    force
+        Learn although the coefficients are none that a machine has, or explain less than half of u; the notes then
+        say so.
 
     Returns
     -------
@@ -67,7 +72,8 @@ def learn(
         If the recordings are too short or excite too little, if a point has none, or if those of a fault do not
         differ from healthy.
     RecordingError
-        If u and y are certainly out of step by more than the loop file says, and that is not accepted.
+        If u and y are certainly out of step by more than the loop file says, and that is not accepted; if u or y wraps;
+        if the coefficients are implausible, without `force`.
     LoopError
         If settings contradict each other.
     BaselineError
@@ -90,11 +96,13 @@ def learn(
     notes = {name: _compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
     learned: list[Baseline] = []
     for name, some in named.items():
+        check_wraps(some)
         one = learning.learn_baseline(loop, some, progress, accept_delay)
+        odd = check_plausibility(one, force or loop.implausible == "note")
         longest = max(some, key=lambda rec: rec.samples)
         progress("operating points")
         alike = [note for other in learned if (note := _resemblance_note(other, name, longest)) is not None]
-        one = one.model_copy(update={"point": name, "notes": (*one.notes, *notes[name], *alike)})
+        one = one.model_copy(update={"point": name, "notes": (*odd, *one.notes, *notes[name], *alike)})
         learned.append(learn_faults.add_learned_faults(one, labels[name], progress) if name in labels else one)
     return learned[0].model_copy(update={"others": tuple(learned[1:])})
 

@@ -133,11 +133,8 @@ def instrument_system(loop: Loop) -> LinearSystem:
 
 
 def filter_cutoff(loop: Loop) -> float:
-    """Return the cutoff of the state-variable filter [Hz]: the loop file's, or a tenth of the sample rate.
-
-    A tenth leaves ten samples per period at the cutoff, where the hold on y is still good.
-    """
-    return loop.monitor.cutoff if loop.monitor.cutoff is not None else loop.sample_rate / 10.0
+    """Return the cutoff of the state-variable filter [Hz]."""
+    return loop.cutoff
 
 
 def _svf_paths(loop: Loop) -> tuple[LinearSystem, LinearSystem, list[LinearSystem], int]:

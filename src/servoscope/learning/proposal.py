@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from servoscope.core.errors import RecordingError
+import numpy as np
+
+from servoscope.core import number_format
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import IrregularTimeError, RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.learning.inspection import Inspection, inspect
 from servoscope.models.loop import Columns, Loop, MonitorSettings
+from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, read
-from servoscope.signals.readers.guess_columns import FIELDS, guess_mapping
+from servoscope.signals.readers.axes import find_axes, signal_names
+from servoscope.signals.readers.columns import LinearCombination, parse_combination
+from servoscope.signals.readers.formats import open_file
+from servoscope.signals.readers.guess_columns import FIELDS, guess_mapping, quoted_channel
+from servoscope.signals.readers.table import number_column
 from servoscope.signals.readers.units import split_unit
+from servoscope.signals.readers.wrap import find_wrap
 
 MEMORIES = 10.0  # that a recording to learn from should have at least
 LONGEST_MEMORY_S, LEAST_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
 WORTH = 0.005  # share of u that a higher order or a stiffness has to explain
+JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
 CLEAR = 0.9  # share of u that a plant explains; below it, the choice is in doubt
 
 
@@ -51,12 +63,18 @@ class LoopProposal:
         return "\n".join(written) + "\n"
 
 
-def propose_columns(path: Path, channels: Sequence[ChannelInfo]) -> Columns:
-    """Return the columns of a log by the words and units in their names.
+def propose_columns(path: Path, channels: Sequence[ChannelInfo], axis: str | None = None) -> Columns:
+    """Return the columns of a log by the words and units in their names; `axis`: of a file with several, which one.
 
-    Raises RecordingError if no name suggests u or y.
+    Raises RecordingError if no name suggests u or y, or the file has no such axis.
     """
-    names = [channel.name for channel in channels]
+    names = signal_names(channels)
+    axes = find_axes(names)
+    if axis is not None:
+        if axis not in axes:
+            has = f"it has {', '.join(axes)}" if axes else "its names show one axis; name the columns with --columns"
+            raise RecordingError(f"{path}: no axis {axis!r}, {has}")
+        names = axes[axis]
     fields = guess_mapping(names)
     missing = [letter for letter in "uy" if fields[FIELDS[letter]] is None]
     if missing:
@@ -75,16 +93,28 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
 
     Raises RecordingError if the log cannot be read, or nothing moves in it.
     """
-    recording = read(path, columns=columns)
-    found = inspect(recording)
+    columns, wraps = _unwrapped_columns(path, columns)
+    try:
+        recording = read(path, columns=columns)
+        found = inspect(recording)
+        irregular = found.sampling.jitter_percent > JITTER_PERCENT
+    except IrregularTimeError:
+        irregular = True
+    if irregular:
+        columns = columns.model_copy(update={"resample": True})
+        recording = read(path, columns=columns)
+        found = inspect(recording)
     best = found.best_order
     if best is None or found.suggested_cutoff_hz is None:
         raise RecordingError(f"{path}: {found.summary}")
     rate = float(f"{recording.sample_rate:.6g}")
     # the largest of two digits that the recommendation allows
-    cutoff = float(f"{found.suggested_cutoff_hz:.2g}")
+    resampled = next((defect.text.values["cutoff"] for defect in recording.defects if defect.kind == "resampled"), None)
+    cutoff = number_format.round_down(
+        min(found.suggested_cutoff_hz, resampled if isinstance(resampled, float) else math.inf)
+    )
     memory = max(LEAST_PERIODS / cutoff, min(LONGEST_MEMORY_S, recording.duration_s / MEMORIES))
-    memory = float(f"{memory:.2g}")
+    memory = number_format.round_down(memory)
     frequencies = [f for f in MonitorSettings().frequencies if f <= cutoff] or [float(f"{cutoff / 2.0:.2g}")]
     settings = {
         "sample_rate": rate,
@@ -116,7 +146,7 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
     doubtful = share < CLEAR
     lines = (
         ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
-        *_column_lines(columns),
+        *_column_lines(columns, wraps, recording),
         ProposalLine("plant", "kind", '"polynomial"', message("init.kind")),
         ProposalLine("plant", "order", str(order), explained, doubtful),
         ProposalLine("plant", "friction", json.dumps(best.friction), _friction_reason(best.friction)),
@@ -153,7 +183,35 @@ def propose(path: str | Path, columns: Columns | None = None) -> tuple[LoopPropo
     return proposal, inspect(read(path, proposal.loop), proposal.loop)
 
 
-def _column_lines(columns: Columns) -> list[ProposalLine]:
+def _unwrapped_columns(path: Path, columns: Columns) -> tuple[Columns, dict[str, float]]:
+    """Return the columns with those unwrapped that wrap, and the ranges in which the keys concerned do."""
+    opened = open_file(path, columns.text)
+    plain: dict[str, LinearCombination] = {}
+    for key, text in (("reference", columns.reference), ("input", columns.input), ("output", columns.outputs[0])):
+        try:
+            combination = parse_combination(text, opened.columns, path.name)
+        except ServoscopeError:  # the reference may be missing; what else is wrong is told when the log is read
+            continue
+        if len(combination.factors) == 1 and not combination.constant and not combination.wraps:
+            plain[key] = combination
+    if len(columns.outputs) > 1:
+        plain.pop("output", None)
+    wanted = [name for each in plain.values() for name in each.factors]
+    pieces: dict[str, list[FloatArray]] = {name: [] for name in wanted}
+    for table in opened.iter_chunks(wanted) if wanted else ():
+        for name in wanted:
+            pieces[name].append(number_column(table, name, "init"))
+    changes, wraps = {}, {}
+    for key, each in plain.items():
+        ((name, factor),) = each.factors.items()
+        if (period := find_wrap(np.concatenate(pieces[name]))) is not None:
+            text = f"{quoted_channel(name)} % {period:.16g}"
+            changes[key] = text if factor == 1.0 else f"{factor:.15g} * ({text})"
+            wraps[key] = period
+    return columns.model_copy(update=changes), wraps
+
+
+def _column_lines(columns: Columns, wraps: Mapping[str, float], recording: Recording) -> list[ProposalLine]:
     lines = []
     if columns.time is not None:
         lines.append(ProposalLine("columns", "time", _quoted(columns.time), message("init.column")))
@@ -162,7 +220,12 @@ def _column_lines(columns: Columns) -> list[ProposalLine]:
         unit = split_unit(texts[0].rpartition("* ")[2].strip("`"))[1]
         why = message("init.column_unit", unit=unit) if unit else message("init.column_plain")
         value = _quoted(texts[0]) if len(texts) == 1 else f"[{', '.join(map(_quoted, texts))}]"
-        lines.append(ProposalLine("columns", key, value, why, doubtful=not unit and key == "output"))
+        if key in wraps:
+            why = message("init.wraps", range=wraps[key])
+        lines.append(ProposalLine("columns", key, value, why, doubtful=(not unit and key == "output") or key in wraps))
+    if columns.resample:
+        how = next(defect.text for defect in recording.defects if defect.kind == "resampled")
+        lines.append(ProposalLine("columns", "resample", "true", message("init.resample", how=how)))
     if columns.text is not None:
         given = columns.text.model_dump(exclude_defaults=True)
         value = ", ".join(f"{key} = {json.dumps(each, ensure_ascii=False)}" for key, each in given.items())

@@ -50,7 +50,22 @@ class Columns(Settings):
     output: NonEmptyStr | Annotated[tuple[NonEmptyStr, ...], Field(min_length=2)] = "y"
     time_unit: Literal["s", "ms", "us", "ns", "min"] = "s"  # unit of a numeric time column
     segment: tuple[NonEmptyStr, ...] = ()  # columns whose change starts a new run; a time reset does too
+    resample: bool = False  # whether rows are put on the loop's sample rate, where logs come irregularly or at another
+    # zone of dates and times that are written in local time, as Europe/Berlin; None: they count as they are written
+    time_zone: NonEmptyStr | None = None
     text: TextLayout | None = None  # of text files whose table is not found by itself
+
+    @field_validator("time_zone")
+    @classmethod
+    def _known_zone(cls, value: str | None) -> str | None:
+        if value is not None:
+            from zoneinfo import ZoneInfo
+
+            try:
+                ZoneInfo(value)
+            except (KeyError, ValueError, OSError):
+                raise ValueError(f"{value!r} is no zone of the IANA list, give one as Europe/Berlin") from None
+        return value
 
     @field_validator("output")
     @classmethod
@@ -119,6 +134,9 @@ class Loop(ShortRepr, Settings):
     input_logged: Literal["after_limiter", "before_limiter"] = "after_limiter"
     input_limits: Interval | None = None  # limits [lo, hi] of u
     input_deadzone: Interval | None = None  # range [lo, hi] of u in which the valve is shut
+    # what `learn` does with coefficients that no machine has, or that explain less than half of u: ``note`` where u
+    # only stands in for the force of the drive
+    implausible: Literal["refuse", "note"] = "refuse"
     # columns, plant, controller, monitor: the sections of the file; the controller is optional
     columns: Columns = Columns()
     plant: SerializeAsAny[plants.Plant]
@@ -217,6 +235,14 @@ class Loop(ShortRepr, Settings):
         return self
 
     @property
+    def cutoff(self) -> float:
+        """Cutoff of the state-variable filter [Hz]: the file's, or a tenth of the sample rate.
+
+        A tenth leaves ten samples per period at the cutoff, where the hold on y is still good.
+        """
+        return self.monitor.cutoff if self.monitor.cutoff is not None else self.sample_rate / 10.0
+
+    @property
     def needs_reference(self) -> bool:
         """Whether r has a part in the loop; elsewhere u may stand for it in recordings that have none."""
         of_sign = getattr(self.plant, "sign_from", "output") == "reference"
@@ -278,8 +304,11 @@ class Loop(ShortRepr, Settings):
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, ready for JSON, that `from_dict` turns into an equal loop."""
         plain: dict[str, Any] = self.model_dump(mode="json")
-        if self.columns.text is None:  # hashes of loops without it stay as they were
-            del plain["columns"]["text"]
+        for key in ("text", "resample", "time_zone"):  # came later: hashes of loops without them stay as they were
+            if not plain["columns"][key]:
+                del plain["columns"][key]
+        if self.implausible == "refuse":
+            del plain["implausible"]
         if self.monitor.feature_false_alarms == FEATURE_FALSE_ALARMS:
             del plain["monitor"]["feature_false_alarms"]  # came later: files and hashes of loops without it stay
         return {key: value for key, value in plain.items() if value is not None}

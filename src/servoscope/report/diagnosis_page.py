@@ -11,6 +11,7 @@ import numpy as np
 from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
+from servoscope.diagnosis.motion_signature import SignatureWidth, compare_signatures
 from servoscope.models.loop import Loop
 from servoscope.report.format_values import (
     describe_candidate,
@@ -79,6 +80,7 @@ def render_diagnosis_page(
         agreement=_agreement(diagnosis.candidates[0], refit.recursive[0]) if refit is not None else "",
         sizes=list(_sizes(diagnosis.candidates[0], refit)) if refit is not None else [],
         **_figures(diagnosis, trace, recording, loop),
+        **_signature(diagnosis, recording, loop),
         units=loop.plant.units,
         coefficient_units=dict(zip(loop.plant.names, loop.plant.coefficient_units, strict=True)),
         responses=[(point.frequency_hz, _response_cells(point)) for point in diagnosis.ifrf],
@@ -194,6 +196,31 @@ def _figures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loo
         "figures": [(name, lead, render_svg(figure, f"f{i}")) for i, (name, lead, figure) in enumerate(drawn)],
         "sizes_figure": render_svg(sizes, "sizes") if sizes is not None else "",
     }
+
+
+def _signature(diagnosis: Diagnosis, recording: Recording, loop: Loop) -> dict[str, Any]:
+    """Return the picture of the motion signature, and the rows of its table; both empty where there is none."""
+    from servoscope.report.plotting import render_svg
+    from servoscope.report.signature_figure import plot_signature
+
+    before, after = compare_signatures(recording, loop, diagnosis.onset_s[1] if diagnosis.onset_s else None)
+    if after is None:
+        return {"signature_figure": "", "signature_rows": []}
+    rows = [
+        (name, [_width_text(getattr(each, field)) if each is not None else "–" for each in (before, after)], unit)
+        for name, field, unit in (
+            ("Friction band", "friction_band", loop.plant.units[1]),
+            ("Lost motion", "lost_motion", loop.plant.units[0]),
+        )
+        if getattr(after, field) is not None
+    ]
+    figure = plot_signature(before, after, units=loop.plant.units)
+    return {"signature_figure": render_svg(figure, "signature"), "signature_rows": rows}
+
+
+def _width_text(width: SignatureWidth) -> str:
+    """Return a width with its 95 % interval's half width."""
+    return " ± ".join(format_with_std(width.value, 1.96 * width.std))
 
 
 def _response_cells(point: ResponsePoint) -> tuple[str, ...]:

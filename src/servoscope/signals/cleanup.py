@@ -15,6 +15,7 @@ from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.core.messages import message
 from servoscope.signals.defects import Defect, defects_at, limit_defects, split_consecutive
 from servoscope.signals.recording import Recording, with_defects
+from servoscope.signals.resample import ResampleTarget, resample_rows
 from servoscope.signals.spikes import find_spikes, follows_reference_step
 from servoscope.signals.time_axis import build_time_axis
 from servoscope.signals.timebase import Timebase
@@ -39,26 +40,33 @@ def clean(
     limits: tuple[float, float] | None = None,
     labels: tuple[str, str, str] = ("r", "u", "y"),
     channels: Mapping[str, npt.ArrayLike] | None = None,
+    target: ResampleTarget | None = None,
 ) -> Recording:
-    """Turn rows as logged into a recording; what cannot be used is dropped and listed, nothing is interpolated.
+    """Turn rows as logged into a recording; what cannot be used is dropped and listed.
 
     Rows are sorted and repeats dropped within a run; a row with a NaN or a spike in any channel is dropped
-    whole; a step of more than 1.5 samples is a gap, after which `restart` is set. u at a limit is valid data.
+    whole; a step of more than 1.5 samples is a gap, after which `restart` is set. u at a limit is valid data. Without
+    a `target`, to whose rate the rows that are left are resampled, nothing is interpolated.
 
     `t`: time stamps [s], shape (N,); `r, u, y`: reference, control input, measured output, shape (N,); `name`: what
     the recording is called, also in errors; `sample_rate`: expected sample rate [Hz]; None: taken from the time
     stamps; `run`: numbers, shape (N,), whose change starts a new run; a time reset does too; `limits`: limits [lo,
     hi] of u, for the count of saturated samples; None: a plateau at the extreme value counts; `labels`: what errors
-    call r, u and y; `channels`: further columns, whose rows go with the others; raises NotEnoughError if fewer than 20
-    usable rows, or runs shorter than that, are left; raises RecordingError if the time axis is unusable, the sample
-    rate is not the expected one, a channel holds no numbers, u or y is constant, or u and y seem to be swapped.
+    call r, u and y; `channels`: further columns, whose rows go with the others; `target`: what to resample to.
+
+    Raises NotEnoughError if fewer than 20 usable rows, or runs shorter than that, are left; raises RecordingError if
+    the time axis is unusable, the sample rate is not the expected one, a channel holds no numbers, u or y is constant,
+    or u and y seem to be swapped.
     """
     raw = [np.asarray(channel, dtype=np.float64) for channel in (t, r, u, y)]
     extra = {name: np.asarray(channel, dtype=np.float64) for name, channel in (channels or {}).items()}
     if any(channel.ndim != 1 or channel.size != raw[0].size for channel in (*raw, *extra.values())):
         raise RecordingError(f"{name}: t, r, u and y must be columns of equal length")
     _check_channels(raw[1:], name, labels)
-    axis = build_time_axis(raw[0], None if run is None else np.asarray(run), sample_rate, name)
+    axis = build_time_axis(
+        raw[0], None if run is None else np.asarray(run), None if target else sample_rate, name, regular=target is None
+    )
+    target = target and target.at(axis.sample_rate, axis.t)
     timebase, defects = Timebase(1.0 / axis.sample_rate), list(axis.defects)
     logged: list[npt.NDArray[Any]] = [axis.t, axis.run, *(axis.reorder(channel) for channel in raw[1:])]
     carried = {name: axis.reorder(channel) for name, channel in extra.items()}
@@ -84,18 +92,35 @@ def clean(
     t_kept, run_kept, r_kept, u_kept, y_kept = (outofcore.drop_rows(column, spikes) for column in columns)
 
     _check_length(t_kept.size, int(run_kept[-1]) + 1 if run_kept.size else 1, name)
-    gap_after = timebase.find_gaps(t_kept, run_kept)
+    kept = {name: outofcore.drop_rows(channel, gone) for name, channel in carried.items()}
+    resampled = None
+    if target is None:
+        gap_after = timebase.find_gaps(t_kept, run_kept)
+    else:
+        signals = [r_kept, u_kept, y_kept, *kept.values()]
+        held = {1} | ({0} if np.array_equal(r_kept, u_kept) else set())
+        resampled = resample_rows(t_kept, run_kept, signals, held, target, name)
+        gap_after = resampled.gap_after
     defects += _gap_defects(t_kept, gap_after, axis.t[dropped], timebase.period)
     if t_kept.size < raw[0].size:
         _check_channels([r_kept, u_kept, y_kept], name, labels)
     _check_swapped(r_kept, u_kept, y_kept, name, labels)
     defects += _saturation_defects(t_kept, u_kept, limits)
+    rate = axis.sample_rate
+    if resampled is not None and target is not None:
+        words = message(
+            "defect.resampled", measured=rate, rate=target.rate, error=resampled.error, cutoff=target.cutoff
+        )
+        defects.append(Defect("resampled", float(t_kept[0]), float(t_kept[-1]), t_kept.size, words))
+        t_kept, run_kept, rate = resampled.t, resampled.run, target.rate
+        r_kept, u_kept, y_kept, *others = resampled.columns
+        kept = dict(zip(kept, others, strict=True))
+        _check_length(t_kept.size, int(run_kept[-1]) + 1, name)
     numbered, restart = _renumber_runs(run_kept)
-    restart[gap_after + 1] = True
-    kept = {name: outofcore.drop_rows(channel, gone) for name, channel in carried.items()}
-    recording = Recording(
-        t_kept, r_kept, u_kept, y_kept, restart, kept, name=name, sample_rate=axis.sample_rate, run=numbered
-    )
+    restart |= resampled.restart if resampled is not None else False
+    if resampled is None:
+        restart[gap_after + 1] = True
+    recording = Recording(t_kept, r_kept, u_kept, y_kept, restart, kept, name=name, sample_rate=rate, run=numbered)
     return with_defects(recording, *defects)
 
 

@@ -16,7 +16,8 @@ MAX_DEFECTS = 100  # events of one kind that are listed one by one
 class Defect:
     """One thing that was wrong with a recording, and what was done about it."""
 
-    kind: str  # ``nan``, ``spike``, ``repeat``, ``order``, ``gap``, ``jitter``, ``clock``, ``saturation`` or ``text``
+    kind: str  # ``nan``, ``spike``, ``repeat``, ``order``, ``gap``, ``jitter``, ``clock``, ``saturation``,
+    # ``resampled`` or ``text``
     from_s: float  # from_s, to_s: when, on the recording's clock [s]
     to_s: float
     count: int  # number of rows concerned; of a gap, the number of rows that are missing

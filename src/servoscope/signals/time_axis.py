@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, IndexArray, Int32Array
-from servoscope.core.errors import RecordingError
+from servoscope.core.errors import IrregularTimeError, RecordingError
 from servoscope.core.messages import message
 from servoscope.signals.defects import Defect, mask_spans
 from servoscope.signals.timebase import (
@@ -31,6 +31,7 @@ MAX_IRREGULAR_SHARE = 0.2  # share of steps that may be far from one sample peri
 JITTER = 0.1  # sample periods
 RATE_TOLERANCE = 0.01
 RATE_NOTE = 0.001
+RESAMPLE_HINT = "correct sample_rate, or say --resample (resample = true in [columns])"
 
 
 class TimeAxis(NamedTuple):
@@ -57,11 +58,14 @@ class TimeAxis(NamedTuple):
         return column
 
 
-def build_time_axis(t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: float | None, name: str) -> TimeAxis:
+def build_time_axis(
+    t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: float | None, name: str, regular: bool = True
+) -> TimeAxis:
     """Sort the rows within their runs and lay the runs end to end where their times overlap.
 
     `t`: time stamps [s] as logged, shape (N,); `marks`: values, shape (N,), whose change starts a new run; None:
-    there is one; `sample_rate`: expected [Hz]; None: as measured; `name`: what errors call the recording.
+    there is one; `sample_rate`: expected [Hz]; None: as measured; `name`: what errors call the recording; `regular`:
+    whether steps have to be of one length, because nobody resamples them.
 
     Raises RecordingError if the time axis runs backwards or in disorder, is too coarse or irregular, or the rate is not
     the expected one.
@@ -82,7 +86,7 @@ def build_time_axis(t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: 
         backwards = backward_rows(t)
     begins = run_starts(t, begins, backwards, period)
     t, order = _sort_runs(t, begins, np.setdiff1d(backwards, begins))
-    rate, jitter = _measure_rate(t, begins, sample_rate, name)
+    rate, jitter = _measure_rate(t, begins, sample_rate, name, regular)
     used = sample_rate if sample_rate is not None else rate
     laid = _separate_runs(t, begins, 1.0 / used)
 
@@ -179,7 +183,9 @@ def _sort_runs(
     return t, found
 
 
-def _measure_rate(t: FloatArray, begins: IndexArray, expected: float | None, name: str) -> tuple[float, int]:
+def _measure_rate(
+    t: FloatArray, begins: IndexArray, expected: float | None, name: str, regular: bool
+) -> tuple[float, int]:
     """Return the measured rate [Hz] and the number of jittery steps."""
     some = _sample_steps(t, begins)
     some = some[some > 0.0]
@@ -199,10 +205,10 @@ def _measure_rate(t: FloatArray, begins: IndexArray, expected: float | None, nam
             (unit for unit, f in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if abs(rate * f / expected - 1) < 0.02),
             None,
         )
-        hint = (
-            f'is the time in {factor}? then say time_unit = "{factor}"' if factor else "correct sample_rate or resample"
-        )
+        hint = f'is the time in {factor}? then say time_unit = "{factor}"' if factor else RESAMPLE_HINT
         raise RecordingError(f"{name}: sampled at {rate:.6g} Hz, the loop says {expected:.6g} Hz: {hint}")
+    if not regular:
+        return rate, 0
     period = 1.0 / (expected if expected is not None else rate)
     advancing = far = jitter = 0
     for rows in outofcore.iter_chunks(0, t.size, t):
@@ -212,9 +218,9 @@ def _measure_rate(t: FloatArray, begins: IndexArray, expected: float | None, nam
         far += int(((steps > GAP_STEP) | (steps < 0.5)).sum())
         jitter += int(((np.abs(steps - 1.0) > JITTER + 1e-6) & (steps <= GAP_STEP)).sum())
     if far > MAX_IRREGULAR_SHARE * advancing:
-        raise RecordingError(
+        raise IrregularTimeError(
             f"{name}: {far} of {advancing} time steps are far from one sample of {period:g} s:"
-            " log at a fixed rate, nothing is interpolated here"
+            " log at a fixed rate, or have them resampled: --resample, or resample = true in [columns]"
         )
     return rate, jitter
 

@@ -95,6 +95,12 @@ def print_written_path(out: Console, path: object) -> None:
     out.print(Text(f"  wrote {path}"), soft_wrap=True)
 
 
+def print_command(out: Console, text: str, command: str) -> None:
+    """Print what to do next, and its command on one line that can be copied."""
+    print_notes(out, [text], "green", "-")
+    out.print(Text(f"    {command}"), soft_wrap=True)
+
+
 def print_baseline(out: Console, baseline: Baseline) -> None:
     """Print what was learned, operating point by operating point."""
     for point in baseline.per_point:
@@ -178,19 +184,20 @@ def _format_sources(b: Baseline) -> str:
 
 def print_channels(out: Console, path: Path, channels: Sequence[ChannelInfo]) -> None:
     """Print the columns of a file, which of them might be t, r, u and y, and what to do next."""
+    from servoscope.signals.readers.axes import signal_names
     from servoscope.signals.readers.guess_columns import format_mapping, guess_mapping
 
     print_title(out, path.name, f": {len(channels)} columns")
     limits = [[f"{x:.6g}" if math.isfinite(x) else DASH for x in (c.min, c.max)] for c in channels]
     rows = [(c.name, c.dtype, *limit) for c, limit in zip(channels, limits, strict=True)]
     print_table(out, ("column", "type", "smallest", "largest"), rows, words=2)
-    fields = guess_mapping([c.name for c in channels])
+    fields = guess_mapping(signal_names(channels))
     if mapping := format_mapping(fields):
         print_notes(out, [say("cli.proposed_mapping", mapping=mapping)])
     missing = [letter for letter, field in (("u", "input"), ("y", "output")) if fields[field] is None]
     if missing:
         print_notes(out, [say("cli.missing_mapping", names=missing)])
-    print_notes(out, [say("cli.next_init", path=shlex.quote(str(path)))], "green", "-")
+    print_command(out, say("cli.next_init"), f"servoscope init {shlex.quote(str(path))}")
 
 
 def print_column_mapping(out: Console, columns: Columns) -> None:

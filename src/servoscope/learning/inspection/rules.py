@@ -157,7 +157,7 @@ def _signal_findings(m: InspectionMeasurements, loop: Loop | None, constant: tup
         yield "missing", severity, _inspection("missing", percent=s.missing_percent, gaps=gaps)
     for defect in m.defects:
         if defect.kind not in ("saturation", "jitter"):
-            severity = "care" if defect.rows > 0.1 * s.samples and defect.kind != "clock" else "note"
+            severity = "care" if defect.rows > 0.1 * s.samples and defect.kind not in ("clock", "resampled") else "note"
             several = _inspection("defects", events=defect.events, first=defect.first)
             yield defect.kind, severity, several if defect.events > 1 else text_message(defect.first)
     for q in m.quantisation:

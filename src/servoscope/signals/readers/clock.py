@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
-from datetime import date
+from datetime import date, datetime, timedelta
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,8 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 
 DAY_S = 86400.0
+EPOCH = date(1970, 1, 1).toordinal()
+QUARTER_S = 900.0  # clocks are put forward and back at full quarters of an hour
 MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 MOMENT = re.compile(
     r"(?P<date>\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?\.\d\d?\.\d{2,4}|\d\d?/\d\d?/\d{2,4}|\d\d?-[A-Za-z]{3}-\d{4})?"
@@ -76,12 +79,53 @@ def _day_number(text: str) -> int | None:
         return None
 
 
+class ZoneOffset:
+    """How far the clocks of a zone are ahead of UTC, piece by piece; `zone`: its IANA name.
+
+    In the hour that comes twice when clocks are put back, rows after the step back belong to the second one.
+    """
+
+    def __init__(self, zone: str) -> None:
+        from zoneinfo import ZoneInfo
+
+        self._zone = ZoneInfo(zone)
+        self._last, self._again = -math.inf, -math.inf  # last row; until when the hour is its second [s]
+
+    def offsets(self, local: FloatArray) -> FloatArray:
+        """Return the offset [s], shape (N,), at local times [s since 1970 as written], shape (N,), NaN at NaN."""
+        found = np.full(local.size, np.nan)
+        known = np.flatnonzero(np.isfinite(local))
+        if not known.size:
+            return found
+        times = local[known]
+        steps, quarters = np.diff(times, prepend=self._last), np.floor(times / QUARTER_S)
+        each, where = np.unique(quarters, return_inverse=True)
+        first, second = np.array([self._both(quarter * QUARTER_S) for quarter in each.tolist()]).T
+        again = np.where(steps < -QUARTER_S, times + 3.0 * 3600.0, -np.inf)  # clocks go back by less than three hours
+        again = np.maximum.accumulate(np.append(self._again, again))[1:]
+        found[known] = np.where(times < again, second[where], first[where])
+        self._last, self._again = float(times[-1]), float(again[-1])
+        return found
+
+    def _both(self, local: float) -> tuple[float, float]:
+        """Return the offsets [s] of a local time that comes once or twice."""
+        moment = datetime(1970, 1, 1) + timedelta(seconds=local)
+        both = (moment.replace(tzinfo=self._zone, fold=fold).utcoffset() for fold in (0, 1))
+        first, second = (offset.total_seconds() if offset is not None else 0.0 for offset in both)
+        return first, second if second < first else first  # an hour that is skipped has no second one
+
+
 class ClockParser:
     """Turns dates and times of day into seconds, chunk by chunk; without dates, midnight starts a new day."""
 
     def __init__(self) -> None:
         self._first: int | None = None
         self._last, self._days = -np.inf, 0
+
+    @property
+    def midnight(self) -> float | None:
+        """The first midnight [s since 1970 as written]; None where the texts have no dates."""
+        return None if self._first is None else DAY_S * (self._first - EPOCH)
 
     def seconds(self, cells: Sequence[str | None]) -> FloatArray | int:
         """Return seconds since the first midnight, NaN for empty cells, shape (N,); else the index of a misfit."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from pydantic import ValidationError
@@ -20,17 +21,20 @@ FIELDS = {
     **{key: "output" for key in ("y", "output")},
     "segment": "segment",
 }
-ALLOWED_EXPRESSIONS = "only sums of channels and numbers, times or divided by numbers, are understood"
+ALLOWED_EXPRESSIONS = (
+    "only sums of channels and numbers, times or divided by numbers, are understood, and channel % range where it wraps"
+)
 MAX_SHOWN = 12
 HEADER_HINT = "; if a line of it has their names, say --header-row"
 COLUMNS_HINT = "say where the signals stand: --columns 't=..., r=..., u=..., y=...' or [columns] in the loop file"
 
 
 class LinearCombination(NamedTuple):
-    """A linear combination: constant + sum of factor times channel."""
+    """A linear combination: constant + sum of factor times channel; `wraps` are the ranges of channels that wrap."""
 
     factors: dict[str, float]
     constant: float
+    wraps: Mapping[str, float] = MappingProxyType({})
 
     def __add__(self, other: object) -> LinearCombination:
         """Sum of two combinations."""
@@ -39,19 +43,21 @@ class LinearCombination(NamedTuple):
         factors = dict(self.factors)
         for name, factor in other.factors.items():
             factors[name] = factors.get(name, 0.0) + factor
-        return LinearCombination(factors, self.constant + other.constant)
+        return LinearCombination(factors, self.constant + other.constant, {**self.wraps, **other.wraps})
 
     def scale(self, factor: float) -> LinearCombination:
         """Return the combination times a number."""
-        return LinearCombination({name: f * factor for name, f in self.factors.items()}, self.constant * factor)
+        factors = {name: f * factor for name, f in self.factors.items()}
+        return LinearCombination(factors, self.constant * factor, self.wraps)
 
 
 def parse_columns(text: str, base: Columns | None = None) -> Columns:
     """Read a mapping such as ``"r=qg, u=35.15 * vir, y=qm, t=time[ms]"``.
 
     The keys are t, r, u, y (or their long names) and segment (several columns with ``+`` between them). A unit in
-    brackets after the time column is its unit; ``t=`` means that there is no such column; y may stand several times,
-    once per sensor. Keys that are not named stay as in `base`. Raises LoopError if a pair cannot be read.
+    brackets after the time column is its unit, a zone such as [Europe/Berlin] that of its dates; ``t=`` means that
+    there is no such column; y may stand several times, once per sensor. Keys that are not named stay as in `base`.
+    Raises LoopError if a pair cannot be read.
     """
     fields: dict[str, object] = (base or Columns()).model_dump()
     outputs: list[str] = []
@@ -63,9 +69,11 @@ def parse_columns(text: str, base: Columns | None = None) -> Columns:
         if field == "segment":
             fields[field] = tuple(_strip_backticks(part) for part in value.split("+"))
         elif field == "time":
-            named = re.fullmatch(r"(.*?)\s*\[(\w+)\]", value)
+            named = re.fullmatch(r"(.*?)\s*\[(\w+(?:/[\w/]+)?)\]", value)
             fields["time"] = _strip_backticks(named[1] if named else value) or None
-            fields["time_unit"] = named[2] if named else "s"
+            zone = named is not None and "/" in named[2]
+            fields["time_unit"] = named[2] if named and not zone else "s"
+            fields["time_zone"] = named[2] if named and zone else None
         elif field == "output":
             outputs.append(value)
             fields[field] = tuple(outputs) if len(outputs) > 1 else value
@@ -104,8 +112,9 @@ def parse_combination(text: str, known: Iterable[str], where: str) -> LinearComb
     """Read a channel's name or a linear combination, such as ``"0.025 * counts + 3"``.
 
     Names with blanks or odd characters are put in backticks inside combinations: "-`motor speed`/2". A text that is the
-    name of a channel is that channel. `where`: how errors begin. Raises LoopError if the text is not a linear
-    combination, RecordingError if a channel does not exist.
+    name of a channel is that channel. "counts % 65536" is a channel that wraps in a range of 65536, unwrapped. `where`:
+    how errors begin. Raises LoopError if the text is not a linear combination, RecordingError if a channel does not
+    exist.
     """
     known = list(known)
     stripped = text.strip()
@@ -152,6 +161,10 @@ def _evaluate(node: ast.expr, quoted: Mapping[str, str], known: list[str], where
         return left + right
     if isinstance(node.op, ast.Sub):
         return left + right.scale(-1.0)
+    if isinstance(node.op, ast.Mod) and not right.factors and right.constant > 0.0:
+        if list(left.factors.values()) == [1.0] and not left.constant and not left.wraps:
+            return left._replace(wraps=dict.fromkeys(left.factors, right.constant))
+        raise ValueError("only a channel itself wraps")
     if isinstance(node.op, ast.Mult) and not left.factors:
         return right.scale(left.constant)
     if isinstance(node.op, ast.Mult) and not right.factors:

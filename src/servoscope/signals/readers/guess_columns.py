@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from servoscope.signals.readers.units import si_factor, split_unit
@@ -32,7 +32,7 @@ WORDS = {
     "r": (
         *("r", "ref", "reference", "setpoint", "set", "sp", "soll", "sollwert", "sollposition", "sollwinkel", "target"),
         *("solldrehzahl", "sollgeschwindigkeit", "fuhrungsgrosse", "consigne", "riferimento", "consigna", "referencia"),
-        *("desired", "demand", "demanded", "commanded", "objetivo", "obiettivo", "qg"),
+        *("desired", "demand", "demanded", "commanded", "objetivo", "obiettivo", "qg", "goal"),
         *("设定", "给定", "目标", "指令", "参考"),
     ),
     "u": (
@@ -40,14 +40,14 @@ WORDS = {
         *("ventil", "torque", "current", "voltage", "force", "pwm", "effort", "vir", "iq", "moment", "drehmoment"),
         *("strom", "motorstrom", "spannung", "kraft", "couple", "courant", "tension", "commande", "coppia", "corrente"),
         *("tensione", "comando", "forza", "par", "corriente", "tensionsalida", "mando", "fuerza", "voltaje"),
-        *("电流", "转矩", "扭矩", "力矩", "电压", "控制量", "阀"),
+        *("电流", "转矩", "扭矩", "力矩", "电压", "控制量", "阀", "tau", "duty", "load"),
     ),
     "y": (
         *("y", "output", "ist", "istwert", "istposition", "istwinkel", "istdrehzahl", "actual", "act", "measured"),
         *("feedback", "position", "pos", "angle", "speed", "velocity", "encoder", "displacement", "qm", "mesure"),
         *("mesuree", "reelle", "vitesse", "misura", "misurata", "posizione", "reale", "velocita", "posicion", "medida"),
         *("real", "velocidad", "lage", "winkel", "drehzahl", "geschwindigkeit", "weg"),
-        *("实际", "反馈", "位置", "测量", "速度", "角度"),
+        *("实际", "反馈", "位置", "测量", "速度", "角度", "q"),
     ),
 }
 # what u is and r is not: a reference of the torque is what the controller puts out
@@ -79,6 +79,7 @@ ERRORS = {
     "erreur",
     "ecart",
 }
+OF_CONTROLLER = {"control", "controller", "command", "cmd", "drive"}  # whose output is u
 COMMAND = ("command", "cmd")  # what the controller commands where there is a reference besides, else the reference
 FIELDS = {"t": "time", "r": "reference", "u": "input", "y": "output"}
 TIME_UNITS = {"ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns", "min": "min", "s": "s", "sec": "s"}
@@ -98,9 +99,13 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
     heir = "u" if has_reference else "r"
     words = {**WORDS, heir: (*WORDS[heir][:2], *COMMAND, *WORDS[heir][2:])}
     found: dict[str, str] = {}
+    if (pair := _named_alike(plain, parts)) is not None:
+        found["r"], found["y"] = pair
     for whole in (True, False):  # a name that is the word comes before one that only contains it
         for letter in [each for each in words if each not in found]:
             among = plain if letter == "r" else values
+            if letter == "y":
+                among = [name for name in values if not ("output" in parts[name] and parts[name] & OF_CONTROLLER)]
             left = [name for name in among if name not in found.values()]
             matches = (
                 name
@@ -111,6 +116,23 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
             if (match := next(matches, None)) is not None:
                 found[letter] = match
     return {letter: found[letter] for letter in WORDS if letter in found}
+
+
+def _named_alike(names: Sequence[str], parts: Mapping[str, set[str]]) -> tuple[str, str] | None:
+    """Return the first reference whose name is another's with a word such as target before it, and that other."""
+    ahead = set(WORDS["r"]) - {"r"}
+    for reference in names:
+        if parts[reference] & ahead and (rest := parts[reference] - ahead):
+            for name in names:
+                if parts[name] == rest and _units_agree(reference, name):
+                    return reference, name
+    return None
+
+
+def _units_agree(one: str, other: str) -> bool:
+    """Tell whether two names have the same unit, or one has none."""
+    units = {split_unit(one)[1], split_unit(other)[1]} - {""}
+    return len(units) < 2
 
 
 def _plain(name: str) -> str:

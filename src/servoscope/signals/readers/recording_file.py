@@ -23,6 +23,8 @@ from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.frames import Source, open_source
 from servoscope.signals.readers.select import CellReader, ColumnTypeChanged, RowFilter, format_cell
 from servoscope.signals.readers.table import Table, TableFile, TimeColumn, number_column
+from servoscope.signals.readers.wrap import Unwrapper
+from servoscope.signals.resample import ResampleTarget
 
 TIME_NAMES = ("t", "time", "zeit", "timestamp", "time_s", "seconds", "datetime", "date", "elapsed")
 
@@ -127,6 +129,12 @@ def _read_table_parts(
         f"[columns] {key}": [_parse_signal(opened, text, f"{name}: [columns] {key}") for text in several]
         for key, several in texts_by_key.items()
     }
+    unwrappers = {
+        (name, period): Unwrapper(period)
+        for several in signals.values()
+        for signal in several
+        for name, period in signal.wraps.items()
+    }
     clock = _find_time_column(opened, columns, loop)
     segments = [CellReader(find_channel(x, known, f"{name}: [columns] segment")) for x in columns.segment]
     wanted = {*chosen.columns, *(x for several in signals.values() for signal in several for x in signal.factors)}
@@ -142,7 +150,10 @@ def _read_table_parts(
         if apart is not None:
             cells = apart.read(table)
             rows = {f"{name}[{by}={format_cell(v)}]": mask & (cells == v) for v in dict.fromkeys(cells[mask].tolist())}
-        each = {what: [_evaluate_signal(table, one, what) for one in several] for what, several in signals.items()}
+        each = {
+            what: [_evaluate_signal(table, one, what, unwrappers) for one in several]
+            for what, several in signals.items()
+        }
         values = [several[0] if len(several) == 1 else np.mean(several, axis=0) for several in each.values()]
         if clock is not None:
             values.insert(0, clock.seconds(table))
@@ -159,7 +170,16 @@ def _read_table_parts(
         letter: letter if letter == text else f"{letter} ({text!r})"
         for letter, text in zip("ruy", keys.values(), strict=True)
     }
-    return [part.recording(label, loop, (labels["r"], labels["u"], labels["y"])) for label, part in parts.items()]
+    target = _resample_target(columns, loop)
+    signals_ = labels["r"], labels["u"], labels["y"]
+    return [part.recording(label, loop, signals_, target) for label, part in parts.items()]
+
+
+def _resample_target(columns: Columns, loop: Loop | None) -> ResampleTarget | None:
+    """Return what rows are resampled to; None where nobody asks for it."""
+    if not columns.resample:
+        return None
+    return ResampleTarget(loop.sample_rate, loop.cutoff, loop.hold) if loop is not None else ResampleTarget()
 
 
 def _without_reference(opened: TableFile, columns: Columns, loop: Loop | None) -> Columns:
@@ -197,7 +217,9 @@ class _RecordingBuilder:
             column.append(x if rows.all() else x[rows])
         self._rows += int(rows.sum())
 
-    def recording(self, name: str, loop: Loop | None, labels: tuple[str, str, str]) -> Recording:
+    def recording(
+        self, name: str, loop: Loop | None, labels: tuple[str, str, str], target: ResampleTarget | None
+    ) -> Recording:
         """Return the rows cleaned."""
         rate = loop.sample_rate if loop is not None else None
         columns = [column.to_array() for column in self._columns]
@@ -208,7 +230,8 @@ class _RecordingBuilder:
         run = runs[0] if runs else None
         limits = loop.input_limits if loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]
-        recording = clean(t, r, u, y, name=name, sample_rate=rate, run=run, limits=limits, labels=labels, channels=each)
+        options = {"sample_rate": rate, "run": run, "limits": limits, "labels": labels, "channels": each}
+        recording = clean(t, r, u, y, name=name, target=target if self._has_time else None, **options)  # type: ignore[arg-type]
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)
             notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))
@@ -232,9 +255,10 @@ def _find_time_column(opened: TableFile, columns: Columns, loop: Loop | None) ->
     wanted, known = columns.time, opened.columns
     where = f"{opened.name}: [columns] time"
     if wanted is not None and wanted not in known and "+" in wanted:
-        return TimeColumn([find_channel(part, known, where) for part in wanted.split("+")], columns.time_unit)
+        parts = [find_channel(part, known, where) for part in wanted.split("+")]
+        return TimeColumn(parts, columns.time_unit, columns.time_zone)
     if wanted is not None and (wanted in known or wanted != Columns().time):
-        return TimeColumn([find_channel(wanted, known, where)], columns.time_unit)
+        return TimeColumn([find_channel(wanted, known, where)], columns.time_unit, columns.time_zone)
     # A clock under another name must not be thrown away for a uniform one.
     clock = next((name for name in known if re.split(r"[\s\[(]", name.casefold())[0] in TIME_NAMES), None)
     if wanted is not None and (clock is not None or loop is None):
@@ -257,10 +281,15 @@ def _parse_signal(opened: TableFile, text: str, where: str) -> LinearCombination
     return combination
 
 
-def _evaluate_signal(table: Table, combination: LinearCombination, what: str) -> FloatArray:
+def _evaluate_signal(
+    table: Table, combination: LinearCombination, what: str, unwrappers: Mapping[tuple[str, float], Unwrapper]
+) -> FloatArray:
     total = np.full(table.rows, combination.constant)
     for name, factor in combination.factors.items():
-        total += factor * number_column(table, name, what)
+        x = number_column(table, name, what)
+        if name in combination.wraps:
+            x = unwrappers[name, combination.wraps[name]].unwrap(table, x)
+        total += factor * x
     return total
 
 

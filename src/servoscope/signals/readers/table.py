@@ -11,7 +11,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.clock import ClockParser, is_clock
+from servoscope.signals.readers.clock import ClockParser, ZoneOffset, is_clock
 
 NULL_TEXTS = (
     *("", "NaN", "nan", "NAN", "-nan", "-NaN", "NA", "N/A", "#N/A", "#NA", "null", "NULL", "None", "-", "?"),
@@ -80,12 +80,15 @@ class TimeColumn:
     """The time in seconds, chunk by chunk; dates and times count from the first row that has them.
 
     `columns`: names of a column, or of several that make one clock together: a date, a time of day, milliseconds;
-    `unit`: of numbers in one column.
+    `unit`: of numbers in one column; `zone`: of dates and times that are local; None: they count as they are written.
     """
 
-    def __init__(self, columns: Sequence[str], unit: str) -> None:
+    def __init__(self, columns: Sequence[str], unit: str, zone: str | None = None) -> None:
         self.columns, self._unit = tuple(columns), unit
+        self._zone = ZoneOffset(zone) if zone is not None else None
+        self._first_offset: float | None = None
         self._origin: tuple[int, float] | None = None
+        self._naive = False  # whether the column holds dates and times without a zone
         self._begin: float | None = None
         self._clocks = {column: ClockParser() for column in self.columns}
 
@@ -95,11 +98,27 @@ class TimeColumn:
         Raises RecordingError if a cell holds text that is neither number nor time.
         """
         if len(self.columns) == 1:
-            return self._column_seconds(table, self.columns[0], self._unit)
+            return self._elapsed(self._column_seconds(table, self.columns[0], self._unit))
         parts = [
             self._column_seconds(table, each, TIME_UNITS_BY_NAME.get(each.casefold(), "s")) for each in self.columns
         ]
-        return np.asarray(np.sum(parts, axis=0))
+        return self._elapsed(np.asarray(np.sum(parts, axis=0)))
+
+    def _elapsed(self, seconds: FloatArray) -> FloatArray:
+        """Return seconds as they passed, where those given are of local dates and a zone is known."""
+        midnights = [clock.midnight for clock in self._clocks.values() if clock.midnight is not None]
+        if self._zone is None or (self._local_origin is None and not midnights):
+            return seconds
+        start = self._local_origin if self._local_origin is not None else midnights[0] + (self._begin or 0.0)
+        offsets = self._zone.offsets(seconds + start)
+        if self._first_offset is None and np.isfinite(offsets).any():
+            self._first_offset = float(offsets[np.isfinite(offsets)][0])
+        return np.asarray(seconds - (offsets - (self._first_offset or 0.0)))
+
+    @property
+    def _local_origin(self) -> float | None:
+        """The first moment of a column of moments without a zone [s since 1970]; None where there is none."""
+        return self._origin[0] / self._origin[1] if self._origin is not None and self._naive else None
 
     def _column_seconds(self, table: Table, name: str, unit: str) -> FloatArray:
         import pyarrow as pa
@@ -114,6 +133,7 @@ class TimeColumn:
             column = column.cast(pa.timestamp("ms"))
         elif pa.types.is_time32(column.type):
             column = column.cast(pa.time64("ns"))
+        self._naive = pa.types.is_timestamp(column.type) and column.type.tz is None
         per_second = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[column.type.unit]
         whole = column.cast(pa.int64()).fill_null(0).to_numpy()
         known = np.flatnonzero(~missing)

@@ -56,6 +56,29 @@ export function signals(c, { t, r, u, y, units, name = "time [s]", marks = [] })
   };
 }
 
+// Mean input over position, forward and backward, on the left, and over speed on the right.
+export function signature(c, { curves, units }) {
+  const colours = { before: c.healthy, after: c.measured, measured: c.measured };
+  const pairs = (at, values) => at.map((x, i) => [x, values[i]]);
+  const y = (index) => axis(c, index ? "" : `mean u${unit(units?.u)}`, { type: "value", scale: true, gridIndex: index, gap: 52, label: { formatter: short } });
+  const x = (index, name) => axis(c, name, { type: "value", scale: true, gridIndex: index, splitNumber: 4, label: { formatter: short } });
+  return {
+    grid: [
+      { left: 70, right: "54%", top: 30, bottom: 40 },
+      { left: "54%", right: 14, top: 30, bottom: 40 },
+    ],
+    legend: legend(c, curves.map((one) => one.words)),
+    tooltip: tooltip(c, { formatter: (points) => points.map((one) => `${one.seriesName}: ${number(one.value[1], 4)} ${units?.u ?? ""}`).join("\n") }),
+    xAxis: [x(0, `output y${unit(units?.y)}`), x(1, "speed of y")],
+    yAxis: [y(0), y(1)],
+    series: curves.flatMap((one) => [
+      line(one.words, pairs(one.position, one.forward), colours[one.words], { xAxisIndex: 0, yAxisIndex: 0 }),
+      line(one.words, pairs(one.position, one.backward), colours[one.words], { xAxisIndex: 0, yAxisIndex: 0, stroke: { type: [5, 3] } }),
+      line(one.words, pairs(one.speed, one.by_speed), colours[one.words], { xAxisIndex: 1, yAxisIndex: 1 }),
+    ]),
+  };
+}
+
 export const short = (value) => (value === 0 ? "0" : number(Number(value.toPrecision(3)), 3).replace(/(\.\d*?)0+(?=$| )/, "$1").replace(/\.(?=$| )/, ""));
 
 // An estimate relative to healthy over time, with its band of two standard deviations.

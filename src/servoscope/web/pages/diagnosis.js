@@ -1,7 +1,7 @@
 // One diagnosis at its permanent address: verdict, grounds, candidates, pictures, numbers; it prints on paper.
 import { get, part, query } from "./api.js";
 import { plot } from "./charts.js";
-import { coefficient, signals, tests } from "./curves.js";
+import { coefficient, signals, signature, tests } from "./curves.js";
 import { h, section, table } from "./dom.js";
 import { mark, prose, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
@@ -80,6 +80,7 @@ function sections(found, said, picture, drawn, signal) {
     made.push(section("Change over time", "Above the dashed line, chance is no longer an explanation.", picture("Both tests over time, as multiples of their limits", (c) => tests(c, { ...trace, marks, clock: false, range: [trace.t[0], trace.t.at(-1)] }))));
   }
   if (found.signals) made.push(section("Signals", null, picture("Reference, output and input", (c) => signals(c, { ...found.signals, units, marks }), "plot tall")));
+  if (found.signature?.length) made.push(section("Motion signature", "Mean input over position, forward (solid) and backward (dashed), and over speed: the gap between the two directions is friction.", picture("Mean input over position and speed", (c) => signature(c, { curves: found.signature, units }))));
   if (said.ifrf?.length) {
     const plane = planes(said.ifrf.map(response), units.response ?? "", signal);
     if (trace) plane.trails(trace.responses, trace.t);

@@ -120,6 +120,7 @@ def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
         coefficient_units=[one.unit for one in data.trace.parameters],
         signals=data.signals,
         trace=data.trace,
+        signature=data.signature,
         report=f"{API}/diagnoses/{id_}/report",
         upload=record.upload,
     )

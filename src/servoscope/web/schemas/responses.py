@@ -161,6 +161,17 @@ class TraceColumns(ApiResponse):
     parameters: list[TraceParameter]
 
 
+class SignatureColumns(ApiResponse):
+    """Mean u over position, forward and backward, and over speed; null where nothing was measured."""
+
+    words: str
+    position: list[float | None]
+    forward: list[float | None]
+    backward: list[float | None]
+    speed: list[float | None]
+    by_speed: list[float | None]
+
+
 class DiagnosisData(ApiResponse):
     """The data of a diagnosis of an upload, as its job writes them."""
 
@@ -169,6 +180,7 @@ class DiagnosisData(ApiResponse):
     units: list[str]  # of y and u
     signals: SignalColumns
     trace: TraceColumns
+    signature: list[SignatureColumns] = []
 
 
 class BaselineRef(ApiResponse):
@@ -228,6 +240,7 @@ class DiagnosisDetail(DiagnosisRow):
     coefficient_units: list[str]
     signals: SignalColumns | None = None
     trace: TraceColumns | None = None
+    signature: list[SignatureColumns] = []
     report: str | None = None
     upload: str | None = None
 

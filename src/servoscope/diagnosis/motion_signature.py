@@ -1,0 +1,135 @@
+"""What a valve or drive engineer looks at first: u over position and over speed, forward against backward."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.learning.inspection.model_order import fit_regression
+from servoscope.models.loop import Loop
+from servoscope.signals import Recording
+
+BINS = 40  # of position and of speed
+FEWEST = 5  # samples that a bin needs
+SLOW = 0.02  # of the fast speeds (99th percentile), below which direction means nothing
+MOST_ROWS = 200_000  # that are looked at, the newest
+WINDOW = 0.5  # periods of the cutoff over which a parabola is fitted to the signals
+LEAST_MOTION = 200  # samples in motion
+
+
+class SignatureWidth(NamedTuple):
+    """How far apart forward and backward are at rest, with its standard deviation."""
+
+    value: float
+    std: float
+
+
+class MotionSignature(NamedTuple):
+    """Mean u by direction, shape (B,) each, NaN where nothing was measured.
+
+    `friction_band`: how much more u takes forward than backward as the speed goes to 0, that is twice the dry friction;
+    `lost_motion`: by how much r is further ahead of y forward than backward there, that is backlash; None without r.
+    """
+
+    position: FloatArray
+    forward: FloatArray
+    backward: FloatArray
+    speed: FloatArray
+    by_speed: FloatArray
+    friction_band: SignatureWidth
+    lost_motion: SignatureWidth | None
+
+
+def motion_signature(recording: Recording, loop: Loop, from_s: float, to_s: float) -> MotionSignature | None:
+    """Return the signature of the rows with from_s <= t < to_s; None if they hold too little motion both ways."""
+    first, end = np.searchsorted(recording.t, [from_s, to_s])
+    rows = recording[max(int(first), int(end) - MOST_ROWS) : int(end)]
+    window = 2 * max(2, round(0.5 * WINDOW * loop.sample_rate / loop.cutoff)) + 1
+    if rows.samples < 2 * window:
+        return None
+    y, v, a = _smoothed(rows.y, rows.restart, window, loop.sample_rate)
+    u, _, _ = _smoothed(rows.u, rows.restart, window, loop.sample_rate)
+    ahead, _, _ = _smoothed(rows.r - rows.y, rows.restart, window, loop.sample_rate)
+    known = np.isfinite(v)
+    if not known.any():
+        return None
+    fast = float(np.quantile(np.abs(v[known]), 0.99))
+    moving = known & (np.abs(v) > SLOW * fast)
+    if min((moving & (v > 0.0)).sum(), (moving & (v < 0.0)).sum()) < LEAST_MOTION / 2:
+        return None
+    position = _bin_edges(y[moving])
+    speeds = np.linspace(-fast, fast, BINS + 1)
+    block = max(round(loop.monitor.memory * loop.sample_rate), window)
+    band = _width_at_rest(u, y, v, a, moving, block)
+    if band is None:
+        return None
+    lost = None if np.array_equal(rows.r, rows.u) else _width_at_rest(ahead, y, v, a, moving, block)
+    return MotionSignature(
+        0.5 * (position[1:] + position[:-1]),
+        _bin_means(y, u, moving & (v > 0.0), position),
+        _bin_means(y, u, moving & (v < 0.0), position),
+        0.5 * (speeds[1:] + speeds[:-1]),
+        _bin_means(v, u, moving, speeds),
+        band,
+        lost,
+    )
+
+
+def compare_signatures(
+    recording: Recording, loop: Loop, onset_s: float | None
+) -> tuple[MotionSignature | None, MotionSignature | None]:
+    """Return the signatures before and from an onset on; without an onset that of the whole recording is the second."""
+    start, end = float(recording.t[0]), math.inf
+    if onset_s is None or onset_s <= start:
+        return None, motion_signature(recording, loop, start, end)
+    return motion_signature(recording, loop, start, onset_s), motion_signature(recording, loop, onset_s, end)
+
+
+def _smoothed(x: FloatArray, restart: BoolArray, window: int, rate: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a signal, its first and its second derivative by a moving parabola (Savitzky and Golay, 1964), (N,) each.
+
+    NaN where the window does not fit between two gaps.
+    """
+    from scipy.signal import savgol_coeffs
+
+    found = np.full((3, x.size), np.nan)
+    half = window // 2
+    starts = np.flatnonzero(np.append(restart, True))
+    weights = [savgol_coeffs(window, 2, deriv=k, delta=1.0 / rate, use="dot") for k in range(3)]
+    for start, stop in zip(np.append(0, starts[starts > 0])[:-1], starts[starts > 0], strict=True):
+        if stop - start >= window:
+            for row, each in zip(found, weights, strict=True):
+                row[start + half : stop - half] = np.correlate(x[start:stop], each, mode="valid")
+    return found[0], found[1], found[2]
+
+
+def _width_at_rest(
+    x: FloatArray, y: FloatArray, v: FloatArray, a: FloatArray, moving: BoolArray, block: int
+) -> SignatureWidth | None:
+    """Return how far a signal's values forward and backward are apart as the speed goes to 0.
+
+    From least squares on the sign of the speed, the speed by direction, acceleration, position and a constant.
+    """
+    columns = (np.sign(v), np.maximum(v, 0.0), np.minimum(v, 0.0), a, y, np.ones_like(v))
+    phi = np.nan_to_num(np.stack(columns, axis=1))
+    fit = fit_regression(("sign", "forward", "backward", "acceleration", "position", "one"), x, phi, moving, block)
+    if fit is None:
+        return None
+    return SignatureWidth(2.0 * float(fit.theta[0]), 2.0 * math.sqrt(max(float(fit.covariance[0, 0]), 0.0)))
+
+
+def _bin_edges(x: FloatArray) -> FloatArray:
+    low, high = np.quantile(x, [0.005, 0.995])
+    return np.linspace(float(low), float(high), BINS + 1)
+
+
+def _bin_means(at: FloatArray, x: FloatArray, used: BoolArray, edges: FloatArray) -> FloatArray:
+    """Return the mean of x in bins of another signal, shape (B,), NaN where there are too few samples."""
+    which = np.digitize(at[used], edges) - 1
+    inside = (which >= 0) & (which < BINS)
+    counts = np.bincount(which[inside], minlength=BINS)
+    sums = np.bincount(which[inside], weights=x[used][inside], minlength=BINS)
+    return np.where(counts >= FEWEST, sums / np.maximum(counts, 1), np.nan)

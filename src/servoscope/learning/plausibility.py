@@ -1,0 +1,51 @@
+"""Whether a baseline is one that a machine can have: signs of its coefficients, and what the motion explains of u."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from servoscope.core.errors import RecordingError
+from servoscope.core.messages import Message, message
+from servoscope.detection.baseline import Baseline
+from servoscope.learning.inspection.rules import LEAST_EXPLAINED
+from servoscope.signals import Recording
+from servoscope.signals.readers.wrap import find_wrap
+
+# of a motor axis: what turns motion into force can have no other sign; stiffness and offset can, as gravity does
+POSITIVE = ("inertia", "viscous_friction", "viscous_friction_forward", "viscous_friction_backward", "coulomb_friction")
+CERTAIN = 3.0  # standard deviations below 0
+
+
+def check_wraps(recordings: Sequence[Recording]) -> None:
+    """Refuse recordings in which u or y wraps; raises RecordingError, which says how to declare it."""
+    for recording in recordings:
+        for name, x in (("u", recording.u), ("y", recording.y)):
+            if (period := find_wrap(x)) is not None:
+                raise RecordingError(
+                    f"{recording.name}: {name} jumps by {period:.6g}, the range in which it wraps: write COLUMN %"
+                    f" {period:.16g} for its column, in --columns or [columns]"
+                )
+
+
+def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
+    """Refuse a baseline that no machine has; with `force`, return what is odd as notes instead.
+
+    Raises RecordingError, which says what is odd and what to do.
+    """
+    odd = []
+    if baseline.explained < LEAST_EXPLAINED:
+        odd.append(message("learning.unexplained", share=baseline.explained))
+    below = [
+        message("learning.negative", name=name, value=value, deviation=math.sqrt(baseline.covariance[i][i]))
+        for i, (name, value) in enumerate(zip(baseline.names, baseline.theta, strict=True))
+        if name in POSITIVE and value + CERTAIN * math.sqrt(baseline.covariance[i][i]) < 0.0
+    ]
+    if below:
+        all_below = len(below) == sum(name in POSITIVE for name in baseline.names)
+        advice = "learning.negative_all" if all_below else "learning.negative_some"
+        odd.append(message("learning.implausible", coefficients=below, advice=message(advice)))
+    if odd and not force:
+        names = ", ".join(source.name for source in baseline.sources[:3])
+        raise RecordingError(f"{names}: {message('learning.no_baseline', reasons=odd)}")
+    return odd

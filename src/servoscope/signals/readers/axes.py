@@ -1,0 +1,51 @@
+"""Which columns of a file are signals, and to which of its axes they belong."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+
+from servoscope.signals.readers.guess_columns import guess_columns
+from servoscope.signals.readers.recording_file import ChannelInfo
+
+# what tells axes apart in names: a number, or a letter that stands alone or ends a word as in AxisX
+MARK = re.compile(r"\d+|(?<![A-Za-z0-9])[XYZABCxyzabc](?![A-Za-z0-9])|(?<=[a-z])[XYZABC](?![A-Za-z])")
+
+STEADY = 2.0  # the largest over the smallest value, below which a positive column is a supply rather than a signal
+
+
+def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
+    """Return the names of columns that may be signals: without those that hardly vary, as a supply or temperature.
+
+    All of them where none of the others may be u.
+    """
+    names = [channel.name for channel in channels]
+    moving = [each.name for each in channels if not 0.0 < each.min <= each.max < STEADY * each.min]
+    lost = {"t", "u", "y"} & guess_columns(names).keys() - guess_columns(moving).keys()
+    return names if lost else moving
+
+
+def find_axes(names: Sequence[str]) -> dict[str, list[str]]:
+    """Return the columns that each axis can take, by the axis's mark; none where a file has one axis.
+
+    Columns are of several axes where their names differ in one number or letter only, and where for at least two
+    of them both u and y are found. Columns without a mark, such as the time, belong to all.
+    """
+    groups: dict[str, dict[str, str]] = defaultdict(dict)  # mark -> name with a blank in its place -> name
+    for name in names:
+        for found in MARK.finditer(name):
+            blank = f"{name[: found.start()]}\0{name[found.end() :]}"
+            if blank.strip("\0 _[]()"):  # a name that is nothing but its mark tells nothing: x, y
+                groups[found[0]][blank] = name
+    shared = {blank for each in groups.values() for blank in each}
+    shared = {blank for blank in shared if sum(blank in each for each in groups.values()) > 1}
+    own = {mark: [each[blank] for blank in each if blank in shared] for mark, each in groups.items()}
+    marked = {name for each in own.values() for name in each}
+    axes = {}
+    for mark, mine in own.items():
+        columns = [name for name in names if name in mine or name not in marked]
+        found_columns = guess_columns(columns)
+        if all(found_columns.get(letter) in mine for letter in "uy"):
+            axes[mark] = columns
+    return axes if len(axes) > 1 else {}

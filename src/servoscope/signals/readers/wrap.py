@@ -1,0 +1,67 @@
+"""Counters and angles that wrap: the range in which they do, and the same without jumps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.signals.readers.table import Table
+
+# ranges in which counters and angles wrap: bits of a word, degrees, radians, turns, lines of encoders
+RANGES = (*(2.0**bits for bits in (8, 10, 12, 14, 16, 17, 20, 23, 24, 32)), 360.0, 3600.0, 36000.0, 2.0 * math.pi, 1.0)
+NEGATIVE = 0.75  # share of the range from which the first value is one below zero, as a word with a sign is logged
+FILLED = 0.9  # share of the range that the values span
+SMOOTHER = 20.0  # times shorter than the range are all steps of the column unwrapped
+MOST_JUMPS = 0.1  # share of the steps
+ROUNDING = 1e-3  # of the range
+
+
+class Unwrapper:
+    """Unwraps a column piece by piece; a first value in the last quarter of the range counts as negative."""
+
+    def __init__(self, period: float) -> None:
+        self._period, self._last, self._offset = period, math.nan, 0.0
+        self._piece: Table | None = None
+        self._found = np.zeros(0)
+
+    def unwrap(self, table: Table, x: FloatArray) -> FloatArray:
+        """Return a piece of the column, shape (N,), without jumps; several signals may ask for the same piece."""
+        if table is self._piece:
+            return self._found
+        self._piece = table
+        known = np.flatnonzero(np.isfinite(x))
+        found = x.copy()
+        if known.size:
+            if math.isnan(self._last):
+                self._last = float(x[known[0]])
+                self._offset = -self._period if self._last > NEGATIVE * self._period else 0.0
+            steps = np.diff(x[known], prepend=self._last)
+            turns = self._offset - self._period * np.cumsum(np.round(steps / self._period))
+            found[known] += turns
+            self._last, self._offset = float(x[known[-1]]), float(turns[-1])
+        self._found = found
+        return found
+
+
+def find_wrap(x: FloatArray) -> float | None:
+    """Return the range in which a column, shape (N,), wraps; None if it does not seem to.
+
+    It does where its values fill one of the known ranges, few steps are longer than half of it, and all steps of the
+    same column unwrapped are much shorter.
+    """
+    x = x[np.isfinite(x)]
+    if x.size < 3:
+        return None
+    steps, span = np.diff(x), float(np.ptp(x))
+    for period in sorted(RANGES):
+        if not FILLED * period < span <= period * (1.0 + ROUNDING):
+            continue
+        turns = np.round(steps / period)
+        left = np.abs(steps - period * turns)
+        jumps = np.count_nonzero(turns)
+        moves = float(left[turns == 0.0].max(initial=0.0)) > 0.0  # a switch does not move between its jumps
+        if 0 < jumps <= MOST_JUMPS * steps.size and moves and SMOOTHER * float(left.max()) < period:
+            return float(period)
+    return None
