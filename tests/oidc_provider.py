@@ -53,14 +53,14 @@ class CertifiedProvider(Provider):
     """A provider whose ID tokens hold what the standard demands, and no names and groups."""
 
     def _command(self) -> list[str]:
-        return [found_node(), str(SERVER), json.dumps(self._users), SECRET, ADDRESS + CALLBACK]
+        return [found_node(SERVER), str(SERVER), json.dumps(self._users), SECRET, ADDRESS + CALLBACK]
 
 
-def found_node() -> str:
-    """Return Node.js; skip the test without it or the provider."""
+def found_node(server: Path) -> str:
+    """Return Node.js; skip the test without it or the packages of a server."""
     node = shutil.which("node")
-    if node is None or not SERVER.with_name("node_modules").is_dir():
-        pytest.skip("oidc-provider is not on this machine: scripts/install-test-servers installs it")
+    if node is None or not server.with_name("node_modules").is_dir():
+        pytest.skip(f"{server.parent.name} is not installed: scripts/install-test-servers installs it")
     return node
 
 

@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import servoscope as ss
+import test_features
 from commands import run
 from drives import Drive, compiler
 from servoscope.core.errors import BaselineError, StateError
@@ -229,6 +230,23 @@ def test_coefficients_alone_behind_a_stage_of_the_input(tmp_path: Path, made: Ca
     assert row[:, 4 : 4 + n].tobytes() == trace.theta.tobytes()
 
 
+@functools.cache
+def with_features() -> Baseline:
+    """An axis with friction, learned from as many recordings as features need."""
+    return ss.learn(test_features.LOOP, [test_features.axis(seed) for seed in range(4)])
+
+
+def test_coefficients_alone_beside_features(tmp_path: Path) -> None:
+    baseline = with_features()
+    assert baseline.features is not None
+    signals, monitor = golden_signals(baseline, 20_000), Monitor(baseline)
+    _, trace = monitor.run(monitor.init(), *signals)
+    row, n = run_alone(baseline, tmp_path, signals), len(baseline.names)
+    assert row[:, 1].tobytes() == trace.statistic.tobytes()
+    assert row[:, 4 : 4 + n].tobytes() == trace.theta.tobytes()
+    assert "no sequential test and no features" in (tmp_path / "servo_monitor.h").read_text(encoding="utf-8")
+
+
 class TestSinglePrecision:
     """Floats, with the bits of the monitor in single precision."""
 
@@ -291,6 +309,10 @@ class TestRefusals:
         with pytest.raises(BaselineError, match=r"estimator = 'sliding-window'.*line \d+"):
             export_c(fresh(altered(demo(), estimator="sliding-window")))
 
+    def test_features(self) -> None:
+        with pytest.raises(BaselineError, match=r"features beside.*feature_false_alarms = 0, or give --only-coef"):
+            export_c(with_features())
+
     def test_operating_points(self) -> None:
         other = demo().model_copy(update={"point": "warm"})
         with pytest.raises(BaselineError, match="--point cold"):
@@ -309,3 +331,15 @@ def test_command(tmp_path: Path) -> None:
         *("axis.c", "axis.h", "axis_golden.h", "check.c", "Makefile")
     }
     assert "make -C" in result.out.replace("\n", " ")
+
+
+def test_motions_never_seen_are_the_servers(tmp_path: Path) -> None:
+    """Where the model is known to hold under the motions of the recordings alone, header and terminal say so."""
+    baseline = with_features().model_copy(update={"features": None, "members": (), "exact": None})
+    assert baseline.limited_motion is not None and demo().limited_motion is None
+    baseline.save(tmp_path / "baseline.json")
+    result = run("export", tmp_path / "baseline.json", "--c", tmp_path)
+    assert result.code == 0, result.err
+    for text in (" ".join(result.out.split()), (tmp_path / "servo_monitor.h").read_text(encoding="utf-8")):
+        assert "an alarm may be no fault: the server looks at that" in text
+    assert "an alarm may" not in export_c(demo()).files["servo_monitor.h"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import subprocess
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -12,9 +11,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from reliability.servers import node_opcua
 
 from brokers import until
+from oidc_provider import found_node
 from servoscope.core.errors import ConfigError
 from servoscope.service.opcua.monitored_items import ItemGrant
 from servoscope.service.opcua.resample import Resampler
@@ -26,6 +25,7 @@ from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
 from test_opcua import certificate, free_port
 
+SERVER = Path(__file__).with_name("opcua_server") / "plant.js"
 RATE = 20.0
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
@@ -35,20 +35,15 @@ def nodes(machine: str, y: str = "y") -> OpcuaNodes:
 
 
 class ForeignPlant:
-    """The server of `opcua_plant.js`, which may be killed and started again."""
+    """The server of `opcua_server`, which may be killed and started again."""
 
     def __init__(self) -> None:
-        packages = node_opcua()
-        if packages is None:
-            pytest.skip("node-opcua is not on this machine: scripts/install-test-servers installs it")
-        self.port, self._environment = free_port(), {**os.environ, "NODE_OPCUA": str(packages)}
+        self.port, self._node = free_port(), found_node(SERVER)
         self.start()
 
     def start(self) -> None:
-        words = ["node", str(Path(__file__).with_name("opcua_plant.js")), str(self.port), str(RATE)]
-        self._process = subprocess.Popen(
-            words, env=self._environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
+        words = [self._node, str(SERVER), str(self.port), str(RATE)]
+        self._process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         assert self._process.stdout is not None
         until(lambda: self._process.stdout and "ready" in self._process.stdout.readline(), 120.0)
         self._process.stdout.close()

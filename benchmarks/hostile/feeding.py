@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import resource
 import sys
 import tempfile
 import time
@@ -16,9 +17,10 @@ from hostile.damage import damaged
 from hostile.targets import Target, targets
 from servoscope.core.errors import MessageError, ServoscopeError
 
-__all__ = ["fed", "feed_all", "markdown"]
+__all__ = ["broken_bounds", "fed", "feed_all", "markdown"]
 
 SHOWN = 3  # of what must not happen, on stderr
+MAX_S, MAX_MB = 20.0, 1000.0  # for one input; memory is that of a whole process, its libraries included
 
 
 def fed(target: Target, inputs: int, seed: int = 1) -> dict[str, Any]:
@@ -27,6 +29,8 @@ def fed(target: Target, inputs: int, seed: int = 1) -> dict[str, Any]:
     came: Counter[str] = Counter()
     cases: Counter[str] = Counter()
     slowest, shown = 0.0, 0
+    Path("/proc/self/clear_refs").write_text("5")  # the peak of its memory begins anew
+    before = peaks_kb()
     for good in target.good:
         target.feed(good, chance)  # as it is, it is read
     for number in range(inputs):
@@ -50,7 +54,33 @@ def fed(target: Target, inputs: int, seed: int = 1) -> dict[str, Any]:
     return {
         "name": target.name, "inputs": inputs, **{key: came[key] for key in ("read", "refused", "badly told", "other")},
         "cases": dict(cases.most_common()), "slowest_s": round(slowest, 2),
+        "peak_mb": round(max(kb for one, kb in peaks_kb().items() if kb > before.get(one, 0) or one == "self") / 1024),
     }  # fmt: skip
+
+
+def peaks_kb() -> dict[str, int]:
+    """Return the most memory [kB] of this process, of those that it has started, and of the largest that ended."""
+    children = Path("/proc/self/task").glob("*/children")
+    living = ["self", *(word for file in children for word in file.read_text(encoding="utf-8").split())]
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    return {"ended": ended, **{each: _peak_kb(each) for each in living}}
+
+
+def _peak_kb(process: str) -> int:
+    try:
+        text = Path(f"/proc/{process}/status").read_text(encoding="utf-8")
+    except OSError:  # it has just ended
+        return 0
+    return next((int(line.split()[1]) for line in text.splitlines() if line.startswith("VmHWM")), 0)
+
+
+def broken_bounds(found: list[dict[str, Any]]) -> list[str]:
+    """Return the names of targets with an input that came to something else than read or refused, in bounds."""
+    return [
+        one["name"]
+        for one in found
+        if one["other"] + one["badly told"] or one["slowest_s"] > MAX_S or one["peak_mb"] > MAX_MB
+    ]
 
 
 def feed_all(inputs: int, only: str = "") -> list[dict[str, Any]]:
@@ -62,7 +92,10 @@ def feed_all(inputs: int, only: str = "") -> list[dict[str, Any]]:
 
 def markdown(found: dict[str, Any]) -> str:
     """Return the table."""
-    lines = [("reader or decoder", "inputs", "read", "refused", "any other exception", "slowest"), ("---",) * 6]
+    lines = [
+        ("reader or decoder", "inputs", "read", "refused", "any other exception", "slowest", "most memory"),
+        ("---",) * 7,
+    ]
     lines += [
         (
             one["name"],
@@ -71,6 +104,7 @@ def markdown(found: dict[str, Any]) -> str:
             f"{one['refused']}",
             f"{one['other'] + one['badly told']}",
             f"{one['slowest_s']:.2f} s",
+            f"{one['peak_mb']} MB",
         )
         for one in found["targets"]
     ]

@@ -30,12 +30,15 @@ class Fleet:
         Where its recordings and service files are.
     assets, hours, speed
         How many, for how long (simulated), at how many times the true speed.
+    block_s
+        Length of a block [s].
     """
 
     folder: Path
     assets: int
     hours: float
     speed: float
+    block_s: float = BLOCK_S
 
     @property
     def rounds(self) -> int:
@@ -75,7 +78,7 @@ class Fleet:
             f'[store]\nurl = "{store}"',
             "[diagnosis]\nevery_s = 3600.0",
             "[alarms.fault]\noff_delay_s = 10.0",
-            f'[sources.line]\nkind = "replay"\nspeed = {speed}\nblock = {BLOCK_S}\nstart = 2026-01-01T00:00:00Z',
+            f'[sources.line]\nkind = "replay"\nspeed = {speed}\nblock = {self.block_s}\nstart = 2026-01-01T00:00:00Z',
         ]
         lines += [
             f'[assets.{asset}]\nbaseline = "baseline.json"\nsource = "line"\nfiles = {self.files(asset)}'.replace(
@@ -98,7 +101,9 @@ class Fleet:
         for name in self.names:
             files = tuple(self.files(name))
             if files not in known:
-                tape = ReplayStream(tuple(recordings[file] for file in files), round(BLOCK_S * loop.sample_rate), False)
+                tape = ReplayStream(
+                    tuple(recordings[file] for file in files), round(self.block_s * loop.sample_rate), False
+                )
                 blocks = samples = digest = 0
                 while (block := tape.block(name, blocks, began)) is not None:
                     blocks, samples, digest = blocks + 1, samples + block.t.size, block.digest(digest)

@@ -99,12 +99,6 @@ def mosquitto() -> Path | None:
     return Path(found) if found else None
 
 
-def node_opcua() -> Path | None:
-    """Return where scripts/install-test-servers has put the packages of node-opcua; None where it has not."""
-    found = Path(__file__).parents[2] / ".test-servers" / "node_modules"
-    return found if (found / "node-opcua").is_dir() and shutil.which("node") else None
-
-
 class Mosquitto:
     """A broker; it writes its sessions down once a second, and what is younger is lost when it is killed.
 

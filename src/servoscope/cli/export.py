@@ -40,7 +40,7 @@ def export(
     """Write the monitor of a baseline for a drive or a simulator: the same results as on the server."""
     from servoscope.cli.render import results
     from servoscope.detection.baseline import Baseline
-    from servoscope.export import export_c, export_fmu, save_st
+    from servoscope.export import UNSEEN_MOTION, export_c, export_fmu, save_st
 
     if c is None and fmu is None and st is None:
         raise typer.BadParameter("say what to write: --c DIR, --fmu FILE or --st DIR")
@@ -50,7 +50,7 @@ def export(
     if point is not None:
         learned = learned.at(point)
     summary: dict[str, Any] = {"files": []}
-    notes = []
+    notes = [UNSEEN_MOTION] if learned.limited_motion is not None else []
     if c is not None:
         made = export_c(learned, name, only_coefficients=only_coefficients, single=precision == "single")
         summary["files"] += map(str, made.save(c))

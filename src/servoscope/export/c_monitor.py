@@ -23,10 +23,13 @@ from servoscope.export.image import pack_image
 from servoscope.export.precision import describe_rounding
 from servoscope.export.steps_c import step_functions
 
-__all__ = ["CMonitor", "export_c"]
+__all__ = ["UNSEEN_MOTION", "CMonitor", "export_c"]
 
 NAME = "servo_monitor"
 MAX_LINE = 108
+UNSEEN_MOTION = (
+    "Under motions that the healthy recordings do not hold an alarm may be no fault: the server looks at that."
+)
 
 
 class _Template(string.Template):
@@ -84,8 +87,7 @@ def export_c(
     golden = GoldenRun.of(baseline, made.recursion, baseline.limit, made.delays)
     values = common_words(made, name) | _number_words(single) | _sizes(made, single) | _code(made, name, single)
     values |= {
-        "left_out": (" Only coefficients: there is no sequential test." if only_coefficients else "")
-        + (" Features beside the coefficients are not exported." if baseline.features is not None else ""),
+        "left_out": _left_out(baseline, only_coefficients),
         "rounding": describe_rounding(made, only_coefficients, golden) if single else "",
     }
     named = {"monitor.c": f"{name}.c", "monitor.h": f"{name}.h", "check.c": "check.c", "Makefile": "Makefile"}
@@ -93,6 +95,17 @@ def export_c(
     image = pack_image(made.mark, golden.state, *golden.alarm)
     texts[f"{name}_golden.h"] = golden_text(golden, name, image)
     return CMonitor(texts, made.mark, values["state_bytes"], values["constant_bytes"])
+
+
+def _left_out(baseline: Baseline, only_coefficients: bool) -> str:
+    """Return what the header says of the monitor on the server that this one does not have."""
+    sentences = []
+    if only_coefficients:
+        features = " and no features" * (baseline.features is not None)
+        sentences.append(f"Only coefficients: there is no sequential test{features}.")
+    if baseline.limited_motion is not None:
+        sentences.append(UNSEEN_MOTION)
+    return "".join(f"\n * {sentence}" for sentence in sentences)
 
 
 def _sizes(made: ExportConstants, single: bool) -> dict[str, Any]:

@@ -58,6 +58,11 @@ class ExportConstants:
                 f"{loop.name}: {stage} cannot be exported: learn a baseline without it, or give "
                 "--only-coefficients and hand u over as it is behind that stage"
             )
+        if baseline.features is not None and not only_coefficients:
+            raise BaselineError(
+                f"{loop.name}: the features beside the coefficients cannot be exported: learn a baseline with "
+                "[monitor] feature_false_alarms = 0, or give --only-coefficients"
+            )
         derived = MonitorConstants.from_baseline(baseline)
         if only_coefficients:
             derived = replace(derived, constants=derived.constants._replace(watch=None))

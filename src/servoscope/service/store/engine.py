@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import sqlalchemy as sa
 from sqlalchemy import exc
@@ -32,6 +33,7 @@ HINTS = {  # what to do, where SQLite does not say it
     sqlite3.SQLITE_CANTOPEN: ", its folder must be one that servoscope may write to",
     sqlite3.SQLITE_READONLY: ", file and folder must be ones that servoscope may write to",
 }
+UNCHANGED = {"mode": "ro", "immutable": "1", "uri": "true"}
 LOCK_RELEASE_S = 2.0  # s: after which a killed process has released its lock
 
 
@@ -72,12 +74,15 @@ def display_url(url: URL) -> str:
 
 
 def create_store_engine(
-    url: URL, network: NetworkSettings | None = None, *, lock_timeout_s: float = LOCK_TIMEOUT_S
+    url: URL, network: NetworkSettings | None = None, *, lock_timeout_s: float = LOCK_TIMEOUT_S, write: bool = False
 ) -> sa.Engine:
     """Return an engine that has opened nothing yet; raises StoreError if the driver is missing."""
     if url.get_backend_name() == "sqlite":
-        engine = sa.create_engine(url, connect_args={"timeout": lock_timeout_s}, hide_parameters=True)
-        sa.event.listen(engine, "connect", _set_up_sqlite)
+        lies_still = not write and _lies_still(Path(str(url.database)))
+        read = url.set(database=f"file:{quote(str(url.database))}", query=UNCHANGED) if lies_still else url
+        engine = sa.create_engine(read, connect_args={"timeout": lock_timeout_s}, hide_parameters=True)
+        if not lies_still:
+            sa.event.listen(engine, "connect", _set_up_sqlite)
         # the driver itself begins late, and ends a transaction before it changes a table
         sa.event.listen(engine, "begin", lambda connection: connection.exec_driver_sql("BEGIN"))
         return engine
@@ -91,6 +96,15 @@ def create_store_engine(
     if network is not None:
         sa.event.listen(engine, "do_connect", lambda *given: _resolve_host(network, given[-1]))
     return engine
+
+
+def _lies_still(path: Path) -> bool:
+    """Whether a file is a copy on a medium that cannot be written, and whole without its log.
+
+    SQLite keeps the log beside it, and would not read the file where it cannot make one.
+    """
+    log = path.with_name(f"{path.name}-wal")
+    return not os.access(path.parent, os.W_OK, effective_ids=True) and not (log.exists() and log.stat().st_size)
 
 
 def _resolve_host(network: NetworkSettings, arguments: dict[str, Any]) -> None:

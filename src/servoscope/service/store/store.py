@@ -96,7 +96,7 @@ class Store:
         """
         try:
             found = engine.parse_store_url(url, folder or Path.cwd())
-            store = cls(found, engine.create_store_engine(found, network, lock_timeout_s=lock_timeout_s))
+            store = cls(found, engine.create_store_engine(found, network, lock_timeout_s=lock_timeout_s, write=write))
         except ModuleNotFoundError as error:
             raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
         if found.get_backend_name() == "sqlite":

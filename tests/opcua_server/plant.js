@@ -1,12 +1,11 @@
 // An OPC UA server of another stack, as a process of its own: what it grants is less than it is asked for.
 //
-//     node tests/opcua_plant.js PORT RATE [CERTIFICATES]
+//     node tests/opcua_server/plant.js PORT RATE [CERTIFICATES]
 //
 // Sample k, at RATE, holds r = 5, u = sin(k / 7), y = cos(k / 9), each stamped by the server. `press.*` may be sampled every 50 ms at
 // best (its MinimumSamplingInterval), `lift.*` as fast as asked. With a folder CERTIFICATES only clients it knows are let in.
 "use strict";
-const path = require("node:path");
-const opcua = require(path.join(process.env.NODE_OPCUA, "node-opcua"));
+const opcua = require("node-opcua");
 
 async function main(port, rate, folder) {
   const security = folder && {
