@@ -196,9 +196,10 @@ def _propose(rng: np.random.Generator, u: FloatArray, weight: FloatArray) -> tup
     renewed = outside | (rng.random(POPULATION) < DEFENCE)
     drawn[renewed] = rng.random((int(renewed.sum()), u.shape[1]))
     heavy = weight > 1e-6
-    steps = np.linalg.solve(spread, (drawn[:, None, :] - u[heavy]).reshape(-1, u.shape[1]).T)
-    distance = np.square(steps).sum(axis=0).reshape(POPULATION, -1)
-    kernel = np.exp(-0.5 * distance) / np.prod(np.diag(spread) * np.sqrt(2.0 * np.pi))
+    to, of = np.linalg.solve(spread, drawn.T), np.linalg.solve(spread, u[heavy].T)
+    # |a - b|^2 by products of matrices: all pairs at once
+    distance = np.square(to).sum(axis=0)[:, None] + np.square(of).sum(axis=0) - 2.0 * to.T @ of
+    kernel = np.exp(-0.5 * np.maximum(distance, 0.0)) / np.prod(np.diag(spread) * np.sqrt(2.0 * np.pi))
     inside = 1.0 - float(outside.mean())
     prior = 1.0 - inside * (1.0 - DEFENCE)
     return drawn, (1.0 - DEFENCE) * (kernel @ weight[heavy]) + prior

@@ -41,6 +41,7 @@ from servoscope.service.records import BlockRefusal, StepResult, TableRow, trans
 from servoscope.service.residual_history import evaluation_status, update_history
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.continuity import BlockContinuity, check_continuity
+from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
 from servoscope.signals import quality
 from servoscope.signals.samples import Samples
 from servoscope.signals.timebase import Timebase
@@ -257,7 +258,8 @@ class Asset:
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
         self._trim_window()
-        return StepResult([TableRow("diagnoses", values)], [])
+        named = fault_rows(window.until, "full", diagnosis.document.get("faults", []))
+        return StepResult([TableRow("diagnoses", values), *(TableRow("sizes", row) for row in named)], [])
 
     @property
     def _current(self) -> AssetState:
@@ -271,6 +273,9 @@ class Asset:
 
     def _add_row(self, table: str, **values: Any) -> None:
         self._result.rows.append(TableRow(table, {"number": self._next_row_number(), **values}))
+
+    def _add_sizes(self, rows: Iterable[dict[str, Any]]) -> None:
+        self._result.rows.extend(TableRow("sizes", row) for row in rows)
 
     def _process_samples(self, block: Block, continuity: BlockContinuity) -> None:
         """Update monitor, data quality and the history of residuals."""
@@ -305,6 +310,9 @@ class Asset:
         )
         for row in rows:
             self._add_row("residuals", **row)
+        evaluation = self._current.evaluation
+        if times.size and period_number(evaluation.t) != period_number(state.evaluation.t):
+            self._add_sizes(coefficient_rows(float(times[-1]), evaluation.parameters))
 
     def _examine(self) -> None:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
@@ -316,13 +324,15 @@ class Asset:
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, recent, state.evaluation.features),
+            lambda: examine_blocks(self.baseline, self.name, recent, state.evaluation.features, single_fault(state)),
             examination_phase(self.name),
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )
         self.state = replace(state, examination=examination)
         if result is None:
             return
+        if result.size is not None:
+            self._add_sizes(fault_rows(t, "live", [result.size.model_dump(mode="json")]))
         if result.verdict != state.examination.verdict:
             self._add_row("diagnoses", t=t, grounds="examination", **result.columns())
         examination, in_full = schedule_full_diagnosis(examination, self._schedule, t)
@@ -368,3 +378,9 @@ class Asset:
 def fault_names(faults: Iterable[Mapping[str, Any]]) -> set[str]:
     """Return which faults are named."""
     return {str(fault["name"]) for fault in faults}
+
+
+def single_fault(state: AssetState) -> str | None:
+    """Return the fault that the last full diagnosis has named; None where it named none or several."""
+    faults = state.examination.faults
+    return str(faults[0]["name"]) if len(faults) == 1 else None

@@ -43,6 +43,7 @@ class StoreSettings(ConnectionSettings):
     url: NonEmptyStr = "history.sqlite"
     residual_every_s: Seconds = 60.0  # time between two stored residuals of an asset [s]
     residual_days: Seconds = 400.0  # how long they are kept; diagnoses, alarms and audit are kept for ever
+    size_days: Seconds = 7300.0  # how long sizes and coefficients are kept, thinned to one a day
 
 
 class DiagnosisSettings(Settings):

@@ -39,6 +39,7 @@ class Service:
         self.assets, self.notifier = components.assets, components.notifier
         self._publishers, self._restarted = components.publishers, components.restarted
         self.buffer, self.residual_days = config.service.buffer, config.store.residual_days
+        self.size_days = config.store.size_days
         self.writer = StoreWriter(self.store, config.name, self.buffer)
         self.metrics = ServiceMetrics(self)
         self.clock = SteadyClock()

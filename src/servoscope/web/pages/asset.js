@@ -5,6 +5,7 @@ import { plot } from "./charts.js";
 import { commands, STATES } from "./commands.js";
 import { signals as drawn, tests } from "./curves.js";
 import { h, section, table, tell, titled } from "./dom.js";
+import { growth } from "./growth.js";
 import { follow } from "./live.js";
 import { badge, mark, priority, prose, say, STATUS, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
@@ -16,7 +17,7 @@ const SIGNALS_S = 30;
 const SIGNALS_EVERY_MS = 2000;
 const POINTS = 500;
 
-export async function show(main, { session, signal, linked, part: name, entitle }) {
+export async function show(main, { session, signal, linked, values, part: name, entitle }) {
   entitle(name);
   const path = `/assets/${part(name)}`;
   let asset = await get(path, signal);
@@ -25,6 +26,7 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   const about = [asset.about.loop, asset.about.plant && `plant ${asset.about.plant}`, asset.about.point, asset.about.sample_rate_hz && `${asset.about.sample_rate_hz} Hz`].filter(Boolean).join(", ");
   const plane = planes(asset.responses, units.response ?? "", signal);
   const sizes = parameters(asset.parameters);
+  const grown = growth(path, () => asset, values, signal);
   const said = h("p", { class: "working", role: "status" });
   const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
   const statistic = h("div", { class: "plot tall" });
@@ -38,6 +40,7 @@ export async function show(main, { session, signal, linked, part: name, entitle 
     h(
       "div",
       { class: "columns" },
+      grown.element,
       section("Inverse frequency response", "Input per unit of output, as a complex number: the diamond is healthy, the dot is now, its ellipse holds 95 %. Each panel has its own scales.", plane.element),
       half(titled("Distance from healthy", spans, statistic)),
       half(titled("Signals", h("small", {}, `the last ${SIGNALS_S} s`), samples)),
@@ -77,6 +80,7 @@ export async function show(main, { session, signal, linked, part: name, entitle 
     const [alarms, found] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 20 }), signal)]);
     past.replaceChildren(steps(alarms.transitions, false));
     diagnoses.replaceChildren(list(found.diagnoses));
+    await grown.load();
   }
 
   async function sample() {
@@ -134,7 +138,7 @@ function began({ verdict, onset, since }) {
 function told(asset) {
   if (asset.verdict !== "fault" || !asset.sizes.length) return asset.summary;
   const each = asset.sizes.map((one) => `${one.parameter} is ${number(one.ratio, 4)} times its healthy value (95 %: ${number(one.low, 4)} to ${number(one.high, 4)})`);
-  return `${capital(each.join(", "))}, as the last full diagnosis says.`;
+  return `${capital(each.join(", "))}${asset.sized ? ` on ${moment(asset.sized)}` : ""}.`;
 }
 
 const half = (element) => (element.classList.add("half"), element);

@@ -6,12 +6,13 @@ import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from pydantic import Field
 
 from servoscope.detection.result import Verdict
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
+from servoscope.prognosis.forecast import Outlook
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
 from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
@@ -123,6 +124,7 @@ class AssetRow(ApiResponse):
     deviation: float | None
     alarms: list[AlarmRow]
     sizes: list[FaultSize]
+    sized: float | None
     t: float
     at: float
     severity: float
@@ -138,6 +140,7 @@ class AssetRow(ApiResponse):
             "deviation": relative_residual(status),
             "alarms": alarms,
             "sizes": fault_sizes(status),
+            "sized": status.newest_sizes[1] if status.verdict == "fault" else None,
             "t": status.position.t,
             "at": at,
             "severity": _severity(status, alarms),
@@ -267,6 +270,44 @@ class ResidualHistory(ApiResponse):
     residuals: list[ResidualSeries]
 
 
+class SizeCurve(ApiResponse):
+    """A fault or coefficient over time, as a ratio to healthy, with its 95 % intervals."""
+
+    name: str
+    kind: Literal["full", "live", "coefficient"]
+    t: list[float]
+    value: list[float]
+    low: list[float]
+    high: list[float]
+    healthy: list[float]
+
+
+class SizeHistory(ApiResponse):
+    """How faults and coefficients of an asset have changed; of each of `points` equal parts of the time one value."""
+
+    asset: str
+    curves: list[SizeCurve]
+
+
+class Forecast(ApiResponse):
+    """How a size grows, and when it reaches a limit: intervals as lower end, median, upper end."""
+
+    asset: str
+    name: str
+    limit: float
+    coverage: float
+    points: int
+    from_t: float
+    to_t: float
+    outlook: Outlook
+    value: tuple[float, float, float] | None
+    rate_per_day: tuple[float, float, float] | None
+    remaining_s: tuple[float | None, float | None, float | None] | None
+    odds: float | None
+    summary: str
+    explanation: tuple[str, ...]
+
+
 class RecentSignals(SignalColumns):
     """The last seconds as measured."""
 
@@ -298,7 +339,7 @@ def fault_sizes(status: AssetStatus) -> list[FaultSize]:
             low=fault.interval[0],
             high=fault.interval[1],
         )
-        for fault in (status.faults if status.verdict == "fault" else ())
+        for fault in (status.newest_sizes[0] if status.verdict == "fault" else ())
     ]
 
 
