@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,11 @@ from servoscope.core.errors import StoreError
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.alarms import AlarmSettings
 from servoscope.service.asset import Asset, AssetPolicy
+from servoscope.service.checkpoint import pack_state, unpack_state
 from servoscope.service.config import DiagnosisSettings
+from servoscope.service.diagnosis_worker import DiagnosisWorker, find_due_prognosis
 from servoscope.service.examination import StoredDiagnosis, diagnose_blocks, examine_blocks
+from servoscope.service.outlook import DuePrognosis
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Batch, Store
 from servoscope.service.store.series import DAY_S, HOUR_S, query_sizes, read_series, thin_columns, thin_sizes
@@ -27,6 +31,9 @@ from servoscope.simulation import FaultEvent
 
 BEGAN = 1767225600.0  # midnight
 NOW = BEGAN + 100 * DAY_S
+POLICY = AssetPolicy(
+    DiagnosisSettings(window_s=30.0, every_s=60.0), QualitySettings(window_s=2.0), AlarmSettings(), 60.0
+)
 LEAK = {"name": "leakage", "parameter": "C_ie", "ratio": 1.2, "interval": [1.19, 1.21]}
 
 
@@ -156,11 +163,47 @@ def test_what_one_fault_does_not_explain_has_no_size() -> None:
     assert examined(*alone, fault=None).size is None and examined(*alone, fault="never").size is None
 
 
+def test_a_limit_that_comes_near_is_an_alarm_until_the_fault_has_gone(tmp_path: Path) -> None:
+    store = Store.open("history.sqlite", tmp_path, write=True)
+    rng, days = np.random.default_rng(0), np.arange(0.0, 100.0)
+    sizes = 1.0 + 0.004 * days + 0.002 * rng.standard_normal(days.size)
+    rows = [row(BEGAN + day * DAY_S, "live", size) for day, size in zip(days.tolist(), sizes.tolist(), strict=True)]
+    written(store, [{**one, "low": one["value"] - 0.004, "high": one["value"] + 0.004} for one in rows])
+    worker = DiagnosisWorker()
+    found = worker.submit_prognosis(store, "press", DuePrognosis("leakage", 1.5, BEGAN)).result()
+    worker.close()
+    store.close()
+    assert found.outlook == "forecast" and found.remaining_s is not None
+    low, middle, high = (each / DAY_S for each in found.remaining_s if each is not None)
+    assert low < 26.0 < high and middle == pytest.approx(26.0, abs=3.0)  # 0.5 at 0.004 a day: 125 days, 99 are over
+
+    limited = replace(POLICY, limits={"leakage": 1.5})
+    asset = Asset("press", halls.baseline(), Monitor(halls.baseline()), limited)
+    for block in blocks(2, "C_ie=1.2@10", seconds=30.0):
+        asset.process(block)
+    assert asset.state is not None
+    named = replace(asset.state.examination, faults=[LEAK], onset=BEGAN)
+    asset.state = replace(asset.state, examination=named)
+    due = find_due_prognosis(asset.state, limited.limits, 3600.0)
+    assert due == DuePrognosis("leakage", 1.5, BEGAN)
+    (occurs,) = asset.apply_prognosis(found.model_copy(update={"to_t": asset.state.position.t})).transitions
+    assert (occurs.alarm, occurs.is_new) == ("limit", True)
+    assert occurs.cause == found.summary and "weeks, most likely in" in occurs.cause
+    assert find_due_prognosis(asset.state, limited.limits, 3600.0) is None
+    outlook = asset.status(unpack_state(pack_state(asset.state), "press")).outlook
+    assert outlook is not None and outlook.rate_per_day is not None and outlook.reach_t is not None
+    assert outlook.reach_t[0] == pytest.approx(asset.state.position.t + low * DAY_S)
+
+    repaired = replace(asset.state.examination, faults=[], verdict="healthy")
+    asset.state = replace(asset.state, examination=repaired)
+    assert asset.status(asset.state).outlook is None
+    for block in blocks(4, began=BEGAN + 2 * DAY_S, first=30, seconds=2.0):
+        asset.process(block)
+    assert asset.state.alarms["limit"].condition == "normal"
+
+
 def test_the_headline_of_a_leak_that_grows_is_its_newest_size() -> None:
-    policy = AssetPolicy(
-        DiagnosisSettings(window_s=30.0, every_s=60.0), QualitySettings(window_s=2.0), AlarmSettings(), 60.0
-    )
-    asset = Asset("press", halls.baseline(), Monitor(halls.baseline()), policy)
+    asset = Asset("press", halls.baseline(), Monitor(halls.baseline()), POLICY)
     rows = [row for block in blocks(2, "C_ie=1.2@10") for row in asset.process(block).rows]
     for window, part in asset.due_diagnoses(ended=True):
         rows += asset.apply_diagnosis(window, diagnose_blocks(asset.baseline, "press", part)).rows

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +16,7 @@ from servoscope.core.settings_errors import suggest_name
 from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.follower import DiagnosisSchedule, Follower
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.alarms import (
     AlarmSettings,
     AlarmTransition,
@@ -36,6 +37,7 @@ from servoscope.service.examination_schedule import (
     schedule_full_diagnosis,
     update_examination,
 )
+from servoscope.service.outlook import Outlook, PrognosisSettings, current_outlook, single_fault
 from servoscope.service.reception import FOLLOWED
 from servoscope.service.records import BlockRefusal, StepResult, TableRow, transition_row
 from servoscope.service.residual_history import evaluation_status, update_history
@@ -55,6 +57,8 @@ class AssetPolicy:
     quality: quality.QualitySettings
     alarms: AlarmSettings
     residual_every_s: float
+    prognosis: PrognosisSettings = field(default_factory=PrognosisSettings)
+    limits: Mapping[str, float] = field(default_factory=dict)  # by fault, ratio to healthy at which the machine stops
 
 
 class Asset:
@@ -71,7 +75,8 @@ class Asset:
         self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
         self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s)
         self._limits = policy.quality.limits(self._rate)
-        self._definitions = policy.alarms.asset_alarms
+        alarms, limited = policy.alarms.asset_alarms, bool(policy.limits)
+        self._definitions = {key: one for key, one in alarms.items() if limited or one.source != "outlook"}
         self._window: deque[Block] = deque()
         self._result = StepResult([], [])
         self.state: AssetState | None = None
@@ -235,6 +240,13 @@ class Asset:
     def _is_first_diagnosis(self, window: PendingDiagnosis) -> bool:
         return window.until <= self._schedule.end(self._current.examination.since)
 
+    def apply_prognosis(self, found: Prognosis) -> StepResult:
+        """Keep a prognosis, and advance the alarms by it."""
+        state, self._result = self._current, StepResult([], [])
+        self.state = replace(state, outlook=Outlook.from_prognosis(found, state.position.t))
+        self._advance_alarms(state.position.t)
+        return self._result
+
     def apply_diagnosis(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> StepResult:
         """Store the result of one of `due_diagnoses`; a second result for it has no effect."""
         state = self._current
@@ -324,7 +336,9 @@ class Asset:
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, recent, state.evaluation.features, single_fault(state)),
+            lambda: examine_blocks(
+                self.baseline, self.name, recent, state.evaluation.features, single_fault(state.examination.faults)
+            ),
             examination_phase(self.name),
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )
@@ -346,6 +360,7 @@ class Asset:
         state = self._current
         findings = tuple(quality.active_findings(state.quality))
         statistic, level = state.evaluation.peaks
+        outlook = current_outlook(state.outlook, state.examination.faults)
         snapshot = AssetSnapshot(
             verdict=quality.limit_verdict(state.examination.verdict, findings),
             quality=findings,
@@ -353,6 +368,9 @@ class Asset:
             level=level,
             reception=self.reception,
             cause=asset_summary(state.examination, findings),
+            # of a fault that has gone nothing is left to wait for
+            outlook=outlook.word(t, self.policy.prognosis.ahead_s) if outlook is not None else "far",
+            outlook_cause=outlook.summary if outlook is not None else "",
         )
         alarms, transitions = advance_alarms(self._definitions, state.alarms, snapshot, t)
         self.state = replace(state, alarms=alarms)
@@ -378,9 +396,3 @@ class Asset:
 def fault_names(faults: Iterable[Mapping[str, Any]]) -> set[str]:
     """Return which faults are named."""
     return {str(fault["name"]) for fault in faults}
-
-
-def single_fault(state: AssetState) -> str | None:
-    """Return the fault that the last full diagnosis has named; None where it named none or several."""
-    faults = state.examination.faults
-    return str(faults[0]["name"]) if len(faults) == 1 else None

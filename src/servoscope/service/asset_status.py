@@ -16,6 +16,7 @@ from servoscope.detection.result import FaultEstimate
 from servoscope.service.alarms import FAULT_ALARM, AlarmDefinition, LifecycleState, Ne107, Priority, evaluate_ne107
 from servoscope.service.checkpoint import AssetState, StreamPosition
 from servoscope.service.examination_schedule import ExaminationState
+from servoscope.service.outlook import Outlook, current_outlook
 from servoscope.service.reception import FOLLOWED, Reception, ReceptionState
 from servoscope.service.residual_history import EvaluationStatus
 from servoscope.signals import quality
@@ -71,6 +72,7 @@ class AssetStatus(EvaluationStatus):
     # size, sized: of the fault by the newest examination, and when that was [UTC s]; None: by the full diagnosis alone
     size: FaultEstimate | None = None
     sized: float | None = None
+    outlook: Outlook | None = None  # when the fault reaches its limit; None: it has none, or nothing is known yet
     position: StreamPosition = Field(alias="counted")
     metadata: AssetMetadata = Field(AssetMetadata(), alias="about")
 
@@ -181,6 +183,7 @@ def asset_status(
             **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
             **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
             **({"size": examination.size, "sized": examination.sized} if examination.size else {}),
+            **({} if (outlook := current_outlook(state.outlook, examination.faults)) is None else {"outlook": outlook}),
             **({} if reception == FOLLOWED else {"reception": reception.state}),
             **state.evaluation.model_dump(exclude_unset=True),
         }

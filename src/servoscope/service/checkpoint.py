@@ -14,6 +14,7 @@ from servoscope.core.errors import StateError
 from servoscope.diagnosis.follower import FollowerState
 from servoscope.service.alarms import AlarmState
 from servoscope.service.examination_schedule import ExaminationState, PendingDiagnosis
+from servoscope.service.outlook import Outlook
 from servoscope.service.residual_history import EvaluationStatus, HistoryState
 
 MAGIC = b"servoscope state"
@@ -58,6 +59,7 @@ class AssetState(FollowerState):
     pending_diagnoses: tuple[PendingDiagnosis, ...] = ()
     alarms: dict[str, AlarmState] = field(default_factory=dict)
     evaluation: EvaluationStatus = field(default_factory=EvaluationStatus)
+    outlook: Outlook | None = None  # None: no prognosis was asked for
 
 
 def pack_state(state: AssetState) -> bytes:
@@ -73,6 +75,7 @@ def pack_state(state: AssetState) -> bytes:
         "windows": [asdict(window) for window in state.pending_diagnoses],
         "alarms": {name: alarm.to_dict() for name, alarm in state.alarms.items()},
         "shown": state.evaluation.to_json(),
+        **({} if state.outlook is None else {"outlook": state.outlook.model_dump(mode="json")}),
     }
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     numbers = state.monitor.astype("<f8").tobytes() + state.quality.astype("<f8").tobytes()
@@ -118,4 +121,5 @@ def unpack_state(packed: bytes, asset: str) -> AssetState:
         pending_diagnoses=tuple(PendingDiagnosis(**window) for window in document["windows"]),
         alarms=alarms,
         evaluation=EvaluationStatus.model_validate(document["shown"]),
+        outlook=Outlook.model_validate(document["outlook"]) if "outlook" in document else None,
     )
