@@ -241,6 +241,7 @@ function lineOf(first) {
   const statistic = gauge();
   const level = gauge();
   const element = h("div", { role: "row", class: "line" }, state, h("span", { role: "cell", class: "name" }, name), group, what, since, statistic.element, level.element, deviation, growth, limit, data, alarms, last);
+  [...element.children].forEach((one, i) => one.setAttribute("data-name", COLUMNS[i]));
   const drawn = (one, value) => {
     tell(one.value, multiple(value));
     const share = Math.round(Math.min((value ?? 0) / 1.5, 1) * 48); // px; the limit is at 32

@@ -2,7 +2,7 @@
 import { get, query } from "./api.js";
 import { plot } from "./charts.js";
 import { growth as drawn } from "./curves.js";
-import { h, tell, titled } from "./dom.js";
+import { h, save, tell, titled } from "./dom.js";
 import { say } from "./marks.js";
 import { change, count, moment, number, plain } from "./words.js";
 
@@ -10,14 +10,18 @@ const DAY_S = 86400;
 const SPANS = { "7 d": 7 * DAY_S, "60 d": 60 * DAY_S, "1 y": 366 * DAY_S, all: null };
 const WEEK = 7;
 
-export function growth(path, asset, values, signal) {
+export function growth(path, name, asset, values, signal) {
   const canvas = h("div", { class: "plot tall" });
   const said = h("p", { class: "summary", role: "status" });
   const why = h("p", { class: "note" });
   const which = h("select", { "aria-label": "What is followed" });
   const limit = h("input", { type: "number", step: "any", "aria-label": "Limit, as a ratio to healthy", placeholder: "limit, such as 1.5", value: values.get("limit") ?? "" });
   const buttons = Object.keys(SPANS).map((words) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(words) }, words));
-  const element = titled("How it grows", [which, limit, ...buttons], said, canvas, why);
+  const exports = [
+    h("button", { type: "button", class: "filter screen", title: "Save the picture", onclick: () => save(chart.image(), `${name} ${which.value}.png`) }, "PNG"),
+    h("button", { type: "button", class: "filter screen", title: "Save the values", onclick: () => save(table(), `${name} ${which.value}.csv`) }, "CSV"),
+  ];
+  const element = titled("How it grows", [which, limit, ...buttons, ...exports], said, canvas, why);
   let span = SPANS[values.get("span")] === undefined ? "60 d" : values.get("span");
   let [curves, forecast] = [[], null];
   const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal);
@@ -27,6 +31,13 @@ export function growth(path, asset, values, signal) {
     const own = curves.filter((curve) => curve.name === which.value);
     const all = own.flatMap(({ kind, t, value, low, high, healthy }) => t.map((at, i) => ({ t: at, value: value[i], low: low[i], high: high[i], healthy: healthy[i], full: kind === "full" })));
     return all.sort((a, b) => a.t - b.t);
+  }
+
+  // The values as `servoscope trend` reads them.
+  function table() {
+    const lines = rows().map((one) => [new Date(1000 * one.t).toISOString(), one.value, one.low, one.high, one.healthy, one.full ? "full" : ""].join());
+    const text = [`time,${which.value},low,high,healthy,diagnosis`, ...lines, ""].join("\n");
+    return URL.createObjectURL(new Blob([text], { type: "text/csv" }));
   }
 
   function shown() {
