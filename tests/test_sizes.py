@@ -25,7 +25,15 @@ from servoscope.service.examination import StoredDiagnosis, diagnose_blocks, exa
 from servoscope.service.outlook import DuePrognosis
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Batch, Store
-from servoscope.service.store.series import DAY_S, HOUR_S, query_sizes, read_series, thin_columns, thin_sizes
+from servoscope.service.store.series import (
+    DAY_S,
+    HOUR_S,
+    query_sizes,
+    read_notes,
+    read_series,
+    thin_columns,
+    thin_sizes,
+)
 from servoscope.signals.quality import QualitySettings
 from servoscope.simulation import FaultEvent
 
@@ -126,6 +134,16 @@ def test_a_coefficient_is_followed_as_a_share_of_healthy_and_a_wrong_name_is_tol
         query_sizes(store, "press")
     with pytest.raises(StoreError, match="leakge"):
         query_sizes(store, "press", "leakge")
+
+
+def test_after_a_note_that_a_part_was_renewed_the_trend_begins_anew(store: Store) -> None:
+    written(store, [row(BEGAN + k * DAY_S, "live", 1.1) for k in range(10)])
+    store.add_audit("otto", "press", "note", {"t": BEGAN + 7 * DAY_S, "text": "pump replaced", "anew": True})
+    store.add_audit("otto", "press", "note", {"t": BEGAN + 8 * DAY_S, "text": "oil topped up", "anew": False})
+    store.add_audit("otto", "lift", "note", {"t": BEGAN + 9 * DAY_S, "text": "rope replaced", "anew": True})
+    assert [note["text"] for note in read_notes(store, "press")] == ["pump replaced", "oil topped up"]
+    assert query_sizes(store, "press").t.size == 3
+    assert query_sizes(store, "press", since=BEGAN).t.size == 10  # who asks for it gets what was before
 
 
 def test_means_for_a_picture_are_those_of_equal_spans() -> None:

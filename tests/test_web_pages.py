@@ -103,6 +103,10 @@ def test_an_asset_says_how_its_fault_grows_and_what_to_check(open_page: Open, tm
         page.get_by_role("button", name="PNG").click()
     download.value.save_as(tmp_path / "sizes.png")
     assert (tmp_path / "sizes.png").read_bytes().startswith(b"\x89PNG")
+    page.get_by_text("Note what was done").click()
+    page.get_by_label("What was done").fill("oil filter changed")
+    page.get_by_role("button", name="Note it").click()
+    expect(page.get_by_text(re.compile("oil filter changed \\(local\\)"))).to_be_visible()
     page.get_by_label("Limit, as a ratio to healthy").fill("1.3")
     page.keyboard.press("Tab")
     page.wait_for_url("**limit=1.3**")  # what is looked at can be sent to somebody

@@ -17,7 +17,7 @@ from servoscope.service.log import log
 from servoscope.service.outlook import DuePrognosis, current_outlook, single_fault
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
-from servoscope.service.store.series import query_sizes
+from servoscope.service.store.series import last_renewal, query_sizes
 
 MAX_ATTEMPTS = 2  # of a diagnosis that takes its process down with it
 TASK = "servoscope.service.diagnosis_worker:diagnose_packed_blocks"
@@ -40,7 +40,8 @@ class DiagnosisWorker:
         """Ask when a fault of an asset reaches its limit."""
 
         def ask() -> Prognosis:
-            series = query_sizes(store, name, due.fault, due.since)
+            since = max(due.since, last_renewal(store, name) or due.since)
+            series = query_sizes(store, name, due.fault, since)
             columns = {key: getattr(series, key).tolist() for key in ("t", "value", "std")}
             return Prognosis.model_validate(self._worker.run(PROGNOSIS_TASK, due.fault, columns, due.limit))
 

@@ -17,12 +17,14 @@ from servoscope.core.errors import StoreError
 from servoscope.core.settings_errors import suggest_name
 from servoscope.prognosis.series import NORMAL_95, SizeSeries
 from servoscope.service.store import tables
+from servoscope.service.store.rows import Row
 from servoscope.service.store.store import Store
 
 Series = FloatArray  # of a fault or coefficient: t, value, low, high, healthy, shape (5, N)
 HOUR_S, DAY_S = 3600.0, 86400.0
 DENSE_S, HOURLY_S = 7 * DAY_S, 60 * DAY_S
 TIERS = ((DENSE_S, HOUR_S), (HOURLY_S, DAY_S))  # from which age on, into parts of which width
+NOTE = "note"  # in the audit: what somebody noted about an asset
 FAULT_KINDS = ("full", "live")
 
 
@@ -75,6 +77,19 @@ def read_series(
     return {key: np.array(rows, dtype=np.float64).T for key, rows in found.items()}
 
 
+def read_notes(store: Store, asset: str) -> list[Row]:
+    """Return what people have noted about an asset, in the order of `t`: with `who`, `text` and `anew`."""
+    table = tables.audit
+    query = sa.select(table.c.who, table.c.document).where(table.c.asset == asset, table.c.what == NOTE)
+    notes = [{"who": row["who"], **row["document"]} for row in store.fetch(query.order_by(table.c.id))]
+    return sorted(notes, key=lambda note: float(note["t"]))
+
+
+def last_renewal(store: Store, asset: str) -> float | None:
+    """Return since when an asset has been another one, as somebody noted ("pump replaced") [UTC s]; None: never."""
+    return max((note["t"] for note in read_notes(store, asset) if note["anew"]), default=None)
+
+
 def thin_columns(columns: Series, points: int) -> Series:
     """Return a series, shape (5, N), as at most `points` means over equal spans of time."""
     t = columns[0]
@@ -88,14 +103,15 @@ def thin_columns(columns: Series, points: int) -> Series:
 def query_sizes(store: Store, asset: str, name: str | None = None, since: float | None = None) -> SizeSeries:
     """Return the size of an asset's fault, or of a coefficient, over time, as a ratio to healthy.
 
-    `name`: None if only one fault was ever named; `since`: [UTC s] what was found before is left out.
+    `name`: None if only one fault was ever named; `since`: [UTC s] what was found before is left out; None: what was
+    found before the last note that the asset was renewed.
 
     Raises
     ------
     StoreError
         If no fault was named, another one, or several and `name` does not say which.
     """
-    series = read_series(store, asset, (since, None))
+    series = read_series(store, asset, (last_renewal(store, asset) if since is None else since, None))
     faults = sorted({each for kind, each in series if kind in FAULT_KINDS})
     coefficients = sorted({each for kind, each in series if kind not in FAULT_KINDS})
     if name is None and len(faults) > 1:

@@ -27,7 +27,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const about = [asset.about.loop, asset.about.plant && `plant ${asset.about.plant}`, asset.about.point, asset.about.sample_rate_hz && `${asset.about.sample_rate_hz} Hz`].filter(Boolean).join(", ");
   const plane = planes(asset.responses, units.response ?? "", signal);
   const sizes = parameters(asset.parameters);
-  const grown = growth(path, name, () => asset, values, signal);
+  const grown = growth(path, name, () => asset, { session, values, signal });
   const said = h("p", { class: "working", role: "status" });
   const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
   const sure = h("div", {});

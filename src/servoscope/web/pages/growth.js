@@ -1,8 +1,8 @@
 // How a fault grows: one curve of its size over months, a limit that may be tried, and when it will be reached.
-import { get, query } from "./api.js";
+import { get, mayChange, post, query } from "./api.js";
 import { plot } from "./charts.js";
 import { growth as drawn } from "./curves.js";
-import { h, save, tell, titled } from "./dom.js";
+import { during, field, h, save, tell, titled } from "./dom.js";
 import { say } from "./marks.js";
 import { change, count, moment, number, plain } from "./words.js";
 
@@ -10,7 +10,7 @@ const DAY_S = 86400;
 const SPANS = { "7 d": 7 * DAY_S, "60 d": 60 * DAY_S, "1 y": 366 * DAY_S, all: null };
 const WEEK = 7;
 
-export function growth(path, name, asset, values, signal) {
+export function growth(path, name, asset, { session, values, signal }) {
   const canvas = h("div", { class: "plot tall" });
   const said = h("p", { class: "summary", role: "status" });
   const why = h("p", { class: "note" });
@@ -21,9 +21,10 @@ export function growth(path, name, asset, values, signal) {
     h("button", { type: "button", class: "filter screen", title: "Save the picture", onclick: () => save(chart.image(), `${name} ${which.value}.png`) }, "PNG"),
     h("button", { type: "button", class: "filter screen", title: "Save the values", onclick: () => save(table(), `${name} ${which.value}.csv`) }, "CSV"),
   ];
-  const element = titled("How it grows", [which, limit, ...buttons, ...exports], said, canvas, why);
+  const noted = h("ul", { class: "why" });
+  const element = titled("How it grows", [which, limit, ...buttons, ...exports], said, canvas, why, noted, mayChange(session.role, "operator") && noting());
   let span = SPANS[values.get("span")] === undefined ? "60 d" : values.get("span");
-  let [curves, forecast] = [[], null];
+  let [curves, forecast, notes] = [[], null, []];
   const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal);
 
   // All curves of what is chosen as one, in the order of time.
@@ -31,6 +32,22 @@ export function growth(path, name, asset, values, signal) {
     const own = curves.filter((curve) => curve.name === which.value);
     const all = own.flatMap(({ kind, t, value, low, high, healthy }) => t.map((at, i) => ({ t: at, value: value[i], low: low[i], high: high[i], healthy: healthy[i], full: kind === "full" })));
     return all.sort((a, b) => a.t - b.t);
+  }
+
+  // What was done to the machine: told in the curve, and where the trend may begin anew.
+  function noting() {
+    const [text, when, anew] = [h("input", { maxlength: "200", required: true }), h("input", { type: "datetime-local" }), h("input", { type: "checkbox" })];
+    const [answer, button] = [h("p", { class: "working", role: "status" }), h("button", {}, "Note it")];
+    const submit = (event) => {
+      event.preventDefault();
+      return during(button, answer, async () => {
+        await post(`${path}/notes`, { t: when.value ? new Date(when.value).getTime() / 1000 : asset().t, text: text.value, anew: anew.checked }, signal);
+        event.target.reset();
+        await load();
+      });
+    };
+    const form = h("form", { onsubmit: submit }, h("div", { class: "fields" }, field("What was done", text), field("When (else: now)", when), h("label", {}, anew, " The trend begins anew")), h("div", { class: "actions" }, button), answer);
+    return h("details", { class: "screen" }, h("summary", {}, "Note what was done, such as: pump replaced"), form);
   }
 
   // The values as `servoscope trend` reads them.
@@ -59,6 +76,7 @@ export function growth(path, name, asset, values, signal) {
       unit: ratio ? " %" : "",
       limit: goal,
       forecast: reach ? { t: forecast.to_t, value: percent(forecast.value[1]), ends } : null,
+      marks: notes.map((note) => [note.t, note.text]),
       range: [SPANS[span] === null ? null : asset().t - SPANS[span], until],
     };
   }
@@ -79,6 +97,8 @@ export function growth(path, name, asset, values, signal) {
   async function load() {
     const from = SPANS[span] === null ? null : asset().t - SPANS[span];
     const found = await Promise.all(["faults", "coefficients"].map((of) => get(query(`${path}/sizes`, { of, from, points: 600 }), signal)));
+    notes = (await get(`${path}/notes`, signal)).notes;
+    noted.replaceChildren(...notes.map((note) => h("li", {}, `${moment(note.t, { seconds: false })}: ${note.text} (${note.who})${note.anew ? "; the trend begins here" : ""}`)));
     curves = found.flatMap((one) => one.curves);
     const names = [...new Set(curves.map((curve) => curve.name))];
     if (String(names) !== [...which.options].map((one) => one.value).join()) {

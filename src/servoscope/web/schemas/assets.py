@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from pydantic import Field
 
@@ -284,44 +284,6 @@ class ResidualHistory(ApiResponse):
     statistic: list[float]
     level: list[float]
     residuals: list[ResidualSeries]
-
-
-class SizeCurve(ApiResponse):
-    """A fault or coefficient over time, as a ratio to healthy, with its 95 % intervals."""
-
-    name: str
-    kind: Literal["full", "live", "coefficient"]
-    t: list[float]
-    value: list[float]
-    low: list[float]
-    high: list[float]
-    healthy: list[float]
-
-
-class SizeHistory(ApiResponse):
-    """How faults and coefficients of an asset have changed; of each of `points` equal parts of the time one value."""
-
-    asset: str
-    curves: list[SizeCurve]
-
-
-class Forecast(ApiResponse):
-    """How a size grows, and when it reaches a limit: intervals as lower end, median, upper end."""
-
-    asset: str
-    name: str
-    limit: float
-    coverage: float
-    points: int
-    from_t: float
-    to_t: float
-    outlook: OutlookKind
-    value: tuple[float, float, float] | None
-    rate_per_day: tuple[float, float, float] | None
-    remaining_s: tuple[float | None, float | None, float | None] | None
-    odds: float | None
-    summary: str
-    explanation: tuple[str, ...]
 
 
 class RecentSignals(SignalColumns):

@@ -87,6 +87,14 @@ class TrendQuery(ApiRequest):
     since: UtcSeconds | None = Field(None, alias="from")
 
 
+class NoteRequest(ApiRequest):
+    """What was done to an asset and when [UTC s]; `anew`: its trend begins there."""
+
+    t: UtcSeconds
+    text: Annotated[str, Field(min_length=1, max_length=200)]
+    anew: bool = False
+
+
 class RowQuery(TimeQuery):
     """The newest rows of a time."""
 
