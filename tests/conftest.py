@@ -14,7 +14,10 @@ from typing import Any
 
 import hypothesis
 import pytest
+import sqlalchemy as sa
 from reliability.servers import Postgres, programs
+
+from servoscope.service.store import Store, tables
 
 pytest_plugins = ("opening",)  # the browser, and what stands before it
 PROJECT = Path(__file__).resolve().parent.parent
@@ -75,6 +78,27 @@ def postgres() -> Iterator[Postgres]:
     server.start()
     yield server
     server.remove()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    """Where a store may be made: on either database."""
+    if request.param == "sqlite":
+        yield str(tmp_path / "history.sqlite")
+        return
+    server: Postgres = request.getfixturevalue("postgres")
+    yield server.url
+    engine = sa.create_engine(server.url.replace("postgresql", "postgresql+psycopg"))
+    tables.METADATA.drop_all(engine)
+    engine.dispose()
+
+
+@pytest.fixture
+def store(url: str) -> Iterator[Store]:
+    """An empty store."""
+    opened = Store.open(url, write=True)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture

@@ -275,7 +275,7 @@ def test_a_transition_goes_to_json_and_back() -> None:
 
 def test_alarms_need_no_configuration_and_say_what_to_do() -> None:
     settings = AlarmSettings()
-    assert list(settings.asset_alarms) == ["fault", "data_quality", "reception", "undetermined"]
+    assert list(settings.asset_alarms) == ["fault", "data_quality", "reception", "limit", "undetermined"]
     assert list(settings.service_alarms) == ["connection", "buffering"]
     for one in settings.definitions.values():
         assert one.consequence and one.operator_action and one.response_time_s
@@ -289,7 +289,7 @@ def test_a_table_changes_keys_of_a_default_and_another_name_adds_an_alarm() -> N
     assert settings.asset_alarms["fault"] == AlarmSettings().asset_alarms["fault"].model_copy(
         update={"priority": "critical"}
     )
-    assert list(settings.asset_alarms) == ["fault", "data_quality", "reception", "near"]
+    assert list(settings.asset_alarms) == ["fault", "data_quality", "reception", "limit", "near"]
 
 
 @pytest.mark.parametrize(

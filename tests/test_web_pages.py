@@ -14,6 +14,7 @@ import pytest
 import screens
 from opening import SIZE, THEMES, Open, accessible, diagnosis_of, painted, shot
 from screens import asked
+from servoscope.prognosis.series import read_sizes
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
 expect = playwright.expect
@@ -84,6 +85,46 @@ def test_an_asset_says_what_is_wrong_how_much_and_since_when(open_page: Open) ->
     assert painted(page)
 
 
+def test_an_asset_says_how_its_fault_grows_and_what_to_check(open_page: Open, tmp_path: Path) -> None:
+    page = open_page("/assets/press-1?limit=1.5&span=7+d")
+    expect(page.get_by_text("What to check: plan an inspection.")).to_be_visible()
+    expect(page.get_by_role("heading", name="How sure, and what else it could be")).to_be_visible()
+    expect(page.get_by_role("region", name="Candidates, the most probable first")).to_contain_text("leakage")
+    expect(page.get_by_label("What is followed")).to_have_value("leakage")
+    expect(page.get_by_role("button", name="7 d").first).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_text("values are shown")).to_be_visible()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="CSV").click()
+    path = tmp_path / "sizes.csv"
+    download.value.save_as(path)
+    series = read_sizes(path, "leakage", interval=("low", "high"))  # as servoscope trend reads it
+    assert series.value[-1] == pytest.approx(1.2, abs=0.02) and 0.0 < series.std[-1] < 0.01
+    with page.expect_download() as download:
+        page.get_by_role("button", name="PNG").click()
+    download.value.save_as(tmp_path / "sizes.png")
+    assert (tmp_path / "sizes.png").read_bytes().startswith(b"\x89PNG")
+    page.get_by_text("Note what was done").click()
+    page.get_by_label("What was done").fill("oil filter changed")
+    page.get_by_role("button", name="Note it").click()
+    expect(page.get_by_text(re.compile("oil filter changed \\(local\\)"))).to_be_visible()
+    page.get_by_label("Limit, as a ratio to healthy").fill("1.3")
+    page.keyboard.press("Tab")
+    page.wait_for_url("**limit=1.3**")  # what is looked at can be sent to somebody
+
+
+def test_a_phone_shows_cards_and_is_accessible(open_page: Open) -> None:
+    for path in ("/", "/assets/press-1"):
+        page = open_page(path, "dark")
+        page.set_viewport_size({"width": 390, "height": 844})
+        expect(page.get_by_role("heading", level=1)).to_be_visible()
+        page.wait_for_timeout(1000)
+        accessible(page)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert page.locator("table:visible, .grid:visible").evaluate_all(
+            "all => all.every(one => one.scrollWidth <= 390)"
+        )
+
+
 def test_an_asset_is_live(open_page: Open) -> None:
     page = open_page("/assets/lift-1")
     last = page.locator(".facts dd").last
@@ -142,7 +183,7 @@ def test_every_page_is_accessible(open_page: Open, base: str, path: str, theme: 
         shot(page, "fleet-dark")
 
 
-@pytest.mark.parametrize("width", [1366, 800, 500])
+@pytest.mark.parametrize("width", [1440, 800, 390])
 def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: Path, width: int) -> None:
     wide = tmp_path / "wide.csv"  # what other columns a log has is its own affair
     rows = [[str(i / 100) for _ in range(17)] for i in range(300)]

@@ -60,7 +60,7 @@ def trend(
         )
     else:
         from servoscope.cli.service import check_assets, open_store
-        from servoscope.service.store.queries import query_sizes
+        from servoscope.service.store.series import query_sizes
 
         if asset is None:
             raise typer.BadParameter(f"{source}: name the asset: --asset NAME")

@@ -153,35 +153,36 @@ def fit_wear(series: SizeSeries, rng: np.random.Generator) -> WearPosterior:
 def filter_series(courses: Courses, scaled: ScaledSeries) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the log-likelihood of each course, shape (G,), and mean and covariance of its state at the last value."""
     n, g = 2 + len(scaled.inputs), courses.start.size
-    x, P, h = np.zeros((g, n)), np.zeros((g, n, n)), np.zeros(n)
-    P[:, 0, 0], P[:, 1, 1] = DIFFUSE**2, np.where(np.isfinite(courses.start), RATE**2, 0.0)
-    P[:, range(2, n), range(2, n)] = 1.0
-    h[0] = 1.0
+    # courses last: each step then runs through whole rows
+    x, P = np.zeros((n, g)), np.zeros((n, n, g))
+    P[0, 0], P[1, 1] = DIFFUSE**2, np.where(np.isfinite(courses.start), RATE**2, 0.0)
+    P[range(2, n), range(2, n)] = 1.0
+    R = np.square(courses.noise)
     log_likelihood, before, before_t = np.zeros(g), courses.clock(0.0), 0.0
     for k, t in enumerate(scaled.t.tolist()):
         clock = courses.clock(t)
         _predict(courses, x, P, clock - before, t - before_t)
         before, before_t = clock, t
-        h[2:] = scaled.inputs[:, k]
-        gain = P @ h
-        S = gain @ h + scaled.R[k] * np.square(courses.noise)
-        e = scaled.y[k] - x @ h
+        h = scaled.inputs[:, k]
+        gain = P[0] + np.tensordot(h, P[2:], 1)
+        S = gain[0] + h @ gain[2:] + scaled.R[k] * R
+        e = scaled.y[k] - x[0] - h @ x[2:]
         log_likelihood -= 0.5 * (e * e / S + np.log(S))
-        x += gain * (e / S)[:, None]
-        P -= gain[:, :, None] * (gain / S[:, None])[:, None, :]
-    return log_likelihood, x, P
+        x += gain * (e / S)
+        P -= gain[:, None] * (gain / S)
+    return log_likelihood, x.T, np.moveaxis(P, -1, 0)
 
 
 def _predict(courses: Courses, x: FloatArray, P: FloatArray, clock: FloatArray, t: float) -> None:
     """Move level and rate on by the steps `clock`, shape (G,), of the clock and `t` of time, in place."""
-    x[:, 0] += clock * x[:, 1]
-    P[:, 0, :] += clock[:, None] * P[:, 1, :]
-    P[:, :, 0] += clock[:, None] * P[:, :, 1]
+    x[0] += clock * x[1]
+    P[0] += clock * P[1]
+    P[:, 0] += clock * P[:, 1]
     walk = np.where(clock > 0.0, np.square(courses.walk) * t, 0.0)
-    P[:, 0, 0] += np.square(courses.diffusion) * clock + walk * np.square(clock) / 3.0
-    P[:, 0, 1] += walk * clock / 2.0
-    P[:, 1, 0] += walk * clock / 2.0
-    P[:, 1, 1] += walk
+    P[0, 0] += np.square(courses.diffusion) * clock + walk * np.square(clock) / 3.0
+    P[0, 1] += walk * clock / 2.0
+    P[1, 0] += walk * clock / 2.0
+    P[1, 1] += walk
 
 
 def _propose(rng: np.random.Generator, u: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -196,9 +197,10 @@ def _propose(rng: np.random.Generator, u: FloatArray, weight: FloatArray) -> tup
     renewed = outside | (rng.random(POPULATION) < DEFENCE)
     drawn[renewed] = rng.random((int(renewed.sum()), u.shape[1]))
     heavy = weight > 1e-6
-    steps = np.linalg.solve(spread, (drawn[:, None, :] - u[heavy]).reshape(-1, u.shape[1]).T)
-    distance = np.square(steps).sum(axis=0).reshape(POPULATION, -1)
-    kernel = np.exp(-0.5 * distance) / np.prod(np.diag(spread) * np.sqrt(2.0 * np.pi))
+    to, of = np.linalg.solve(spread, drawn.T), np.linalg.solve(spread, u[heavy].T)
+    # |a - b|^2 by products of matrices: all pairs at once
+    distance = np.square(to).sum(axis=0)[:, None] + np.square(of).sum(axis=0) - 2.0 * to.T @ of
+    kernel = np.exp(-0.5 * np.maximum(distance, 0.0)) / np.prod(np.diag(spread) * np.sqrt(2.0 * np.pi))
     inside = 1.0 - float(outside.mean())
     prior = 1.0 - inside * (1.0 - DEFENCE)
     return drawn, (1.0 - DEFENCE) * (kernel @ weight[heavy]) + prior

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import zlib
 from collections import deque
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from servoscope.core.settings_errors import suggest_name
 from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.alarms import (
     AlarmSettings,
     AlarmStandstill,
@@ -42,10 +43,12 @@ from servoscope.service.examination_schedule import (
     schedule_full_diagnosis,
     update_examination,
 )
+from servoscope.service.outlook import Outlook, PrognosisSettings, current_outlook, single_fault
 from servoscope.service.reception import FOLLOWED
 from servoscope.service.records import BlockRefusal, StepResult, TableRow, transition_row
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.continuity import BlockContinuity, check_continuity
+from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
 from servoscope.signals import quality
 
 
@@ -57,6 +60,8 @@ class AssetPolicy:
     quality: quality.QualitySettings
     alarms: AlarmSettings
     residual_every_s: float
+    prognosis: PrognosisSettings = field(default_factory=PrognosisSettings)
+    limits: Mapping[str, float] = field(default_factory=dict)  # by fault, ratio to healthy at which the machine stops
 
 
 class Asset:
@@ -74,7 +79,8 @@ class Asset:
         self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s)
         self._limits = policy.quality.limits(self._rate)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
-        self._definitions = policy.alarms.asset_alarms
+        alarms, limited = policy.alarms.asset_alarms, bool(policy.limits)
+        self._definitions = {key: one for key, one in alarms.items() if limited or one.source != "outlook"}
         self._window: deque[Block] = deque()
         self._window_samples = 0
         self._accepted: tuple[Block, BlockContinuity] | None = None
@@ -271,6 +277,13 @@ class Asset:
     def _is_first_diagnosis(self, window: PendingDiagnosis) -> bool:
         return window.until <= self._schedule.end(self._current.examination.since)
 
+    def apply_prognosis(self, found: Prognosis) -> StepResult:
+        """Keep a prognosis, and advance the alarms by it."""
+        state, self._result = self._current, StepResult([], [])
+        self.state = replace(state, outlook=Outlook.from_prognosis(found, state.position.t))
+        self._advance_alarms(state.position.t)
+        return self._result
+
     def apply_diagnosis(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> StepResult:
         """Store the result of one of `due_diagnoses`; a second result for it has no effect."""
         state = self._current
@@ -283,7 +296,8 @@ class Asset:
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
         self._trim_window()
-        return StepResult([TableRow("diagnoses", values)], [])
+        named = fault_rows(window.until, "full", diagnosis.document.get("faults", []))
+        return StepResult([TableRow("diagnoses", values), *(TableRow("sizes", row) for row in named)], [])
 
     @property
     def _current(self) -> AssetState:
@@ -297,6 +311,9 @@ class Asset:
 
     def _add_row(self, table: str, **values: Any) -> None:
         self._result.rows.append(TableRow(table, {"number": self._next_row_number(), **values}))
+
+    def _add_sizes(self, rows: Iterable[dict[str, Any]]) -> None:
+        self._result.rows.extend(TableRow("sizes", row) for row in rows)
 
     def _count(self, block: Block, continuity: BlockContinuity, followed: LaneOutput) -> None:
         """Keep a block and the state after it."""
@@ -328,6 +345,9 @@ class Asset:
         )
         for row in followed.rows:
             self._add_row("residuals", **row)
+        evaluation = self._current.evaluation
+        if evaluation.t is not None and period_number(evaluation.t) != period_number(state.evaluation.t):
+            self._add_sizes(coefficient_rows(evaluation.t, evaluation.status.parameters))
 
     def _examine(self) -> None:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
@@ -342,7 +362,9 @@ class Asset:
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, recent(), state.evaluation.features),
+            lambda: examine_blocks(
+                self.baseline, self.name, recent(), state.evaluation.features, single_fault(state.examination.faults)
+            ),
             self._phase,
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )
@@ -350,6 +372,8 @@ class Asset:
             self.state = replace(state, examination=examination)
         if result is None:
             return
+        if result.size is not None:
+            self._add_sizes(fault_rows(t, "live", [result.size.model_dump(mode="json")]))
         if result.verdict != state.examination.verdict:
             self._add_row("diagnoses", t=t, grounds="examination", **result.columns())
         examination, in_full = schedule_full_diagnosis(examination, self._schedule, t)
@@ -362,7 +386,10 @@ class Asset:
         """Update the alarms at time `t` [UTC s]."""
         state = self._current
         findings, settled = tuple(quality.active_findings(state.quality)), self._settled
-        known = state.examination, findings, self.reception
+        outlook = current_outlook(state.outlook, state.examination.faults)
+        # of a fault that has gone nothing is left to wait for
+        word = outlook.word(t, self.policy.prognosis.ahead_s) if outlook is not None else "far"
+        known = state.examination, findings, self.reception, word
         if settled is not None and settled.known == known:
             at = settled.at if state.alarms_at is None else state.alarms_at
             if at <= t < settled.until:
@@ -376,6 +403,8 @@ class Asset:
             level=level,
             reception=self.reception,
             cause=asset_summary(state.examination, findings),
+            outlook=word,
+            outlook_cause=outlook.summary if outlook is not None else "",
         )
         alarms, transitions = advance_alarms(self._definitions, state.alarms_now, snapshot, t)
         self.state = replace(state, alarms=alarms, alarms_at=None)

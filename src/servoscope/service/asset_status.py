@@ -16,6 +16,7 @@ from servoscope.detection.result import FaultEstimate
 from servoscope.service.alarms import FAULT_ALARM, AlarmDefinition, LifecycleState, Ne107, Priority, evaluate_ne107
 from servoscope.service.checkpoint import AssetState, StreamPosition
 from servoscope.service.examination_schedule import ExaminationState
+from servoscope.service.outlook import Outlook, current_outlook
 from servoscope.service.reception import FOLLOWED, Reception, ReceptionState
 from servoscope.service.residual_history import EvaluationStatus
 from servoscope.signals import quality
@@ -68,8 +69,20 @@ class AssetStatus(EvaluationStatus):
     # when sound data last showed the fault, and the end of the window that named it [UTC s]
     fault_at: float | None = None
     diagnosed: float | None = None
+    # size, sized: of the fault by the newest examination, and when that was [UTC s]; None: by the full diagnosis alone
+    size: FaultEstimate | None = None
+    sized: float | None = None
+    outlook: Outlook | None = None  # when the fault reaches its limit; None: it has none, or nothing is known yet
     position: StreamPosition = Field(alias="counted")
     metadata: AssetMetadata = Field(AssetMetadata(), alias="about")
+
+    @property
+    def newest_sizes(self) -> tuple[tuple[FaultEstimate, ...], float | None]:
+        """The newest sizes of its faults, and when they were found [UTC s], None where that is not known."""
+        follows = self.size is not None and [self.size.name] == [fault.name for fault in self.faults]
+        if follows and self.size is not None and (self.sized or 0.0) >= (self.diagnosed or 0.0):
+            return (self.size,), self.sized
+        return self.faults, self.diagnosed
 
 
 class FloodCounts(_StatusRecord):
@@ -169,6 +182,8 @@ def asset_status(
             "about": metadata,
             **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
             **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
+            **({"size": examination.size, "sized": examination.sized} if examination.size else {}),
+            **({} if (outlook := current_outlook(state.outlook, examination.faults)) is None else {"outlook": outlook}),
             **({} if reception == FOLLOWED else {"reception": reception.state}),
             **state.evaluation.status.model_dump(exclude_unset=True),
         }

@@ -67,7 +67,7 @@ class BlockLanes:
             excess, level, _ = _peaks(trace).tolist()
             features = None if trace.features is None else float(trace.features[-1])
             exceeded = bool(trace.exceeded[-1])
-            evaluation = LatestEvaluation(exceeded, (excess, level), features, _writer(trace, times))
+            evaluation = LatestEvaluation(exceeded, (excess, level), features, float(times[-1]), _writer(trace, times))
         return LaneOutput(new, checked, state.samples + len(t), last_t, history, rows, evaluation)
 
     def are_regular(self, blocks: Sequence[LaneInput]) -> list[bool]:
@@ -111,7 +111,9 @@ class BlockLanes:
                 history = HistoryState(history.period, max(history.excess, known), max(history.level, level))
             else:
                 history, rows = update_history(history, trace.lane(i), times[i], self._residual_every_s)
-            evaluation = LatestEvaluation(exceeded, (excess, level), None, _writer(trace, times, i))
+            evaluation = LatestEvaluation(
+                exceeded, (excess, level), None, float(times[i, -1]), _writer(trace, times, i)
+            )
             # copies: an asset that falls silent must not hold the arrays of all others
             new, seen = monitors[i].copy(), checked[i].copy()
             found.append(LaneOutput(new, seen, state.samples + size, at, history, rows, evaluation))

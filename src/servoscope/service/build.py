@@ -8,7 +8,7 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from servoscope.core.errors import BaselineError, ConfigError
@@ -116,7 +116,9 @@ def _resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Ass
 
 
 def _build_assets(config: ServiceFile) -> dict[str, Asset]:
-    policy = AssetPolicy(config.diagnosis, config.quality, config.alarms, config.store.residual_every_s)
+    policy = AssetPolicy(
+        config.diagnosis, config.quality, config.alarms, config.store.residual_every_s, config.prognosis
+    )
     files: dict[Path, Baseline] = {}
     shared: dict[tuple[Path, str | None], tuple[Baseline, Monitor]] = {}
     assets = {}
@@ -137,7 +139,14 @@ def _build_assets(config: ServiceFile) -> dict[str, Asset]:
             except BaselineError:
                 points = ", ".join(baseline.points)
                 raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
-        assets[name] = Asset(name, *shared[path, point], policy, settings.group)
+        faults = [fault.name for fault in shared[path, point][0].loop.plant.all_faults]
+        common = {fault: limit for fault, limit in config.prognosis.limits.items() if fault in faults}
+        if settings.limits is not None:
+            _check_names(f"[assets] {name}.limits", f"fault of {name}", settings.limits, faults)
+        limits = common if settings.limits is None else settings.limits
+        assets[name] = Asset(name, *shared[path, point], replace(policy, limits=limits), settings.group)
+    known = [fault.name for one in assets.values() for fault in one.baseline.loop.plant.all_faults]
+    _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
     for asset in {id(one.baseline): one for one in assets.values()}.values():
         asset.compile_kernels()
     return assets

@@ -16,6 +16,7 @@ from servoscope.core.errors import StateError
 from servoscope.diagnosis.follower import FollowerState
 from servoscope.service.alarms import AlarmState
 from servoscope.service.examination_schedule import ExaminationState, PendingDiagnosis
+from servoscope.service.outlook import Outlook
 from servoscope.service.residual_history import EvaluationStatus, HistoryState, LatestEvaluation
 
 MAGIC = b"servoscope state"
@@ -81,6 +82,7 @@ class AssetState(FollowerState):
     pending_diagnoses: tuple[PendingDiagnosis, ...] = ()
     alarms: dict[str, AlarmState] = field(default_factory=dict)
     evaluation: LatestEvaluation = field(default_factory=LatestEvaluation)
+    outlook: Outlook | None = None  # None: no prognosis was asked for
     # up to when `alarms` have been advanced, where nothing but that has changed since [UTC s]; None: as they say
     alarms_at: float | None = None
 
@@ -105,6 +107,7 @@ def pack_state(state: AssetState) -> bytes:
         "windows": [vars(window) for window in state.pending_diagnoses],
         "alarms": {name: alarm.to_dict() for name, alarm in state.alarms_now.items()},
         "shown": state.evaluation.status.to_json(),
+        **({} if state.outlook is None else {"outlook": state.outlook.model_dump(mode="json")}),
     }
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     numbers = state.monitor.astype("<f8").tobytes() + state.quality.astype("<f8").tobytes()
@@ -150,4 +153,5 @@ def unpack_state(packed: bytes, asset: str) -> AssetState:
         pending_diagnoses=tuple(PendingDiagnosis(**window) for window in document["windows"]),
         alarms=alarms,
         evaluation=LatestEvaluation.from_status(EvaluationStatus.model_validate(document["shown"])),
+        outlook=Outlook.model_validate(document["outlook"]) if "outlook" in document else None,
     )

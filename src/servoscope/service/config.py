@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from servoscope.core.settings import NonEmptyStr, NonNegative, Settings
+from servoscope.core.settings import NonEmptyStr, NonNegative, Positive, Settings
 from servoscope.service.access import WebSettings
 from servoscope.service.actions import ActionSettings
 from servoscope.service.alarms import AlarmSettings
@@ -15,6 +15,7 @@ from servoscope.service.config_types import Address, FileSettings, Name, Seconds
 from servoscope.service.kinds import PUBLISHERS, SOURCES, parse_tables
 from servoscope.service.network import ConnectionSettings, NetworkSettings, apply_network
 from servoscope.service.opcua.settings import OpcuaNodes
+from servoscope.service.outlook import PrognosisSettings
 from servoscope.service.publishers.base import PublisherSettings
 from servoscope.service.sources.base import SourceSettings
 from servoscope.signals.quality import QualitySettings
@@ -43,6 +44,7 @@ class StoreSettings(ConnectionSettings):
     url: NonEmptyStr = "history.sqlite"
     residual_every_s: Seconds = 60.0  # time between two stored residuals of an asset [s]
     residual_days: Seconds = 400.0  # how long they are kept; diagnoses, alarms and audit are kept for ever
+    size_days: Seconds = 7300.0  # how long sizes and coefficients are kept, thinned to one a day
 
 
 class DiagnosisSettings(Settings):
@@ -62,6 +64,7 @@ class AssetSettings(Settings):
     files: Paths | None = None  # what a source of kind ``replay`` replays for it, one recording after the other
     nodes: OpcuaNodes | None = None  # where a source of kind ``opcua`` finds it
     group: Annotated[str, Field(strict=True, max_length=100)] = ""  # what it belongs to: a line, a hall
+    limits: dict[NonEmptyStr, Positive] | None = None  # instead of those of ``[prognosis]``
 
 
 class ServiceFile(FileSettings):
@@ -70,12 +73,13 @@ class ServiceFile(FileSettings):
     kind_of_file: ClassVar[str] = "service file"
 
     name: Name = "servoscope"  # what the service is called in alarms and messages
-    # service, store, network, diagnosis, quality, alarms, actions, web: the sections of these names; each may be left
-    # out. Without ``[web]`` there are no pages.
+    # service, store, network, diagnosis, prognosis, quality, alarms, actions, web: the sections of these names; each
+    # may be left out. Without ``[web]`` there are no pages.
     service: ServiceSettings = ServiceSettings()
     store: StoreSettings = StoreSettings()
     network: NetworkSettings = NetworkSettings()
     diagnosis: DiagnosisSettings = DiagnosisSettings()
+    prognosis: PrognosisSettings = PrognosisSettings()
     quality: QualitySettings = QualitySettings()
     alarms: AlarmSettings = Field(default_factory=lambda: AlarmSettings.model_validate({}))
     actions: ActionSettings = ActionSettings()

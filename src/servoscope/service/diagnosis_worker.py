@@ -1,21 +1,27 @@
-"""Full diagnoses in a process of their own: seconds of work that would otherwise hold up the samples of all assets."""
+"""Full diagnoses and prognoses in a process of their own: work that would hold up the samples of all assets."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import Any
 
 from servoscope.core.workers import Worker, WorkerError
 from servoscope.detection.baseline import Baseline
+from servoscope.prognosis.forecast import Prognosis
+from servoscope.service.checkpoint import AssetState
 from servoscope.service.examination import StoredDiagnosis, diagnose_blocks, undetermined
 from servoscope.service.log import log
+from servoscope.service.outlook import DuePrognosis, current_outlook, single_fault
 from servoscope.service.sources.block import Block
+from servoscope.service.store import Store
+from servoscope.service.store.series import last_renewal, query_sizes
 
 MAX_ATTEMPTS = 2  # of a diagnosis that takes its process down with it
 TASK = "servoscope.service.diagnosis_worker:diagnose_packed_blocks"
+PROGNOSIS_TASK = "servoscope.service.outlook:prognose_in_worker"
 
 
 class DiagnosisWorker:
@@ -29,6 +35,17 @@ class DiagnosisWorker:
     def submit(self, baseline: Baseline, name: str, blocks: Sequence[Block]) -> Future[StoredDiagnosis]:
         """Ask for the diagnosis of a window."""
         return self._executor.submit(self._diagnose, baseline, name, list(blocks))
+
+    def submit_prognosis(self, store: Store, name: str, due: DuePrognosis) -> Future[Prognosis]:
+        """Ask when a fault of an asset reaches its limit."""
+
+        def ask() -> Prognosis:
+            since = max(due.since, last_renewal(store, name) or due.since)
+            series = query_sizes(store, name, due.fault, since)
+            columns = {key: getattr(series, key).tolist() for key in ("t", "value", "std")}
+            return Prognosis.model_validate(self._worker.run(PROGNOSIS_TASK, due.fault, columns, due.limit))
+
+        return self._executor.submit(ask)
 
     def close(self) -> None:
         """Stop; a diagnosis under way is dropped."""
@@ -47,6 +64,15 @@ class DiagnosisWorker:
                     break
                 log("error", "full diagnosis lost its process", asset=name, why=str(error))
         return undetermined("crashed")
+
+
+def find_due_prognosis(state: AssetState, limits: Mapping[str, float], every_s: float) -> DuePrognosis | None:
+    """Return the prognosis that is due of an asset with these limits by fault; None: none is."""
+    examination, t = state.examination, state.position.t
+    fault, last = single_fault(examination.faults), current_outlook(state.outlook, examination.faults)
+    if fault is None or fault not in limits or (last is not None and last.asked <= t < last.asked + every_s):
+        return None
+    return DuePrognosis(fault, limits[fault], examination.onset or 0.0)
 
 
 def diagnose_packed_blocks(

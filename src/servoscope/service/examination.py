@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -11,9 +11,12 @@ from pydantic import BaseModel, ConfigDict
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.result import Verdict
+from servoscope.detection.result import FaultEstimate, Verdict
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
+
+if TYPE_CHECKING:  # its kernels are loaded when something is examined
+    from servoscope.diagnosis.examine import Examination
 
 
 class StoredDiagnosis(BaseModel):
@@ -27,6 +30,7 @@ class StoredDiagnosis(BaseModel):
     document: dict[str, Any] = {}  # of a diagnosis: as `diagnose --json` prints it
     # whether an alarm has gone that is still in the window: until it has left it, the window proves nothing
     recovering: bool = False
+    size: FaultEstimate | None = None  # of the fault that was named before, as it is now; None: not known
 
     @property
     def summary(self) -> str:
@@ -67,12 +71,12 @@ def undetermined(key: str, **values: Any) -> StoredDiagnosis:
 
 
 def examine_blocks(
-    baseline: Baseline, name: str, blocks: Sequence[Block], features: float | None = None
+    baseline: Baseline, name: str, blocks: Sequence[Block], features: float | None = None, fault: str | None = None
 ) -> StoredDiagnosis:
     """Examine the last minutes with the reference that was applied in them, without a refit.
 
     `features`: their score in the monitor, as a multiple of its limit. It has seen more spans than the last minutes
-    hold, so its word counts where the coefficients are healthy.
+    hold, so its word counts where the coefficients are healthy. `fault`: the one that was named, to follow its size.
 
     Where the samples cannot be used, the verdict is ``undetermined`` and the headline has the reason.
     """
@@ -99,7 +103,29 @@ def examine_blocks(
     excess = float((exam.statistic / baseline.limit)[first:].max())
     level = message("service.examination.level", level=float(exam.estimates.level[first:].max()))
     headline = message("service.examination.fault", excess=excess, level=level if baseline.members else None)
-    return StoredDiagnosis(verdict="fault", headline=headline, onset=onset)
+    size = _follow_size(exam, fault, first) if fault is not None else None
+    return StoredDiagnosis(verdict="fault", headline=headline, onset=onset, size=size)
+
+
+def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | None:
+    """Return the size of a fault at the end of the window, by the recursion; the alarm began at evaluation `first`.
+
+    None where the coefficients are not where this fault alone would have moved them: then it has no size.
+    """
+    from servoscope.detection.chi2_test import Onset
+    from servoscope.diagnosis.batch_estimate import isolation_inputs
+    from servoscope.isolation.isolate import isolate
+
+    begin = int(exam.estimates.index[first]) if first else 0
+    t = float(exam.recording.t[begin])
+    onset = Onset(t, t, t, begin)
+    try:
+        signatures, deviation, covariance = isolation_inputs(exam, onset, exam.evaluations - 1)
+        own = [signature for signature in signatures if signature.fault.name == fault]
+        best = isolate(own, deviation, covariance)[0]
+    except (ServoscopeError, np.linalg.LinAlgError, ArithmeticError):
+        return None
+    return best.faults[0] if best.name == fault else None
 
 
 def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:

@@ -53,6 +53,9 @@ class ExaminationState:
     # stands until something shows that it has gone; None: there is none
     fault_at: float | None = None
     diagnosed: float | None = None
+    # size, sized: the newest size of the fault, by an examination, and when that was [UTC s]; {}: no such size yet
+    size: dict[str, Any] = field(default_factory=dict)
+    sized: float | None = None
 
 
 def examination_phase(asset: str) -> float:
@@ -109,6 +112,8 @@ def update_examination(
         named=state.named if unchanged or not faulty or state.fault_at is not None else "",
         fault_at=t if faulty and sound else state.fault_at if faulty or stands else None,
         diagnosed=state.diagnosed if faulty or stands else None,
+        size=result.size.model_dump(mode="json") if result.size else state.size if faulty or stands else {},
+        sized=t if result.size else state.sized if faulty or stands else None,
     )
     return new, result
 

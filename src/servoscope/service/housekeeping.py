@@ -17,6 +17,7 @@ from servoscope.service.notifications import Notifier
 from servoscope.service.records import StepResult, audit_row
 from servoscope.service.sources.base import BlockSource, RejectionCounter
 from servoscope.service.store import CommandOutcome, CommandRow, Store
+from servoscope.service.store.series import thin_sizes
 from servoscope.service.writer import StoreWriter
 
 RETENTION_EVERY_S = 3600.0
@@ -35,7 +36,8 @@ class HousekeepingContext(Protocol):
     notifier: Notifier
     dispatcher: OutboxDispatcher
     metrics: ServiceMetrics
-    residual_days: float  # how long residuals are kept
+    residual_days: float  # residual_days, size_days: how long residuals and sizes are kept
+    size_days: float
 
     @property
     def troubles(self) -> Mapping[str, str]:
@@ -56,6 +58,7 @@ class Housekeeping:
         self._executed: set[int] = set()  # commands whose outcome is not yet stored
         self._rejections = RejectionCounter()
         self._next_retention = self._next_rejections = 0.0
+        self._thinned: dict[str, float] = {}  # by asset, until when on its clock its sizes are thinned
 
     def run_due(self) -> None:
         """Do what is due."""
@@ -65,7 +68,7 @@ class Housekeeping:
         try:
             if self._service.writer.unavailable_since is None:
                 self._execute_commands()
-                self._delete_old_residuals()
+                self._delete_old_rows()
         except StoreUnavailableError as error:
             log("debug", "store unavailable", why=str(error))  # the next commit reports it as an error
 
@@ -136,12 +139,18 @@ class Housekeeping:
         audit = {"alarm": row["alarm"], "asked": row["at"], **document, "outcome": outcome.text}
         service.writer.add(name, [audit_row(row["command"], audit, row["who"])])
 
-    def _delete_old_residuals(self) -> None:
-        now, kept_s = time.monotonic(), self._service.residual_days * DAY_S
+    def _delete_old_rows(self) -> None:
+        now = time.monotonic()
         if now < self._next_retention:
             return
         self._next_retention = now + RETENTION_EVERY_S
-        assets = self._service.assets
-        before = {name: one.state.position.t - kept_s for name, one in assets.items() if one.state is not None}
-        if count := self._service.store.delete_before("residuals", before):
-            log("info", "old residuals deleted", rows=count)
+        store, assets = self._service.store, self._service.assets
+        clocks = {name: one.state.position.t for name, one in assets.items() if one.state is not None}
+        for table, days in (("residuals", self._service.residual_days), ("sizes", self._service.size_days)):
+            before = {name: t - days * DAY_S for name, t in clocks.items()}
+            if count := store.delete_before(table, before):
+                log("info", f"old {table} deleted", rows=count)
+        thinned = sum(thin_sizes(store, name, t, self._thinned.get(name)) for name, t in clocks.items())
+        self._thinned = clocks
+        if thinned:
+            log("info", "old sizes thinned", rows=thinned)

@@ -69,15 +69,16 @@ class LatestEvaluation:
         exceeded: bool = False,
         peaks: tuple[float | None, float | None] = (None, None),
         features: float | None = None,
+        t: float | None = None,  # [UTC s]
         write: Callable[[], EvaluationStatus] = EvaluationStatus,
     ) -> None:
-        self.exceeded, self.peaks, self.features = exceeded, peaks, features
+        self.exceeded, self.peaks, self.features, self.t = exceeded, peaks, features, t
         self._write = write
 
     @classmethod
     def from_status(cls, status: EvaluationStatus) -> LatestEvaluation:
         """Return the evaluation that a checkpoint has written down."""
-        return cls(status.exceeded, status.peaks, status.features, lambda: status)
+        return cls(status.exceeded, status.peaks, status.features, status.t, lambda: status)
 
     @property
     def status(self) -> EvaluationStatus:

@@ -10,13 +10,14 @@ from concurrent.futures import Future
 from servoscope import __version__
 from servoscope.core.errors import ServoscopeError, StoreUnavailableError
 from servoscope.core.messages import message, render
+from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.asset import Asset
 from servoscope.service.asset_groups import BlockOffer
 from servoscope.service.build import ServiceComponents
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile
-from servoscope.service.diagnosis_worker import DiagnosisWorker
+from servoscope.service.diagnosis_worker import DiagnosisWorker, find_due_prognosis
 from servoscope.service.examination import StoredDiagnosis
 from servoscope.service.examination_schedule import PendingDiagnosis
 from servoscope.service.housekeeping import Housekeeping
@@ -32,6 +33,7 @@ from servoscope.service.writer import StoreWriter
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
 MAX_PAUSE_S = 0.05
 HOUSEKEEPING_EVERY_S = 1.0
+PROGNOSIS_RETRY_S = 60.0  # after one that failed
 
 
 class Service:
@@ -43,6 +45,7 @@ class Service:
         self._groups = components.groups
         self._publishers, self._restarted = components.publishers, components.restarted
         self.buffer, self.residual_days = config.service.buffer, config.store.residual_days
+        self.size_days = config.store.size_days
         self.writer = StoreWriter(self.store, config.name, self.buffer)
         self.metrics = ServiceMetrics(self)
         self.clock = SteadyClock()
@@ -50,6 +53,8 @@ class Service:
         self.dispatcher = OutboxDispatcher(self.store, config.name, actions, self.clock)
         self._diagnosis_worker = DiagnosisWorker()
         self._diagnosis_jobs: dict[tuple[str, PendingDiagnosis], Future[StoredDiagnosis]] = {}
+        self._prognosis_jobs: dict[str, Future[Prognosis]] = {}
+        self._prognosis_from: dict[str, float] = {}  # by asset, before when none is asked for again, monotonic [s]
         # s: that it has been ready for blocks; a sensor is not silent because the service is busy, or its buffer full
         self._listening_s = 0.0
         self._receptions = {name: ReceptionLog(heard_before=asset.heard) for name, asset in self.assets.items()}
@@ -117,6 +122,7 @@ class Service:
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + HOUSEKEEPING_EVERY_S
             self._check_reception()
+            self._run_prognoses()
             self._housekeeping.run_due()
         if self._exhausted:
             self.writer.finish()
@@ -174,6 +180,27 @@ class Service:
             rows += self.notifier.accommodate_fault(name, diagnosis, window.until, now)
             self.writer.add(self.config.name, rows)
             self.writer.set_checkpoint(asset)
+
+    def _run_prognoses(self) -> None:
+        """Ask for the prognoses that are due, and take the results of those that are done."""
+        now, free = time.monotonic(), not self._exhausted
+        for name, asset in self.assets.items():
+            job, limits = self._prognosis_jobs.get(name), asset.policy.limits
+            if job is None and free and limits and now >= self._prognosis_from.get(name, 0.0):
+                due = find_due_prognosis(asset.state, limits, self.config.prognosis.every_s) if asset.state else None
+                if due is not None:
+                    self._prognosis_jobs[name] = self._diagnosis_worker.submit_prognosis(self.store, name, due)
+            elif job is not None and job.done():
+                del self._prognosis_jobs[name]
+                try:
+                    found = job.result()
+                except ServoscopeError as error:  # nothing stored yet, or the store is away
+                    self._prognosis_from[name] = now + PROGNOSIS_RETRY_S
+                    log("debug", "no prognosis", asset=name, why=str(error))
+                    continue
+                log("info", "prognosis", asset=name, summary=found.summary)
+                self.handle_result(asset, asset.apply_prognosis(found))
+                self.writer.set_checkpoint(asset)
 
     def note_refusal(self, name: str, why: str) -> None:
         """Note that something of an asset came and could not be used."""
@@ -253,7 +280,13 @@ class Service:
     @property
     def _ended(self) -> bool:
         """Whether there is nothing left to do, and never will be."""
-        return self._exhausted and not self._diagnosis_jobs and self.writer.empty and self.dispatcher.idle
+        return (
+            self._exhausted
+            and not self._diagnosis_jobs
+            and not self._prognosis_jobs
+            and self.writer.empty
+            and self.dispatcher.idle
+        )
 
     @property
     def _pause_s(self) -> float:

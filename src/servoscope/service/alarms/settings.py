@@ -16,7 +16,7 @@ from servoscope.signals.quality import KINDS
 
 StrictText = Annotated[str, Field(strict=True)]
 
-AlarmSource = Literal["verdict", "quality", "reception", "statistic", "level", "buffered", "connection"]
+AlarmSource = Literal["verdict", "quality", "reception", "outlook", "statistic", "level", "buffered", "connection"]
 Priority = Literal["low", "medium", "high", "critical"]
 Ne107 = Literal["good", "maintenance_required", "out_of_specification", "function_check", "failure"]
 
@@ -25,9 +25,11 @@ ALARM_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 SERVICE_SOURCES: tuple[AlarmSource, ...] = ("buffered", "connection")  # sources of the service itself
 SOURCE_WORDS: dict[str, tuple[str, ...]] = {
     "verdict": ("fault", "undetermined"), "quality": KINDS, "reception": STATES, "connection": ("trouble",),
+    "outlook": ("near", "reached"),
 }  # fmt: skip
 ABNORMAL_WORDS: dict[str, tuple[str, ...]] = {  # where `when` says nothing
     "verdict": ("fault",), "quality": KINDS, "reception": ALARMED_STATES, "connection": ("trouble",),
+    "outlook": ("near", "reached"),
 }  # fmt: skip
 
 
@@ -35,7 +37,8 @@ class AlarmDefinition(Settings):
     """One alarm of an asset."""
 
     enabled: Annotated[bool, Field(strict=True)] = True  # whether there is this alarm at all
-    # the ``verdict``, the findings of data ``quality``, how samples come in (``reception``), the ``statistic`` T^2 or
+    # the ``verdict``, the findings of data ``quality``, how samples come in (``reception``), when a fault reaches its
+    # limit (``outlook``, of assets that have a limit), the ``statistic`` T^2 or
     # the sequential test's ``level`` as multiples of their limits; of the service itself the share of the buffer that
     # waits to be stored, ``buffered``, and the ``connection`` of each source and outlet
     source: AlarmSource
@@ -110,6 +113,10 @@ DEFAULT_ALARMS: dict[str, dict[str, Any]] = {  # a table of the same name change
     "reception": {
         "source": "reception", "on_delay_s": 30.0, "off_delay_s": 10.0,
         "priority": "medium", "response_time_s": 3600.0, "ne107": "function_check",
+    },
+    "limit": {
+        "source": "outlook", "off_delay_s": 86400.0,
+        "priority": "medium", "response_time_s": 604800.0, "ne107": "maintenance_required",
     },
     "connection": {
         "source": "connection", "on_delay_s": 10.0, "off_delay_s": 60.0,

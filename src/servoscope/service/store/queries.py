@@ -7,12 +7,8 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
 import sqlalchemy as sa
 
-from servoscope.core.errors import StoreError
-from servoscope.core.settings_errors import suggest_name
-from servoscope.prognosis.series import NORMAL_95, SizeSeries
 from servoscope.service.store import tables
 from servoscope.service.store.rows import Row
 from servoscope.service.store.store import Store
@@ -76,31 +72,6 @@ def query_downsampled(store: Store, asset: str, span: tuple[float, float], point
         .order_by(top.c.part)
     )
     return rows, sum(row["rows"] for row in rows)
-
-
-def query_sizes(store: Store, asset: str, fault: str | None = None, since: float | None = None) -> SizeSeries:
-    """Return the size of an asset's fault over time, by its full diagnoses, as a ratio to healthy.
-
-    `fault`: None if only one fault was ever named; `since`: [UTC s] what was found before is left out.
-
-    Raises
-    ------
-    StoreError
-        If no fault was named, another one, or several and `fault` does not say which.
-    """
-    found: dict[str, list[tuple[float, float, float]]] = {}
-    for row in query_history(store, "diagnoses", assets=[asset], span=(since, None)):
-        for one in row["document"].get("faults", []) if row["grounds"] == "full" else ():
-            low, high = one["interval"]
-            found.setdefault(one["name"], []).append((row["t"], one["ratio"], (high - low) / (2.0 * NORMAL_95)))
-    if not found:
-        raise StoreError(f"{asset}: no fault was named in that time, so there is no size to follow")
-    if fault is None and len(found) > 1:
-        raise StoreError(f"{asset}: several faults were named, say which: --value {' or '.join(found)}")
-    name = fault or next(iter(found))
-    if name not in found:
-        raise StoreError(f"{asset}: a fault {name!r} was never named, {suggest_name(name, found)}")
-    return SizeSeries.from_arrays(name, *np.array(found[name]).T)
 
 
 def format_time(t: float, timespec: str = "seconds") -> str:

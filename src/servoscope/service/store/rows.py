@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, NotRequired, TypedDict
 
 from servoscope.core.messages import message, render
+from servoscope.prognosis.series import NORMAL_95
 
 Row = Mapping[str, Any]  # of any table
+SIZE_EVERY_S = 600.0  # between two stored values of a coefficient
 REFUSED = "refused: "  # how the outcome of a refused command begins in rows of version 0.1, which have no fields for it
 
 
@@ -79,3 +81,27 @@ class CommandOutcome(NamedTuple):
         if "accepted" in document:
             return cls(document["accepted"], document.get("refusal", ""))
         return cls(not outcome.startswith(REFUSED), outcome.removeprefix(REFUSED))
+
+
+def fault_rows(t: float, kind: str, faults: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of faults as a diagnosis names them, found at `t` [UTC s]."""
+    rows = []
+    for fault in faults:
+        low, high = fault["interval"]
+        values = {"value": fault["ratio"], "low": low, "high": high, "healthy": 1.0}
+        rows.append({"t": t, "kind": kind, "name": fault["name"], **values})
+    return rows
+
+
+def coefficient_rows(t: float, parameters: Iterable[tuple[str, float, float, float]]) -> list[dict[str, Any]]:
+    """Return the rows of coefficients, each with name, value, standard deviation and healthy value, at `t` [UTC s]."""
+    rows = []
+    for name, value, std, healthy in parameters:
+        values = {"value": value, "low": value - NORMAL_95 * std, "high": value + NORMAL_95 * std, "healthy": healthy}
+        rows.append({"t": t, "kind": "coefficient", "name": name, **values})
+    return rows
+
+
+def period_number(t: float | None) -> int | None:
+    """Return in which period of `SIZE_EVERY_S` a time [UTC s] lies: of each, the first values are stored."""
+    return None if t is None else int(t // SIZE_EVERY_S)

@@ -3,15 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import sqlalchemy as sa
 
 from servoscope.core.errors import EmptyStoreError, StoreError
-from servoscope.service.store.tables import METADATA, meta
+from servoscope.service.store.rows import Row, fault_rows
+from servoscope.service.store.tables import METADATA, diagnoses, meta, sizes
+
+
+def _fill_sizes(connection: sa.Connection) -> None:
+    """Make the table of a store of version 1, and fill it with what its full diagnoses have found."""
+    sizes.create(connection)
+    found: dict[tuple[Any, ...], Row] = {}
+    for row in connection.execute(sa.select(diagnoses).where(diagnoses.c.grounds == "full")).mappings():
+        for one in fault_rows(row["t"], "full", row["document"].get("faults", [])):
+            found[row["asset"], row["t"], one["name"]] = {"asset": row["asset"], **one}
+    if found:
+        connection.execute(sizes.insert(), list(found.values()))
+
 
 Migration = Callable[[sa.Connection], None]
 FIRST_VERSION = 1
-MIGRATIONS: list[Migration] = []  # the first leads from version 1 to 2; a step that was released is never changed
+MIGRATIONS: list[Migration] = [_fill_sizes]  # the first leads from 1 to 2; a step that was released is never changed
+SIZES_FROM = 2  # version with sizes over time
+READABLE_FROM = 1  # oldest version that is read as it is: what came later are further tables
 
 
 def schema_version() -> int:
@@ -19,8 +35,8 @@ def schema_version() -> int:
     return FIRST_VERSION + len(MIGRATIONS)
 
 
-def create_or_migrate(connection: sa.Connection, name: str, *, write: bool) -> None:
-    """Create the tables of an empty store, and migrate those of an older version, if `write` allows it.
+def create_or_migrate(connection: sa.Connection, name: str, *, write: bool) -> int:
+    """Create the tables of an empty store, and migrate those of an older version, if `write` allows it; return it.
 
     The connection is in a transaction, so that a migration is made whole or not at all. Raises StoreError if the store
     (`name` in messages) is of a newer version, lacks a table, or has tables of another program.
@@ -33,7 +49,7 @@ def create_or_migrate(connection: sa.Connection, name: str, *, write: bool) -> N
             raise EmptyStoreError(f"{name}: holds no history yet, start it with servoscope run")
         METADATA.create_all(connection)
         connection.execute(meta.insert(), [{"key": "schema", "value": schema_version()}])
-        return
+        return schema_version()
     found, newest = connection.execute(sa.select(meta.c.value).where(meta.c.key == "schema")).scalar(), schema_version()
     if not isinstance(found, int) or found < FIRST_VERSION:
         raise StoreError(f"{name}: does not say of which version its tables are, restore it from a copy")
@@ -42,9 +58,12 @@ def create_or_migrate(connection: sa.Connection, name: str, *, write: bool) -> N
         raise StoreError(f"{where}, this servoscope knows up to {newest}: install a newer one")
     if found < newest:
         if not write:
+            if found >= READABLE_FROM:
+                return found
             raise StoreError(f"{where}, servoscope run brings them to {newest}")
         for step in MIGRATIONS[found - FIRST_VERSION :]:
             step(connection)
         connection.execute(meta.update().where(meta.c.key == "schema").values(value=newest))
     elif missing := set(METADATA.tables) - present:
         raise StoreError(f"{name}: its table {min(missing)} is missing, restore it from a copy")
+    return newest

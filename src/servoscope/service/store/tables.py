@@ -71,6 +71,20 @@ diagnoses = _numbered_table(
     sa.Column("onset", sa.Double),
     sa.Column("document", sa.JSON, nullable=False),
 )
+sizes = sa.Table(  # faults and coefficients over years, thinned (`series.py`)
+    "sizes",
+    METADATA,
+    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("t", sa.Double, primary_key=True),
+    # full: a fault by a full diagnosis; live: a fault by an examination; coefficient: by the recursion
+    sa.Column("kind", sa.Text, primary_key=True),
+    sa.Column("name", sa.Text, primary_key=True),
+    sa.Column("value", sa.Double, nullable=False),  # of a fault: a ratio to healthy
+    sa.Column("low", sa.Double, nullable=False),  # low, high: 95 % interval
+    sa.Column("high", sa.Double, nullable=False),
+    sa.Column("healthy", sa.Double, nullable=False),
+    sqlite_with_rowid=False,
+)
 transitions = _numbered_table(
     "transitions",
     sa.Column("alarm", sa.Text, nullable=False),

@@ -4,7 +4,9 @@ import { history as steps } from "./alarms.js";
 import { plot } from "./charts.js";
 import { commands, STATES } from "./commands.js";
 import { signals as drawn, tests } from "./curves.js";
+import { candidates, mimics } from "./diagnosis.js";
 import { h, section, table, tell, titled } from "./dom.js";
+import { growth } from "./growth.js";
 import { follow } from "./live.js";
 import { badge, mark, priority, prose, say, STATUS, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
@@ -16,7 +18,7 @@ const SIGNALS_S = 30;
 const SIGNALS_EVERY_MS = 2000;
 const POINTS = 500;
 
-export async function show(main, { session, signal, linked, part: name, entitle }) {
+export async function show(main, { session, signal, linked, values, part: name, entitle }) {
   entitle(name);
   const path = `/assets/${part(name)}`;
   let asset = await get(path, signal);
@@ -25,19 +27,24 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   const about = [asset.about.loop, asset.about.plant && `plant ${asset.about.plant}`, asset.about.point, asset.about.sample_rate_hz && `${asset.about.sample_rate_hz} Hz`].filter(Boolean).join(", ");
   const plane = planes(asset.responses, units.response ?? "", signal);
   const sizes = parameters(asset.parameters);
+  const grown = growth(path, name, () => asset, { session, values, signal });
   const said = h("p", { class: "working", role: "status" });
   const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
+  const sure = h("div", {});
+  const certainty = section("How sure, and what else it could be", null, sure);
   const statistic = h("div", { class: "plot tall" });
   const samples = h("div", { class: "plot tall" });
   const spans = Object.entries(SPANS).map(([words, seconds]) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(seconds) }, words));
   const baseline = asset.baseline && h("a", { href: `/design?baseline=${part(asset.baseline)}` }, "What this baseline can tell apart");
 
   main.replaceChildren(
-    h("div", { class: "head" }, h("h1", {}, name), h("span", { class: "note" }, about), h("span", { class: "gap" }), baseline),
+    h("div", { class: "head" }, h("h1", {}, name), h("span", { class: "note" }, about), h("span", { class: "gap" }), baseline, h("button", { type: "button", class: "screen", onclick: () => print() }, "Print")),
     verdict.element,
     h(
       "div",
       { class: "columns" },
+      grown.element,
+      certainty,
       section("Inverse frequency response", "Input per unit of output, as a complex number: the diamond is healthy, the dot is now, its ellipse holds 95 %. Each panel has its own scales.", plane.element),
       half(titled("Distance from healthy", spans, statistic)),
       half(titled("Signals", h("small", {}, `the last ${SIGNALS_S} s`), samples)),
@@ -74,9 +81,25 @@ export async function show(main, { session, signal, linked, part: name, entitle 
   }
 
   async function look() {
-    const [alarms, found] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 20 }), signal)]);
+    const [alarms, found, advice] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 20 }), signal), get("/alarms", signal)]);
     past.replaceChildren(steps(alarms.transitions, false));
     diagnoses.replaceChildren(list(found.diagnoses));
+    verdict.advise(advice.alarms.find((one) => one.asset === name && one.alarm === "fault")?.operator_action);
+    await explain(found.diagnoses.filter((one) => one.grounds === "full").at(-1));
+    await grown.load();
+  }
+
+  // The candidates of the last full diagnosis; the numbers behind them are on its own page.
+  async function explain(row) {
+    certainty.hidden = !row || asset.verdict !== "fault";
+    if (certainty.hidden || sure.dataset.id === row.id) return;
+    sure.dataset.id = row.id;
+    const full = await get(`/diagnoses/${part(row.id)}`, signal);
+    const said = full.document ?? {};
+    sure.replaceChildren(
+      h("p", { class: "note" }, `By the full diagnosis of ${moment(row.t)}: `, h("a", { href: `/diagnoses/${part(row.id)}` }, "all of it, with the reasons"), "."),
+      ...[said.candidates?.length && candidates(full, said), said.refit?.mimics?.length && mimics(said)].filter(Boolean),
+    );
   }
 
   async function sample() {
@@ -134,7 +157,7 @@ function began({ verdict, onset, since }) {
 function told(asset) {
   if (asset.verdict !== "fault" || !asset.sizes.length) return asset.summary;
   const each = asset.sizes.map((one) => `${one.parameter} is ${number(one.ratio, 4)} times its healthy value (95 %: ${number(one.low, 4)} to ${number(one.high, 4)})`);
-  return `${capital(each.join(", "))}, as the last full diagnosis says.`;
+  return `${capital(each.join(", "))}${asset.sized ? ` on ${moment(asset.sized)}` : ""}.`;
 }
 
 const half = (element) => (element.classList.add("half"), element);
@@ -151,7 +174,9 @@ function verdictOf(name) {
   const summary = h("p", { class: "summary" });
   const facts = Object.fromEntries(["since", "size", "statistic", "level", "data", "last"].map((key) => [key, { value: h("b", {}), more: h("small", {}) }]));
   const names = { since: "Since", size: "How large", statistic: "Statistic T², × limit", level: "Sequential test, × limit", data: "Data", last: "Last sample" };
-  const element = h("div", { class: "verdict", "aria-label": `Verdict on ${name}`, role: "region" }, kind, headline, summary, h("dl", { class: "facts" }, Object.entries(facts).map(([key, one]) => h("div", {}, h("dt", {}, names[key]), h("dd", {}, one.value, one.more)))));
+  const advice = h("p", { class: "advice" });
+  const advise = (words) => say(advice, words ? `What to check: ${words}.` : "");
+  const element = h("div", { class: "verdict", "aria-label": `Verdict on ${name}`, role: "region" }, kind, headline, summary, advice, h("dl", { class: "facts" }, Object.entries(facts).map(([key, one]) => h("div", {}, h("dt", {}, names[key]), h("dd", {}, one.value, one.more)))));
   const put = (key, value, more = "") => (say(facts[key].value, value), tell(facts[key].more, more));
   let look = "";
   const update = (asset) => {
@@ -172,7 +197,7 @@ function verdictOf(name) {
     put("data", capital(asset.quality.map(plain).join(", ") || "sound"), `${count(asset.counted.lost)} blocks lost`);
     put("last", moment(asset.t).slice(11), moment(asset.t).slice(0, 10));
   };
-  return { element, update };
+  return { element, update, advise };
 }
 
 function headlineOf(asset) {

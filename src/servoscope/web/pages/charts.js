@@ -34,7 +34,8 @@ export function plot(element, label, describe, signal) {
   watcher.observe(element);
   element.setAttribute("role", "img");
   element.setAttribute("aria-label", label);
-  const one = { draw, print: () => (now(), chart.getZr().flush()) };
+  const image = () => (now(), chart.getZr().flush(), chart.getDataURL({ pixelRatio: 2, backgroundColor: colours().paper }));
+  const one = { draw, image, print: () => (now(), chart.getZr().flush()) };
   plots.add(one);
   signal.addEventListener("abort", () => {
     cancelAnimationFrame(wanted);

@@ -81,6 +81,43 @@ export function signature(c, { curves, units }) {
 
 export const short = (value) => (value === 0 ? "0" : number(Number(value.toPrecision(3)), 3).replace(/(\.\d*?)0+(?=$| )/, "$1").replace(/\.(?=$| )/, ""));
 
+// A size over months as a change in percent, with its 95 % band: dots are full diagnoses, the dashes lead to the limit.
+export function growth(c, { t, value, low, high, full, unit: of, limit, forecast, range = [null, null], marks = [] }) {
+  const pairs = (values) => t.map((at, i) => [1000 * at, values[i]]);
+  const band = { type: "line", showSymbol: false, silent: true, lineStyle: { opacity: 0 }, stack: "band", stackStrategy: "all" };
+  const ways = forecast ? forecast.ends.map((end) => line("until the limit", [[1000 * forecast.t, forecast.value], [1000 * end, limit]], c.alarm, { silent: true, stroke: { width: 1.1, type: [4, 4] } })) : [];
+  const drawn = {
+    silent: true,
+    symbol: "none",
+    label: { show: true, position: "insideStartTop", color: c.ink, formatter: ({ name }) => name },
+    data: [
+      ...(limit === null ? [] : [{ yAxis: limit, name: "limit", lineStyle: { color: c.alarm, type: [6, 3], width: 1.2 } }]),
+      ...marks.map(([at, words]) => ({ xAxis: 1000 * at, name: words, lineStyle: { color: c.ink, type: [2, 3], width: 1 } })),
+    ],
+  };
+  const said = (at, words, i) => `${moment(at, { seconds: false })}\n${words} ${number(value[i], 3)}${of} (${number(low[i], 3)} to ${number(high[i], 3)})`;
+  return {
+    grid: { left: 62, right: 14, top: 30, bottom: 28 },
+    legend: legend(c, ["size", "full diagnosis"]),
+    tooltip: tooltip(c, {
+      formatter: ([{ value: [at] }]) => {
+        const i = t.indexOf(at / 1000);
+        return i < 0 ? "" : said(t[i], full.has(i) ? "full diagnosis:" : "size", i);
+      },
+    }),
+    dataZoom: [{ type: "inside", zoomOnMouseWheel: "ctrl", filterMode: "none" }],
+    xAxis: axis(c, "", { type: "time", min: at(range[0], true), max: at(range[1], true), splitNumber: 6 }),
+    yAxis: axis(c, `change${unit(of.trim())}`, { type: "value", scale: true, gap: 44, splitNumber: 4, label: { formatter: short } }),
+    series: [
+      { ...band, name: "low", data: pairs(low) },
+      { ...band, name: "width", data: t.map((at, i) => [1000 * at, high[i] - low[i]]), areaStyle: { color: c.measured, opacity: 0.2 } },
+      line("size", pairs(value), c.measured, { markLine: drawn, showSymbol: t.length < 2 }),
+      { type: "scatter", name: "full diagnosis", data: [...full].map((i) => [1000 * t[i], value[i]]), symbolSize: 7, color: c.ink },
+      ...ways,
+    ],
+  };
+}
+
 // An estimate relative to healthy over time, with its band of two standard deviations.
 export function coefficient(c, { t, one }) {
   const usable = one.nominal.map((nominal, i) => nominal && Math.abs(nominal) > one.std[i]);

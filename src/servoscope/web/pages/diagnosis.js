@@ -72,10 +72,7 @@ function sections(found, said, picture, drawn, signal) {
   const counted = found.began ? `Seconds count from ${moment(found.began, { fraction: 2 })}, where the window begins.` : null;
   if (said.explanation?.length) made.push(section("Why", counted, h("ul", { class: "why" }, said.explanation.map((words) => h("li", {}, prose(words))))));
   if (said.candidates?.length) made.push(section("Candidates", "What could explain the change, how large each explanation would have to be, how probable it is.", candidates(found, said)));
-  if (said.refit?.mimics?.length) {
-    const rows = said.refit.mimics.map((one) => [h("span", {}, prose(one.name)), one.words, one.unit === "ratio" ? `× ${number(one.value, 4)}` : `${number(one.value, 3)} ${one.unit}`]);
-    made.push(section("What else it could be", null, table("Causes outside the list of faults", ["Cause", "In words", "*Size"], rows)));
-  }
+  if (said.refit?.mimics?.length) made.push(section("What else it could be", null, mimics(said)));
   if (trace) {
     made.push(section("Change over time", "Above the dashed line, chance is no longer an explanation.", picture("Both tests over time, as multiples of their limits", (c) => tests(c, { ...trace, marks, clock: false, range: [trace.t[0], trace.t.at(-1)] }))));
   }
@@ -105,7 +102,12 @@ function sections(found, said, picture, drawn, signal) {
 
 const response = (one) => ({ ...one, ellipse: [2 * one.real_std, 2 * one.imag_std, 0] });
 
-function candidates(found, said) {
+export function mimics(said) {
+  const rows = said.refit.mimics.map((one) => [h("span", {}, prose(one.name)), one.words, one.unit === "ratio" ? `× ${number(one.value, 4)}` : `${number(one.value, 3)} ${one.unit}`]);
+  return table("Causes outside the list of faults", ["Cause", "In words", "*Size"], rows);
+}
+
+export function candidates(found, said) {
   const rows = said.candidates.map((one) => {
     const sizes = one.faults.map((fault) => [fault, size(fault)]);
     const bar = h("i");

@@ -34,12 +34,14 @@ export function mark(element, name, value) {
 // A table: head is a list of names, "*Name" for numbers; rows are lists of cells, elements or text.
 export function table(caption, head, rows, attributes = {}) {
   const numeric = head.map((name) => name.startsWith("*"));
+  // On a phone rows are cards, and each value says by itself what it is.
+  const named = (element, i) => (element.setAttribute("data-name", head[i]?.replace("*", "") ?? ""), element);
   const cell = (content, i) =>
     content instanceof HTMLTableCellElement
-      ? content
+      ? named(content, i)
       : i === 0
         ? h("th", { scope: "row" }, content)
-        : h("td", { class: numeric[i] && "n" }, content);
+        : named(h("td", { class: numeric[i] && "n" }, content), i);
   return h(
     "div",
     { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },
@@ -83,4 +85,9 @@ export async function during(button, said, work, settle = () => (button.disabled
   } finally {
     settle();
   }
+}
+
+// Lets the browser save what an address holds.
+export function save(address, name) {
+  h("a", { href: address, download: name }).click();
 }

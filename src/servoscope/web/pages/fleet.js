@@ -3,37 +3,48 @@ import { get } from "./api.js";
 import { h, mark as set, tell } from "./dom.js";
 import { follow } from "./live.js";
 import { mark, say, VERDICTS } from "./marks.js";
-import { DASH, duration, moment, multiple, plain, recent, sentence, size } from "./words.js";
+import { DASH, duration, moment, multiple, plain, recent, sentence, signed, size } from "./words.js";
 
 const STALE_S = 10; // without a sample for so long, the age is told
 const ORDER_MS = 5000; // between two changes of the order: rows must not run away from whoever reads them
-const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² / limit", "CUSUM / limit", "Deviation", "Data", "Alarms", "Sample"];
+const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² / limit", "CUSUM / limit", "Deviation", "Growth / week", "Limit in", "Data", "Alarms", "Sample"];
 // Steps of urgency: what the statistics do below their limits moves no row.
 const rank = (row) => 2 * Math.floor(row.severity / 4) + (row.severity % 4 >= 1 ? 1 : 0);
+const WEEK = 7;
+const ORDERS = {
+  worst: ["Worst first", (row) => -rank(row)],
+  next: ["Limit soonest first", (row) => remaining(row, 0)?.[0] ?? Infinity],
+  growth: ["Fastest growth first", (row) => -Math.abs(row.outlook?.rate_per_day?.[1] ?? 0)],
+};
+// Silent or healthy, what has a fault stands above what has none.
+const faulty = (row) => (row.verdict === "fault" ? 0 : 1);
 const OPEN = ["unacknowledged", "returned_unacknowledged", "latched_unacknowledged"];
 
 export async function show(main, { signal, linked, values }) {
   const assets = new Map(); // name -> { row, tile, line }
-  const filter = { verdict: values.get("verdict") ?? "", search: values.get("search") ?? "", group: values.get("group") ?? "", open: false };
+  const filter = { verdict: values.get("verdict") ?? "", search: values.get("search") ?? "", group: values.get("group") ?? "", order: values.get("order") ?? "worst", open: false, unheard: false };
   const map = h("div", { class: "map" });
   const body = h("div", { role: "rowgroup", class: "rows" });
   const none = h("p", { class: "empty" }, "Loading");
   const counts = filters();
   const search = h("input", { type: "search", placeholder: "Search", "aria-label": "Search assets", value: filter.search });
   const groups = h("select", { "aria-label": "Group" }, h("option", { value: "" }, "All groups"));
+  const orders = h("select", { "aria-label": "Order" }, Object.entries(ORDERS).map(([key, [words]]) => h("option", { value: key }, words)));
+  orders.value = filter.order in ORDERS ? filter.order : "worst";
+  const grid = h("div", { class: "grid fleet", role: "table", "aria-label": "Assets, worst first" });
   let now = 0;
 
   main.replaceChildren(
-    h("div", { class: "head" }, h("h1", {}, "Fleet"), counts.element, h("span", { class: "gap" }), groups, search),
+    h("div", { class: "head" }, h("h1", {}, "Fleet"), counts.element, h("span", { class: "gap" }), orders, groups, search),
     map,
-    h(
-      "div",
-      { class: "grid fleet", role: "table", "aria-label": "Assets, worst first" },
-      h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: ((i > 4 && i < 8) || i === 10) && "n" }, name)))),
-      body,
-    ),
+    grid,
     none,
   );
+  grid.append(
+    h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: ((i > 4 && i < 10) || i === 12) && "n" }, name)))),
+    body,
+  );
+  orders.addEventListener("change", () => ((filter.order = orders.value), chosen(), order(true)));
   search.addEventListener("input", () => ((filter.search = search.value), chosen()));
   groups.addEventListener("change", () => ((filter.group = groups.value), chosen()));
   search.addEventListener("keydown", (event) => event.key === "Enter" && [...assets.values()].find((one) => !one.line.element.hidden)?.line.name.click());
@@ -41,14 +52,14 @@ export async function show(main, { signal, linked, values }) {
 
   function filters() {
     const element = h("div", { class: "filters", role: "group", "aria-label": "Show" });
-    const made = [["", "All"], ...Object.entries(VERDICTS), ["open", "To acknowledge"]].map(([key, words]) => {
+    const made = [["", "All"], ...Object.entries(VERDICTS), ["open", "To acknowledge"], ["unheard", "Not heard"]].map(([key, words]) => {
       const amount = h("b", {}, "0");
       const press = () => {
-        filter.open = key === "open" && !filter.open;
-        filter.verdict = key === "open" || filter.verdict === key ? "" : key;
+        for (const one of ["open", "unheard"]) filter[one] = key === one && !filter[one];
+        filter.verdict = key in VERDICTS && filter.verdict !== key ? key : "";
         chosen();
       };
-      const button = h("button", { type: "button", onclick: press, class: `filter ${key}` }, key && key !== "open" && mark(key), words, amount);
+      const button = h("button", { type: "button", onclick: press, class: `filter ${key}` }, key in VERDICTS && mark(key), words, amount);
       element.append(button);
       return [key, button, amount];
     });
@@ -56,9 +67,10 @@ export async function show(main, { signal, linked, values }) {
   }
 
   function recount() {
-    const found = { "": assets.size, fault: 0, undetermined: 0, healthy: 0, open: 0 };
+    const found = { "": assets.size, fault: 0, undetermined: 0, healthy: 0, open: 0, unheard: 0 };
     for (const { row } of assets.values()) {
       found[row.verdict] += 1;
+      found.unheard += row.heard ? 0 : 1;
       found.open += row.alarms.some((alarm) => OPEN.includes(alarm.state)) ? 1 : 0;
     }
     for (const [key, , amount] of counts.made) tell(amount, String(found[key]));
@@ -67,6 +79,7 @@ export async function show(main, { signal, linked, values }) {
   function wanted({ row }) {
     if (filter.verdict && row.verdict !== filter.verdict) return false;
     if (filter.group && row.group !== filter.group) return false;
+    if (filter.unheard && row.heard) return false;
     if (filter.open && !row.alarms.some((alarm) => OPEN.includes(alarm.state))) return false;
     const text = filter.search && `${row.asset} ${row.group} ${row.summary} ${row.alarms.map((alarm) => alarm.alarm).join(" ")}`;
     return !filter.search || text.toLowerCase().includes(filter.search.trim().toLowerCase());
@@ -87,8 +100,8 @@ export async function show(main, { signal, linked, values }) {
   }
 
   function chosen() {
-    for (const [key, button] of counts.made) set(button, "aria-pressed", String(key === "open" ? filter.open : !filter.open && filter.verdict === key));
-    const told = new URLSearchParams(Object.entries({ verdict: filter.verdict, search: filter.search, group: filter.group }).filter(([, value]) => value));
+    for (const [key, button] of counts.made) set(button, "aria-pressed", String(key in filter ? filter[key] : !filter.open && !filter.unheard && filter.verdict === key));
+    const told = new URLSearchParams(Object.entries({ verdict: filter.verdict, search: filter.search, group: filter.group, order: filter.order === "worst" ? "" : filter.order }).filter(([, value]) => value));
     history.replaceState(null, "", told.size ? `/?${told}` : "/");
     sift();
   }
@@ -96,7 +109,10 @@ export async function show(main, { signal, linked, values }) {
   // Rows are put where they belong, but not under somebody's hands.
   function order(forced = false) {
     if (!forced && (body.matches(":hover") || body.contains(document.activeElement))) return;
-    const worst = [...assets.values()].sort((a, b) => rank(b.row) - rank(a.row) || (a.row.asset < b.row.asset ? -1 : 1));
+    const [words, key] = ORDERS[orders.value];
+    set(grid, "aria-label", `Assets, ${words.toLowerCase()}`);
+    const by = (a, b) => (key(a.row) < key(b.row) ? -1 : key(a.row) > key(b.row) ? 1 : 0);
+    const worst = [...assets.values()].sort((a, b) => faulty(a.row) - faulty(b.row) || by(a, b) || rank(b.row) - rank(a.row) || (a.row.asset < b.row.asset ? -1 : 1));
     worst.forEach(({ line }, i) => body.children[i] !== line.element && body.insertBefore(line.element, body.children[i] ?? null));
   }
 
@@ -190,6 +206,20 @@ function dress({ row, tile }) {
   set(tile, "title", `${row.asset}\n${sentence(row.summary)}`);
 }
 
+// How long until the limit, [earliest, latest] in s; null: no forecast.
+function remaining({ outlook }, now) {
+  if (outlook?.outlook === "reached") return [0, 0];
+  if (outlook?.outlook !== "forecast") return null;
+  return [outlook.reach_t[0] - now, outlook.reach_t[2] === null ? Infinity : outlook.reach_t[2] - now];
+}
+
+function limitIn(row, now) {
+  const left = remaining(row, now);
+  if (!left) return row.outlook ? "not in sight" : DASH;
+  if (left[1] <= 0) return "reached";
+  return left[1] === Infinity ? `from ${duration(left[0])}` : `${duration(left[0])} – ${duration(left[1])}`;
+}
+
 // What is known, without the verdict, which stands beside it.
 function known(row) {
   const named = (row.sizes ?? []).map((one) => `${one.words.replace(/ \(.*/, "")}, ${one.parameter} ${size({ ...one, interval: [one.low, one.high] })[0]}`);
@@ -207,10 +237,11 @@ function lineOf(first) {
   const cell = (kind = "") => h("span", { role: "cell", class: kind });
   const name = h("a", { href: `/assets/${encodeURIComponent(first.asset)}` }, first.asset);
   const state = cell("state");
-  const [group, what, since, deviation, data, alarms, last] = [cell(), cell("what"), cell(), cell("n"), cell(), cell(), cell("n")];
+  const [group, what, since, deviation, growth, limit, data, alarms, last] = [cell(), cell("what"), cell(), cell("n"), cell("n"), cell("n"), cell(), cell(), cell("n")];
   const statistic = gauge();
   const level = gauge();
-  const element = h("div", { role: "row", class: "line" }, state, h("span", { role: "cell", class: "name" }, name), group, what, since, statistic.element, level.element, deviation, data, alarms, last);
+  const element = h("div", { role: "row", class: "line" }, state, h("span", { role: "cell", class: "name" }, name), group, what, since, statistic.element, level.element, deviation, growth, limit, data, alarms, last);
+  [...element.children].forEach((one, i) => one.setAttribute("data-name", COLUMNS[i]));
   const drawn = (one, value) => {
     tell(one.value, multiple(value));
     const share = Math.round(Math.min((value ?? 0) / 1.5, 1) * 48); // px; the limit is at 32
@@ -237,6 +268,9 @@ function lineOf(first) {
     drawn(statistic, row.statistic);
     drawn(level, row.level);
     tell(deviation, row.deviation === null ? DASH : `${(100 * row.deviation).toFixed(1)} %`);
+    tell(growth, row.outlook?.rate_per_day ? `${signed(100 * WEEK * row.outlook.rate_per_day[1], 2)} %` : DASH);
+    tell(limit, limitIn(row, row.t));
+    set(limit, "title", row.outlook?.summary ?? "no limit is set, or no fault is named");
     tell(data, row.quality.map(plain).join(", ") || "sound");
     data.classList.toggle("bad", row.quality.length > 0);
     tell(alarms, open ? `${open} to answer` : row.alarms.length ? `${row.alarms.length} answered` : DASH);

@@ -3,6 +3,7 @@ import { h, tell } from "./dom.js";
 import { prose } from "./marks.js";
 import { DASH, signed, withStd } from "./words.js";
 
+const HEADS = ["Name", "Estimate ± 2σ", "Unit", "Healthy", "Change", "In σ", "95 % interval"];
 const WIDTH = 160; // px of the picture of an interval
 
 export function parameters(first) {
@@ -12,13 +13,13 @@ export function parameters(first) {
     const dot = h("b");
     const picture = h("td", {}, h("span", { class: "interval", "aria-hidden": "true" }, band, dot));
     const unit = h("td", { class: "unit" }, one.unit || DASH);
+    [cells.value, unit, cells.nominal, cells.change, cells.sigma, picture].forEach((cell, i) => cell.setAttribute("data-name", HEADS[i + 1]));
     return { name: one.name, cells, band, dot, element: h("tr", {}, h("th", { scope: "row" }, prose(one.name)), cells.value, unit, cells.nominal, cells.change, cells.sigma, picture) };
   });
-  const heads = ["Name", "Estimate ± 2σ", "Unit", "Healthy", "Change", "In σ", "95 % interval"];
   const element = h(
     "div",
     { class: "scroll", tabindex: "0", role: "region", "aria-label": "Coefficients" },
-    h("table", {}, h("thead", {}, h("tr", {}, heads.map((name, i) => h("th", { scope: "col", class: i > 0 && i < 6 && i !== 2 && "n" }, name)))), h("tbody", {}, rows.map((row) => row.element))),
+    h("table", {}, h("thead", {}, h("tr", {}, HEADS.map((name, i) => h("th", { scope: "col", class: i > 0 && i < 6 && i !== 2 && "n" }, name)))), h("tbody", {}, rows.map((row) => row.element))),
   );
 
   function update(all) {

@@ -10,15 +10,27 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Query
 from starlette.exceptions import HTTPException
 
+from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.prognosis.forecast import prognose
 from servoscope.service.asset_status import AssetStatus
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store, tables
 from servoscope.service.store.queries import query_downsampled, query_history
-from servoscope.web.dependencies import VIEWER, Context, ContextDep
+from servoscope.service.store.series import FAULT_KINDS, NOTE, query_sizes, read_notes, read_series, thin_columns
+from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.downsample import signal_columns
 from servoscope.web.routes.baselines import asset_baseline_id
 from servoscope.web.schemas import assets as schemas
-from servoscope.web.schemas.requests import FleetQuery, HistoryQuery, RowQuery, SignalQuery
+from servoscope.web.schemas import sizes
+from servoscope.web.schemas.requests import (
+    FleetQuery,
+    HistoryQuery,
+    NoteRequest,
+    RowQuery,
+    SignalQuery,
+    SizeQuery,
+    TrendQuery,
+)
 from servoscope.web.schemas.responses import DiagnosisRow
 from servoscope.web.statuses import StatusEntry, asset_statuses, read_statuses, service_statuses
 
@@ -95,6 +107,51 @@ def get_residuals(context: ContextDep, asset: str, query: Annotated[HistoryQuery
         level=[row["level"] for row in rows],
         residuals=residuals,
     )
+
+
+@router.get("/assets/{asset}/sizes")
+def get_sizes(context: ContextDep, asset: str, query: Annotated[SizeQuery, Query()]) -> sizes.SizeHistory:
+    """Return how its faults, or its coefficients, have changed over a time."""
+    find_asset(context, asset)
+    kinds = FAULT_KINDS if query.of == "faults" else ("coefficient",)
+    found = read_series(context.store, asset, query.span, kinds) if context.store.has_sizes else {}
+    columns = ("t", "value", "low", "high", "healthy")
+    curves = [
+        sizes.SizeCurve.model_validate(
+            {"kind": kind, "name": name, **dict(zip(columns, thin_columns(rows, query.points).tolist(), strict=True))}
+        )
+        for (kind, name), rows in found.items()
+    ]
+    return sizes.SizeHistory(asset=asset, curves=curves)
+
+
+@router.get("/assets/{asset}/notes")
+def list_notes(context: ContextDep, asset: str) -> sizes.NoteList:
+    """List what people have noted about it."""
+    find_asset(context, asset)
+    return sizes.NoteList(notes=[sizes.Note.model_validate(note) for note in read_notes(context.store, asset)])
+
+
+@router.post("/assets/{asset}/notes", status_code=201)
+def add_note(context: ContextDep, who: Operator, asset: str, request: NoteRequest) -> sizes.Note:
+    """Note what was done to it."""
+    find_asset(context, asset)
+    context.store.add_audit(who.user, asset, NOTE, request.model_dump())
+    return sizes.Note(who=who.user, **request.model_dump())
+
+
+@router.get("/assets/{asset}/trend")
+def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Query()]) -> sizes.Forecast:
+    """Return how a size grows, and when it will reach a limit; 404 where there is no such size."""
+    find_asset(context, asset)
+    try:
+        series = query_sizes(context.store, asset, query.name, query.since)
+    except StoreUnavailableError:
+        raise
+    except StoreError as error:
+        raise HTTPException(404, str(error)) from None
+    found = prognose(series, query.limit)
+    return sizes.Forecast(asset=asset, **found.model_dump(exclude={"headline", "reasons", "effects"}))
 
 
 @router.get("/assets/{asset}/signals")

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from servoscope.detection.result import Verdict
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
+from servoscope.prognosis.forecast import Outlook as OutlookKind
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
 from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
@@ -105,6 +106,18 @@ class FaultSize(ApiResponse):
     high: float
 
 
+class OutlookRow(ApiResponse):
+    """When a fault reaches its limit: intervals as lower end, median, upper end."""
+
+    name: str
+    limit: float
+    outlook: OutlookKind
+    asked: float
+    reach_t: tuple[float | None, float | None, float | None] | None
+    rate_per_day: tuple[float, float, float] | None
+    summary: str
+
+
 class AssetRow(ApiResponse):
     """An asset in the list of the fleet."""
 
@@ -123,6 +136,9 @@ class AssetRow(ApiResponse):
     deviation: float | None
     alarms: list[AlarmRow]
     sizes: list[FaultSize]
+    sized: float | None
+    outlook: OutlookRow | None
+    heard: bool
     t: float
     at: float
     severity: float
@@ -138,6 +154,9 @@ class AssetRow(ApiResponse):
             "deviation": relative_residual(status),
             "alarms": alarms,
             "sizes": fault_sizes(status),
+            "sized": status.newest_sizes[1] if status.verdict == "fault" else None,
+            "outlook": status.outlook.model_dump() if status.outlook else None,
+            "heard": status.reception == "followed" and "silent" not in status.quality,
             "t": status.position.t,
             "at": at,
             "severity": _severity(status, alarms),
@@ -298,7 +317,7 @@ def fault_sizes(status: AssetStatus) -> list[FaultSize]:
             low=fault.interval[0],
             high=fault.interval[1],
         )
-        for fault in (status.faults if status.verdict == "fault" else ())
+        for fault in (status.newest_sizes[0] if status.verdict == "fault" else ())
     ]
 
 

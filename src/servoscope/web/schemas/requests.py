@@ -73,6 +73,28 @@ class HistoryQuery(TimeQuery):
     points: Annotated[int, Field(ge=10, le=5000)] = 500
 
 
+class SizeQuery(HistoryQuery):
+    """A time, in how many parts, of faults or of coefficients."""
+
+    of: Literal["faults", "coefficients"] = "faults"
+
+
+class TrendQuery(ApiRequest):
+    """Of which fault or coefficient (None: the only fault), until which ratio to healthy, and from when on [UTC s]."""
+
+    name: Id | None = None
+    limit: Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
+    since: UtcSeconds | None = Field(None, alias="from")
+
+
+class NoteRequest(ApiRequest):
+    """What was done to an asset and when [UTC s]; `anew`: its trend begins there."""
+
+    t: UtcSeconds
+    text: Annotated[str, Field(min_length=1, max_length=200)]
+    anew: bool = False
+
+
 class RowQuery(TimeQuery):
     """The newest rows of a time."""
 
