@@ -30,7 +30,13 @@ from test_architecture import load
 PROJECT = Path(__file__).resolve().parent.parent
 DOCS = PROJECT / "docs"
 PAGES = [PROJECT / "README.md", PROJECT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
-RUN = ("tutorial.md", "from-matlab.md", "how-to/python.md", "how-to/trend.md")  # their Python is run, below
+RUN = (
+    "README.md",
+    "tutorial.md",
+    "from-matlab.md",
+    "how-to/python.md",
+    "how-to/trend.md",
+)  # their Python is run, below
 # Python that no page can run, and why: the page shows a part of somebody else's program
 FRAGMENTS = {
     "fleet.md": "the frame is the reader's, in Spark; test_spark.py runs the call",
@@ -38,7 +44,6 @@ FRAGMENTS = {
     "how-to/drive.md": "the image comes from a drive; test_export.py goes there and back",
     "reference/messages.md": "the sender is the reader's; test_payload.py compares with it byte by byte",
     "CONTRIBUTING.md": "packages of the reader's; test_source_contract.py installs and runs them",
-    "README.md": "the first lines of how-to/python.md, in another folder",
 }
 
 
@@ -80,8 +85,13 @@ class TestTutorial:
 
 @pytest.mark.slow
 def test_the_page_for_users_of_python(tmp_path: Path) -> None:
-    folder = prepared(tmp_path)
-    assert run_page(DOCS / "how-to" / "python.md", folder) >= 9
+    folder = tmp_path / "demo-output"
+    folder.mkdir()
+    assert run_page(DOCS / "how-to" / "python.md", prepared(folder)) >= 10
+    shown = tmp_path / "README.md"  # its Python alone: its commands read a log of the reader's
+    text = "".join(block.text for block in code_blocks(PROJECT / "README.md") if block.kind == "python")
+    shown.write_text(f"```python\n{text}```\n\n```text\nfault (FaultEstimate(name='leakage', ...\n```\n")
+    assert run_page(shown, tmp_path) == 2
 
 
 def test_the_page_of_trends(tmp_path: Path) -> None:
