@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 CODE := src tests benchmarks scripts
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format figures pictures sbom clean
+.PHONY: help install demo test test-all lint format figures pictures docs sbom clean
 .DELETE_ON_ERROR:
 
 help:           ## list the targets
@@ -39,11 +39,14 @@ figures: $(STAMP)  ## run the programs behind the figures of the documents, and 
 pictures: $(STAMP)  ## the pictures of the pages in docs/images/pages, from the browser's tests
 	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/test_web_pages.py tests/test_web_files.py
 
+docs: $(STAMP)     ## the site of docs/, as wheels have it: servoscope docs opens it
+	$(BIN)/python -m sphinx -q -W -E -d build/docs docs src/servoscope/site
+
 sbom: $(STAMP)     ## the software bill of materials of a release, as CycloneDX: servoscope.cdx.json
 	$(BIN)/python scripts/sbom.py -o servoscope.cdx.json
 
 clean:          ## remove what the other targets made
-	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist src/servoscope/site
 	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Done again only when one of the two files has changed; .venv itself is kept then, unless its Python is gone.

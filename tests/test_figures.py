@@ -40,13 +40,13 @@ def test_every_page_says_what_was_measured(figures: ModuleType, capsys: pytest.C
 
 
 def test_a_changed_number_is_found(figures: ModuleType, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    readme = copy / "README.md"
-    text = readme.read_text(encoding="utf-8")
+    page = copy / "docs" / "results.md"
+    text = page.read_text(encoding="utf-8")
     begin = text.index("cranfield-40: 40.false -->") + len("cranfield-40: 40.false -->")
-    readme.write_text(text[:begin] + "5 of 5" + text[text.index("<!-- end -->", begin) :], encoding="utf-8")
+    page.write_text(text[:begin] + "5 of 5" + text[text.index("<!-- end -->", begin) :], encoding="utf-8")
     assert figures.main([], copy) == 1
     line = text.count("\n", 0, begin) + 1
-    assert capsys.readouterr().out.startswith(f"README.md:{line}: value cranfield-40: 40.false has '5 of 5'")
+    assert capsys.readouterr().out.startswith(f"docs/results.md:{line}: value cranfield-40: 40.false has '5 of 5'")
 
 
 def test_a_changed_cell_of_a_table_is_found(figures: ModuleType, copy: Path) -> None:
@@ -74,7 +74,7 @@ def test_written_pages_agree(figures: ModuleType, copy: Path) -> None:
     results["values"]["40.false"] = "4 of 5"
     stored.write_text(json.dumps(results), encoding="utf-8")
     assert figures.main([], copy) == 1
-    assert [path.name for path in figures.write(copy, {"cranfield-40": results})] == ["README.md"]
+    assert [path.name for path in figures.write(copy, {"cranfield-40": results})] == ["results.md"]
     assert figures.main([], copy) == 0
 
 

@@ -11,7 +11,10 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
+
+import pytest
 
 BUILD = "import hatchling.build, sys; print(hatchling.build.build_wheel(sys.argv[1]))"
 
@@ -22,10 +25,11 @@ def pinned(path: Path) -> dict[str, str]:
     return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
 
 
-def build(source: Path, folder: Path, umask: int, seconds: int) -> str:
-    """Return the digest of the wheel of a copy of the source whose files have another time and other permissions."""
-    shutil.copytree(source / "src", folder / "src", ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+def build(source: Path, folder: Path, umask: int, seconds: int) -> Path:
+    """Return the wheel of a copy of the source whose files have another time and other permissions."""
+    for name in ("src", "docs"):
+        shutil.copytree(source / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "site"))
+    for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
         shutil.copy(source / name, folder)
     for path in folder.rglob("*"):
         os.utime(path, (seconds, seconds))
@@ -34,15 +38,56 @@ def build(source: Path, folder: Path, umask: int, seconds: int) -> str:
     argv = [sys.executable, "-c", BUILD, str(folder / "dist")]
     done = subprocess.run(argv, cwd=folder, env=environment | {"TZ": "Asia/Tokyo"}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return hashlib.sha256((folder / "dist" / done.stdout.strip()).read_bytes()).hexdigest()
+    return folder / "dist" / done.stdout.strip().splitlines()[-1]
 
 
-def test_two_builds_have_the_same_bytes(project: Path, tmp_path: Path) -> None:
-    (tmp_path / "one").mkdir()
-    (tmp_path / "other").mkdir()
-    assert build(project, tmp_path / "one", 0, 1_700_000_000) == build(
-        project, tmp_path / "other", 0o077, 1_800_000_000
+@pytest.fixture(scope="module")
+def wheel(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel; it is only built if no page has a link that leads nowhere, and no page is missing in index.md."""
+    return build(project, tmp_path_factory.mktemp("one"), 0, 1_700_000_000)
+
+
+@pytest.mark.slow
+def test_two_builds_have_the_same_bytes(project: Path, wheel: Path, tmp_path: Path) -> None:
+    other = build(project, tmp_path, 0o077, 1_800_000_000)
+    assert hashlib.sha256(wheel.read_bytes()).hexdigest() == hashlib.sha256(other.read_bytes()).hexdigest()
+
+
+@pytest.mark.slow
+def test_a_wheel_brings_the_site_which_asks_for_nothing_from_outside(
+    project: Path, wheel: Path, tmp_path: Path
+) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path)
+    site = tmp_path / "servoscope" / "site"
+    pages = {path.relative_to(project / "docs").with_suffix(".html") for path in (project / "docs").rglob("*.md")}
+    found = {path.relative_to(site) for path in site.rglob("*.html")}
+    assert found - pages == {Path("genindex.html"), Path("search.html")} and pages <= found
+    loads = re.compile(
+        r"<(?:script|img|iframe)[^>]*\ssrc=\"([^\"]*)|<link[^>]*rel=\"(?:stylesheet|preload)[^>]*href=\"([^\"]*)"
     )
+    for page in found:
+        wanted = ["".join(one) for one in loads.findall((site / page).read_text())]
+        assert wanted and all((site / page.parent / one.split("?")[0]).exists() for one in wanted), page
+    styles = "".join(path.read_text() for path in site.rglob("*.css"))
+    assert not re.search(r"@import[^;]*//|url\([\"']?(?:https?:)?//", styles)
+    assert "leakag" in (site / "searchindex.js").read_text()  # what the search knows, by stems
+    # without the site, the command says how to get it; with it, where it is
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    argv = [sys.executable, "-m", "servoscope", "docs"]
+    there = subprocess.run(argv, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert Path(there.stdout.strip()) == site / "index.html", there.stderr
+    (site / "index.html").unlink()
+    gone = subprocess.run(argv, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert gone.returncode == 1 and "make docs" in gone.stderr
+
+
+def test_wheels_are_built_with_what_the_pages_are_made_with(project: Path) -> None:
+    settings = tomllib.loads((project / "pyproject.toml").read_text())
+    extra = settings["project"]["optional-dependencies"]["docs"]
+    assert set(extra) <= set(settings["build-system"]["requires"])
+    tested = pinned(project / "requirements-dev.lock")
+    assert dict(each.split("==") for each in extra).items() <= tested.items()
 
 
 def test_a_container_installs_what_the_tests_run_with_and_nothing_without_a_hash(project: Path) -> None:

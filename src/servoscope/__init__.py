@@ -29,9 +29,11 @@ __all__ = [
     "diagnose",
     "inspect",
     "learn",
+    "plot",
     "read",
     "read_parts",
     "simulate",
+    "write_report",
 ]
 
 aliases.install()
@@ -46,6 +48,8 @@ if TYPE_CHECKING:
     from servoscope.diagnosis.operating_points import learn
     from servoscope.learning.inspection import inspect
     from servoscope.models.loop import Loop
+    from servoscope.report.diagnosis_page import write_report
+    from servoscope.report.plots import plot
     from servoscope.signals.readers import read, read_parts
     from servoscope.signals.recording import Recording
     from servoscope.simulation import simulate
@@ -61,9 +65,11 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "diagnose": "diagnosis.diagnose",
         "inspect": "learning.inspection",
         "learn": "diagnosis.operating_points",
+        "plot": "report.plots",
         "read": "signals.readers",
         "read_parts": "signals.readers",
         "simulate": "simulation",
+        "write_report": "report.diagnosis_page",
     }
 
     def __getattr__(name: str) -> object:

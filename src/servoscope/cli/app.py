@@ -17,7 +17,7 @@ GARBAGE = 200_000  # new objects before cycles are looked for: loading code make
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 GROUPS = {
-    "Begin": ("demo", "init", "inspect", "help"),
+    "Begin": ("demo", "tutorial", "init", "inspect", "docs", "help"),
     "Judge recordings": ("learn", "diagnose", "verify"),
     "Follow machines for months": ("run", "watch", "history", "trend", "alarms", "serve", "users", "publish", "fleet"),
     "Before deployment, and in the drive": ("simulate", "design", "export"),
@@ -69,6 +69,23 @@ def show_help(
     whole = context.find_root()
     shown = whole if command is None else _context_of(whole, command)
     typer.echo(shown.get_help())
+
+
+@app.command("docs")
+def show_docs() -> None:
+    """Open the documentation that came with this installation in the browser; off a terminal, print where it is."""
+    import webbrowser
+    from pathlib import Path
+
+    from servoscope.core.errors import OutputError
+    from servoscope.report.page import say
+
+    page = Path(__file__).parent.parent / "site" / "index.html"
+    if not page.is_file():
+        raise OutputError(say("docs.missing"))
+    typer.echo(str(page))
+    if sys.stdout.isatty():
+        webbrowser.open(page.as_uri())
 
 
 def _context_of(whole: Any, name: str) -> Any:

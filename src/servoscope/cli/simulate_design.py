@@ -190,3 +190,23 @@ def demo(
 
     with exclusive_folder(output):
         demonstration.run_demo(output, lambda words: app(list(words), standalone_mode=False))
+
+
+@app.command()
+def tutorial(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the logs.")] = Path(
+        "tutorial"
+    ),
+) -> None:
+    """Write the four logs that the tutorial reads: a motor axis, healthy on three days and faulty on Friday."""
+    from servoscope.cli.render import results
+    from servoscope.core.files import atomic_write, exclusive_folder
+    from servoscope.report.page import say
+    from servoscope.simulation.tutorial import DAYS, tutorial_log
+
+    out = results.create_console()
+    with exclusive_folder(output):
+        for day in DAYS:
+            atomic_write(output / f"{day}.csv", tutorial_log(day).encode())
+            results.print_written_path(out, output / f"{day}.csv")
+    results.print_notes(out, [say("tutorial.next", log=str(output / "monday.csv"))], "green", "-")

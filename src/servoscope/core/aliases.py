@@ -10,6 +10,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 ALIASES = {
+    "servoscope.loop": "servoscope.models.loop",
     "servoscope.errors": "servoscope.core.errors",
     "servoscope.scoring": "servoscope.research.scoring",
     "servoscope.fleet.spark": "servoscope.fleet.spark",

@@ -88,6 +88,13 @@ def diagnose(
         If the recording's sample rate is not the loop's.
     BaselineError
         If the baseline has no such point.
+
+    Examples
+    --------
+    >>> diagnose("baseline.json", "wednesday.csv").verdict
+    'healthy'
+    >>> [(fault.name, round(fault.ratio, 2)) for fault in diagnose("baseline.json", "friday.csv").faults]
+    [('viscous_friction', 1.25)]
     """
     learned = Baseline.of(baseline)
     return _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]

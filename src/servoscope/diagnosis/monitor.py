@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -35,8 +36,8 @@ class Monitor:
     Parameters
     ----------
     baseline
-        One baseline, or one per asset. The assets of a fleet may differ in everything but sample rate, evaluation rate,
-        coefficients and monitored frequencies; those of one structure are followed together.
+        One baseline or its path, or one per asset. The assets of a fleet may differ in everything but sample rate,
+        evaluation rate, coefficients and monitored frequencies; those of one structure are followed together.
     share_budget
         Whether the budget of false alarms is divided among the assets of a fleet; otherwise each asset has all of it.
     precision
@@ -46,17 +47,26 @@ class Monitor:
     ------
     BaselineError
         If the baselines cannot be followed together, or one of them has several operating points.
+
+    Examples
+    --------
+    >>> monitor = Monitor("baseline.json")
+    >>> friday = ss.read("friday.csv", "loop.toml")
+    >>> state, trace = monitor.run(monitor.init(), friday.r, friday.u, friday.y)
+    >>> print(f"changed at {trace.t[trace.exceeded][0]:.0f} s")
+    changed at 41 s
     """
 
     def __init__(
         self,
-        baseline: Baseline | Sequence[Baseline],
+        baseline: Baseline | str | Path | Sequence[Baseline | str | Path],
         *,
         share_budget: bool = False,
         precision: Literal["double", "single"] = "double",
     ) -> None:
-        self.baselines = (baseline,) if isinstance(baseline, Baseline) else tuple(baseline)
-        self.fleet = not isinstance(baseline, Baseline)
+        self.fleet = not isinstance(baseline, Baseline | str | Path)
+        several: Any = baseline if self.fleet else (baseline,)
+        self.baselines = tuple(Baseline.of(each) for each in several)
         if not self.baselines:
             raise BaselineError("a monitor needs at least one baseline")
         distinct = {id(each): each for each in self.baselines}

@@ -79,6 +79,13 @@ def learn(
     BaselineError
         If a recording is a fault to the earlier baseline and the change is not accepted, if a point has no name, or if
         a fault has the name of one that the plant knows, or a point that has no healthy recordings.
+
+    Examples
+    --------
+    >>> baseline = learn("loop.toml", ["monday.csv", "tuesday.csv"])
+    >>> baseline.names
+    ('viscous_friction', 'inertia', 'coulomb_friction', 'offset')
+    >>> baseline.save("baseline.json")
     """
     loop = Loop.of(loop)
     if isinstance(recordings, str | Path):

@@ -290,6 +290,12 @@ class Loop(ShortRepr, Settings):
             What error messages call it, for example the file's name.
 
         Raises LoopError if a key is unknown or missing or a value is wrong.
+
+        Examples
+        --------
+        >>> plant = {"kind": "polynomial", "order": 2, "friction": "coulomb"}
+        >>> Loop.from_dict({"sample_rate": 1000.0, "plant": plant}).plant.names
+        ('viscous_friction', 'inertia', 'coulomb_friction')
         """
         if not isinstance(mapping, Mapping):
             raise LoopError(f"{source}: must be a table of settings, found {type(mapping).__name__}")

@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
 from servoscope.diagnosis.motion_signature import SignatureWidth, compare_signatures
 from servoscope.models.loop import Loop
@@ -27,7 +29,10 @@ from servoscope.report.format_values import (
     time_decimals,
 )
 from servoscope.report.page import render_page, say, write_page
+from servoscope.report.plain_values import provenance
 from servoscope.signals import Recording
+from servoscope.signals.readers import as_recording
+from servoscope.signals.readers.frames import Source
 
 UNLIKELY = 0.05  # a candidate below this probability is not in the headline
 LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
@@ -56,6 +61,32 @@ def write_diagnosis_page(
     Raises OutputError if the file cannot be written.
     """
     write_page(path, render_diagnosis_page(diagnosis, trace, recording, loop, provenance))
+
+
+def write_report(path: str | Path, baseline: Baseline | str | Path, recording: Recording | Source) -> Diagnosis:
+    """Diagnose a recording, write the report on it as one HTML page, and return the diagnosis.
+
+    Parameters
+    ----------
+    path
+        Page to write; nothing half-written stays behind.
+    baseline, recording
+        As for `diagnose`.
+
+    Raises OutputError if the page cannot be written, and what `diagnose` raises.
+
+    Examples
+    --------
+    >>> write_report("friday.html", "baseline.json", "friday.csv").verdict
+    'fault'
+    """
+    learned = Baseline.of(baseline)
+    judged = as_recording(recording, learned.loop)
+    diagnosis, trace = diagnose_with_trace(learned, judged)
+    used = learned.at(diagnosis.point) if diagnosis.point else learned
+    file = "not from a file" if isinstance(baseline, Baseline) else str(baseline)
+    write_diagnosis_page(path, diagnosis, trace, judged, used.loop, provenance(used, file, judged.name))
+    return diagnosis
 
 
 def render_diagnosis_page(

@@ -84,7 +84,7 @@ def replace_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def provenance(baseline: Baseline, file: Path, recording: Path) -> dict[str, str]:
+def provenance(baseline: Baseline, file: Path | str, recording: Path | str) -> dict[str, str]:
     """Return where a diagnosis comes from, line by line, for its page."""
     from datetime import UTC, datetime
 

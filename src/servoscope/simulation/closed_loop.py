@@ -65,6 +65,16 @@ def simulate(
 
     Raises SimulationError if the loop has no controller or is unstable with one of the plants, or r or a fault does
     not fit, LoopError if the plant has no nominal values.
+
+    Examples
+    --------
+    >>> from servoscope.simulation import FaultEvent, reference
+    >>> from servoscope.simulation.tutorial import AXIS
+    >>> loop = ss.Loop.from_dict(AXIS)
+    >>> r = reference("trapezoid", 20.0, loop.sample_rate)
+    >>> recording, truth = simulate(loop, r, faults=[FaultEvent.parse("inertia=1.5@10")], seed=1)
+    >>> truth.ratios["inertia"][[0, -1]]
+    array([1. , 1.5])
     """
     r = check_reference(r)
     n_u, n_y = draw_noise(r.size, noise_u_std, noise_y_std, seed)

@@ -98,6 +98,11 @@ def inspect(recording: Recording | Source, loop: Loop | str | Path | None = None
     -------
     Inspection
         ``model_dump(mode="json")`` of it is one JSON object without NaN.
+
+    Examples
+    --------
+    >>> inspect("monday.csv", "loop.toml").verdict
+    'usable'
     """
     loop = Loop.of(loop) if loop is not None else None
     recording = as_recording(recording, loop)

@@ -69,7 +69,7 @@ def _channel_info(name: str, types: list[str], ranges: list[tuple[float, float]]
 
 def read(
     path: Source,
-    loop: Loop | None = None,
+    loop: Loop | str | Path | None = None,
     *,
     columns: Columns | None = None,
     where: Mapping[str, str] | None = None,
@@ -82,13 +82,19 @@ def read(
         CSV and other text, Parquet, MAT (v5 and v7.3), HDF5, and with ``servoscope[formats]`` MDF (3 and 4), TDMS,
         Excel, LabVIEW (.lvm), MCAP of ROS 2 and ULog; any of them in .gz or .zip.
     loop
-        The loop it was taken from: columns, sample rate, input limits. None: columns t, r, u, y, rate as measured.
+        The loop it was taken from, or its path: columns, sample rate, input limits. None: columns t, r, u, y, rate as
+        measured.
     columns
         Where the signals stand; overrides the loop's.
     where
         Rows to take, by column: a value, several with commas, or a range, ``{"load": "20", "run": "1-5"}``.
 
     Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
+
+    Examples
+    --------
+    >>> read("monday.csv", "loop.toml")
+    Recording(name: monday.csv, length: 60 s, samples: 12000, rate: 200 Hz, defects: 0)
     """
     (recording,) = read_parts(path, loop, columns=columns, where=where)
     return recording
@@ -96,7 +102,7 @@ def read(
 
 def read_parts(
     path: Source,
-    loop: Loop | None = None,
+    loop: Loop | str | Path | None = None,
     *,
     columns: Columns | None = None,
     where: Mapping[str, str] | None = None,
@@ -106,6 +112,7 @@ def read_parts(
 
     Parameters and errors are those of `read`; a recording is called ``file.csv[run=6]``. Without `by`, there is one.
     """
+    loop = None if loop is None else Loop.of(loop)
     columns = columns or (loop.columns if loop is not None else Columns())
     texts: set[str] = set()
     while True:
