@@ -281,16 +281,23 @@ def t_squared(theta: Array, expected: Array, covariance: Array) -> Array:
     return np.array([(t - m) @ np.linalg.inv(C) @ (t - m) for t, m, C in zip(theta, expected, covariance, strict=True)])
 
 
-def change_point(v: Array, changed: Array, a: Array, ramp: Array, variance: float) -> Array:
-    """Return the log-likelihood of a change at every update i: v - ramp(k - i) changed is AR noise, N(0, variance)."""
+def change_point(v: Array, changed: Array, ramp: Array, lags: int) -> Array:
+    """Return the log-likelihood of a change at every update i: v - size ramp(k - i) changed is noise, size at its best.
+
+    Divided by the long-run variance over the variance of the scores under the best change.
+    """
     N = len(v)
-    found = []
+    found, left = [], []
     for i in range(N):
-        share = [0.0 if k < i else ramp[k - i] if k - i < len(ramp) else 1.0 for k in range(N)]
-        left = v - np.array(share) * changed
-        white = [left[k] - sum(a[j - 1] * left[k - j] for j in range(1, min(len(a), k) + 1)) for k in range(N)]
-        found.append(-sum(e**2 for e in white) / (2.0 * variance))
-    return np.array(found)
+        column = changed * np.array([0.0 if k < i else ramp[k - i] if k - i < len(ramp) else 1.0 for k in range(N)])
+        size = max(float(np.linalg.lstsq(column[:, None], v, rcond=None)[0][0]), 0.0) if column.any() else 0.0
+        left.append(v - size * column)
+        found.append(-sum(left[-1] ** 2))
+    e = left[int(np.argmax(found))]
+    d = e * changed - np.mean(e * changed)
+    gamma = [sum(d[lag:] * d[: N - lag]) / N for lag in range(lags + 1)]
+    longer = 1.0 + 2.0 * sum((1.0 - lag / (lags + 1.0)) * gamma[lag] / gamma[0] for lag in range(1, lags + 1))
+    return np.array(found) / (2.0 * np.mean(e**2) * max(1.0, longer))
 
 
 def inside(points: Array, polygon: Array) -> npt.NDArray[np.bool_]:

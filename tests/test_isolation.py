@@ -74,6 +74,20 @@ def test_intervals_hold_the_truth_19_times_of_20() -> None:
     assert 181 <= hits <= 198, hits
 
 
+@pytest.mark.parametrize("ratio", [0.8, 1.1, 3.0])
+def test_what_is_not_known_of_the_healthy_value_widens_a_size_as_far_as_it_has_changed(ratio: float) -> None:
+    """The healthy value is off by 20 % (standard deviation), and what is seen is the change, not the ratio."""
+    rng, inside, widths, std = np.random.default_rng(1), 0, [], 0.2
+    line = parameter_signature(fault("pump"), lambda q: SCALE * PUMP * (q - 1.0), std)
+    for seed in range(100):
+        seen = SCALE * PUMP * (ratio - 1.0) * np.exp(std * rng.standard_normal())
+        (found,) = isolate([line], draw(seen, seed), SIGMA, lambda: None)[0].faults
+        inside += found.interval[0] <= ratio <= found.interval[1]
+        widths.append(np.log(found.interval[1] / found.interval[0]))
+    assert inside >= 90
+    assert np.median(widths) < 1.5 * 2.0 * 1.96 * std * abs(ratio - 1.0)
+
+
 def test_probabilities_are_the_integrals_over_the_prior() -> None:
     """Against adaptive quadrature, where two faults fit about equally well."""
     first, second = bent(PUMP), bent(PUMP + np.array([0.0, 0.0, 0.0, 0.15]))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy import motion as study
-from accuracy import rig
+from accuracy import onset, rig
 from accuracy.axis import AXES, RATE, loop, moves, random_motion, record
 
 import servoscope as ss
@@ -176,3 +176,15 @@ def test_an_output_that_never_changes_says_nothing() -> None:
         rig.baseline("multisine", 60.0, 0), study.replace(recording, u=0.0 * recording.u, y=0.0 * recording.y)
     )
     assert diagnosis.verdict == "undetermined" and not diagnosis.candidates
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cogging", "stribeck"])
+def test_the_onset_is_dated_where_the_residual_is_no_noise(name: str) -> None:
+    """Friction and magnets that the model lacks moved it by up to 40 s; of eight steps one may be outside by chance."""
+    found = [onset.axis_job(0, name, runs=10)]
+    seen = [run for run in found[0]["runs"] if "onset" in run and run["what"] != "shift"]
+    inside = sum(run["onset"][0] <= run["begin"] <= run["onset"][2] for run in seen)
+    assert len(seen) >= 5 and inside >= len(seen) - 1
+    assert np.median([abs(run["onset"][1] - run["begin"]) for run in seen]) < 0.3
+    assert all(len(row) == len(onset.TABLES[1].columns) for row in onset.covered_on_axis(name, found))

@@ -12,7 +12,8 @@ from rich.console import Console
 
 import servoscope as ss
 from servoscope.cli.render.diagnosis import print_diagnosis
-from servoscope.isolation.ml.switching import SequenceCost, likeliest_sequence
+from servoscope.isolation.ml.hypothesis import fit_hypothesis
+from servoscope.isolation.ml.plant_sequence import SequenceCost, likeliest_sequence
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.simulation import FaultEvent, reference
 
@@ -70,6 +71,15 @@ def test_the_likeliest_sequence_finds_each_plant_where_it_was(baseline: ss.Basel
     assert set(path.tolist()) == {0, 2}
     changes = np.flatnonzero(np.diff(path)) + 1
     assert np.abs(changes - [200, 400]).max() <= 60  # a late switch may win at first
+
+
+def test_a_size_of_which_nothing_shows_is_left_where_it_was(baseline: ss.Baseline) -> None:
+    """A change at the very end has a gradient of zero: the search divided by its length, and went on with no number."""
+    window = RefitWindow.from_recording(baseline, simulated(baseline.loop, 3), 0, 400)
+    leakage = next(fault for fault in baseline.plant.faults if fault.parameter == "C_ie")
+    d, starts = np.zeros(window.nuisance_count), [np.array([0.1])]
+    found = fit_hypothesis(window, [leakage], ChangeProfile(400), d, starts, free=False)
+    assert found.x == pytest.approx([0.1]) and np.isfinite(found.cost)
 
 
 def test_two_steps_are_two_intervals_with_their_sizes(stepped: ss.Diagnosis) -> None:

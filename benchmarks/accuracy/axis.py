@@ -34,6 +34,8 @@ class Axis:
     cogging: float = 0.0  # N
     belt_hz: float = 0.0  # resonance of the load on its belt; 0: rigid
     load_share: float = 0.5  # of the mass that is behind the belt
+    load: float = 0.0  # N against the motor
+    shift: float = 0.0  # of the sensor [m]
 
 
 AXES = {
@@ -53,8 +55,8 @@ def _run(r, p, q, switch, n_y, n_u, gains, limit, dt, substeps):  # type: ignore
     speed = 0.0
     h = dt / substeps
     for k in range(N):
-        m, b, c, gain, static, v_s, cogging, pitch, w, share = p if k < switch else q
-        y[k] = x + n_y[k]
+        m, b, c, gain, static, v_s, cogging, pitch, w, share, load_force, shift = p if k < switch else q
+        y[k] = x + shift + n_y[k]
         speed += 0.5 * ((y[k] - before) / dt - speed)
         before = y[k]
         ahead = (r[min(k + 1, N - 1)] - r[k]) / dt
@@ -67,7 +69,7 @@ def _run(r, p, q, switch, n_y, n_u, gains, limit, dt, substeps):  # type: ignore
         stiffness = w * w * motor * load / m
         for _ in range(substeps):
             friction = c + static * np.exp(-((v / v_s) ** 2))
-            force = gain * (u[k] + n_u[k]) - b * v - cogging * np.sin(2.0 * np.pi * x / pitch)
+            force = gain * (u[k] + n_u[k]) - b * v - cogging * np.sin(2.0 * np.pi * x / pitch) - load_force
             if w > 0.0:
                 spring = stiffness * (xl - x) + 0.02 * stiffness / w * (vl - v)
                 vl -= h * spring / load
@@ -118,6 +120,8 @@ def record(axis: Axis, r: FloatArray, seed: int, faulty: Axis | None = None, at:
             PITCH,
             2.0 * np.pi * a.belt_hz,
             a.load_share,
+            a.load,
+            a.shift,
         )
         for a in (axis, faulty or axis)
     )

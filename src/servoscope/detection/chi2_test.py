@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.estimation.pipeline import Estimates, Pipeline, Tuning
+from servoscope.estimation.noise_model import long_run_inflation
+from servoscope.estimation.pipeline import Pipeline
 from servoscope.signals import Recording
 
 SECONDS_PER_YEAR = 365.25 * 86400.0
@@ -126,29 +127,24 @@ class Onset:
 
 
 def estimate_onset(
-    pipeline: Pipeline,
-    tuning: Tuning,
-    recording: Recording,
-    estimates: Estimates,
-    healthy: FloatArray,
-    faulty: FloatArray,
-    until: int,
-    last: int,
+    pipeline: Pipeline, recording: Recording, healthy: FloatArray, faulty: FloatArray, until: int, last: int
 ) -> Onset:
-    """Find when the regression stopped following `healthy` and began to follow `faulty`.
+    """Find when the regression stopped following `healthy` and went towards `faulty`.
 
-    Change point by maximum likelihood on the residual whitened by an autoregression of the noise, with a flat prior
-    over the samples before the alarm (Basseville and Nikiforov, 1993, section 2.6). While the filters settle, the
-    share of the change that they have let through counts.
+    Change point by least squares on the residual of the regression, the size of the change at its best for each time,
+    with a flat prior over the samples before the alarm (Basseville and Nikiforov, 1993, section 2.6). While the filters
+    settle, the share of the change that they have let through counts. The residual is coloured, and where friction or
+    elasticity are not the model's it is no noise at all; so the likelihood is tempered by the long-run variance of the
+    scores (Newey and West, 1987) instead of whitened, which would raise what the model misses above the change.
 
-    `healthy, faulty`: coefficients before and after, shape (n,); `until`: sample of the alarm: the onset is not
-    later; `last`: last sample that `faulty` speaks for.
+    `healthy, faulty`: coefficients before, and on the way of the change, shape (n,); `until`: sample of the alarm: the
+    onset is not later; `last`: last sample that `faulty` speaks for.
     """
     reach = round(REACH * pipeline.memory * pipeline.stride)
     while True:
         begin = max(until - reach, 0) // pipeline.stride * pipeline.stride
         near = recording.rows(slice(begin, min(last, until + reach) + 1))
-        likelihood = _likelihood(pipeline, tuning, near, float(estimates.power[-1]), healthy, faulty, until - begin)
+        likelihood = _log_likelihood(pipeline, near, healthy, faulty, until - begin)
         weight = np.exp(likelihood - likelihood.max())
         share = np.cumsum(weight) / weight.sum()
         likely = int(np.argmax(likelihood))
@@ -158,38 +154,32 @@ def estimate_onset(
     low, high = (begin + int(k) for k in np.searchsorted(share, [0.025, 0.975]))
     likely += begin
     # what the filters leave of a step is known only about, so neither end is surer than half their settling time
-    blur = pipeline.bank.wait / (2.0 * recording.sample_rate)
+    blur = pipeline.bank.wait // 2
+    low, high = max(min(low, likely - blur), 0), min(max(high, likely + blur), until)
     t = recording.t
-    return Onset(
-        max(float(t[min(low, until)]) - blur, float(t[0])),
-        float(t[likely]),
-        min(float(t[min(high, until)]) + blur, float(t[until])),
-        likely,
-    )
+    return Onset(float(t[low]), float(t[likely]), float(t[high]), likely)
 
 
-def _likelihood(
-    pipeline: Pipeline,
-    tuning: Tuning,
-    recording: Recording,
-    power: float,
-    healthy: FloatArray,
-    faulty: FloatArray,
-    until: int,
+def _log_likelihood(
+    pipeline: Pipeline, recording: Recording, healthy: FloatArray, faulty: FloatArray, until: int
 ) -> FloatArray:
     """Return the logarithm of the likelihood of a change at each of the samples up to `until`, but for a constant."""
     # u itself changes at once, where u_a of stage 1 has to learn the change first
     single = replace(pipeline, stage_one=None)
     g = single.regression(recording.r, recording.u, recording.y, recording.restart)
     used = np.flatnonzero(g.ok)
-    phi = g.phi[used]
-    changed = phi @ (faulty - healthy)
-    noise = tuning.noise.autoregression()  # a short memory: what surrounds each candidate is computed anew
-    costs = _change_costs(g.eta[used] - phi @ healthy, changed, noise.a, _onset_of_filters(pipeline))
-    scale = 2.0 * noise.variance * max(1.0, power)
+    phi, ramp = g.phi[used], _onset_of_filters(pipeline)
+    v, changed = g.eta[used] - phi @ healthy, phi @ (faulty - healthy)
+    score = _sums_after(v * changed, ramp)
+    information = np.maximum(_sums_after(changed**2, ramp**2), np.finfo(np.float64).tiny)
+    size = np.maximum(score, 0.0) / information
     # a change between two updates shows at the later one
     at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
-    return np.asarray(-costs[at_update] / scale)
+    gained = size * score
+    best = at_update[int(np.argmax(gained[at_update]))]
+    e = v - size[best] * changed * np.concatenate([np.zeros(best), ramp, np.ones(len(v))])[: len(v)]
+    variance = float(e @ e) / len(e) * long_run_inflation(e * changed, len(ramp))
+    return np.asarray(gained[at_update] / (2.0 * variance))
 
 
 def _onset_of_filters(pipeline: Pipeline) -> FloatArray:
@@ -202,32 +192,8 @@ def _onset_of_filters(pipeline: Pipeline) -> FloatArray:
     return np.asarray(np.clip(share, 0.0, 1.0))
 
 
-def _change_costs(v: FloatArray, changed: FloatArray, a: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return the sum of squared innovations for a change at each update, shape (N,).
-
-    The residual under a change at i is v(k) - ramp(k - i) changed(k): v before, v - changed once the filters have
-    settled, and in between the share of the change that they have let through.
-    """
-    N, p, W = len(v), len(a), len(ramp)
-    before, after = (_whiten_ar(each, a) ** 2 for each in (v, v - changed))
-    sum_before = np.concatenate([[0.0], np.cumsum(before)])
-    sum_after = np.concatenate([[0.0], np.cumsum(after)])
-    span = W + p  # updates whose innovation mixes the two
-    padded_v = np.concatenate([np.zeros(p), v, np.zeros(span)])
-    padded_changed = np.concatenate([np.zeros(p), changed, np.zeros(span)])
-    share = np.concatenate([np.zeros(p), ramp, np.ones(p)])
-    windows = np.lib.stride_tricks.sliding_window_view
-    residual = windows(padded_v, p + span)[:N] - share * windows(padded_changed, p + span)[:N]
-    white = residual[:, p:].copy()
-    for lag, weight in enumerate(a, start=1):
-        white -= weight * residual[:, p - lag : p - lag + span]
-    inside = np.arange(N)[:, None] + np.arange(span) < N
-    end = np.minimum(np.arange(N) + span, N)
-    return np.asarray(sum_before[:N] + (white**2 * inside).sum(axis=1) + sum_after[N] - sum_after[end])
-
-
-def _whiten_ar(v: FloatArray, a: FloatArray) -> FloatArray:
-    white = v.copy()
-    for lag, weight in enumerate(a, start=1):
-        white[lag:] -= weight * v[:-lag]
-    return white
+def _sums_after(x: FloatArray, ramp: FloatArray) -> FloatArray:
+    """Return for each update i the sum of x(k) ramp(k - i) over k >= i, shape (N,); behind its end the ramp is 1."""
+    N, W = len(x), len(ramp)
+    after = np.concatenate([np.cumsum(x[::-1])[::-1], np.zeros(W + 1)])[W : W + N]
+    return np.asarray(np.correlate(np.concatenate([x, np.zeros(W - 1)]), ramp, "valid") + after)

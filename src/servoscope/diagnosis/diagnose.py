@@ -328,9 +328,7 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
     progress("onset")
     onset = estimate_onset(
         exam.pipeline,
-        exam.tuning,
         exam.recording,
-        exam.estimates,
         exam.expected[at],
         exam.estimates.theta[at],
         sample,

@@ -12,7 +12,7 @@ from servoscope.detection.chi2_test import Onset
 from servoscope.diagnosis.batch_estimate import estimate_batch_deviation
 from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.instrument import InstrumentTuning, instrument_model
-from servoscope.estimation.noise_model import sample_autocovariance
+from servoscope.estimation.noise_model import long_run_inflation
 from servoscope.models.lti import LinearSystem
 
 REACH = 6.0  # memories before the alarm, among which the onset is looked for
@@ -66,7 +66,7 @@ def _onset_by_output(
     settling = min(_transient(healthy), len(cost) - 1)
     variance = float(np.mean(before[settling : max(len(cost) // 2, settling + LAGS)] ** 2))
     cost = cost[settling:]
-    weight = np.exp(-(cost - cost.min()) / (2.0 * variance * _inflation(after[-LONGEST:])))
+    weight = np.exp(-(cost - cost.min()) / (2.0 * variance * long_run_inflation(after[-LONGEST:], LAGS)))
     share = np.cumsum(weight) / weight.sum()
     if begin + settling > 0 and share[min(LAGS, len(share) - 1)] > EDGE:
         return None
@@ -110,9 +110,3 @@ def _switch_costs(before: FloatArray, after: FloatArray, apart: FloatArray, chan
         error = np.where(inside, windows[k] - apart[k] @ decay.T, 0.0)
         cost[k] = sums[0][k] + (error**2).sum(axis=1) + sums[1][N] - sums[1][np.minimum(k + W, N)]
     return cost
-
-
-def _inflation(error: FloatArray) -> float:
-    """Return the long-run variance of an error over its variance, at least 1."""
-    gamma = sample_autocovariance([error - error.mean()], LAGS)
-    return max(1.0, float(1.0 + 2.0 * (gamma[1:] / gamma[0] * (1.0 - np.arange(1, LAGS + 1) / (LAGS + 1.0))).sum()))

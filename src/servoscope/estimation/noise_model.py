@@ -113,6 +113,14 @@ def sample_autocovariance(runs: Sequence[FloatArray], lags: int) -> FloatArray:
     return np.array(products) / total
 
 
+def long_run_inflation(x: FloatArray, lags: int) -> float:
+    """Return the long-run variance of a signal over its variance, at least 1 (Newey and West, 1987)."""
+    lags = min(lags, len(x) - 1)
+    gamma = sample_autocovariance([x - x.mean()], lags)
+    weight = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
+    return max(1.0, 1.0 + 2.0 * float(gamma[1:] @ weight) / max(float(gamma[0]), np.finfo(np.float64).tiny))
+
+
 def largest_autocorrelation(e: FloatArray, lags: int) -> float:
     """Return the largest autocorrelation of innovations (N,) at lags 1 ... lags, without its sign."""
     gamma = sample_autocovariance([e], lags)

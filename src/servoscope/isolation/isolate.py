@@ -173,9 +173,8 @@ class _SignatureSearch:
         log_weight = -(J + logdet) / 2.0
         posterior = Posterior.from_log_density(x, log_weight)
         low, high = posterior.interval
-        low, high = (
-            best - np.hypot(best - low, 1.96 * signature.healthy_std),
-            best + np.hypot(high - best, 1.96 * signature.healthy_std),
-        )
+        # a size is relative to the healthy value: its error is that of the change, and a small change's is small
+        vague = 1.96 * signature.healthy_std * min(float(np.expm1(abs(best))), 1.0)
+        low, high = best - np.hypot(best - low, vague), best + np.hypot(high - best, vague)
         evidence = posterior.log_area - float(np.log(signature.high - signature.low))
         return _SignatureFit(signature, self.cache[best][0], evidence, best, float(low), float(high), self.cosine(best))

@@ -18,6 +18,7 @@ UNSEEN = 3.0  # standard deviations below which a size is as good as none
 REACH = 5.0  # standard deviations of the size over which its likelihood is integrated
 POINTS = 31
 AT_BOUND = 1e-6
+EPSILON = float(np.finfo(np.float64).eps)
 IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
 
 
@@ -106,7 +107,8 @@ def fit_hypothesis(
                 x_scale="jac",
                 ftol=1e-7 if free else 1e-4,
                 xtol=1e-7 if free else 1e-4,
-                gtol=None,
+                # only where nothing shows at all: the search divides by the length of a gradient that is zero
+                gtol=EPSILON,
                 max_nfev=STEPS,
             )
         except ValueError as error:  # residuals that are no numbers
