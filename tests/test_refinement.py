@@ -15,7 +15,7 @@ from servoscope.detection.baseline import ExactPredictorFit
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml import RefitResult, find_other_causes, fit_hypotheses
 from servoscope.isolation.ml.hypothesis import SizePrior, fit_hypothesis
-from servoscope.isolation.ml.onset import STEP, _ChangeCosts
+from servoscope.isolation.ml.onset import STEP, ChangeCosts
 from servoscope.isolation.ml.validity import fit_exact_predictor
 from servoscope.isolation.ml.window import SENSOR_GAIN, ChangeProfile, RefitWindow, plant_input
 from servoscope.models.discretise import discretise
@@ -152,7 +152,7 @@ def test_the_sweep_is_what_whole_passes_give(window: RefitWindow, names: tuple[s
     faults = [fault for fault in window.plant.faults if fault.parameter in names]
     x = np.full(len(names), 0.1)
     found = fit_hypothesis(window, faults, ChangeProfile(2000), np.zeros(4), [x], free=True)
-    table = _ChangeCosts(window, found, 1.0)
+    table = ChangeCosts(window, found, 1.0)
     Q, _ = np.linalg.qr(window.jacobian(np.concatenate([found.d, found.x]), names, found.profile, slice(4)))
     for onsets, overs in (([1500, 1990, 2000, 2500], [0] * 4), ([1500, 1900], [300, 40])):
         got, _ = table.costs(np.array(onsets), np.array(overs))

@@ -20,7 +20,7 @@ TRUE = WhiteNoise(u_std=NOISE_U_STD, y_std=NOISE_Y_STD)
 def known(recording: ss.Recording, plant: Plant, noise: WhiteNoise = TRUE) -> RefitWindow:
     """Return all of a recording as the refit sees it that knows plant and noise exactly."""
     bench, nothing = PredictorFactory.from_input(loop(), noise, recording.u), np.zeros((0, 0))
-    return RefitWindow(bench, plant, nothing, (), 0, recording.u, recording.y, recording.restart)
+    return RefitWindow(plant, nothing, (), 0, recording.u, recording.y, recording.restart, bench)
 
 
 def innovations(recording: ss.Recording, plant: Plant, noise: WhiteNoise = TRUE) -> FloatArray:

@@ -25,6 +25,7 @@ from servoscope.core.errors import BaselineError, LoopError
 from servoscope.core.files import atomic_write
 from servoscope.core.messages import MessageText
 from servoscope.core.short_repr import ShortRepr
+from servoscope.detection.axis_model import AxisModel
 from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, worst_case_hypotheses
 from servoscope.detection.expectation import Expectation
 from servoscope.detection.feature_model import FeatureModel
@@ -122,6 +123,8 @@ class Baseline(ShortRepr, _BaselineModel):
         of its limit when learned without it. None and empty where there are fewer than four recordings.
     motion
         The motion that the recordings hold; None in baselines of earlier versions, and where they are very short.
+    axis
+        The healthy motor axis that the refit starts from; None for other kinds of plants.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -165,6 +168,7 @@ class Baseline(ShortRepr, _BaselineModel):
     features: FeatureModel | None = None
     left_out: Vector = ()
     motion: MotionRange | None = None
+    axis: AxisModel | None = None
     point: str = ""
     others: tuple[Baseline, ...] = ()
 
@@ -200,11 +204,9 @@ class Baseline(ShortRepr, _BaselineModel):
 
     @model_serializer(mode="wrap")
     def _without_nothing(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave the motion out where there is none: a baseline of an earlier version is written as it was."""
+        """Leave out what earlier versions did not know, where there is none: their files are written as they were."""
         fields: dict[str, Any] = write(self)
-        if self.motion is None:
-            fields.pop("motion", None)
-        return fields
+        return {name: value for name, value in fields.items() if value is not None or name not in ("motion", "axis")}
 
     @cached_property
     def loop(self) -> Loop:

@@ -266,8 +266,11 @@ def _explain_alarm(
     recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
     progress("refit")
     last = int(exam.estimates.index[alarm.evaluation])
-    # the refit takes the model for exact
-    seen = (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
+    # the refit takes the model for exact, but that of an axis follows the recording
+    seen = (
+        exam.change is not None
+        or (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
+    )
     refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
         several = trace_timeline(exam, refined, alarm.onset, recursive, SURE, lambda: progress("refit"))
@@ -326,6 +329,9 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
     # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
     at = exam.evaluations - 1 if exam.alarm[-1] else first + int(np.argmax(exam.statistic[first:]))
     progress("onset")
+    if (change := exam.change) is not None:
+        t = exam.recording.t
+        return RecordingAlarm(change.detected, at, Onset(*(float(t[change.onset]),) * 3, change.onset))
     onset = estimate_onset(
         exam.pipeline,
         exam.recording,

@@ -28,6 +28,7 @@ from servoscope.detection.trace import Statistic, any_exceeded, detection_statis
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, RegressionRunner, Tuning
+from servoscope.isolation.ml.axis_scan import AxisChange
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 from servoscope.simulation import closed_loop_poles
@@ -56,6 +57,7 @@ class Examination:
     statistic: FloatArray  # T^2, shape (K,)
     skipped_share: float  # share of the updates that the estimator's guard skipped
     noise_growth: float  # of the noise's variance against the baseline's
+    change: AxisChange | None = None  # within the recording, where it is one of a motor axis
     replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
 
     @classmethod
@@ -79,7 +81,12 @@ class Examination:
         growth = 1.0 if exam.noise is None else _noise_growth(exam.pipeline, exam.estimates)
         if growth > 1.0:  # it shifts the expectation, and the sequential test would take it for steps of a change
             exam = _run_recursion(baseline, recording, exam.pipeline, growth)
-        return replace(exam, skipped_share=skipped, replaced=replaced)
+        change = None
+        if baseline.axis is not None:
+            from servoscope.isolation.ml.axis_scan import find_axis_change
+
+            change = find_axis_change(baseline, recording)
+        return replace(exam, skipped_share=skipped, replaced=replaced, change=change)
 
     @property
     def evaluations(self) -> int:
@@ -118,7 +125,14 @@ class Examination:
     @cached_property
     def apparent_alarm(self) -> npt.NDArray[np.bool_]:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
-        return apply_alarm_delays(any_exceeded(self._of_coefficients), *self.pipeline.delays)
+        return self._changed | apply_alarm_delays(any_exceeded(self._of_coefficients), *self.pipeline.delays)
+
+    @property
+    def _changed(self) -> npt.NDArray[np.bool_]:
+        """Whether a change within the recording had been detected, shape (K,)."""
+        found = self.estimates.index >= (self.recording.samples if self.change is None else self.change.detected)
+        found[-1:] |= self.change is not None  # it may be detected after the last evaluation
+        return np.asarray(found)
 
     @cached_property
     def alarm(self) -> npt.NDArray[np.bool_]:
@@ -132,7 +146,8 @@ class Examination:
             T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
             # the sequential test knows no model error
             exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN))
-        return apply_alarm_delays(exceeded & any_exceeded(self._of_coefficients), *self.pipeline.delays)
+        exceeded &= any_exceeded(self._of_coefficients)
+        return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
     @cached_property
     def motion(self) -> RecordedMotion | None:

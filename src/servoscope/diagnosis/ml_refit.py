@@ -26,13 +26,14 @@ def refit_recording(
     exam: Examination, onset: Onset, alarm: int, last: int, progress: Callable[[], None]
 ) -> RefitResult | None:
     """Refit the seconds around an onset; None where the exact predictor does not even explain healthy recordings."""
-    exact = exam.baseline.exact
-    if exact is None or exact.misfit > 1.0:
+    exact, axis = exam.baseline.exact, exam.baseline.axis
+    if axis is None and (exact is None or exact.misfit > 1.0):
         return None
     from servoscope.isolation.ml import MAX_WINDOW_SAMPLES, fit_hypotheses
 
-    begin = max(onset.sample - MAX_WINDOW_SAMPLES, 0)
-    near = exam.recording.rows(slice(begin, onset.sample + MAX_WINDOW_SAMPLES))
+    most = MAX_WINDOW_SAMPLES * (1 if axis is None else axis.stride)
+    begin = max(onset.sample - most, 0)
+    near = exam.recording.rows(slice(begin, onset.sample + most))
     found = fit_hypotheses(exam.baseline, near, onset.sample - begin, alarm - begin, last - begin, progress)
     return replace(found, window=replace(found.window, first_sample=found.window.first_sample + begin))
 
@@ -52,11 +53,12 @@ def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:
 
 def refit_onset(refined: RefitResult, exam: Examination) -> Onset:
     """Return the onset in the recording's time."""
-    t, first, onset = exam.recording.t, refined.window.first_sample, refined.onset
+    t, first, onset, stride = exam.recording.t, refined.window.first_sample, refined.onset, refined.window.stride
     last = len(t) - 1
-    low, likely, high = (min(first + k, last) for k in (onset.low, onset.profile.onset, onset.high))
+    low, likely, high = (min(first + k * stride, last) for k in (onset.low, onset.profile.onset, onset.high))
+    high = min(high + stride - 1, last)  # it may come anywhere within a sample of the window
     # the first changed sample ends the interval in which the change came
-    return Onset(float(t[max(low - 1, 0)]), float(t[likely]), float(t[high]), likely)
+    return Onset(float(t[max(low - stride, 0)]), float(t[likely]), float(t[high]), likely)
 
 
 def summarise_refit(
@@ -71,8 +73,8 @@ def summarise_refit(
     units = {"of y": of_y or "in units of y", "of u": of_u or "in units of u"}
     return RefitSummary(
         from_s=float(t[first + window.first_sample]),
-        to_s=float(t[first + window.first_sample + window.samples - 1]),
-        over_s=over / exam.recording.sample_rate if over > refined.onset.high - refined.onset.low else 0.0,
+        to_s=float(t[first + window.first_sample + (window.samples - 1) * window.stride]),
+        over_s=over / window.sample_rate if over > refined.onset.high - refined.onset.low else 0.0,
         noise=float(np.sqrt(refined.noise_variance)),
         misfit=refined.goodness.statistic,
         limit=refined.goodness.limit,

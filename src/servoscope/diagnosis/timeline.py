@@ -35,6 +35,8 @@ def trace_timeline(
     from servoscope.isolation.ml import MAX_WINDOW_SAMPLES, find_timeline, is_constant
     from servoscope.isolation.ml.window import RefitWindow
 
+    if exam.baseline.axis is not None:  # its search knows linear plants only
+        return ()
     explained = not refined.is_unknown and refined.goodness.statistic <= refined.goodness.limit
     lasts = bool(exam.alarm[-1]) and not refined.onset.profile.duration  # a drift may be steps
     if explained and lasts and is_constant(refined):

@@ -170,6 +170,7 @@ class Pipeline:
             velocity=bank.velocity,
             v_of_r=bank.velocity_of_reference,
             codes=tuple(EXTRA_COLUMNS.index(extra) for extra in bank.extras),
+            shapes=tuple(x for extra in bank.extras for x in loop.plant.column_shapes.get(extra, ())),
             limits=(-np.inf, np.inf) if unlimited else (loop.input_limits or (-np.inf, np.inf)),
             deadzone=dead,
             sign_speed=float(getattr(loop.plant, "sign_speed", 0.0)),

@@ -56,10 +56,10 @@ class RecursionConstants(NamedTuple):
     off and the rest divided by `basis` (n, n). With `steady` they are chosen so that P_d is the identity, and P stays
     there. `theta` is the baseline's in these coordinates, `origin` the same in physical units.
 
-    `bank` and `velocity` are filters, `codes` the non-linear inputs, `limits` and `deadzone` of u; `a` (lags,) and
-    `heads` (lags,) are the noise's model as `moments.propagate_covariance` takes it, `variance` that of v, in updates:
-    of every `stride`-th sample; `extra` is the size of the estimator's private state, and `watch` is the sequential
-    test.
+    `bank` and `velocity` are filters, `codes` the non-linear inputs, `shapes` two numbers for each with a shape,
+    `limits` and `deadzone` of u; `a` (lags,) and `heads` (lags,) are the noise's model as
+    `moments.propagate_covariance` takes it, `variance` that of v, in updates: of every `stride`-th sample; `extra` is
+    the size of the estimator's private state, and `watch` is the sequential test.
     """
 
     estimator: str
@@ -68,6 +68,7 @@ class RecursionConstants(NamedTuple):
     velocity: LinearSystem
     v_of_r: bool
     codes: tuple[int, ...]
+    shapes: tuple[float, ...]
     limits: tuple[float, float]
     deadzone: tuple[float, float]
     sign_speed: float
@@ -306,7 +307,12 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
             **{"velocity": 11, "bank": entries[0], "steady": len(first.bank.A) * first.bank.B.shape[1]},
             **{"P_d": 0 if first.steady else n * n, "noise": 1 + 2 * lags, "shadow": entries[1], "shadow_steady": nxs},
             **{"apart": n, "white": 1 + 2 * memory, "prior": 0 if start else n * n, "origin": 0 if start else n},
-            **{"basis": 0 if start else n * n, "rate": 0 if start else 1, "response": frequencies * 2 * (n + 1)},
+            **{
+                "basis": 0 if start else n * n,
+                "rate": 0 if start else 1,
+                "response": frequencies * 2 * (n + 1),
+                "shapes": len(first.shapes),
+            },
         }
     )
     sizes = KernelSizes(
@@ -366,6 +372,6 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
             *([float(x) for x in (*counts, *gates, c.memory, 1.0 / c.memory, c.R, test.warm if test else 0)],),
             *(v.A.ravel(), v.B[:, 0], v.C[0], v.D[0], v.steady[:, 0]),
             *(pack_coefficients(spec.bank, c.bank), c.bank.steady.ravel(), np.zeros(0) if c.steady else c.P_d.ravel()),
-            *([c.variance], pad(c.a, lags), pad(c.heads, lags), shadow, *evaluation, members.ravel()),
+            *([c.variance], pad(c.a, lags), pad(c.heads, lags), shadow, *evaluation, c.shapes, members.ravel()),
         ]
     )

@@ -11,6 +11,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
+from servoscope.detection.axis_model import AxisModel
 from servoscope.detection.baseline import Baseline, BaselineSource, digest
 from servoscope.detection.cusum_design import CusumHypothesis
 from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system
@@ -34,6 +35,7 @@ from servoscope.estimation.noise_model import AR_ORDER, fit_white_noise, sample_
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, fit_tuning, prefers_white_noise
 from servoscope.isolation.ml.validity import fit_exact_predictor
+from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.delay import check_delay
 from servoscope.learning.detectability import (
     WORTH_A_LOOK,
@@ -46,6 +48,7 @@ from servoscope.learning.features import learn_features
 from servoscope.learning.innovation_fit import FILE_ERROR, fit_innovations
 from servoscope.learning.instrument import learn_instrument, learns_instrument
 from servoscope.models.loop import Loop
+from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 from servoscope.simulation import reference, simulate
 
@@ -245,6 +248,12 @@ def _assemble_baseline(
                     notes += warnings
             if healthy.misfit > 10.0 * pipeline.bank.n:
                 notes.append(message("learning.physics_misfit", misfit=healthy.misfit, expected=pipeline.bank.n))
+    axis: AxisModel | None = None
+    if isinstance(loop.plant, AxisPlant):
+        axis, warnings = fit_axis(loop, recordings)
+        notes += warnings
+        if axis is not None:  # scatter between recordings; a change within one is told from its own past
+            error += np.diag(axis.scatter(pipeline.bank.names) ** 2)
     between = scatter(deviations_between, fit.each_covariance)
     outliers = find_outliers(deviations_between, fit.each_covariance + error)
     notes += describe_outliers(outliers, [rec.name for rec in recordings], pipeline.bank.names)
@@ -315,6 +324,7 @@ def _assemble_baseline(
         features=features,
         left_out=tuple(left_out),
         motion=learn_motion(pipeline, recordings),
+        axis=axis,
     )
     progress("predictor")
     predictor = fit_exact_predictor(baseline, recordings)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from servoscope.core.jit.symbolic import Bool, dot, fma, maximum, minimum, sqrt, tril_index, where
+from servoscope.core.jit.symbolic import Bool, dot, fma, maximum, minimum, sine, sqrt, tril_index, where
 from servoscope.core.jit.template import specialise
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "minimum",
     "on_compilation",
     "prefetch",
+    "sine",
     "specialise",
     "sqrt",
     "stack_array",

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from servoscope.core.jit import Bool, dot, fma, maximum, minimum, where
+from servoscope.core.jit import Bool, dot, fma, maximum, minimum, sine, where
 from servoscope.estimation.kernel import sparse_lti
 from servoscope.estimation.kernel.cusum import CLIP, LAGS, update_cusum, whiten_sample
 from servoscope.estimation.kernel.sparse_lti import SparsityPattern
@@ -260,15 +260,25 @@ class SampleSteps:
 
     def _inputs(self, c: Any, r: Any, u: Any, y: Any, speed: Any) -> list[Any]:
         """Return the bank's inputs: r, u within its limits, y, and the columns of friction and offset."""
-        w = [r, minimum(maximum(u, c[self.at.low]), c[self.at.high]), y]
+        w, shaped = [r, minimum(maximum(u, c[self.at.low]), c[self.at.high]), y], 0
         for kind in self.size.codes:
             if kind == 0:
                 w.append(where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0)))
             elif kind < 3:
                 w.append(maximum(speed, 0.0) if kind == 1 else minimum(speed, 0.0))
-            else:
+            elif kind == 3:
                 w.append(1.0)
+            else:
+                w.append(self._shaped_input(c, self.at.shapes + 2 * shaped, kind, y, speed))
+                shaped += 1
         return w
+
+    def _shaped_input(self, c: Any, k: int, kind: int, y: Any, speed: Any) -> Any:
+        """Return Stribeck friction at a speed scaled by c[k], or the sine of y scaled by c[k] and moved by c[k + 1]."""
+        if kind == 4:
+            slow = c[k] * speed
+            return where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0)) / fma(slow, slow, 1.0)
+        return sine(fma(c[k], y, c[k + 1]))
 
     def _mean_square(self, c: Any, s: Any, residual: Any) -> Any:
         return fma(fma(residual, residual, -s[self.to.power]), c[self.at.share], s[self.to.power])

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.estimation.tuning import sum_covariance
 from servoscope.isolation.ml.least_squares import normalise_columns, orthonormal_basis
-from servoscope.isolation.ml.predictor import Predictor
-from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 
-LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
 MISFIT = 1e-3  # probability with which a true hypothesis may fit worse than the limit
-SYSTEMATIC = 2e-3  # share of a change that nominal parameters may be off by
 
 
 @dataclass(frozen=True)
@@ -28,33 +27,29 @@ class GoodnessOfFit:
 
 
 def misspecification_columns(
-    window: RefitWindow, predictor: Predictor, profile: ChangeProfile, where: BoolArray
+    window: ChangeWindow, predictor: Any, profile: ChangeProfile, where: BoolArray
 ) -> FloatArray:
     """Return what wrong models leave in the innovations, shape (N, q).
 
-    Missed dynamics: u and y of the last samples, as additions to y; backlash: the sign of y', added to y; Coulomb
-    friction: the same, added to u; offsets of both. `where` (N,) are the samples from which they count.
+    The window's `unmodelled_signals`; `where` (N,) are the samples from which they count.
     """
-    u, y = window.u, window.y
-    moving = np.sign(_speed(y))
     nothing = np.zeros(window.samples)
-    to_y = [_later(x, lag) for x in (u, y) for lag in range(1, LAGS + 1)] + [_later(moving, 1), np.ones(window.samples)]
-    to_u = [_later(moving, 1), np.ones(window.samples)]
+    to_y, to_u = window.unmodelled_signals()
     columns = [window.disturbance_response(predictor, profile, nothing, column * where) for column in to_y]
     columns += [window.disturbance_response(predictor, profile, column * where, nothing) for column in to_u]
     return np.array(columns).T
 
 
 def score_test(
-    Z: FloatArray, jacobian: FloatArray, residual: FloatArray, noise_variance: float, shift: float
+    Z: FloatArray, jacobian: FloatArray, residual: FloatArray, noise_variance: float, shift: float, coloured: int = 0
 ) -> GoodnessOfFit:
     """Test whether columns Z (N, q) explain part of a residual that the unknowns of the fit do not.
 
     Score test (Rao, 1948): both are projected off the Jacobian (N + m, k) first.
 
     `Z, jacobian, residual`: columns, and the least-squares problem at its end; the last rows of the latter are the
-    prior's; `shift`: root of the sum of squares that the change adds to healthy innovations: a share of it may be
-    left.
+    prior's; `shift`: root of the sum of squares that may be left, because nominal parameters are a little off;
+    `coloured`: samples over which the residual of a true hypothesis hangs together, 0 where it is white.
     """
     from scipy import special
 
@@ -64,15 +59,11 @@ def score_test(
     own = orthonormal_basis(Z - Q @ (Q.T @ Z))
     dof = own.shape[1]
     left = residual - Q @ (Q.T @ residual)
-    statistic = float(((own.T @ left) ** 2).sum()) / noise_variance
-    limit = float(special.chdtri(max(dof, 1), MISFIT)) + (SYSTEMATIC * shift) ** 2 / noise_variance
+    scores = own * left[:, None]
+    if coloured and dof:  # their long-run covariance (Newey and West, 1987)
+        total = scores.sum(axis=0)
+        statistic = float(total @ np.linalg.solve(sum_covariance(scores, coloured), total))
+    else:
+        statistic = float((scores.sum(axis=0) ** 2).sum()) / noise_variance
+    limit = float(special.chdtri(max(dof, 1), MISFIT)) + shift**2 / noise_variance
     return GoodnessOfFit(statistic, dof, limit)
-
-
-def _later(x: FloatArray, samples: int) -> FloatArray:
-    return np.concatenate([np.full(samples, x[0]), x[:-samples]])
-
-
-def _speed(y: FloatArray, over: int = 5) -> FloatArray:
-    """Return the difference over a few samples, so that noise does not decide its sign as long as there is motion."""
-    return np.concatenate([np.zeros(over), y[over:] - y[:-over]])

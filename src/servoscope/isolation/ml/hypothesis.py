@@ -9,7 +9,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.isolation.ml.least_squares import explained_sum_of_squares, last_unknown_std
-from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 from servoscope.isolation.posterior import Posterior
 from servoscope.models.plants import Fault
 
@@ -63,7 +63,7 @@ def log_ratio_bounds(faults: Sequence[Fault]) -> tuple[FloatArray, FloatArray]:
 
 
 def fit_hypothesis(
-    window: RefitWindow,
+    window: ChangeWindow,
     faults: Sequence[Fault],
     profile: ChangeProfile,
     d: FloatArray,
@@ -124,7 +124,7 @@ def fit_hypothesis(
 
 
 def refit_contenders_jointly(
-    window: RefitWindow, fitted: Sequence[HypothesisFit], noise_variance: float, J: float = np.inf
+    window: ChangeWindow, fitted: Sequence[HypothesisFit], noise_variance: float, J: float = np.inf
 ) -> list[HypothesisFit]:
     """Let the healthy parameters follow wherever that may bring a hypothesis within reach of the best one.
 
@@ -138,7 +138,7 @@ def refit_contenders_jointly(
     return [refit_jointly(window, f) if limit >= promise else f for f, promise in zip(fitted, promised, strict=True)]
 
 
-def refit_jointly(window: RefitWindow, fitted: HypothesisFit) -> HypothesisFit:
+def refit_jointly(window: ChangeWindow, fitted: HypothesisFit) -> HypothesisFit:
     """Return a hypothesis whose healthy parameters followed too."""
     return fit_hypothesis(window, fitted.faults, fitted.profile, fitted.d, [fitted.x], free=True)
 
@@ -156,7 +156,7 @@ class SizePrior:
     noise_floor: float
 
     @classmethod
-    def from_window(cls, window: RefitWindow, fault: Fault, profile: ChangeProfile) -> SizePrior:
+    def from_window(cls, window: ChangeWindow, fault: Fault, profile: ChangeProfile) -> SizePrior:
         """Measure by the information that the window holds about a small change."""
         m = window.nuisance_count
         J = window.jacobian(np.zeros(m + 1), (fault.parameter,), profile)
@@ -187,7 +187,7 @@ class HypothesisEvidence:
 
 
 def integrate_evidence(
-    window: RefitWindow, found: HypothesisFit, scales: Sequence[SizePrior], noise_variance: float
+    window: ChangeWindow, found: HypothesisFit, scales: Sequence[SizePrior], noise_variance: float
 ) -> HypothesisEvidence:
     """Integrate likelihood times prior over the sizes.
 
@@ -209,7 +209,7 @@ def integrate_evidence(
 
 
 def _evidence_along_size(
-    window: RefitWindow, found: HypothesisFit, scale: SizePrior, noise_variance: float, volume: float
+    window: ChangeWindow, found: HypothesisFit, scale: SizePrior, noise_variance: float, volume: float
 ) -> HypothesisEvidence:
     m = window.nuisance_count
     (low,), (high,) = log_ratio_bounds(found.faults)

@@ -9,11 +9,9 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.isolation.ml.hypothesis import HypothesisFit
-from servoscope.isolation.ml.predictor import Predictor
-from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
-FORGOTTEN = 1e-3  # share of its state from before a change that a predictor may still hold
 SHORTEST_S = 0.2  # of a drift that is not called a step
 STEPLIKE = 0.5  # probability of a step, before anything is known
 STEPS = 400  # onsets of a step that are tried at first, at most
@@ -52,14 +50,14 @@ class _ChangeGrid:
 
 
 def onset_posterior(
-    window: RefitWindow, fit: HypothesisFit, latest: int, noise_variance: float, drifts: bool = True
+    window: ChangeWindow, fit: HypothesisFit, latest: int, noise_variance: float, drifts: bool = True
 ) -> OnsetEstimate:
     """Find when a change began, as a step or as a drift.
 
     The likelihood of each onset and duration has the sizes and the healthy parameters at their best, by one step of
     Gauss and Newton from where they are.
     """
-    table = _ChangeCosts(window, fit, noise_variance)
+    table = ChangeCosts(window, fit, noise_variance)
     grids = [_step_grid(table, latest, noise_variance)]
     drifting = _ramp_grid(table, latest, noise_variance) if drifts else None
     if drifting is not None:
@@ -86,7 +84,7 @@ def onset_posterior(
     )
 
 
-def _step_grid(table: _ChangeCosts, latest: int, noise_variance: float) -> _ChangeGrid:
+def _step_grid(table: ChangeCosts, latest: int, noise_variance: float) -> _ChangeGrid:
     """Try steps everywhere, and at every sample where they are likely."""
     apart = max(1, latest // STEPS)
     onsets = np.arange(0, latest + 1, apart)
@@ -101,12 +99,12 @@ def _step_grid(table: _ChangeCosts, latest: int, noise_variance: float) -> _Chan
     return _ChangeGrid(onsets, np.zeros_like(onsets), cost, np.full(len(onsets), STEPLIKE), moved)
 
 
-def _ramp_grid(table: _ChangeCosts, latest: int, noise_variance: float) -> _ChangeGrid | None:
+def _ramp_grid(table: ChangeCosts, latest: int, noise_variance: float) -> _ChangeGrid | None:
     """Try drifts of all durations, then ever closer to what is likely; None where the window is too short for one.
 
     The middle of a drift is known better than its ends, so looks are laid out by middle and duration.
     """
-    shortest, longest = SHORTEST_S * table.window.factory.loop.sample_rate, table.window.samples - 1
+    shortest, longest = SHORTEST_S * table.window.sample_rate, table.window.samples - 1
     if longest <= 2.0 * shortest:
         return None
     count = int(np.ceil(np.log(longest / shortest) / np.log(RATIO))) + 1
@@ -157,10 +155,10 @@ def _negligible_cost(noise_variance: float) -> float:
     return 2.0 * float(np.log(1.0 / NEGLIGIBLE)) * noise_variance
 
 
-class _ChangeCosts:
+class ChangeCosts:
     """Smallest sums of squares by onset and duration."""
 
-    def __init__(self, window: RefitWindow, fit: HypothesisFit, noise_variance: float) -> None:
+    def __init__(self, window: ChangeWindow, fit: HypothesisFit, noise_variance: float) -> None:
         self.window, self.noise_variance = window, noise_variance
         # the healthy parameters' share of everything, prior included, is taken out once and for all
         z = np.concatenate([fit.d, fit.x])
@@ -171,27 +169,15 @@ class _ChangeCosts:
             prior @ prior,
             prior @ Q[window.samples :],
         )
-        sizes = [fit.x, *(fit.x + STEP * e for e in np.eye(len(fit.x)))]
-        drifting = [window.predictor(fit.d, fit.names, x, ChangeProfile(0, 1)) for x in sizes]
-        self.drifting = Predictor(*(np.stack(parts) for parts in zip(*drifting, strict=True)))
-        self.stepping = Predictor(*(np.ascontiguousarray(part[:, [0, -1]]) for part in self.drifting))
-        A, K, c = self.stepping.A[0], self.stepping.K[0, :, -1], self.stepping.c[0]
-        slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
-        self.settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), window.samples)
+        self.sums = window.change_sums(fit.d, fit.names, fit.x, STEP, self.Q)
 
     def costs(self, onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the smallest cost of each change, (M,), and by how much it moves the sizes, (M, k).
 
         All changes are steps, or all are drifts.
         """
-        from servoscope.isolation.ml.kernels import sum_over_onsets
-
-        window = self.window
-        parts = self.drifting if overs.any() else self.stepping
-        sums, volume = sum_over_onsets(
-            *parts, STEP, onsets, overs, self.settle, window.u, window.y, window.restart, self.Q
-        )
-        V = len(parts.A)
+        sums, volume = self.sums(onsets, overs)
+        V = sums.shape[1]
         in_e = sums[:, 0, V:] + self.inside
         in_J = sums[:, 1:V, V:]
         g = sums[:, 0, 1:V] - np.einsum("ikm,im->ik", in_J, in_e)

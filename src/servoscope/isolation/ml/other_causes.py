@@ -9,13 +9,12 @@ import numpy as np
 
 from servoscope.core.messages import Message, message, text_message
 from servoscope.isolation.ml.backlash import fit_backlash
-from servoscope.isolation.ml.goodness_of_fit import LAGS, misspecification_columns
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.least_squares import minimise_from_grid, solve_least_squares
 from servoscope.isolation.ml.predictor import Predictor
 from servoscope.isolation.ml.search import RefitResult
 from servoscope.isolation.ml.start_values import fit_further_parameters
-from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow, delayed, speed_sign
 
 AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
 NEARLY_ALL = 0.95  # of what the healthy plant does not explain
@@ -73,21 +72,26 @@ def _ratio(other: HypothesisFit) -> OtherCause:
     return OtherCause(fault.name, text_message(fault.words), float(np.exp(other.x[0])), "ratio", other.cost)
 
 
-def _additive_causes(window: RefitWindow, profile: ChangeProfile, healthy: HypothesisFit) -> Iterator[OtherCause]:
+def _additive_causes(window: ChangeWindow, profile: ChangeProfile, healthy: HypothesisFit) -> Iterator[OtherCause]:
     """Try what is no parameter: a later input, backlash, Coulomb friction, offsets."""
-    yield _delay_cause(window, profile, healthy)
-    gap = fit_backlash(window, profile)
-    yield OtherCause("backlash", message("cause.backlash"), gap.width, "of y", gap.cost)
+    if isinstance(window, RefitWindow):
+        yield _delay_cause(window, profile, healthy)
+        gap = fit_backlash(window, profile)
+        yield OtherCause("backlash", message("cause.backlash"), gap.width, "of y", gap.cost)
     predictor = window.predictor(healthy.d, (), np.zeros(0), profile)
     where = np.arange(window.samples) >= profile.onset
-    columns = misspecification_columns(window, predictor, profile, where)[:, 2 * LAGS + 1 :]
+    nothing, moving, since = np.zeros(window.samples), delayed(speed_sign(window.y), 1), where.astype(np.float64)
+    signals = (nothing, since), (moving * since, nothing), (since, nothing)
     # a disturbance is taken off y to explain it, so its size has the other sign
     names = (
         ("sensor_offset", message("cause.sensor_offset"), "of y", 1.0),
         ("coulomb_friction", message("cause.coulomb_friction"), "of u", -1.0),
         ("input_offset", message("cause.input_offset"), "of u", 1.0),
     )
-    for (name, cause, unit, factor), column in zip(names, columns.T, strict=True):
+    for (name, cause, unit, factor), (to_u, to_y) in zip(names, signals, strict=True):
+        if name in window.plant.names:  # a fault of its own
+            continue
+        column = window.disturbance_response(predictor, profile, to_u, to_y)
         J = np.column_stack([healthy.jacobian, np.append(column, np.zeros(window.nuisance_count))])
         step, left = solve_least_squares(J, healthy.residual)
         yield OtherCause(name, cause, float(factor * step[-1]), unit, left)

@@ -10,6 +10,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.baseline import Baseline
+from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.goodness_of_fit import GoodnessOfFit, misspecification_columns, score_test
 from servoscope.isolation.ml.hypothesis import (
     IN_REACH,
@@ -23,7 +24,7 @@ from servoscope.isolation.ml.hypothesis import (
 )
 from servoscope.isolation.ml.onset import OnsetEstimate, onset_posterior
 from servoscope.isolation.ml.start_values import SizeGrid, fit_further_parameters, pair_start_values
-from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow
 from servoscope.models.plants import Fault
 from servoscope.signals import Recording
 
@@ -55,7 +56,7 @@ class Hypothesis:
 class RefitResult:
     """Result of the refit."""
 
-    window: RefitWindow  # what it looked at
+    window: ChangeWindow  # what it looked at
     hypotheses: tuple[Hypothesis, ...]  # most probable first
     other_parameters: tuple[
         HypothesisFit, ...
@@ -77,11 +78,15 @@ class RefitResult:
         return self.hypotheses[0]
 
 
-def onset_window(baseline: Baseline, recording: Recording, onset: int, last: int) -> RefitWindow:
+def onset_window(baseline: Baseline, recording: Recording, onset: int, last: int) -> ChangeWindow:
     """Return the stretch around an onset, to the sample `last` at most."""
-    rate = recording.sample_rate
-    first = max(onset - min(round(BEFORE_S * rate), MAX_WINDOW_SAMPLES // 4), 0)
-    end = min(last + 1, onset + round(AFTER_S * rate), first + MAX_WINDOW_SAMPLES)
+    rate, most = recording.sample_rate, MAX_WINDOW_SAMPLES
+    if baseline.axis is not None:
+        most *= baseline.axis.stride
+    first = max(onset - min(round(BEFORE_S * rate), most // 4), 0)
+    end = min(last + 1, onset + round(AFTER_S * rate), first + most)
+    if baseline.axis is not None:
+        return AxisWindow.from_recording(baseline, recording, first, end)
     return RefitWindow.from_recording(baseline, recording, first, end)
 
 
@@ -106,22 +111,22 @@ def fit_hypotheses(
     return search.run()
 
 
-def fit_stretch(window: RefitWindow, faults: Sequence[Fault], progress: Callable[[], None]) -> RefitResult:
+def fit_stretch(window: ChangeWindow, faults: Sequence[Fault], progress: Callable[[], None]) -> RefitResult:
     """Fit every fault and every pair to a window in which the plant differs from healthy from the first sample on."""
     return _HypothesisSearch(window, faults, window.first_sample, window.first_sample, progress).run()
 
 
 class _HypothesisSearch:
     def __init__(
-        self, window: RefitWindow, faults: Sequence[Fault], onset: int, announced: int, progress: Callable[[], None]
+        self, window: ChangeWindow, faults: Sequence[Fault], onset: int, announced: int, progress: Callable[[], None]
     ) -> None:
         self.window, self.faults, self.progress = window, faults, progress
         # a ray is several parameters at once already: pairs are made of the plant's own faults
         self.rays = tuple(ray.fault for ray in window.plant.rays)
-        self.latest = min(announced - window.first_sample, window.samples - 1)
-        self.initial_onset = max(min(onset - window.first_sample, self.latest), 0)
+        self.latest = min((announced - window.first_sample) // window.stride, window.samples - 1)
+        self.initial_onset = max(min((onset - window.first_sample) // window.stride, self.latest), 0)
         self.profile = ChangeProfile(self.initial_onset)
-        self.noise_variance = 1.0
+        self.noise_variance, self.settled = 1.0, False
 
     def run(self) -> RefitResult:
         nothing = np.zeros(self.window.nuisance_count)
@@ -143,6 +148,10 @@ class _HypothesisSearch:
         everything = [self._refit_own_onset(f, best) for f in everything]
         if found.high - found.low <= SHARP and not found.profile.duration:
             found, everything = self._sharpen_onset(found, everything)
+        self.settled = True
+        best = self._update_noise_variance(everything)
+        if self.window.coloured:
+            found = replace(self._onset(best), profile=found.profile)
         return self._weigh(everything, found)
 
     def _sharpen_onset(
@@ -260,8 +269,15 @@ class _HypothesisSearch:
     def _update_noise_variance(self, fitted: Sequence[HypothesisFit]) -> HypothesisFit:
         """Return the closest hypothesis, and take the variance of the noise from it."""
         best = self._best(fitted)
-        self.noise_variance = best.cost / self.window.samples
+        self.noise_variance = self._variance(best)
         return best
+
+    def _variance(self, fitted: HypothesisFit) -> float:
+        """Return the variance of the innovations, as large as the scatter of their scores says."""
+        found = fitted.cost / self.window.used
+        if not self.settled:  # far from the truth scores hang together because the explanation is wrong
+            return found
+        return found * self.window.inflation(fitted.jacobian, fitted.residual, len(fitted.x))
 
     def _onset(self, fitted: HypothesisFit, drifts: bool = True) -> OnsetEstimate:
         return onset_posterior(self.window, fitted, self.latest, self.noise_variance, drifts)
@@ -323,6 +339,9 @@ class _HypothesisSearch:
         healthy = window.predictor(fitted.d, (), np.zeros(0), profile)
         where = np.arange(window.samples) >= profile.onset
         e = fitted.residual[: window.samples]
-        shift = float(np.linalg.norm(window.innovations(healthy, profile) - e))
-        Z = misspecification_columns(window, predictor, profile, where)
-        return score_test(Z, fitted.jacobian, fitted.residual, self.noise_variance, shift)
+        shift = window.systematic * float(np.linalg.norm(window.innovations(healthy, profile) - e))
+        Z, J = misspecification_columns(window, predictor, profile, where), fitted.jacobian
+        if window.coloured:  # what the terms left out before the change is no sign of another one
+            always = misspecification_columns(window, healthy, profile, np.ones_like(where))
+            J = np.hstack([J, np.vstack([always, np.zeros((len(J) - len(always), always.shape[1]))])])
+        return score_test(Z, J, fitted.residual, self.noise_variance, shift, window.coloured)

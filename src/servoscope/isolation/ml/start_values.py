@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,7 @@ from servoscope.isolation.ml.hypothesis import (
     log_ratio_bounds,
     refit_contenders_jointly,
 )
-from servoscope.isolation.ml.predictor import Predictor
-from servoscope.isolation.ml.window import SENSOR_GAIN, ChangeProfile, RefitWindow
+from servoscope.isolation.ml.window import SENSOR_GAIN, ChangeProfile, ChangeWindow
 from servoscope.models.plants import Fault
 
 RUNGS = 33  # sizes of one fault that are looked at
@@ -32,31 +31,31 @@ class SizeGrid:
     """Sizes of one fault from one end of its range to the other, where a search may begin."""
 
     sizes: FloatArray  # logarithms of the ratios
-    predictors: tuple[Predictor, ...]  # of the healthy plant and the one of each size
+    predictors: tuple[Any, ...]  # of the healthy plant and the one of each size
 
     @classmethod
-    def from_window(cls, window: RefitWindow, fault: Fault, d: FloatArray) -> Self:
+    def from_window(cls, window: ChangeWindow, fault: Fault, d: FloatArray) -> Self:
         """Make the predictors, for errors d (m,) of the healthy parameters."""
         (low,), (high,) = log_ratio_bounds([fault])
         sizes, step = np.linspace(low, high, RUNGS), ChangeProfile(0)
         return cls(sizes, tuple(window.predictor(d, (fault.parameter,), np.array([x]), step) for x in sizes))
 
-    def sums_of_squares(self, window: RefitWindow, profile: ChangeProfile) -> FloatArray:
+    def sums_of_squares(self, window: ChangeWindow, profile: ChangeProfile) -> FloatArray:
         """Return the sum of squares of each size, a drift taken as a step in its middle."""
         step = ChangeProfile(profile.onset + profile.duration // 2)
         return np.array([float((window.innovations(each, step) ** 2).sum()) for each in self.predictors])
 
-    def local_minima(self, window: RefitWindow, profile: ChangeProfile) -> list[FloatArray]:
+    def local_minima(self, window: ChangeWindow, profile: ChangeProfile) -> list[FloatArray]:
         """Return the sizes (1,) at the lowest valleys: what a fault does to fast dynamics comes back as an alias."""
         return [self.sizes[at] for at in _local_minima(self.sums_of_squares(window, profile))]
 
 
-def pair_start_values(window: RefitWindow, faults: Sequence[Fault], profile: ChangeProfile) -> list[FloatArray]:
+def pair_start_values(window: ChangeWindow, faults: Sequence[Fault], profile: ChangeProfile) -> list[FloatArray]:
     """Return the sizes (2,) of two faults at the lowest valleys of a grid over both ranges.
 
     Only the seconds around the onset are looked at: far from the truth they say enough.
     """
-    rate, step = window.factory.loop.sample_rate, profile.onset + profile.duration // 2
+    rate, step = window.sample_rate, profile.onset + profile.duration // 2
     first, end = max(step - round(BESIDE_S[0] * rate), 0), step + round(BESIDE_S[1] * rate)
     near, names, d = window.cut(first, end), [fault.parameter for fault in faults], np.zeros(window.nuisance_count)
     low, high = log_ratio_bounds(faults)
@@ -69,7 +68,7 @@ def pair_start_values(window: RefitWindow, faults: Sequence[Fault], profile: Cha
 
 
 def fit_further_parameters(
-    window: RefitWindow, profile: ChangeProfile, best: HypothesisFit, noise_variance: float
+    window: ChangeWindow, profile: ChangeProfile, best: HypothesisFit, noise_variance: float
 ) -> list[HypothesisFit]:
     """Fit every further parameter of the plant, and the gain of the sensor of y."""
     known = {**window.plant.causes, SENSOR_GAIN: "a gain error of the sensor of y"}

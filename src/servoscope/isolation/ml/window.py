@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import abc
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.detection.baseline import Baseline
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.kernels import Array
@@ -17,6 +19,8 @@ from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
+FORGOTTEN = 1e-3  # share of its state from before a change that a predictor may still hold
+LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
 PIECES = 8  # of a drift, within which the predictor changes in straight lines
 TINY = 1e-30  # complex step
 SENSOR_GAIN = "sensor_gain"
@@ -39,45 +43,82 @@ class ChangeProfile:
         return np.arange(1, PIECES + 1) / PIECES if self.duration else np.ones(1)
 
 
-@dataclass(frozen=True, eq=False)
-class RefitWindow:
-    """What a predictor sees."""
+ChangeSums = Callable[[IntArray, IntArray], tuple[FloatArray, FloatArray]]
+"""From onsets and durations (M,) to the sums of products, (M, V, V + m), and of log S, (M,), of V = 1 + k columns: the
+innovations and their derivatives by the k sizes; the last m are products with the rows of Q."""
 
-    factory: PredictorFactory  # where predictors are made
+
+@dataclass(frozen=True, eq=False)
+class ChangeWindow(abc.ABC):
+    """What a refit sees of a recording, whatever predicts y."""
+
     plant: Plant  # the healthy plant as learned
-    # inverse of a root of the covariance of the logarithms of its parameters, shape (m, m); empty where they are
-    # exact
+    # inverse of a root of the covariance of what is not quite known of the healthy plant, d, shape (m, m); empty where
+    # it is exact
     prior: FloatArray
-    names: tuple[str, ...]  # of these parameters, m
+    names: tuple[str, ...]  # of these unknowns, m
     first_sample: int  # sample of the recording at which the window begins
     u: FloatArray  # u, y: what acted on the plant, and what was measured, shape (N,)
     y: FloatArray
     restart: BoolArray  # whether a sample is the first one after a gap, shape (N,)
 
-    @classmethod
-    def from_recording(cls, baseline: Baseline, recording: Recording, first: int, end: int) -> RefitWindow:
-        """Cut samples `first` to `end` out of a recording; the baseline has an exact predictor."""
-        if baseline.exact is None:
-            raise ValueError("a window needs a baseline with an exact predictor")
-        C = np.array(baseline.ratios_covariance)
-        prior = np.linalg.inv(np.linalg.cholesky(C)) if len(C) else np.zeros((0, 0))
-        whole = cls.of_healthy(baseline.loop, baseline.plant, baseline.exact.noise, recording)
-        return replace(whole, prior=prior, names=tuple(baseline.ratios)[: len(C)]).cut(first, end)
+    stride = 1  # samples of the recording from one of the window to the next
+    systematic = 2e-3  # share of a change that nominal parameters may be off by
+    coloured = 0  # samples over which what a true hypothesis leaves may hang together; 0: it is white
 
-    @classmethod
-    def of_healthy(cls, loop: Loop, plant: Plant, noise: WhiteNoise, recording: Recording) -> RefitWindow:
-        """Return all of a recording of a plant whose parameters are exact."""
-        factory = PredictorFactory.from_input(loop, noise, recording.u)
-        u = _delay_input(plant_input(loop, recording.u), recording.restart, factory.integer_delay)
-        return cls(factory, plant, np.zeros((0, 0)), (), 0, u, recording.y, recording.restart)
+    @property
+    @abc.abstractmethod
+    def sample_rate(self) -> float:
+        """Sample rate of the window [Hz]."""
 
-    def cut(self, first: int, end: int) -> RefitWindow:
+    @property
+    @abc.abstractmethod
+    def noise_y_std(self) -> float:
+        """Standard deviation of the noise of y."""
+
+    @abc.abstractmethod
+    def predictor(self, d: Array, names: Sequence[str], x: Array, profile: ChangeProfile) -> Any:
+        """Return the predictors of the healthy plant and of all that follow.
+
+        `d`: error of the healthy plant, shape (m,); `names, x`: parameters or rays that change, or `SENSOR_GAIN`, and
+        by how much their logarithms do, shape (len(names),).
+        """
+
+    @abc.abstractmethod
+    def innovations(self, predictor: Any, profile: ChangeProfile) -> Array:
+        """Return the innovations in standard deviations, shape (N,)."""
+
+    @abc.abstractmethod
+    def disturbance_response(self, predictor: Any, profile: ChangeProfile, u: FloatArray, y: FloatArray) -> FloatArray:
+        """Return what disturbances of u and of y, shape (N,), add to the innovations: they are linear in both."""
+
+    @abc.abstractmethod
+    def change_sums(self, d: FloatArray, names: Sequence[str], x: FloatArray, step: float, Q: FloatArray) -> ChangeSums:
+        """Prepare the sums of products by onset, with the derivatives by differences of `step`."""
+
+    def inflation(self, jacobian: FloatArray, residual: FloatArray, sizes: int) -> float:
+        """Return by how much more the scores of the last unknowns scatter than white innovations would make them.
+
+        `jacobian`, `residual`: of a fit, shapes (N + m, k) and (N + m,).
+        """
+        return 1.0
+
+    def unmodelled_signals(self) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return what a wrong model may have missed, each (N,), as additions to y and to u.
+
+        Missed dynamics: u and y of the last samples; backlash: the sign of y', added to y; Coulomb friction: the same,
+        added to u; offsets of both.
+        """
+        moving, ones = delayed(speed_sign(self.y), 1), np.ones(self.samples)
+        lagged = [delayed(x, lag) for x in (self.u, self.y) for lag in range(1, LAGS + 1)]
+        return [*lagged, moving, ones], [moving, ones]
+
+    def cut(self, first: int, end: int) -> Self:
         """Return samples `first` to `end` of it."""
         restart = self.restart[first:end].copy()
         restart[0] = True
-        return replace(
-            self, first_sample=self.first_sample + first, u=self.u[first:end], y=self.y[first:end], restart=restart
-        )
+        begin = self.first_sample + first * self.stride
+        return replace(self, first_sample=begin, u=self.u[first:end], y=self.y[first:end], restart=restart)
 
     @property
     def samples(self) -> int:
@@ -85,34 +126,19 @@ class RefitWindow:
         return len(self.y)
 
     @property
+    def used(self) -> int:
+        """Number of innovations that count, N as a rule."""
+        return self.samples
+
+    @property
     def nuisance_count(self) -> int:
-        """Number m of healthy parameters that are not quite known."""
+        """Number m of what is not quite known of the healthy plant."""
         return len(self.prior)
 
     @cached_property
-    def healthy(self) -> Predictor:
+    def healthy(self) -> Any:
         """The predictor of the healthy plant as learned."""
-        return self.factory.predictor(self.plant)
-
-    def predictor(self, d: Array, names: Sequence[str], x: Array, profile: ChangeProfile) -> Predictor:
-        """Return the predictors of the healthy plant and of all that follow.
-
-        `d`: error of the logarithms of the healthy parameters, shape (m,); `names, x`: parameters or rays that change,
-        or `SENSOR_GAIN`, and by how much their logarithms do, shape (len(names),).
-        """
-        healthy = dict(zip(self.names, np.exp(d), strict=True)) if np.any(d) else {}
-        each = [self.factory.predictor(self.plant.scaled(healthy)) if healthy else self.healthy]
-        for share in profile.shares:
-            faulty = dict(healthy)
-            for name, value in zip(names, np.exp(share * x), strict=True):
-                faulty[name] = faulty.get(name, 1.0) * value
-            output_gain = faulty.pop(SENSOR_GAIN, 1.0)
-            each.append(self.factory.predictor(self.plant.scaled(self.plant.expand_rays(faulty)), output_gain))
-        return Predictor.concatenate([_cast_predictor(one, np.result_type(*(e.A for e in each))) for one in each])
-
-    def innovations(self, predictor: Predictor, profile: ChangeProfile) -> Array:
-        """Return the innovations in standard deviations, shape (N,)."""
-        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart)
+        return self.predictor(np.zeros(self.nuisance_count), (), np.zeros(0), ChangeProfile(0))
 
     def residual(self, z: Array, names: Sequence[str], profile: ChangeProfile) -> Array:
         """Return what least squares makes small: innovations and prior, shape (N + m,), at z = [d, x]."""
@@ -134,12 +160,85 @@ class RefitWindow:
             columns.append(self.residual(moved, names, profile).imag / TINY)
         return np.array(columns).reshape(-1, self.samples + self.nuisance_count).T
 
+
+@dataclass(frozen=True, eq=False)
+class RefitWindow(ChangeWindow):
+    """What the exact predictor of a linear plant sees."""
+
+    factory: PredictorFactory  # where predictors are made
+
+    @classmethod
+    def from_recording(cls, baseline: Baseline, recording: Recording, first: int, end: int) -> RefitWindow:
+        """Cut samples `first` to `end` out of a recording; the baseline has an exact predictor."""
+        if baseline.exact is None:
+            raise ValueError("a window needs a baseline with an exact predictor")
+        C = np.array(baseline.ratios_covariance)
+        prior = np.linalg.inv(np.linalg.cholesky(C)) if len(C) else np.zeros((0, 0))
+        whole = cls.of_healthy(baseline.loop, baseline.plant, baseline.exact.noise, recording)
+        return replace(whole, prior=prior, names=tuple(baseline.ratios)[: len(C)]).cut(first, end)
+
+    @classmethod
+    def of_healthy(cls, loop: Loop, plant: Plant, noise: WhiteNoise, recording: Recording) -> RefitWindow:
+        """Return all of a recording of a plant whose parameters are exact."""
+        factory = PredictorFactory.from_input(loop, noise, recording.u)
+        u = delay_input(plant_input(loop, recording.u), recording.restart, factory.integer_delay)
+        return cls(plant, np.zeros((0, 0)), (), 0, u, recording.y, recording.restart, factory)
+
+    @property
+    def sample_rate(self) -> float:
+        """Sample rate of the window [Hz]."""
+        return self.factory.loop.sample_rate
+
+    @property
+    def noise_y_std(self) -> float:
+        """Standard deviation of the noise of y."""
+        return self.factory.noise.y_std
+
+    @cached_property
+    def healthy(self) -> Predictor:
+        """The predictor of the healthy plant as learned."""
+        return self.factory.predictor(self.plant)
+
+    def predictor(self, d: Array, names: Sequence[str], x: Array, profile: ChangeProfile) -> Predictor:
+        """Return the predictors of the healthy plant and of all that follow; d are errors of logarithms."""
+        healthy = dict(zip(self.names, np.exp(d), strict=True)) if np.any(d) else {}
+        each = [self.factory.predictor(self.plant.scaled(healthy)) if healthy else self.healthy]
+        for share in profile.shares:
+            faulty = dict(healthy)
+            for name, value in zip(names, np.exp(share * x), strict=True):
+                faulty[name] = faulty.get(name, 1.0) * value
+            output_gain = faulty.pop(SENSOR_GAIN, 1.0)
+            each.append(self.factory.predictor(self.plant.scaled(self.plant.expand_rays(faulty)), output_gain))
+        return Predictor.concatenate([_cast_predictor(one, np.result_type(*(e.A for e in each))) for one in each])
+
+    def innovations(self, predictor: Predictor, profile: ChangeProfile) -> Array:
+        """Return the innovations in standard deviations, shape (N,)."""
+        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart)
+
     def disturbance_response(
         self, predictor: Predictor, profile: ChangeProfile, u: FloatArray, y: FloatArray
     ) -> FloatArray:
         """Return what disturbances of u and of y, shape (N,), add to the innovations: they are linear in both."""
         restart = np.zeros_like(self.restart)
         return np.asarray(predictor.innovations(profile.onset, profile.duration, u, y, restart), dtype=np.float64)
+
+    def change_sums(self, d: FloatArray, names: Sequence[str], x: FloatArray, step: float, Q: FloatArray) -> ChangeSums:
+        """Prepare the sums of products by onset: one pass over the window, in which every predictor settles anew."""
+        from servoscope.isolation.ml.kernels import sum_over_onsets
+
+        sizes = [x, *(x + step * e for e in np.eye(len(x)))]
+        each = [self.predictor(d, names, size, ChangeProfile(0, 1)) for size in sizes]
+        drifting = Predictor(*(np.stack(parts) for parts in zip(*each, strict=True)))
+        stepping = Predictor(*(np.ascontiguousarray(part[:, [0, -1]]) for part in drifting))
+        A, K, c = stepping.A[0], stepping.K[0, :, -1], stepping.c[0]
+        slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
+        settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), self.samples)
+
+        def sums(onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
+            parts = drifting if overs.any() else stepping
+            return sum_over_onsets(*parts, step, onsets, overs, settle, self.u, self.y, self.restart, Q)
+
+        return sums
 
 
 def plant_input(loop: Loop, u: FloatArray) -> FloatArray:
@@ -152,7 +251,17 @@ def plant_input(loop: Loop, u: FloatArray) -> FloatArray:
     return u
 
 
-def _delay_input(u: FloatArray, restart: BoolArray, samples: int) -> FloatArray:
+def delayed(x: FloatArray, samples: int) -> FloatArray:
+    """Return a signal some samples later, its first value before it begins."""
+    return np.concatenate([np.full(samples, x[0]), x[:-samples]])
+
+
+def speed_sign(y: FloatArray, over: int = 5) -> FloatArray:
+    """Return the sign of the difference over a few samples: noise does not decide it as long as there is motion."""
+    return np.asarray(np.sign(np.concatenate([np.zeros(over), y[over:] - y[:-over]])))
+
+
+def delay_input(u: FloatArray, restart: BoolArray, samples: int) -> FloatArray:
     """Return u as it was some samples before, run by run."""
     k = np.arange(len(u))
     begin = np.maximum.accumulate(np.where(restart, k, 0))

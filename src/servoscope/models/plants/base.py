@@ -17,8 +17,9 @@ StateSpace = tuple[FloatArray, FloatArray, FloatArray]
 
 BEYOND = 1.5  # times the logarithms of the full size of a fault ray, as far as it is searched
 
-EXTRA_COLUMNS = ("sign_v", "forward_v", "backward_v", "one")
-"""Columns beyond the powers of s: sign(y'), max(y', 0), min(y', 0) and the constant one."""
+EXTRA_COLUMNS = ("sign_v", "forward_v", "backward_v", "one", "stribeck_v", "sin_y", "cogging_sin", "cogging_cos")
+"""Columns beyond the powers of s: sign(y'), max(y', 0), min(y', 0), the constant one, and those with a shape: Stribeck
+friction, and sines of y."""
 
 
 def _not_zero(value: float) -> float:
@@ -91,6 +92,11 @@ class Plant(BaseModel, abc.ABC):
     def extras(self) -> tuple[str, ...]:
         """Columns after the powers, out of `EXTRA_COLUMNS`."""
         return ()
+
+    @property
+    def column_shapes(self) -> Mapping[str, tuple[float, float]]:
+        """By column of Stribeck friction or of a sine: factor on y' or on y, and phase."""
+        return {}
 
     @property
     def units(self) -> tuple[str, str]:

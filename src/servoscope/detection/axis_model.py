@@ -1,0 +1,37 @@
+"""What `learn` keeps of a healthy motor axis for its refit: coefficients, how well they are known, and the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from servoscope.core.arrays import FloatArray
+from servoscope.estimation.axis_filter import AxisNoise
+from servoscope.models.plants.axis import AxisPlant
+
+
+class AxisModel(BaseModel):
+    """A healthy motor axis with friction, in the unit of ``input_gain u``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    coefficients: dict[str, float]  # all of the plant's
+    parameters: tuple[str, ...]  # those of which the logarithm is known with `covariance` (m, m), between recordings
+    covariance: tuple[tuple[float, ...], ...]
+    noise: AxisNoise
+    stride: int  # samples of a recording from one of the filter to the next
+    rest_speed: float  # below, the axis counts as resting [output per s]
+    offset_std: float  # how far the constant force of a recording may be from that of the others
+    drift_std: float  # and how much it may change within one
+
+    def scatter(self, names: Sequence[str]) -> FloatArray:
+        """Return the standard deviations of coefficients between recordings, shape (len(names),)."""
+        std = dict(zip(self.parameters, np.sqrt(np.diag(np.array(self.covariance))), strict=True))
+        known = {name: float(std[name]) * abs(self.coefficients[name]) for name in self.parameters}
+        return np.array([(known | {"offset": self.offset_std}).get(name, 0.0) for name in names])
+
+    def plant(self, declared: AxisPlant) -> AxisPlant:
+        """Return the plant of the loop file with these coefficients."""
+        return declared.model_copy(update={"coefficients": self.coefficients})

@@ -1,0 +1,99 @@
+"""Whether a motor axis changed within a recording: the likelihood of every onset of every fault against none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.detection.baseline import Baseline
+from servoscope.isolation.ml.axis_window import AxisWindow
+from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
+from servoscope.isolation.ml.onset import ChangeCosts
+from servoscope.isolation.ml.window import ChangeProfile
+from servoscope.models.plants import Fault
+from servoscope.signals import Recording
+
+FALSE_ALARMS = 1e-4  # share of healthy recordings that are called changed
+TRIM = 0.05  # of a stretch at both ends, in which no onset is looked for
+ONSETS = 400  # that are tried
+MOST = 40_000  # samples of a stretch
+
+
+@dataclass(frozen=True)
+class AxisChange:
+    """A change within a recording, by sample of the recording."""
+
+    onset: int  # the most likely one
+    detected: int  # when what had been measured by then was enough to tell it
+
+
+def find_axis_change(baseline: Baseline, recording: Recording) -> AxisChange | None:
+    """Return the first change of an axis within a recording, None where there is none.
+
+    A stretch is compared with itself, so scatter between recordings hides nothing; offset and drift are its own.
+    """
+    for window in _stretches(baseline, recording):
+        found = _change_within(window, baseline.plant.faults)
+        if found is not None:
+            return found
+    return None
+
+
+def scan_limit(faults: int, false_alarms: float = FALSE_ALARMS) -> float:
+    """Return what the largest likelihood ratio of all onsets exceeds in a share of healthy stretches.
+
+    ``P(sup > x) = sqrt(x/(2 pi)) exp(-x/2) (2 log((1 - t)/t) (1 - 1/x) + 2/x)`` for one parameter, onsets from t to
+    1 - t (James, James and Siegmund, 1987), times the number of faults.
+    """
+    x = np.linspace(5.0, 60.0, 2000)
+    range_ = 2.0 * np.log((1.0 - TRIM) / TRIM)
+    probability = faults * np.sqrt(x / (2.0 * np.pi)) * np.exp(-x / 2.0) * (range_ * (1.0 - 1.0 / x) + 2.0 / x)
+    return float(x[np.argmax(probability <= false_alarms)])
+
+
+def _stretches(baseline: Baseline, recording: Recording) -> Iterator[AxisWindow]:
+    assert baseline.axis is not None
+    most = MOST * baseline.axis.stride
+    for first in range(0, max(recording.samples - most // 2, 1), most // 2):
+        yield AxisWindow.from_recording(baseline, recording, first, min(first + most, recording.samples))
+
+
+def _change_within(window: AxisWindow, faults: tuple[Fault, ...]) -> AxisChange | None:
+    N, m = window.samples, window.nuisance_count
+    never = ChangeProfile(N)
+    healthy = fit_hypothesis(window, [], never, np.zeros(m), [np.zeros(0)], free=True)
+    moving = np.cumsum(window.counted)
+    share = moving / max(moving[-1], 1)
+    inside = np.flatnonzero((share >= TRIM) & (share <= 1.0 - TRIM) & window.counted)
+    if len(inside) < ONSETS // 10:
+        return None
+    onsets = inside[:: max(1, len(inside) // ONSETS)]
+    best: tuple[float, Fault, int, float] | None = None
+    for fault in faults:
+        start = replace(healthy, faults=(fault,), x=np.zeros(1))
+        costs, sizes = ChangeCosts(window, start, 1.0).costs(onsets, np.zeros_like(onsets))
+        at = int(np.argmin(costs))
+        if best is None or costs[at] < best[0]:
+            best = float(costs[at]), fault, int(onsets[at]), float(sizes[at, 0])
+    assert best is not None
+    _, fault, onset, size = best
+    low, high = np.log(fault.ratio_range)
+    begin = np.clip([size], 0.9 * low, 0.9 * high)
+    changed = fit_hypothesis(window, [fault], ChangeProfile(onset), healthy.d, [begin], free=True)
+    variance = window.inflation(changed.jacobian, changed.residual, 1) * changed.cost / window.used
+    gain = (healthy.cost - changed.cost) / variance
+    limit = scan_limit(len(faults))
+    if gain <= limit:
+        return None
+    told = _detection(healthy, changed, N, limit * variance)
+    return AxisChange(*(window.first_sample + window.stride * k for k in (onset, max(told, onset))))
+
+
+def _detection(healthy: HypothesisFit, changed: HypothesisFit, N: int, enough: float) -> int:
+    """Return the sample at which the change had lowered the sum of squares by enough."""
+    lowered: FloatArray = np.cumsum(healthy.residual[:N] ** 2 - changed.residual[:N] ** 2)
+    since = changed.profile.onset
+    return min(since + int(np.argmax(lowered[since:] - lowered[since] >= enough)), N - 1)

@@ -1,0 +1,279 @@
+"""The stretch of a recording of a motor axis that a refit looks at: innovations that are linear in its coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.core.jit import kernel
+from servoscope.detection.axis_model import AxisModel
+from servoscope.detection.baseline import Baseline
+from servoscope.estimation.axis_filter import AxisFilter, AxisSignals
+from servoscope.estimation.noise_model import sample_autocovariance
+from servoscope.isolation.ml.kernels import Array
+from servoscope.isolation.ml.window import (
+    SENSOR_GAIN,
+    ChangeProfile,
+    ChangeSums,
+    ChangeWindow,
+    delay_input,
+    plant_input,
+)
+from servoscope.models.loop import Loop
+from servoscope.models.plants.axis import AxisPlant
+from servoscope.signals import Recording
+
+ADDED = ("offset", "drift")  # nuisances of every recording: a constant force, and its change from end to end
+LONG_RUN_S = 0.5  # over which the scores may hang together
+
+
+@dataclass(frozen=True, eq=False)
+class AxisWindow(ChangeWindow):
+    """What the filter of a motor axis sees; `names` are the logarithms of parameters, then `ADDED`."""
+
+    plant: AxisPlant
+    model: AxisModel
+    rate: float
+
+    systematic = 2e-2  # the terms are simpler than friction is
+
+    @classmethod
+    def from_recording(cls, baseline: Baseline, recording: Recording, first: int, end: int) -> AxisWindow:
+        """Cut samples `first` to `end` out of a recording of an axis."""
+        if baseline.axis is None:
+            raise ValueError("a window of an axis needs a baseline of one")
+        return cls.of_healthy(baseline.loop, baseline.axis, recording.rows(slice(first, end)), first)
+
+    @classmethod
+    def of_healthy(cls, loop: Loop, model: AxisModel, recording: Recording, first: int = 0) -> AxisWindow:
+        """Return all of a recording of a healthy axis; it begins at sample `first` of a longer one."""
+        assert isinstance(loop.plant, AxisPlant)
+        signals = axis_signals(loop, recording, model.stride)
+        each = [np.linalg.inv(np.linalg.cholesky(np.array(model.covariance)))] if model.parameters else []
+        m = len(model.parameters)
+        prior = np.zeros((m + 2, m + 2))
+        prior[:m, :m] = each[0] if each else 0.0
+        prior[m:, m:] = np.diag([1.0 / model.offset_std, 1.0 / model.drift_std])
+        return cls(
+            model.plant(loop.plant),
+            prior,
+            (*model.parameters, *ADDED),
+            first,
+            signals.u,
+            signals.y,
+            signals.restart,
+            model,
+            signals.sample_rate,
+        )
+
+    @property
+    def stride(self) -> int:  # type: ignore[override]
+        """Samples of the recording from one of the window to the next."""
+        return self.model.stride
+
+    @property
+    def coloured(self) -> int:  # type: ignore[override]
+        """Samples over which what the terms leave of friction may hang together."""
+        return round(LONG_RUN_S * self.rate)
+
+    @property
+    def sample_rate(self) -> float:
+        """Sample rate of the window [Hz]."""
+        return self.rate
+
+    @property
+    def noise_y_std(self) -> float:
+        """Standard deviation of the noise of y."""
+        return self.model.noise.y_std
+
+    @cached_property
+    def filter(self) -> AxisFilter:
+        """The filter."""
+        return AxisFilter.design(self.model.noise, self.rate)
+
+    @cached_property
+    def signals(self) -> AxisSignals:
+        """The samples of the window."""
+        return AxisSignals(self.u, self.y, self.restart, self.rate)
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """What the coefficients multiply, shape (1 + n + 2, N); the last two are offset and drift."""
+        drift = np.linspace(-0.5, 0.5, self.samples)
+        return np.vstack([self.signals.columns(self.plant), -np.ones(self.samples), -drift])
+
+    @cached_property
+    def counted(self) -> BoolArray:
+        """Where an innovation counts, shape (N,)."""
+        return self.signals.moving(self.model.rest_speed, self.filter.settling)
+
+    @property
+    def used(self) -> int:
+        """Number of innovations that count."""
+        return max(int(self.counted.sum()), 1)
+
+    @cached_property
+    def _weight(self) -> FloatArray:
+        return np.asarray(self.counted / np.sqrt(self.filter.variance))
+
+    @cached_property
+    def _of_output(self) -> FloatArray:
+        return self.filter.of_output(self.y, self.signals.runs)
+
+    def predictor(self, d: Array, names: Sequence[str], x: Array, profile: ChangeProfile) -> Array:
+        """Return the coefficients of all columns, healthy and from then on, shape (p, 1 + n + 2)."""
+        m = len(self.model.parameters)
+        healthy = dict(zip(self.names[:m], np.exp(d[:m]), strict=True))
+        rows = [self._coefficients(healthy, d[m:])]
+        for share in profile.shares:
+            faulty = dict(healthy)
+            for name, value in zip(names, np.exp(share * x), strict=True):
+                faulty[name] = faulty.get(name, 1.0) * value
+            rows.append(self._coefficients(faulty, d[m:]))
+        return np.array(rows)
+
+    def _coefficients(self, factors: dict[str, Any], added: Array) -> Array:
+        factors = dict(factors)
+        output_gain = factors.pop(SENSOR_GAIN, 1.0)
+        plant = self.plant.scaled(self.plant.expand_rays(factors))
+        assert plant.coefficients is not None
+        each = plant.acceleration_coefficients()
+        # what grows with y as measured does so through its gain already
+        degrees = np.array([0, *(column.degree for column in plant.columns)])
+        each = np.where(degrees == 0, output_gain, 1.0) * each
+        return np.concatenate([each, output_gain * np.asarray(added) / plant.coefficients["inertia"]])
+
+    def _acceleration(self, predictor: Array, profile: ChangeProfile, columns: FloatArray) -> Array:
+        """Return the acceleration that follows from the coefficients in force, shape (N,)."""
+        p, k = len(predictor) - 1, np.arange(self.samples)
+        if profile.duration:
+            at = np.clip((k - profile.onset) / profile.duration, 0.0, 1.0) * p
+            low = np.minimum(at.astype(np.int64), p - 1)
+            each = predictor @ columns
+            return np.asarray(each[low, k] * (1.0 - (at - low)) + each[low + 1, k] * (at - low))
+        return np.asarray(np.where(k < profile.onset, predictor[0] @ columns, predictor[-1] @ columns))
+
+    def innovations(self, predictor: Array, profile: ChangeProfile) -> Array:
+        """Return the innovations in standard deviations, shape (N,); 0 where they do not count."""
+        acceleration = self._acceleration(predictor, profile, self.columns)
+        left = self._of_output - self.filter.of_acceleration(acceleration, self.signals.runs)
+        return np.asarray(left * self._weight)
+
+    def disturbance_response(
+        self, predictor: Array, profile: ChangeProfile, u: FloatArray, y: FloatArray
+    ) -> FloatArray:
+        """Return what disturbances of u and of y, shape (N,), add to the innovations."""
+        columns = np.vstack([u, np.zeros((len(self.columns) - 1, self.samples))])
+        acceleration = self._acceleration(np.real(predictor), profile, columns)
+        runs = self.signals.runs
+        added = self.filter.of_output(y, runs) - self.filter.of_acceleration(acceleration, runs)
+        return np.asarray(added * self._weight)
+
+    def unmodelled_signals(self) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return forces that no term of the axis has: of position, of its square, and of the speed's."""
+        v, y = self.signals.speed, self.y - self.y.mean()
+        return [], [y, y**2, v * np.abs(v), v, np.sign(v), np.ones(self.samples)]
+
+    def inflation(self, jacobian: FloatArray, residual: FloatArray, sizes: int) -> float:
+        """Return the long-run variance of the scores of the sizes over that of white innovations, at least 1.
+
+        What is left of real friction hangs together over tenths of seconds (Newey and West, 1987).
+        """
+        if not sizes:
+            return 1.0
+        from servoscope.isolation.ml.least_squares import orthonormal_basis
+
+        J, N, lags = jacobian, self.samples, self.coloured
+        Q = orthonormal_basis(J[:, :-sizes])
+        own = J[:, -sizes:] - Q @ (Q.T @ J[:, -sizes:])
+        e = residual[:N]
+        variance = float(e @ e) / self.used
+        found = [1.0]
+        for column in own[:N].T:
+            gamma = sample_autocovariance([column * e], lags)
+            window = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
+            white = variance * float(column @ column) / N
+            found.append(float(gamma[0] + 2.0 * (window * gamma[1:]).sum()) / max(white, 1e-300))
+        return max(found)
+
+    def change_sums(self, d: FloatArray, names: Sequence[str], x: FloatArray, step: float, Q: FloatArray) -> ChangeSums:
+        """Prepare the sums of products by onset; a drift grows in a straight line."""
+        at = ChangeProfile(0)
+        healthy, changed = self.predictor(d, names, x, at)
+        moved = [(self.predictor(d, names, x + step * e, at)[-1] - changed) / step for e in np.eye(len(x))]
+        added = np.array([changed - healthy, *moved]) @ self.columns
+        e = np.asarray(self.innovations(np.array([healthy, healthy]), at))
+
+        def sums(onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
+            f = self.filter
+            found = onset_sums(
+                f.to_acceleration, f.poles, added, e, self._weight, self.restart, onsets, overs, np.ascontiguousarray(Q)
+            )
+            return found, np.zeros(len(onsets))
+
+        return sums
+
+    def cut(self, first: int, end: int) -> AxisWindow:
+        """Return samples `first` to `end` of it."""
+        return replace(super().cut(first, end))  # what was computed of the whole is left behind
+
+
+def axis_signals(loop: Loop, recording: Recording, stride: int) -> AxisSignals:
+    """Return a recording as the filter of an axis takes it."""
+    restart = recording.restart.copy()
+    restart[0] = True
+    u = delay_input(plant_input(loop, recording.u), restart, round(loop.delay * loop.sample_rate))
+    return AxisSignals.thinned(u, recording.y, restart, loop.sample_rate, stride)
+
+
+@kernel
+def onset_sums(
+    numerator: Array, poles: Array, added: Array, e: Array, weight: Array, restart: BoolArray,
+    onsets: IntArray, durations: IntArray, Q: Array,
+) -> Array:  # fmt: skip
+    """Sum up products of innovations and their derivatives for changes that come at many times, shape (M, V, V + m).
+
+    `added` (V, N): accelerations that the change and its derivatives add, filtered by ``numerator/poles`` (order 3)
+    from the onset on, growing over the duration; `e` (N,): healthy innovations; Q (N, m).
+    """
+    V, N = added.shape
+    m, M = Q.shape[1], len(onsets)
+    out = np.zeros((M, V, V + m))
+    state, row = np.zeros((V, 3)), np.zeros(V)
+    before = np.zeros((N + 1, 1 + m))
+    for k in range(N):
+        before[k + 1, 0] = before[k, 0] + e[k] * e[k]
+        for j in range(m):
+            before[k + 1, 1 + j] = before[k, 1 + j] + e[k] * Q[k, j]
+    for i in range(M):
+        first = onsets[i]
+        state[:] = 0.0
+        out[i, 0, 0] = before[first, 0]
+        for j in range(m):
+            out[i, 0, V + j] = before[first, 1 + j]
+        for k in range(first, N):
+            if restart[k]:
+                state[:] = 0.0
+            share = min((k - first) / durations[i], 1.0) if durations[i] > 0 else 1.0
+            for v in range(V):
+                x = share * added[v, k]
+                y = numerator[0] * x + state[v, 0]
+                for o in range(2):
+                    state[v, o] = numerator[o + 1] * x - poles[o + 1] * y + state[v, o + 1]
+                state[v, 2] = numerator[3] * x - poles[3] * y
+                row[v] = -y * weight[k]
+            row[0] += e[k]
+            for v in range(V):
+                for w in range(v + 1):
+                    out[i, v, w] += row[v] * row[w]
+                for j in range(m):
+                    out[i, v, V + j] += row[v] * Q[k, j]
+        for v in range(V):
+            for w in range(v):
+                out[i, w, v] = out[i, v, w]
+    return out

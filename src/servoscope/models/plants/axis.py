@@ -1,0 +1,206 @@
+"""A motor axis or joint: inertia, and the terms of friction, gravity and cogging that its loop file declares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import LoopError
+from servoscope.models.plants.base import Fault, Plant, StateSpace
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+TermName = Literal[
+    "stiffness", "viscous", "viscous_by_direction", "coulomb", "stribeck", "offset", "gravity", "cogging"
+]
+
+
+@dataclass(frozen=True)
+class AxisColumn:
+    """One coefficient of a term: what it multiplies, as a function of position and speed."""
+
+    coefficient: str
+    column: int | str  # power of s, or one of `EXTRA_COLUMNS`
+    value: Callable[[AxisPlant, FloatArray, FloatArray], FloatArray]  # of y and y', shapes (N,)
+    degree: int = 0  # 1 where it grows with y or y' in proportion
+    signed: bool = False  # whether the coefficient may be negative
+
+
+TERMS: dict[str, tuple[AxisColumn, ...]] = {
+    "stiffness": (AxisColumn("stiffness", 0, lambda _, y, v: y, 1),),
+    "viscous": (AxisColumn("viscous_friction", 1, lambda _, y, v: v, 1),),
+    "viscous_by_direction": (
+        AxisColumn("viscous_friction_forward", "forward_v", lambda _, y, v: np.maximum(v, 0.0), 1),
+        AxisColumn("viscous_friction_backward", "backward_v", lambda _, y, v: np.minimum(v, 0.0), 1),
+    ),
+    "coulomb": (AxisColumn("coulomb_friction", "sign_v", lambda _, y, v: np.sign(v)),),
+    # Stribeck's fall of friction with speed by Hess and Soom (1990), which needs no exponential
+    "stribeck": (
+        AxisColumn(
+            "stribeck_friction", "stribeck_v", lambda p, y, v: np.sign(v) / (1.0 + (v / (p.stribeck_speed or 1.0)) ** 2)
+        ),
+    ),
+    "offset": (AxisColumn("offset", "one", lambda _, y, v: np.ones_like(y), signed=True),),
+    "gravity": (AxisColumn("gravity", "sin_y", lambda p, y, v: np.sin(y - p.hanging_at), signed=True),),
+    "cogging": (
+        AxisColumn("cogging_sin", "cogging_sin", lambda p, y, v: np.sin(p.wave_number * y), signed=True),
+        AxisColumn("cogging_cos", "cogging_cos", lambda p, y, v: np.cos(p.wave_number * y), signed=True),
+    ),
+}
+"""What may act on an axis besides its inertia, by the name that a loop file declares."""
+
+RATIO_RANGES = {"inertia": (0.2, 5.0), "input_gain": (0.3, 3.0)}
+DEFAULT_RANGE = (0.1, 10.0)
+# parameter -> name of the fault, and all that does the same to u and y
+FAULTS = {
+    "inertia": ("payload", "more moved mass: a payload, a coupling, a tool"),
+    "viscous_friction": ("lubrication", "more friction at speed: thick, cold or too much lubricant, a tight seal"),
+    "coulomb_friction": ("dry_friction", "more friction at any speed: a dragging brake, a tight guide, dry bearings"),
+    "stribeck_friction": ("stick_slip", "more friction at low speed: worn or missing lubricant"),
+    "stiffness": ("stiffness", "more force for the same way: a stiffer spring"),
+    "gravity": ("gravity", "more weight without more inertia: a balance that has lost its force"),
+    "input_gain": ("motor_constant", "more u for the same force: weak motor, magnets or amplifier"),
+}
+BY_DIRECTION = "viscous_friction_forward", "viscous_friction_backward"
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value  # TOML has lists, and plants are read strictly
+
+
+class AxisPlant(Plant):
+    """Motor axis ``input_gain u = inertia y'' + sum of terms``, each a coefficient times a function of y and y'."""
+
+    kind: Literal["axis"] = "axis"
+    terms: Annotated[tuple[TermName, ...], BeforeValidator(_as_tuple)] = ("viscous", "coulomb", "offset")
+    # speed [output per s] at which the term ``stribeck`` has fallen to a half
+    stribeck_speed: Positive | None = None
+    # distance [output] after which the term ``cogging`` repeats
+    period: Positive | None = None
+    # output at which the load of the term ``gravity`` hangs, in rad
+    hanging_at: Finite = 0.0
+    # speed [output per s] below which sign(y') is not trusted and set to 0
+    sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    # where the sign of the recursion comes from: the measured output, or the reference where y is noisy or slow
+    sign_from: Literal["output", "reference"] = "output"
+    # cutoff [Hz] of the differentiator behind the sign
+    sign_cutoff: Positive = 50.0
+    # nominal values by name, all of `names`; `learn` needs none
+    coefficients: dict[str, Finite] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if len(set(self.terms)) < len(self.terms):
+            raise ValueError("terms: one stands twice, remove it")
+        if {"viscous", "viscous_by_direction"} <= set(self.terms):
+            raise ValueError("terms: viscous_by_direction takes the place of viscous, remove one of them")
+        for term, key in (("stribeck", "stribeck_speed"), ("cogging", "period")):
+            if (term in self.terms) != (getattr(self, key) is not None):
+                raise ValueError(f"{key}: belongs to the term {term}, give both or none of them")
+        if self.coefficients is not None:
+            unknown = sorted(set(self.coefficients) ^ set(self.names))
+            if unknown:
+                raise ValueError(f"coefficients: give each of {', '.join(self.names)}; check {', '.join(unknown)}")
+            signed = {column.coefficient for column in self.columns if column.signed}
+            wrong = [name for name, value in self.coefficients.items() if value < 0.0 and name not in signed]
+            if wrong or not self.coefficients["inertia"]:
+                raise ValueError(f"coefficients: {(wrong or ['inertia'])[0]} must be positive")
+        return self
+
+    @property
+    def columns(self) -> tuple[AxisColumn, ...]:
+        """The columns of all terms, powers of s first."""
+        each = [column for term in TERMS if term in self.terms for column in TERMS[term]]
+        return tuple(sorted(each, key=lambda column: isinstance(column.column, str)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficients of the powers, inertia last among them, then the others."""
+        linear = [column.coefficient for column in self.columns if isinstance(column.column, int)]
+        others = [column.coefficient for column in self.columns if isinstance(column.column, str)]
+        return (*linear, "inertia", *others)
+
+    @property
+    def powers(self) -> tuple[int, ...]:
+        """Powers of s: those of the terms, and 2."""
+        return (*(column.column for column in self.columns if isinstance(column.column, int)), 2)
+
+    @property
+    def extras(self) -> tuple[str, ...]:
+        """Columns of the other terms."""
+        return tuple(column.column for column in self.columns if isinstance(column.column, str))
+
+    @property
+    def column_shapes(self) -> Mapping[str, tuple[float, float]]:
+        """Factors and phases of Stribeck friction, gravity and cogging."""
+        return {
+            "stribeck_v": (1.0 / (self.stribeck_speed or 1.0), 0.0),
+            "sin_y": (1.0, -self.hanging_at),
+            "cogging_sin": (self.wave_number, 0.0),
+            "cogging_cos": (self.wave_number, 0.5 * np.pi),
+        }
+
+    @property
+    def wave_number(self) -> float:
+        """2 pi over the period of the cogging."""
+        return 2.0 * np.pi / (self.period or 1.0)
+
+    @property
+    def unwatched(self) -> tuple[str, ...]:
+        """What no term shows."""
+        friction = () if "coulomb" in self.terms else ("coulomb_friction",)
+        return ("backlash", *friction, "compliance", *(() if {"offset", "gravity"} & set(self.terms) else ("load",)))
+
+    @property
+    def has_physics(self) -> bool:
+        """Whether nominal coefficients are given."""
+        return self.coefficients is not None
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Changes that are told by name; friction that differs by direction changes in both."""
+        by_direction = "viscous_by_direction" in self.terms
+        known = {*self.names, "input_gain", *(("viscous_friction",) if by_direction else ())}
+        return tuple(
+            Fault(name, parameter, RATIO_RANGES.get(parameter, DEFAULT_RANGE), words)
+            for parameter, (name, words) in FAULTS.items()
+            if parameter in known
+        )
+
+    def _nominal(self) -> dict[str, float]:
+        if self.coefficients is None:
+            raise LoopError("[plant] coefficients: missing, simulation and nominal values need them")
+        return self.coefficients
+
+    def theta(self) -> FloatArray:
+        """Nominal coefficients, shape (n,)."""
+        nominal = self._nominal()
+        return np.array([nominal[name] for name in self.names], dtype=np.float64)
+
+    def scaled(self, factors: Mapping[str, Any]) -> Self:
+        """Return the same axis with coefficients multiplied; ``input_gain`` multiplies all of them."""
+        factors = dict(factors)
+        common, both = factors.pop("input_gain", 1.0), factors.pop("viscous_friction", 1.0)
+        for name in BY_DIRECTION if "viscous_by_direction" in self.terms else ("viscous_friction",):
+            factors[name] = factors.get(name, 1.0) * both
+        scaled = {name: value * common * factors.get(name, 1.0) for name, value in self._nominal().items()}
+        return self.model_copy(update={"coefficients": scaled})
+
+    def acceleration_coefficients(self) -> Any:
+        """Return b and all a_i of ``y'' = b u - sum a_i column_i``, in the order of `columns`; they may be complex."""
+        nominal = self._nominal()
+        each = [self.input_gain, *(nominal[column.coefficient] for column in self.columns)]
+        return np.array(each) / nominal["inertia"]
+
+    def state_space(self) -> StateSpace:
+        """Continuous linear part: states y and y'; friction by direction enters with the mean of both."""
+        nominal = self._nominal()
+        viscous = nominal.get("viscous_friction", 0.5 * sum(nominal.get(name, 0.0) for name in BY_DIRECTION))
+        inertia = nominal["inertia"]
+        A = np.array([[0.0, 1.0], [-nominal.get("stiffness", 0.0) / inertia, -viscous / inertia]])
+        return A, np.array([[0.0], [self.input_gain / inertia]]), np.array([[1.0, 0.0]])

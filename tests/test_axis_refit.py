@@ -1,0 +1,206 @@
+"""Motor axes with friction: the filter against a loop, sums against passes, measured recordings with known changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import servoscope as ss
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import LoopError
+from servoscope.core.jit import sine
+from servoscope.detection.axis_model import AxisModel
+from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals
+from servoscope.isolation.ml.axis_scan import FALSE_ALARMS, TRIM, scan_limit
+from servoscope.isolation.ml.axis_window import AxisWindow
+from servoscope.isolation.ml.window import ChangeProfile
+from servoscope.models.plants.axis import AxisPlant
+
+LOOP: dict[str, Any] = {
+    "sample_rate": 1000.0,
+    "columns": {"time": "t", "reference": "qg", "input": "vir", "output": "qm"},
+    "plant": {"kind": "axis", "terms": ["viscous_by_direction", "coulomb", "offset"], "input_gain": 35.15},
+    "monitor": {"cutoff": 10.0},
+}
+NOISE = AxisNoise(0.3, 0.02, 1e-4)
+
+
+def random_signals(N: int = 300) -> AxisSignals:
+    rng = np.random.default_rng(0)
+    y = np.cumsum(np.cumsum(rng.normal(size=N))) * 1e-3
+    restart = np.zeros(N, dtype=np.bool_)
+    restart[[0, N // 2]] = True
+    return AxisSignals(rng.normal(size=N), y, restart, 100.0)
+
+
+@pytest.fixture
+def window() -> AxisWindow:
+    signals = random_signals()
+    plant = AxisPlant.model_validate({"terms": ("viscous", "coulomb", "offset"), "coefficients": {
+        "inertia": 2.0, "viscous_friction": 1.0, "coulomb_friction": 0.5, "offset": 0.1}})  # fmt: skip
+    model = AxisModel(
+        coefficients=plant.coefficients or {},
+        parameters=("inertia", "viscous_friction", "coulomb_friction"),
+        covariance=((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)),
+        noise=NOISE,
+        stride=1,
+        rest_speed=0.01,
+        offset_std=0.1,
+        drift_std=0.1,
+    )
+    loop = ss.Loop.from_dict({"sample_rate": 100.0, "plant": {"kind": "axis"}})
+    t = np.arange(300) / 100.0
+    r, run = np.zeros(300), np.zeros(300, dtype=np.int32)
+    recording = ss.Recording(
+        t=t, r=r, u=signals.u, y=signals.y, restart=signals.restart, name="random", sample_rate=100.0, run=run
+    )
+    return AxisWindow.of_healthy(loop, model, recording)
+
+
+class TestFilter:
+    def test_it_is_the_textbooks_kalman_filter(self) -> None:
+        """Prediction and correction in turns, each run from rest, until gain and variance are steady."""
+        from scipy.linalg import expm
+
+        signals, T = random_signals(), 0.01
+        made = AxisFilter.design(NOISE, 1.0 / T)
+        A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / NOISE.correlation_s]])
+        Phi, fine = expm(A * T), 2000
+        # the force's noise, added up in small steps
+        small, Q = expm(A * T / fine), np.zeros((3, 3))
+        q = np.diag([0.0, 0.0, 2.0 * NOISE.acceleration_std**2 / NOISE.correlation_s]) * T / fine
+        for _ in range(fine):
+            Q = small @ (Q + 0.5 * q) @ small.T + 0.5 * q
+        B, P = np.array([0.5 * T**2, T, 0.0]), Q
+        for _ in range(2000):
+            K = Phi @ P[:, 0] / (P[0, 0] + NOISE.y_std**2)
+            P = Phi @ P @ Phi.T + Q - np.outer(K, K) * (P[0, 0] + NOISE.y_std**2)
+        assert made.variance == pytest.approx(P[0, 0] + NOISE.y_std**2, rel=1e-5)
+        expected = np.empty(len(signals.y))
+        for k, (u, y) in enumerate(zip(signals.u, signals.y, strict=True)):
+            if signals.restart[k]:
+                x = np.array([y, 0.0, 0.0])
+            expected[k] = y - x[0]
+            x = Phi @ x + B * u + K * expected[k]
+        found = made.of_output(signals.y, signals.runs) - made.of_acceleration(signals.u, signals.runs)
+        assert found == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
+
+    def test_the_sine_of_the_monitor_is_one(self) -> None:
+        angles = np.linspace(-1999.0, 1999.0, 4001)
+        assert np.array([sine(float(x)) for x in angles]) == pytest.approx(np.sin(angles), abs=1e-7)
+
+
+class TestWindow:
+    def test_sums_by_onset_are_those_of_whole_passes(self, window: AxisWindow) -> None:
+        m, names, x = window.nuisance_count, ("coulomb_friction",), np.array([0.3])
+        d, step = np.zeros(m), 1e-6
+        Q = np.random.default_rng(1).normal(size=(window.samples, 2))
+        onsets, overs = np.array([0, 60, 200]), np.array([0, 0, 0])
+        found, _ = window.change_sums(d, names, x, step, Q)(onsets, overs)
+        for sums, onset in zip(found, onsets, strict=True):
+            e, moved = (window.residual(np.append(d, size), names, ChangeProfile(int(onset)))[: window.samples]
+                        for size in (x, x + step))  # fmt: skip
+            both = np.array([e, (moved - e) / step])
+            assert sums == pytest.approx(np.hstack([both @ both.T, both @ Q]), rel=1e-5, abs=1e-7 * float(e @ e))
+
+    def test_the_input_gain_moves_every_coefficient(self, window: AxisWindow) -> None:
+        gain, mass = (
+            window.plant.scaled({name: 2.0}).acceleration_coefficients() for name in ("input_gain", "inertia")
+        )
+        healthy = window.plant.acceleration_coefficients()
+        assert gain / healthy == pytest.approx([0.5, 1.0, 1.0, 1.0])  # more u for the same motion
+        assert mass / healthy == pytest.approx([0.5, 0.5, 0.5, 0.5])
+
+    def test_the_limit_of_the_scan_is_that_of_a_brownian_bridge(self) -> None:
+        """Counted at a probability at which simulation can count: the largest of all standardised partial sums."""
+        rng, N, tries = np.random.default_rng(2), 1000, 4000
+        e = rng.normal(size=(tries, N))
+        S, t = np.cumsum(e, axis=1), np.arange(1, N + 1) / N
+        bridge = (S - t * S[:, -1:]) / np.sqrt(N)
+        inside = (t >= TRIM) & (t <= 1.0 - TRIM)
+        largest = (bridge[:, inside] ** 2 / (t * (1.0 - t))[inside]).max(axis=1)
+        share = float((largest > scan_limit(1, 0.01)).mean())
+        assert 0.005 < share < 0.013  # discrete steps miss a little of the continuous path
+        assert scan_limit(4) > scan_limit(1) > scan_limit(1, 10.0 * FALSE_ALARMS)
+
+
+@pytest.fixture(scope="module")
+def axis(shared_data: Path) -> tuple[ss.Baseline, ss.Recording, ss.Recording]:
+    loop = ss.Loop.from_dict(LOOP)
+    folder = shared_data / "real" / "emps"
+    train, test = (ss.read(folder / f"{name}.mat", loop) for name in ("DATA_EMPS", "DATA_EMPS_PULSES"))
+    return ss.learn(loop, [train]), train, test
+
+
+def added(
+    recording: ss.Recording, since_s: float, force: Callable[[FloatArray, FloatArray], FloatArray]
+) -> ss.Recording:
+    """Add a force [N] of speed and acceleration to u; the acceleration hardly smoothed, or inertia comes out small."""
+    from scipy.signal import savgol_filter
+
+    T = 1.0 / recording.sample_rate
+    v, a = (savgol_filter(recording.y, 11, 3, deriv=order, delta=T) for order in (1, 2))
+    return replace(recording, u=recording.u + np.where(recording.t >= since_s, force(v, a), 0.0) / 35.15)
+
+
+class TestMeasuredAxis:
+    def test_its_coefficients_are_those_of_the_authors(
+        self, axis: tuple[ss.Baseline, ss.Recording, ss.Recording]
+    ) -> None:
+        learned = axis[0].axis
+        assert learned is not None
+        assert learned.coefficients["inertia"] == pytest.approx(95.11, rel=0.01)  # Janot, Gautier and Brunot, 2019
+        assert learned.coefficients["coulomb_friction"] == pytest.approx(20.39, rel=0.03)
+        both = [learned.coefficients[f"viscous_friction_{way}"] for way in ("forward", "backward")]
+        assert both[0] < 203.5 < both[1]  # theirs is one for both ways
+
+    def test_healthy_recordings_are_healthy(self, axis: tuple[ss.Baseline, ss.Recording, ss.Recording]) -> None:
+        assert [ss.diagnose(axis[0], one).verdict for one in axis[1:]] == ["healthy", "healthy"]
+
+    @pytest.mark.parametrize(
+        ("fault", "ratio", "force"),
+        [
+            ("dry_friction", 1.15, lambda v, a: 0.15 * 20.72 * np.sign(v)),
+            ("payload", 0.9, lambda v, a: -0.1 * 95.67 * a),
+        ],
+    )
+    def test_a_change_is_named_with_size_and_time(
+        self,
+        axis: tuple[ss.Baseline, ss.Recording, ss.Recording],
+        fault: str,
+        ratio: float,
+        force: Callable[[FloatArray, FloatArray], FloatArray],
+    ) -> None:
+        diagnosis = ss.diagnose(axis[0], added(axis[1], 11.0, force))
+        assert [one.name for one in diagnosis.faults] == [fault]
+        low, high = diagnosis.faults[0].interval
+        assert low - 0.02 < ratio < high + 0.02
+        assert diagnosis.onset_s is not None
+        assert diagnosis.onset_s[0] <= 11.0 <= diagnosis.onset_s[2]
+        assert high - low < 0.1
+
+
+def test_a_baseline_of_an_axis_comes_back_from_its_file(
+    axis: tuple[ss.Baseline, ss.Recording, ss.Recording], tmp_path: Path
+) -> None:
+    axis[0].save(tmp_path / "axis.json")
+    assert ss.Baseline.load(tmp_path / "axis.json") == axis[0]
+
+
+@pytest.mark.parametrize(
+    ("plant", "told"),
+    [
+        ({"terms": ["stribeck"]}, "stribeck_speed: belongs to the term stribeck"),
+        ({"terms": ["viscous", "viscous_by_direction"]}, "remove one of them"),
+        ({"terms": ["coulomb", "coulomb"]}, "stands twice"),
+        ({"coefficients": {"inertia": 1.0}}, "check coulomb_friction, offset, viscous_friction"),
+    ],
+)
+def test_a_wrong_table_is_refused(plant: dict[str, Any], told: str) -> None:
+    with pytest.raises(LoopError, match=told):
+        ss.Loop.from_dict({"sample_rate": 100.0, "plant": {"kind": "axis", **plant}})
