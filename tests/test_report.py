@@ -16,8 +16,10 @@ from pages import PROVENANCE, Reader, make_diagnosis, make_recording, make_trace
 from servoscope import report
 from servoscope.core.errors import OutputError
 from servoscope.detection.result import Candidate, DiagnosisWarning, FaultEstimate, FinalCoefficient
+from servoscope.diagnosis.motion_signature import compare_signatures
 from servoscope.models.loop import Loop
 from servoscope.report import diagnosis_figures, plotting
+from servoscope.signals import clean
 
 
 @pytest.fixture
@@ -44,11 +46,11 @@ def test_a_fault_is_told_with_when_how_large_and_how_sure(loop: Loop) -> None:
     assert not page.wrong and not page.open
 
 
-def test_the_page_is_one_well_formed_document_with_four_pictures(loop: Loop) -> None:
+def test_the_page_is_one_well_formed_document_with_five_pictures(loop: Loop) -> None:
     page = read(make_diagnosis(), loop)
     pictures = [attrs for tag, attrs in page.tags if tag == "svg" and attrs.get("role") == "img"]
     ids = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
-    assert len(pictures) == 4
+    assert len(pictures) == 5
     assert all("width" not in attrs and "height" not in attrs for attrs in pictures)
     assert len(ids) == len(set(ids)), "an id stands twice"
     used = {str(attrs["xlink:href"]).removeprefix("#") for tag, attrs in page.tags if tag == "use"}
@@ -284,3 +286,25 @@ def test_writing_is_all_or_nothing(loop: Loop, tmp_path: Path, monkeypatch: pyte
     report.write_diagnosis_page(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
     assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert path.stat().st_mode & 0o777 == 0o640 and len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_motion_signature_shows_dry_friction_before_and_after() -> None:
+    """A mass of 2 that takes 0.4 of u to slide forward or backward, 0.7 from the middle on: bands of 0.8 and 1.4."""
+    t = np.arange(0.0, 60.0, 0.005)
+    w = 2.0 * np.pi * np.array([0.23, 0.71])[:, None]
+    y = (np.array([[0.05], [0.02]]) * np.sin(w * t)).sum(axis=0)
+    v, a = np.gradient(y, t), np.gradient(np.gradient(y, t), t)
+    friction = np.where(t < 30.0, 0.4, 0.7) * np.sign(v)
+    noise = 0.02 * np.random.default_rng(1).standard_normal(t.size)
+    recording = clean(t, y + 1e-3 * np.sign(v), 2.0 * a + 3.0 * v + friction + noise, y)
+    plant = {"kind": "polynomial", "order": 2, "friction": "coulomb"}
+    loop = Loop.from_dict({"sample_rate": 200.0, "plant": plant, "monitor": {"cutoff": 10.0}})
+    before, after = compare_signatures(recording, loop, 30.0)
+    assert before is not None and after is not None
+    for signature, band in ((before, 0.8), (after, 1.4)):
+        assert signature.friction_band.value == pytest.approx(band, abs=0.03)
+        assert signature.lost_motion is not None and signature.lost_motion.value == pytest.approx(2e-3, rel=0.05)
+        between = np.nanmedian(signature.forward - signature.backward)
+        assert between > band  # at speed, viscous friction comes on top
+    assert compare_signatures(recording, loop, None)[0] is None
+    assert compare_signatures(recording[:60], loop, None)[1] is None  # one way only

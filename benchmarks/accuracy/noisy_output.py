@@ -56,14 +56,14 @@ def actuator(fault: str, duration_s: float, seed: int, turbulence: float) -> ss.
 @functools.cache
 def healthy_pitch() -> ss.Baseline:
     """Return the baseline of five winds of ten minutes."""
-    return ss.learn(ss.Loop.from_dict(LOOP), [actuator("", 600.0, seed, 1.0) for seed in range(5)])
+    return ss.learn(ss.Loop.from_dict(LOOP), [actuator("", 600.0, seed, 1.0) for seed in range(5)], force=True)
 
 
 def pitch_job(seed: int, turbulence: float) -> Numbers:
     """Learn some recordings one by one, and diagnose a healthy one and both faults, all from other winds."""
     own = 3_000_000 + SEEDS_PER_UNIT * seed + round(10 * turbulence)
     loop = ss.Loop.from_dict(LOOP)
-    learned = [ss.learn(loop, [actuator("", SECONDS, own + 100 * i, turbulence)]) for i in range(LEARNED)]
+    learned = [ss.learn(loop, [actuator("", SECONDS, own + 100 * i, turbulence)], force=True) for i in range(LEARNED)]
     found: Numbers = {"error": [one.theta[2] / TRUE["input"][2] - 1.0 for one in learned]}
     found["std"] = [float(np.sqrt(one.covariance[2][2])) / TRUE["input"][2] for one in learned]
     found["instrument"] = all(one.instrument is not None for one in learned)
@@ -108,7 +108,7 @@ def bias_job(seed: int, source: str, level_db: float, kind: str = "random") -> N
     """Learn one recording; errors and stated deviations are relative."""
     plant = {"kind": "polynomial", "order": 2, "stiffness": source == "input"}
     loop = ss.Loop.from_dict({"sample_rate": RATE, "plant": plant, "monitor": {"cutoff": 3.0, "memory": 20.0}})
-    learned = ss.learn(loop, [drive(2_000_000 + seed, source, level_db, kind)])
+    learned = ss.learn(loop, [drive(2_000_000 + seed, source, level_db, kind)], force=True)
     true = np.array(TRUE[source])
     return {
         "error": (np.array(learned.theta) / true - 1.0).tolist(),

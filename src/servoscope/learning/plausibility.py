@@ -34,7 +34,8 @@ def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
     Raises RecordingError, which says what is odd and what to do.
     """
     odd = []
-    if baseline.explained < LEAST_EXPLAINED:
+    # an instrument sees through noise of y that leaves more of u than the motion explains
+    if baseline.explained < LEAST_EXPLAINED and baseline.instrument is None:
         odd.append(message("learning.unexplained", share=baseline.explained))
     below = [
         message("learning.negative", name=name, value=value, deviation=math.sqrt(baseline.covariance[i][i]))
@@ -42,7 +43,7 @@ def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
         if name in POSITIVE and value + CERTAIN * math.sqrt(baseline.covariance[i][i]) < 0.0
     ]
     if below:
-        all_below = len(below) == sum(name in POSITIVE for name in baseline.names)
+        all_below = len(below) > 1 and len(below) == sum(name in POSITIVE for name in baseline.names)
         advice = "learning.negative_all" if all_below else "learning.negative_some"
         odd.append(message("learning.implausible", coefficients=below, advice=message(advice)))
     if odd and not force:
