@@ -148,6 +148,7 @@ def added(
     return replace(recording, u=recording.u + np.where(recording.t >= since_s, force(v, a), 0.0) / 35.15)
 
 
+@pytest.mark.slow
 class TestMeasuredAxis:
     def test_its_coefficients_are_those_of_the_authors(
         self, axis: tuple[ss.Baseline, ss.Recording, ss.Recording]
@@ -185,6 +186,7 @@ class TestMeasuredAxis:
         assert high - low < 0.1
 
 
+@pytest.mark.slow
 def test_a_baseline_of_an_axis_comes_back_from_its_file(
     axis: tuple[ss.Baseline, ss.Recording, ss.Recording], tmp_path: Path
 ) -> None:

@@ -289,6 +289,11 @@ class _HypothesisSearch:
         several = PAIRS if own > 1 else 0.0
         prior = {1: (1.0 - several - OUTSIDE) / n, 2: several / max(own * (own - 1) / 2, 1)}
         best = self._update_noise_variance(fitted)
+        # tempered, more of them are within reach than were when they were fitted
+        fitted = [
+            self._refit_jointly(f) if self._is_contender(f, best) and not f.has_free_nuisances else f for f in fitted
+        ]
+        best = self._best(fitted)
         top = self._evidence(best, scales)
         told = [
             self._evidence(f, scales)
