@@ -15,7 +15,7 @@ from servoscope.signals import Recording
 BINS = 40  # of position and of speed
 FEWEST = 5  # samples that a bin needs
 SLOW = 0.02  # of the fast speeds (99th percentile), below which direction means nothing
-MOST_ROWS = 200_000  # that are looked at, the newest
+MOST_ROWS = 50_000  # that are looked at, the newest
 WINDOW = 0.5  # periods of the cutoff over which a parabola is fitted to the signals
 LEAST_MOTION = 200  # samples in motion
 
