@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -61,6 +62,30 @@ def test_paths_stand_where_objects_do_and_what_comes_is_short(tmp_path: Path) ->
         assert len(text) < 400 and "\n" not in text and text.startswith(type(shown).__name__)
         assert table.startswith("<table><caption>") and table.count("<tr>") >= 3
     assert "verdict: healthy" in repr(diagnosis)
+    # the same objects as pictures
+    fleet = ss.Monitor([tmp_path / "baseline.json", baseline])
+    r, u, y = (np.stack([signal, signal]) for signal in (recording.r, recording.u, recording.y))
+    trace = fleet.run(fleet.init(), r, u, y)[1]
+    plt.switch_backend("agg")
+    upper, lower = ss.plot(recording)
+    np.testing.assert_array_equal(upper.lines[1].get_ydata(), recording.y)
+    np.testing.assert_array_equal(lower.lines[0].get_ydata(), recording.u)
+    (axes,) = ss.plot(trace)
+    assert [line.get_label() for line in axes.lines if "t2" in str(line.get_label())] == ["t2 of 0", "t2 of 1"]
+    (axes,) = ss.plot(inspection)
+    assert list(axes.lines[0].get_xdata()) == [one.frequency_hz for one in inspection.frequencies]
+    magnitude, phase = ss.plot(baseline)
+    s = 2j * np.pi * np.asarray(magnitude.lines[0].get_xdata())  # the inverse is a polynomial in s
+    H = sum(value * s**k for k, value in enumerate(baseline.theta))
+    np.testing.assert_allclose(np.asarray(magnitude.lines[0].get_ydata()), np.abs(H), rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(phase.lines[0].get_ydata()), np.degrees(np.unwrap(np.angle(H))), atol=1e-6)
+    (axes,) = ss.plot(diagnosis)
+    assert len(axes.get_yticks()) == len(baseline.names)
+    plt.close("all")
+    with pytest.raises(TypeError, match=r"a plot is made of a Recording, .* not of int"):
+        ss.plot(3)  # type: ignore[arg-type]
+    judged = ss.write_report(tmp_path / "page.html", tmp_path / "baseline.json", path)
+    assert judged == diagnosis and "healthy.csv" in (tmp_path / "page.html").read_text()
 
 
 def test_a_name_cannot_put_markup_into_a_notebook(tmp_path: Path) -> None:
