@@ -1,6 +1,6 @@
 """The exported monitor in C beside `Monitor.run`, bit by bit, by compiler, option and processor; its size and cost.
 
-python benchmarks/export.py [--samples 10000000] [--emulated 10000000] [--json]
+python benchmarks/export.py [--samples 10000000] [--emulated 200000] [--json]
 
 Other processors are emulated by QEMU. Instructions of a Cortex-M7 are counted: code for it, linked into a program that
 QEMU runs one instruction at a time. That is no count of cycles.
@@ -283,7 +283,7 @@ def main() -> None:
     """Run the command line of this process."""
     arguments = parser(__doc__)
     arguments.add_argument("--samples", type=int, default=10_000_000)
-    arguments.add_argument("--emulated", type=int, default=10_000_000, help="samples for emulated processors")
+    arguments.add_argument("--emulated", type=int, default=200_000, help="samples for emulated processors")
     given = arguments.parse_args()
     loop = Loop.load(RIG)
     baseline = learn(loop, [simulate(loop, reference("profile", 60.0, 100.0), seed=1)[0]])

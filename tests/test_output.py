@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from commands import run
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
 
@@ -33,3 +34,12 @@ def test_writing_follows_links_and_leaves_devices_alone(tmp_path: Path) -> None:
     assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
     atomic_write(os.devnull, b"gone")
     assert not Path(os.devnull).is_file()
+
+
+def test_names_cannot_steer_the_terminal(tmp_path: Path) -> None:
+    """Those of files and columns come from strangers; a terminal obeys what begins with ESC."""
+    path = tmp_path / "\x1b[2Jlog.csv"
+    path.write_text("t,r\x1b[31m,u\x07,y\n" + "".join(f"{0.01 * k:.2f},{k % 7},{k % 5},{k % 3}\n" for k in range(300)))
+    result = run("inspect", path)
+    assert "?[2Jlog.csv" in result.out and "r?[31m" in result.out
+    assert not set("\x1b\x07") & set(result.out + result.err)

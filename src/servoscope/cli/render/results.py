@@ -6,9 +6,11 @@ import math
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
+from unicodedata import category
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.padding import Padding
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -42,11 +44,22 @@ COLOURS = {
     "does not hold": "red",
 }
 INDENT = (0, 0, 0, 2)
+STEERING = ("Cc", "Cf", "Cs")  # control and format characters, and bytes that are no text
+
+
+class _TextConsole(Console):
+    """A console to which names of files, columns and assets are text: what would steer a terminal is shown as ?."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """Return what is printed, piece by piece."""
+        for segment in super().render(renderable, options):
+            text = "".join("?" if category(c) in STEERING and c != "\n" else c for c in segment.text)
+            yield segment if segment.control else segment._replace(text=text)
 
 
 def create_console(*, stderr: bool = False) -> Console:
     """Return a console on stdout or stderr: without colour when that is no terminal or NO_COLOR is set."""
-    return Console(stderr=stderr, highlight=False, markup=False, emoji=False)
+    return _TextConsole(stderr=stderr, highlight=False, markup=False, emoji=False)
 
 
 def print_title(out: Console, name: str, text: str) -> None:
