@@ -321,7 +321,7 @@ class TestAsset:
                 said = diagnose_blocks(followed.baseline, "press", seen)
                 (fault,) = said.document["faults"]
                 told.append((window.until - BEGAN, followed.is_news(window, said), fault["ratio"]))
-                (row,) = followed.apply_diagnosis(window, said).rows
+                row = followed.apply_diagnosis(window, said).rows[0]
                 onsets.append(row.values["onset"])
                 assert f"since {format_time(onsets[0])} UTC" in row.values["summary"]
         assert [news for _, news, _ in told] == [True, False, False]  # the same fault: nobody is told once more

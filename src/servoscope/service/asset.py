@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -22,14 +22,13 @@ from servoscope.service.alarms import (
     AlarmSettings,
     AlarmStandstill,
     AlarmTransition,
-    AssetSnapshot,
     OperatorCommand,
     advance_alarms,
     initial_alarm_state,
     next_event_time,
     step_alarm,
 )
-from servoscope.service.asset_status import AssetStatus, asset_metadata, asset_status, asset_summary
+from servoscope.service.asset_status import AssetStatus, asset_metadata, asset_snapshot, asset_status
 from servoscope.service.block_lanes import BlockLanes, LaneInput, LaneOutput
 from servoscope.service.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.config import DiagnosisSettings
@@ -43,7 +42,8 @@ from servoscope.service.examination_schedule import (
     schedule_full_diagnosis,
     update_examination,
 )
-from servoscope.service.outlook import Outlook, PrognosisSettings, current_outlook, single_fault
+from servoscope.service.outlook import Outlook, PrognosisSettings, outlook_word, single_fault
+from servoscope.service.recent_blocks import RecentBlocks
 from servoscope.service.reception import FOLLOWED
 from servoscope.service.records import BlockRefusal, StepResult, TableRow, transition_row
 from servoscope.service.sources.block import Block
@@ -81,8 +81,7 @@ class Asset:
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
         alarms, limited = policy.alarms.asset_alarms, bool(policy.limits)
         self._definitions = {key: one for key, one in alarms.items() if limited or one.source != "outlook"}
-        self._window: deque[Block] = deque()
-        self._window_samples = 0
+        self._window = RecentBlocks(policy.diagnosis.window_s, self._rate)
         self._accepted: tuple[Block, BlockContinuity] | None = None
         self._settled: AlarmStandstill | None = None
         self._by_numbers = any(one.source in ("statistic", "level") for one in self._definitions.values())
@@ -114,8 +113,8 @@ class Asset:
         alarms = {name: state.alarms.get(name) or initial_alarm_state(self.name, name, t) for name in self._definitions}
         self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
         position, blocks = state.position, list(stored)
-        self._window = deque(one for one in blocks if one.sequence < position.blocks)
-        self._window_samples = sum(one.t.size for one in self._window)
+        counted = [one for one in blocks if one.sequence < position.blocks]
+        self._window = RecentBlocks(self.policy.diagnosis.window_s, self._rate, counted)
         ahead = position.sequence - position.blocks + 1  # of the sender's numbers; all are of one stream
         return [
             replace(one, sequence=one.sequence + ahead, stream=position.stream)
@@ -160,7 +159,8 @@ class Asset:
     @property
     def first_needed_sequence(self) -> int:
         """The number of the first block of the window: earlier ones are no longer needed."""
-        return self._window[0].sequence if self._window else self._current.position.blocks
+        first = self._window.first_sequence
+        return self._current.position.blocks if first is None else first
 
     def process(self, block: Block, latest: float = math.inf) -> StepResult:
         """Process a block; one that was counted before has no effect, nor has one that is later than `latest` [UTC s].
@@ -189,7 +189,7 @@ class Asset:
         position, self._result = self._current.position, StepResult([], [])
         if continuity is None:
             # its sender sends it again by design, or it is one of the last minutes
-            if block.retained or any(one.t[0] == block.t[0] for one in self._window):
+            if block.retained or self._window.begins_with(block.t[0]):
                 self.state = replace(self._current, position=replace(position, repeated=position.repeated + 1))
                 return self._result
             return self._leave_out(block, "late", behind_s=position.t - start)
@@ -204,7 +204,7 @@ class Asset:
         self._count(block, continuity, followed)
         self._examine()
         self._advance_alarms(self._current.position.t)
-        self._trim_window()
+        self._window.trim(self._current.position.t, self._current.pending_diagnoses)
         nothing_else = len(self._result.rows) == 1 and self._current.alarms is alarms
         undisturbed = self.reception == FOLLOWED and not self._ticked
         self.is_repeatable = nothing_else and undisturbed and self._current.examination is examination
@@ -262,10 +262,7 @@ class Asset:
         t, after_s, pending = self.state.position.t, self._schedule.after, self.state.pending_diagnoses
         # complete, or never to be because the clock was set back
         ready = [window for window in pending if ended or not window.until - after_s <= t < window.until]
-        return [
-            (window, [block for block in self._window if block.sequence >= window.first and block.t[0] < window.until])
-            for window in ready
-        ]
+        return [(window, self._window.within(window)) for window in ready]
 
     def is_news(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> bool:
         """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
@@ -295,7 +292,7 @@ class Asset:
         pending = tuple(one for one in state.pending_diagnoses if one != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
-        self._trim_window()
+        self._window.trim(self._current.position.t, self._current.pending_diagnoses)
         named = fault_rows(window.until, "full", diagnosis.document.get("faults", []))
         return StepResult([TableRow("diagnoses", values), *(TableRow("sizes", row) for row in named)], [])
 
@@ -320,7 +317,6 @@ class Asset:
         state, position, packed = self._current, self._current.position, block.pack()
         # stored under a number of our own, because the sender's may begin anew
         self._window.append(evolve(block, sequence=position.blocks))
-        self._window_samples += block.t.size
         self._result.rows.append(TableRow("recent", {"sequence": position.blocks, "samples": packed}))
         if continuity.is_broken:
             self._result.rows.append(continuity.audit_row(position, block))
@@ -353,10 +349,7 @@ class Asset:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self._current, self.policy.diagnosis
         t = state.position.t
-
-        def recent() -> list[Block]:
-            return [block for block in self._window if block.t[-1] > t - settings.window_s]
-
+        recent = partial(self._window.after, t - settings.window_s)
         examination, result = update_examination(
             state.examination,
             settings,
@@ -386,26 +379,14 @@ class Asset:
         """Update the alarms at time `t` [UTC s]."""
         state = self._current
         findings, settled = tuple(quality.active_findings(state.quality)), self._settled
-        outlook = current_outlook(state.outlook, state.examination.faults)
-        # of a fault that has gone nothing is left to wait for
-        word = outlook.word(t, self.policy.prognosis.ahead_s) if outlook is not None else "far"
+        word = outlook_word(state.outlook, state.examination.faults, t, self.policy.prognosis.ahead_s)
         known = state.examination, findings, self.reception, word
         if settled is not None and settled.known == known:
             at = settled.at if state.alarms_at is None else state.alarms_at
             if at <= t < settled.until:
                 self.state = evolve(state, alarms_at=t)
                 return
-        statistic, level = state.evaluation.peaks
-        snapshot = AssetSnapshot(
-            verdict=quality.limit_verdict(state.examination.verdict, findings),
-            quality=findings,
-            statistic=statistic,
-            level=level,
-            reception=self.reception,
-            cause=asset_summary(state.examination, findings),
-            outlook=word,
-            outlook_cause=outlook.summary if outlook is not None else "",
-        )
+        snapshot = asset_snapshot(state, findings, self.reception, word)
         alarms, transitions = advance_alarms(self._definitions, state.alarms_now, snapshot, t)
         self.state = replace(state, alarms=alarms, alarms_at=None)
         # after transitions a second step may do more, because alarms suppress each other
@@ -417,13 +398,3 @@ class Asset:
         self._result.transitions.extend(transitions)
         for one in transitions:
             self._add_row("transitions", **transition_row(one, self._definitions[one.alarm]))
-
-    def _trim_window(self) -> None:
-        """Drop samples that no examination needs any more; also where the clock was set back."""
-        state, window_s = self._current, self.policy.diagnosis.window_s
-        first = min((window.first for window in state.pending_diagnoses), default=None)
-        while self._window and (first is None or self._window[0].sequence < first):
-            old = self._window[0].t[-1] <= state.position.t - window_s
-            if not old and self._window_samples <= 2.0 * window_s * self._rate:
-                return
-            self._window_samples -= self._window.popleft().t.size

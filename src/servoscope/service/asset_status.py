@@ -13,10 +13,18 @@ from pydantic import BaseModel, ConfigDict, Field
 from servoscope.core.messages import message, render
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import FaultEstimate
-from servoscope.service.alarms import FAULT_ALARM, AlarmDefinition, LifecycleState, Ne107, Priority, evaluate_ne107
+from servoscope.service.alarms import (
+    FAULT_ALARM,
+    AlarmDefinition,
+    AssetSnapshot,
+    LifecycleState,
+    Ne107,
+    Priority,
+    evaluate_ne107,
+)
 from servoscope.service.checkpoint import AssetState, StreamPosition
 from servoscope.service.examination_schedule import ExaminationState
-from servoscope.service.outlook import Outlook, current_outlook
+from servoscope.service.outlook import Outlook, OutlookWord, current_outlook
 from servoscope.service.reception import FOLLOWED, Reception, ReceptionState
 from servoscope.service.residual_history import EvaluationStatus
 from servoscope.signals import quality
@@ -134,6 +142,24 @@ def asset_summary(examination: ExaminationState, findings: Iterable[str], recept
     if quality.limit_verdict(examination.verdict, findings) == examination.verdict:
         return examination.summary
     return render(message("service.examination.data_quality", findings=quality.describe_findings(findings)))
+
+
+def asset_snapshot(
+    state: AssetState, findings: tuple[str, ...], reception: Reception, outlook: OutlookWord
+) -> AssetSnapshot:
+    """Return what the asset's alarms go by."""
+    statistic, level = state.evaluation.peaks
+    current = current_outlook(state.outlook, state.examination.faults)
+    return AssetSnapshot(
+        verdict=quality.limit_verdict(state.examination.verdict, findings),
+        quality=findings,
+        statistic=statistic,
+        level=level,
+        reception=reception,
+        cause=asset_summary(state.examination, findings),
+        outlook=outlook,
+        outlook_cause=current.summary if current is not None else "",
+    )
 
 
 def asset_status(
