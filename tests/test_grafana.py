@@ -13,12 +13,13 @@ from typing import Any
 import sqlalchemy as sa
 from reliability.servers import Postgres
 
+from servoscope.service.layer_times import LayerTimes
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.store import Batch, Store
 
 GRAFANA = Path(__file__).resolve().parents[1] / "grafana"
 DASHBOARD = json.loads((GRAFANA / "dashboards" / "servoscope.json").read_text(encoding="utf-8"))
-LABELS = {"asset", "verdict", "alarm", "priority", "state", "source", "kind", "le"}
+LABELS = {"layer", "asset", "verdict", "alarm", "priority", "state", "source", "kind", "le"}
 NOW = 1767225600.0
 
 
@@ -36,7 +37,7 @@ def queries() -> list[str]:
 def test_every_metric_is_there_and_every_metric_is_shown() -> None:
     writer = SimpleNamespace(unavailable_since=None, waiting=0)
     clock = {"buffer": 1, "last_turn": time.monotonic()}
-    service: Any = SimpleNamespace(assets={}, sources={}, troubles={}, writer=writer, **clock)
+    service: Any = SimpleNamespace(assets={}, sources={}, troubles={}, writer=writer, layers=LayerTimes(), **clock)
     text = ServiceMetrics(service).render().decode()
     known = {name for name in re.findall(r"^# TYPE (\w+) ", text, re.MULTILINE) if not name.endswith("_created")}
     asked = "\n".join(target["expr"] for target in targets() if "expr" in target)
