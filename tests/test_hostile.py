@@ -79,6 +79,7 @@ def test_what_is_broken_is_read_or_refused_and_nothing_else(tmp_path: Path) -> N
     """The benchmark itself, short; its target list is that of all readers and decoders."""
     found = [fed(target, 66, seed=7) for target in targets(tmp_path)]
     assert {one["name"]: one["cases"] for one in found if one["other"] or one["badly told"]} == {}
-    assert broken_bounds([one | {"slowest_s": 0.0} for one in found]) == []  # time is the benchmark's
+    # time and memory are the benchmark's: this process has run other tests
+    assert broken_bounds([one | {"slowest_s": 0.0, "peak_mb": 0} for one in found]) == []
     assert all(one["refused"] for one in found) and len(found) == 23
     assert "| CSV file | 66 |" in markdown({"targets": found, "machine": ""})

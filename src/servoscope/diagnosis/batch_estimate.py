@@ -8,6 +8,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
+from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import Onset
 from servoscope.detection.expectation import Expectation, reference_path
 from servoscope.detection.signature import Signature
@@ -18,6 +19,15 @@ from servoscope.isolation.signatures import fault_signatures
 
 LONGEST = 500_000  # samples of a stretch; more of them add nothing
 ENOUGH = 0.05  # stated relative deviation, up to which half a stretch is enough
+
+
+def stretch_begin(baseline: Baseline, low_s: float, high_s: float) -> float:
+    """Return from when on a recording is taken for changed, by the 95 % interval of its onset [s].
+
+    Directions are learned and compared from the earliest onset on: cutting a motion elsewhere turns them more than some
+    healthy samples do. A fit by an instrument, whose deviation is small, may have nothing from before the change.
+    """
+    return low_s if baseline.instrument is None else high_s
 
 
 def estimate_batch_deviation(exam: Examination, from_s: float, to_s: float = np.inf) -> tuple[FloatArray, FloatArray]:
@@ -76,9 +86,7 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     recording, e, last = exam.recording, exam.estimates, int(exam.estimates.index[at])
     first, whole = exam.memory_start(at), None
     if (exam.baseline.learned or exam.baseline.instrument is not None) and exam.noise is None:
-        # nothing from before the change may be in a fit by an instrument, whose deviation is small
-        change_s = onset.likely_s if exam.baseline.instrument is None else onset.high_s
-        begin = max(change_s, float(recording.t[max(last - LONGEST, 0)]))
+        begin = max(stretch_begin(exam.baseline, onset.low_s, onset.high_s), float(recording.t[max(last - LONGEST, 0)]))
         # where it is not enough, the recursion, which starts from healthy, needs no more than the alarm did
         with contextlib.suppress(NotEnoughError):
             whole = estimate_batch_deviation(exam, begin, float(recording.t[last]) + 0.5 / recording.sample_rate)

@@ -15,7 +15,7 @@ from servoscope.core.messages import Message, message
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.learned_fault import LearnedFault
 from servoscope.detection.result import UNKNOWN
-from servoscope.diagnosis.batch_estimate import estimate_batch_deviation
+from servoscope.diagnosis.batch_estimate import estimate_batch_deviation, stretch_begin
 from servoscope.diagnosis.diagnose import diagnose_examination
 from servoscope.diagnosis.examine import Examination
 from servoscope.isolation.isolate import misfit_limit
@@ -64,7 +64,8 @@ def add_learned_faults(
 
 def _fault_deviation(exam: Examination) -> tuple[FloatArray, FloatArray]:
     onset = diagnose_examination(exam)[0].onset_s
-    return estimate_batch_deviation(exam, onset[1] if onset is not None else float(exam.recording.t[0]))
+    begin = float(exam.recording.t[0]) if onset is None else stretch_begin(exam.baseline, onset[0], onset[2])
+    return estimate_batch_deviation(exam, begin)
 
 
 def _learn_fault(name: str, faulty: Sequence[Examination], healthy: FloatArray) -> LearnedFault:

@@ -113,8 +113,8 @@ class OutlookRow(ApiResponse):
     limit: float
     outlook: OutlookKind
     asked: float
-    reach_t: tuple[float | None, float | None, float | None] | None
-    rate_per_day: tuple[float, float, float] | None
+    reach_t: tuple[float | None, ...] | None
+    rate_per_day: tuple[float, ...] | None
     summary: str
 
 

@@ -53,9 +53,9 @@ class Forecast(ApiResponse):
     from_t: float
     to_t: float
     outlook: Outlook
-    value: tuple[float, float, float] | None
-    rate_per_day: tuple[float, float, float] | None
-    remaining_s: tuple[float | None, float | None, float | None] | None
+    value: tuple[float, ...] | None
+    rate_per_day: tuple[float, ...] | None
+    remaining_s: tuple[float | None, ...] | None
     odds: float | None
     summary: str
     explanation: tuple[str, ...]
