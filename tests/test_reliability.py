@@ -14,8 +14,7 @@ def test_nothing_is_lost_and_nothing_counts_twice(name: str) -> None:
         pytest.skip("PostgreSQL is not on this machine: scripts/install-test-servers installs it")
     found = run.trial(name, (6, 0.5, 120.0), every_s=4.0)
     assert found["blocks"] == 6 * 60
-    wrong = ("lost", "duplicated", "other", "misnumbered")
+    wrong = ("lost", "duplicated", "other", "misnumbered", "different")
     assert {key: found[key] for key in wrong} == dict.fromkeys(wrong, 0)
-    assert found["different"] <= 1  # on a busy machine, in some trials: docs/limits.md, the cause is not known yet
     assert found["lives"] > 1 and found["compared"] == 6
     assert "simulated | 0.5 h, 6 assets" in run.markdown([found])

@@ -14,7 +14,12 @@ from servoscope.service.alarms import AlarmSettings
 from servoscope.service.asset import Asset, AssetPolicy
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.examination import StoredDiagnosis, diagnose_blocks, undetermined
-from servoscope.service.examination_schedule import ExaminationState, update_examination
+from servoscope.service.examination_schedule import (
+    ExaminationState,
+    PendingDiagnosis,
+    accept_diagnosis,
+    update_examination,
+)
 from servoscope.service.sources.block import Block
 from servoscope.signals.quality import QualitySettings
 
@@ -42,6 +47,16 @@ def test_a_fault_stands_until_something_shows_that_it_has_gone() -> None:
         assert examined(at_rest, 3000.0, gone).fault_at is None
     assert examined(start, 10.0, FAULT, sound=False).fault_at is None  # bad data may have made it
     assert examined(ill, 1000.0, FAULT, sound=False).fault_at == 10.0
+
+
+def test_it_does_not_matter_when_a_full_diagnosis_comes_back() -> None:
+    """It is made beside the samples: how long that takes is up to the machine, and what is stored is not."""
+    window = PendingDiagnosis(1, 0, 20.0, "full")
+    named = FAULT.model_copy(update={"document": {"faults": [{"name": "leakage"}]}})
+    ill = examined(ExaminationState(due=0.0), 10.0, FAULT)
+    before = examined(accept_diagnosis(ill, window, named, first=True)[0], 1000.0, HEALTHY)
+    after = accept_diagnosis(examined(ill, 1000.0, HEALTHY), window, named, first=True)[0]
+    assert before == after and before.diagnosed is None
 
 
 @pytest.fixture(scope="module")

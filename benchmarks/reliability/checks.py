@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import sqlalchemy as sa
 
 from reliability.fleet import Fleet
 from servoscope.service.build import build_components
-from servoscope.service.checkpoint import pack_state, unpack_state
 from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
 from servoscope.service.store import Store
@@ -97,17 +96,10 @@ def numbers_of(table: sa.Table, asset: str) -> sa.Select[tuple[int]]:
 
 
 def results(store: Store, asset: str) -> list[object]:
-    """Return all that is stored of an asset.
-
-    But the live size of a fault: an examination measures it once the full diagnosis has named the fault, and when that
-    comes back is a matter of the machine's load, not of the samples.
-    """
+    """Return all that is stored of an asset."""
     found: list[object] = [
         store.fetch(sa.select(table).where(table.c.asset == asset).order_by(*table.primary_key))
         for table in (*NUMBERED, recent)
     ]
     row = store.checkpoints([asset])[asset]
-    state = unpack_state(bytes(row["state"]), asset)
-    state = replace(state, examination=replace(state.examination, size={}, sized=None))
-    status = {key: value for key, value in row["status"].items() if key not in ("size", "sized")}
-    return [*found, row["sequence"], pack_state(state), status]
+    return [*found, row["sequence"], bytes(row["state"]), row["status"]]

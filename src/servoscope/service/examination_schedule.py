@@ -136,9 +136,12 @@ def accept_diagnosis(
     # not of a fault before this one; a later window that names nothing keeps the name
     if diagnosis.verdict == "fault" and (examination.verdict != "fault" or window.until > examination.since):
         faults = diagnosis.document.get("faults", [])
+        # what has gone meanwhile keeps its name only, as if the diagnosis had come before
+        stands = examination.verdict == "fault" or examination.fault_at is not None
         if faults or not examination.named:
-            examination = replace(examination, named=diagnosis.summary, diagnosed=window.until)
-        if examination.verdict == "fault" or examination.fault_at is not None:
+            until = window.until if stands else examination.diagnosed
+            examination = replace(examination, named=diagnosis.summary, diagnosed=until)
+        if stands:
             onset = diagnosis.onset if first and diagnosis.onset is not None else examination.onset
             examination = replace(examination, faults=faults or examination.faults, onset=onset)
     elif diagnosis.verdict == "undetermined" and not examination.named:
