@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import inspect
 import pkgutil
 from collections.abc import Mapping
 from importlib.metadata import entry_points
@@ -21,7 +22,7 @@ ENTRY_POINTS = "servoscope.plants"  # of other packages: name is the kind, objec
 def _built_in() -> dict[str, type[Plant]]:
     modules = [importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__)]
     classes = {each for module in modules for each in vars(module).values() if isinstance(each, type)}
-    plants = [each for each in classes if issubclass(each, Plant) and each is not Plant]
+    plants = [each for each in classes if issubclass(each, Plant) and not inspect.isabstract(each)]
     return {str(each.model_fields["kind"].default): each for each in plants}
 
 

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import LoopError
-from servoscope.models.plants.base import Fault, Plant, StateSpace
+from servoscope.models.plants.base import CoefficientPlant, Fault, StateSpace
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -54,8 +53,6 @@ TERMS: dict[str, tuple[AxisColumn, ...]] = {
 }
 """What may act on an axis besides its inertia, by the name that a loop file declares."""
 
-RATIO_RANGES = {"inertia": (0.2, 5.0), "input_gain": (0.3, 3.0)}
-DEFAULT_RANGE = (0.1, 10.0)
 # parameter -> name of the fault, and all that does the same to u and y
 FAULTS = {
     "inertia": ("payload", "more moved mass: a payload, a coupling, a tool"),
@@ -73,7 +70,7 @@ def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value  # TOML has lists, and plants are read strictly
 
 
-class AxisPlant(Plant):
+class AxisPlant(CoefficientPlant):
     """Motor axis ``input_gain u = inertia y'' + sum of terms``, each a coefficient times a function of y and y'."""
 
     kind: Literal["axis"] = "axis"
@@ -157,30 +154,13 @@ class AxisPlant(Plant):
         return ("backlash", *friction, "compliance", *(() if {"offset", "gravity"} & set(self.terms) else ("load",)))
 
     @property
-    def has_physics(self) -> bool:
-        """Whether nominal coefficients are given."""
-        return self.coefficients is not None
-
-    @property
     def faults(self) -> tuple[Fault, ...]:
         """Changes that are told by name; friction that differs by direction changes in both."""
         by_direction = "viscous_by_direction" in self.terms
         known = {*self.names, "input_gain", *(("viscous_friction",) if by_direction else ())}
         return tuple(
-            Fault(name, parameter, RATIO_RANGES.get(parameter, DEFAULT_RANGE), words)
-            for parameter, (name, words) in FAULTS.items()
-            if parameter in known
+            self._fault(name, parameter, words) for parameter, (name, words) in FAULTS.items() if parameter in known
         )
-
-    def _nominal(self) -> dict[str, float]:
-        if self.coefficients is None:
-            raise LoopError("[plant] coefficients: missing, simulation and nominal values need them")
-        return self.coefficients
-
-    def theta(self) -> FloatArray:
-        """Nominal coefficients, shape (n,)."""
-        nominal = self._nominal()
-        return np.array([nominal[name] for name in self.names], dtype=np.float64)
 
     def scaled(self, factors: Mapping[str, Any]) -> Self:
         """Return the same axis with coefficients multiplied; ``input_gain`` multiplies all of them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr
@@ -220,3 +220,32 @@ class Plant(BaseModel, abc.ABC):
                 raise LoopError(f"{name}: not a parameter of plant {self.kind}, which has {', '.join(known)}")
             if not (np.isfinite(ratio) and ratio > 0.0):
                 raise LoopError(f"{name}={ratio:g}: the ratio to the nominal value must be positive and finite")
+
+
+class CoefficientPlant(Plant):
+    """Plant whose parameters are the coefficients themselves, with nominal values by name in a field `coefficients`."""
+
+    # smallest and largest ratio to the nominal value that is searched, by parameter, and of all others
+    RATIO_RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {"inertia": (0.2, 5.0), "input_gain": (0.3, 3.0)}
+    DEFAULT_RANGE: ClassVar[tuple[float, float]] = (0.1, 10.0)
+
+    if TYPE_CHECKING:  # a field of each plant, at the place that it has in its loop file
+        coefficients: dict[str, float] | None
+
+    @property
+    def has_physics(self) -> bool:
+        """Whether nominal coefficients are given."""
+        return self.coefficients is not None
+
+    def theta(self) -> FloatArray:
+        """Nominal coefficients, shape (n,) [u per output per s^power]."""
+        nominal = self._nominal()
+        return np.array([nominal[name] for name in self.names], dtype=np.float64)
+
+    def _nominal(self) -> dict[str, float]:
+        if self.coefficients is None:
+            raise LoopError("[plant] coefficients: missing, simulation and nominal values need them")
+        return self.coefficients
+
+    def _fault(self, name: str, parameter: str, words: str) -> Fault:
+        return Fault(name, parameter, self.RATIO_RANGES.get(parameter, self.DEFAULT_RANGE), words)

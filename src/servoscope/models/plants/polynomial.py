@@ -8,9 +8,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import LoopError
-from servoscope.models.plants.base import Fault, Plant, StateSpace
+from servoscope.models.plants.base import CoefficientPlant, Fault, StateSpace
 
 POWER_NAMES = ("stiffness", "viscous_friction", "inertia", "jerk", "snap")
 EXTRA_NAMES = {
@@ -19,15 +17,13 @@ EXTRA_NAMES = {
     "backward_v": "viscous_friction_backward",
     "one": "offset",
 }
-RATIO_RANGES = {"inertia": (0.2, 5.0), "input_gain": (0.3, 3.0)}
-DEFAULT_RANGE = (0.1, 10.0)
 INPUT_GAIN_WORDS = "more u for the same motion (weak motor, magnet or amplifier, or all coefficients up together)"
 
 FrictionKind = Literal["none", "coulomb", "directional"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class PolynomialPlant(Plant):
+class PolynomialPlant(CoefficientPlant):
     """Plant whose inverse is a polynomial in s, plus Coulomb friction, friction per direction and a constant."""
 
     kind: Literal["polynomial"] = "polynomial"
@@ -99,29 +95,10 @@ class PolynomialPlant(Plant):
         )
 
     @property
-    def has_physics(self) -> bool:
-        """Whether nominal coefficients are given."""
-        return self.coefficients is not None
-
-    @property
     def faults(self) -> tuple[Fault, ...]:
         """One per coefficient, and the input gain, which scales them all."""
-        single = tuple(self._fault(name, name.replace("_", " ")) for name in self.names)
-        return (*single, self._fault("input_gain", INPUT_GAIN_WORDS))
-
-    @staticmethod
-    def _fault(name: str, words: str) -> Fault:
-        return Fault(name, name, RATIO_RANGES.get(name, DEFAULT_RANGE), words)
-
-    def _nominal(self) -> dict[str, float]:
-        if self.coefficients is None:
-            raise LoopError("[plant] coefficients: missing, simulation and nominal values need them")
-        return self.coefficients
-
-    def theta(self) -> FloatArray:
-        """Nominal coefficients, shape (n,) [u per output per s^power]."""
-        nominal = self._nominal()
-        return np.array([nominal[name] for name in self.names], dtype=np.float64)
+        single = tuple(self._fault(name, name, name.replace("_", " ")) for name in self.names)
+        return (*single, self._fault("input_gain", "input_gain", INPUT_GAIN_WORDS))
 
     def scaled(self, factors: Mapping[str, Any]) -> Self:
         """Return the same plant with coefficients multiplied; ``input_gain`` multiplies all of them.
