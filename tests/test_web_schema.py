@@ -30,8 +30,17 @@ def test_no_request_makes_the_server_fail(tmp_path: Path) -> None:
     config = ServiceFile.load(halls.hall(tmp_path, "done", more=WEB))
     Service(config, build_components(config)).run()
     with Served(tmp_path, "serve", "done.toml") as served:
-        command = ["--checks", CHECKS, "--max-time", str(SECONDS), "--max-examples", str(max(20, SECONDS)), "--seed", "1"]
-        command += ["--phases", "coverage,fuzzing,stateful", "--generation-database", "none", "--request-timeout", "10"]
+        command = [
+            "--checks",
+            CHECKS,
+            "--max-time",
+            str(SECONDS),
+            "--max-examples",
+            str(max(20, SECONDS)),
+            "--seed",
+            "1",
+        ]
+        command += ["--phases", "coverage,fuzzing,stateful", "--generation-database", "none", "--request-timeout", "60"]
         command += ["--exclude-path", "/api/v1/live", "--no-color", "--continue-on-failure"]
         done = subprocess.run(
             [sys.executable, "-m", "schemathesis.cli", "run", f"{served.url}/api/v1/openapi.json", *command],
