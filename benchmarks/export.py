@@ -27,7 +27,9 @@ from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, consecutive_exceedances
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.export import NAME, CMonitor, export_c, unpack_image
+from servoscope.export.golden import frozen_signals
 from servoscope.models.loop import Loop
+from servoscope.signals.quality import QualitySettings
 from servoscope.simulation import FaultEvent, reference, simulate
 
 DRIVER = Path(__file__).with_name("export_driver.c")
@@ -130,16 +132,19 @@ def chunks(loop: Loop, limits: Collection[int]) -> Iterator[tuple[npt.NDArray[np
         for value in (np.nan, np.inf, -np.inf, 1e150, -0.0):
             for at in rng.integers(0, count - 400, 10):
                 signals[int(rng.integers(3))][at : at + int(rng.integers(1, 400))] = value
+        for at in rng.integers(0, max(count - 1500, 1), 6):
+            frozen = signals[int(rng.integers(1, 3))][at : at + int(rng.integers(400, 1500))]
+            frozen[:] = frozen[0]
         yield (*signals, restart)
 
 
-def rows_of(trace: Any, verdicts: Verdicts, names: int) -> npt.NDArray[np.float64]:
+def rows_of(trace: Any, verdicts: Verdicts, names: int, frozen: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
     """Return the evaluations of a trace as the C has them; how many updates there were is not in a trace."""
     H = np.stack([trace.ifrf.H.real, trace.ifrf.H.imag], axis=-1)
     response = np.concatenate([H, trace.ifrf.covariance.reshape(*H.shape[:2], 4)], axis=-1).reshape(len(trace.t), -1)
     theta = [trace.theta, trace.covariance.reshape(-1, names**2)]
     columns = [trace.statistic, trace.level, trace.crossed, *(x for each in theta for x in each.T), *response.T]
-    return np.column_stack([*columns, verdicts.of(trace)])
+    return np.column_stack([*columns, verdicts.of(trace), frozen])
 
 
 def builds(folder: Path, samples: int, emulated: int, levels: Sequence[str] = LEVELS) -> list[Build]:
@@ -177,9 +182,12 @@ def compare(baseline: Baseline, made: Sequence[Build], mark: bytes) -> None:
     """Take the samples through the monitor and through every build."""
     monitor, verdicts = Monitor(baseline), Verdicts(baseline.pipeline().delays)
     state, done, names = monitor.init(), 0, len(baseline.names)
+    limits = QualitySettings().limits(baseline.loop.sample_rate)
     for r, u, y, restart in chunks(baseline.loop, {build.limit for build in made}):
         state, trace = monitor.run(state, r, u, y, restart > 0.0)
-        rows = rows_of(trace, verdicts, names)
+        every = len(r) // len(trace.t)
+        frozen = np.bitwise_or.reduceat(frozen_signals(limits, r, u, y), np.arange(0, len(r), every))
+        rows = rows_of(trace, verdicts, names, frozen[: len(trace.t)])
         text = np.column_stack([r, u, y, restart]).tobytes()
         for build in made:
             if done < build.limit:
@@ -257,13 +265,17 @@ def tables_of(folder: Path, made: Sequence[Build], baseline: Baseline, exported:
         )
         for build in made
     ]
-    note = "Different: evaluations with verdicts, and states, that have another bit in C than from `Monitor.run`."
+    note = (
+        "Different: evaluations with verdicts and frozen signals, and states, that have another bit in C than from "
+        "`Monitor.run` and from the check of data quality."
+    )
     columns = ("processor", "compiler", "option", "samples", "evaluations", "different", "ns per sample")
     ordinary, evaluating = cortex_m7_instructions(folder, baseline.pipeline().constants(baseline.tuning).every)
     stacks = [("x86-64, gcc", "gcc", ()), ("Cortex-M7, gcc", "arm-none-eabi-gcc", CORTEX_M7)]
     size = subprocess.run(["arm-none-eabi-size", "m7.o"], cwd=folder, capture_output=True, text=True, check=True)
     sizes = [
         ("state", f"{exported.state_bytes} B"),
+        ("what is known of the signals, for the check for frozen ones", f"{exported.signal_bytes} B"),
         ("constants", f"{exported.constant_bytes} B"),
         ("code and constants, Cortex-M7, -O2", f"{size.stdout.split()[6]} B"),
     ]

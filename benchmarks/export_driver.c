@@ -1,7 +1,7 @@
 /* Takes the samples of a file through an exported monitor, for benchmarks/export.py: driver SAMPLES IMAGE ROWS.
  *
- * A sample is three doubles and a restart, all doubles; a row is that of an evaluation with its verdict behind it. The
- * image is read, unless it is empty, and written back. */
+ * A sample is three doubles and a restart, all doubles; a row is that of an evaluation with its verdict behind it, and
+ * what was found frozen since the row before. The image is read, unless it is empty, and written back. */
 #include "servo_monitor.h"
 
 #include <stdio.h>
@@ -13,7 +13,9 @@ int main(int count, char **names)
     static servo_monitor_state state;
     static servo_monitor_evaluation q;
     static unsigned char image[SERVO_MONITOR_IMAGE_BYTES];
-    static double row[SERVO_MONITOR_ROW]; /* without the number of updates, with the verdict */
+    static servo_monitor_signals signals;
+    static double row[SERVO_MONITOR_ROW + 1]; /* without the number of updates, with the verdict and what is frozen */
+    int frozen = 0;
     static double block[4096][4];
     FILE *samples;
     FILE *rows;
@@ -32,6 +34,7 @@ int main(int count, char **names)
         return 2;
     }
     servo_monitor_init(&state);
+    servo_monitor_signals_init(&signals);
     if ((fread(image, sizeof image, 1, saved) == 1) && (servo_monitor_load(&state, image) == 0)) {
         return 3;
     }
@@ -42,9 +45,12 @@ int main(int count, char **names)
             if (block[k][3] > 0.0) {
                 servo_monitor_restart(&state);
             }
+            frozen |= servo_monitor_frozen(&signals, block[k][0], block[k][1], block[k][2]);
             if (servo_monitor_step(&state, block[k][0], block[k][1], block[k][2], &q) != 0) {
                 memcpy(row, &q.statistic, (SERVO_MONITOR_ROW - 1) * sizeof row[0]);
                 row[SERVO_MONITOR_ROW - 1] = (double)q.verdict;
+                row[SERVO_MONITOR_ROW] = (double)frozen;
+                frozen = 0;
                 fwrite(row, sizeof row, 1, rows);
             }
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import re
 import subprocess
@@ -25,9 +26,10 @@ from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.export import export_c, pack_image, unpack_image
-from servoscope.export.golden import golden_signals
+from servoscope.export.golden import frozen_signals, golden_signals
 from servoscope.learning.learn import learn_baseline, nominal_baseline
 from servoscope.models.loop import Loop
+from servoscope.signals.quality import QualitySettings
 from servoscope.simulation import FaultEvent, reference, simulate
 
 AXIS: dict[str, Any] = {"kind": "polynomial", "order": 2, "coefficients": {"viscous_friction": 200.0, "inertia": 90.0}}
@@ -343,3 +345,26 @@ def test_motions_never_seen_are_the_servers(tmp_path: Path) -> None:
     for text in (" ".join(result.out.split()), (tmp_path / "servo_monitor.h").read_text(encoding="utf-8")):
         assert "an alarm may be no fault: the server looks at that" in text
     assert "an alarm may" not in export_c(demo()).files["servo_monitor.h"]
+
+
+@pytest.mark.parametrize("held", ["r", "u", "y", "none"])
+def test_frozen_signals_are_those_of_data_quality(folder: Path, held: str) -> None:
+    """At each of 100 000 samples, over ranges that are forgotten in between, with rests, noise, NaN and infinities."""
+    baseline, rng = demo(), np.random.default_rng(5)
+    signals = dict(zip("ruy", golden_signals(baseline, 100_000)[:3], strict=True))
+    for begin in rng.integers(0, 98_000, 20 if held != "none" else 0):
+        stretch = slice(int(begin), int(begin) + int(rng.integers(400, 2000)))
+        signals[held][stretch] = signals[held][begin]
+        if held == "r":  # a y that is noisy at rest, and then quiet
+            signals["y"][stretch] = signals["r"][begin] + 1e-6 * np.round(
+                20.0 * rng.standard_normal(stretch.stop - stretch.start)
+            )
+    with np.errstate(over="ignore"):
+        expected = frozen_signals(QualitySettings().limits(100.0), *signals.values())
+    compiled, state = drive(folder), ctypes.create_string_buffer(1024)
+    compiled.function("signals_init")(state)
+    found = compiled.function("frozen")
+    found.argtypes = [ctypes.c_void_p, *[ctypes.c_double] * 3]
+    samples = np.column_stack(list(signals.values())).tolist()
+    assert [found(state, *sample) for sample in samples] == expected.tolist()
+    assert set(expected.tolist()) >= {"r": {0}, "u": {0, 2}, "y": {0, 1}, "none": {0}}[held]

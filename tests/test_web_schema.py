@@ -30,8 +30,17 @@ def test_no_request_makes_the_server_fail(tmp_path: Path) -> None:
     config = ServiceFile.load(halls.hall(tmp_path, "done", more=WEB))
     Service(config, build_components(config)).run()
     with Served(tmp_path, "serve", "done.toml") as served:
-        command = ["--checks", CHECKS, "--max-time", str(SECONDS), "--max-examples", "20", "--seed", "1"]
-        command += ["--phases", "coverage,fuzzing,stateful", "--generation-database", "none", "--request-timeout", "10"]
+        command = [
+            "--checks",
+            CHECKS,
+            "--max-time",
+            str(SECONDS),
+            "--max-examples",
+            str(max(20, SECONDS)),
+            "--seed",
+            "1",
+        ]
+        command += ["--phases", "coverage,fuzzing,stateful", "--generation-database", "none", "--request-timeout", "60"]
         command += ["--exclude-path", "/api/v1/live", "--no-color", "--continue-on-failure"]
         done = subprocess.run(
             [sys.executable, "-m", "schemathesis.cli", "run", f"{served.url}/api/v1/openapi.json", *command],
@@ -42,6 +51,7 @@ def test_no_request_makes_the_server_fail(tmp_path: Path) -> None:
             timeout=8 * SECONDS,
             check=False,
         )
+    print(done.stdout[-1500:])  # how many requests: pytest -s
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
     assert "✅ Stateful" in done.stdout
     assert "Traceback" not in served.log, served.log

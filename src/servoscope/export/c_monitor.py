@@ -22,11 +22,14 @@ from servoscope.export.golden import GoldenRun, golden_text
 from servoscope.export.image import pack_image
 from servoscope.export.precision import describe_rounding
 from servoscope.export.steps_c import step_functions
+from servoscope.signals.quality import QualitySettings
+from servoscope.signals.quality import kernel as quality
 
 __all__ = ["UNSEEN_MOTION", "CMonitor", "export_c"]
 
 NAME = "servo_monitor"
 MAX_LINE = 108
+SIGNAL_BYTES = 2 * 4 + 4 * 4 + 3 * 8 + 8 * (3 + 3 + 1 + 16 + 4 * 2)  # of the struct `signals` in monitor.h
 UNSEEN_MOTION = (
     "Under motions that the healthy recordings do not hold an alarm may be no fault: the server looks at that."
 )
@@ -45,6 +48,7 @@ class CMonitor:
     mark: bytes  # of the baseline, in images
     state_bytes: int
     constant_bytes: int
+    signal_bytes: int  # of what the check for frozen signals knows; not part of the state
 
     def save(self, folder: str | Path) -> tuple[Path, ...]:
         """Write the files into a folder, which is made if there is none; return their paths.
@@ -86,6 +90,8 @@ def export_c(
     made = ExportConstants.of(baseline, only_coefficients, single)
     golden = GoldenRun.of(baseline, made.recursion, baseline.limit, made.delays)
     values = common_words(made, name) | _number_words(single) | _sizes(made, single) | _code(made, name, single)
+    values |= _frozen_words(made)
+    values["frozen_functions"] = fill_template("frozen.c", values)
     values |= {
         "left_out": _left_out(baseline, only_coefficients),
         "rounding": describe_rounding(made, only_coefficients, golden) if single else "",
@@ -94,7 +100,7 @@ def export_c(
     texts = {each: fill_template(template, values) for template, each in named.items()}
     image = pack_image(made.mark, golden.state, *golden.alarm)
     texts[f"{name}_golden.h"] = golden_text(golden, name, image)
-    return CMonitor(texts, made.mark, values["state_bytes"], values["constant_bytes"])
+    return CMonitor(texts, made.mark, values["state_bytes"], values["constant_bytes"], SIGNAL_BYTES)
 
 
 def _left_out(baseline: Baseline, only_coefficients: bool) -> str:
@@ -127,6 +133,18 @@ def _sizes(made: ExportConstants, single: bool) -> dict[str, Any]:
         "limit": c_literal(made.baseline.limit, single),
         "places": f"#define CUSUMS {size.floats}\n" * bool(size.watched)
         + f"#define PRIVATE {size.floats + size.watched}\n" * (not size.steady),
+    }
+
+
+def _frozen_words(made: ExportConstants) -> dict[str, Any]:
+    """Return the limits of the check for frozen signals, with the defaults of data quality."""
+    limits = QualitySettings().limits(made.baseline.loop.sample_rate)
+    shares = {"motion_share": quality.MOTION_SHARE, "motion_steps": quality.MOTION_STEPS}
+    shares |= {"turn_share": quality.TURN_SHARE, "noise_levels": quality.NOISE_LEVELS}
+    return {name: c_literal(share) for name, share in shares.items()} | {
+        "frozen": limits.frozen,
+        "window": limits.window,
+        "epoch_windows": quality.EPOCH_WINDOWS,
     }
 
 

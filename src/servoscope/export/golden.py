@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, consecutive_exceedances
 from servoscope.estimation.recursion import Recursion
+from servoscope.signals.quality import QualityLimits, QualitySettings, check_block, init_state
 
 __all__ = ["GoldenRun", "golden_signals", "golden_text"]
 
 SHORTEST, LONGEST = 2000, 20_000  # samples
 SEED = 27
+FROZEN = {"frozen_y": 1, "frozen_u": 2}
 WAITING, HEALTHY, FAULT = range(3)
 FNV_OFFSET, FNV_PRIME = 14695981039346656037, 1099511628211
 
@@ -62,6 +65,9 @@ class GoldenRun:
     verdicts: tuple[int, ...]
     state: FloatArray  # at the end
     alarm: tuple[float, float]  # counters of the alarm at the end
+    held: int  # sample at which y, and then u, is held to look frozen
+    stretch: int  # samples of each of four stretches; y is held in the second, u in the last
+    frozen: IntArray  # what is found to be frozen at each of them, 1 y, 2 u
 
     @classmethod
     def of(cls, baseline: Baseline, recursion: Recursion, limit: float, delays: tuple[int, int]) -> GoldenRun:
@@ -73,7 +79,30 @@ class GoldenRun:
             r, u, y = (x.astype(recursion.number) for x in signals)
         state, rows = recursion.run(recursion.start(), r[None], u[None], y[None], restart[None])
         verdicts, alarm = judge(rows[0], limit, delays)
-        return cls((r, u, y), restart, rows[0].copy(), verdicts, state[0].copy(), alarm)
+        limits = QualitySettings().limits(baseline.loop.sample_rate)
+        held, stretch = samples // 3, limits.frozen + samples
+        frozen = frozen_signals(limits, *held_signals((r, u, y), held, stretch))
+        return cls((r, u, y), restart, rows[0].copy(), verdicts, state[0].copy(), alarm, held, stretch, frozen)
+
+
+def held_signals(
+    signals: tuple[npt.NDArray[Any], ...], held: int, stretch: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the signals again and again, (4 stretch,); y is held in the second of four stretches, u in the last."""
+    at = np.arange(4 * stretch) % len(signals[0])
+    r, u, y = (x.astype(np.float64)[at] for x in signals)
+    y[stretch : 2 * stretch], u[3 * stretch :] = signals[2][held], signals[1][held]
+    return r, u, y
+
+
+def frozen_signals(limits: QualityLimits, r: FloatArray, u: FloatArray, y: FloatArray) -> IntArray:
+    """Return what the check of data quality calls frozen at each sample, shape (N,): 0, 1 y, 2 u, 3 both."""
+    _, findings = check_block(limits, init_state(), np.arange(len(r)) * limits.period, r, u, y)
+    changes = np.zeros(len(r), dtype=np.int64)
+    for finding in findings:
+        if finding.kind in FROZEN:
+            changes[round(finding.time / limits.period)] += FROZEN[finding.kind] * (1 if finding.begins else -1)
+    return np.cumsum(changes)
 
 
 def judge(rows: FloatArray, limit: float, delays: tuple[int, int]) -> tuple[tuple[int, ...], tuple[float, float]]:
@@ -90,9 +119,14 @@ def judge(rows: FloatArray, limit: float, delays: tuple[int, int]) -> tuple[tupl
 
 def row_digest(row: npt.NDArray[Any]) -> int:
     """Return FNV-1a, 64 bits, over the bits of numbers."""
+    return digest(row.astype(row.dtype.newbyteorder("<")).tobytes())
+
+
+def digest(numbers: Iterable[int]) -> int:
+    """Return FNV-1a, 64 bits, over small numbers."""
     value = FNV_OFFSET
-    for byte in row.astype(row.dtype.newbyteorder("<")).tobytes():
-        value = ((value ^ byte) * FNV_PRIME) & 0xFFFFFFFFFFFFFFFF
+    for number in numbers:
+        value = ((value ^ number) * FNV_PRIME) & 0xFFFFFFFFFFFFFFFF
     return value
 
 
@@ -111,6 +145,9 @@ def golden_text(run: GoldenRun, prefix: str, image: bytes) -> str:
             f"static const unsigned char golden_restart[GOLDEN_SAMPLES] = {{{_list(map(int, run.restart.tolist()))}}};",
             f"static const uint64_t golden_evaluations[] = {{{_list(f'0x{x:016X}u' for x in digests)}}};",
             f"static const unsigned char golden_verdicts[] = {{{_list(run.verdicts)}}};",
+            f"#define GOLDEN_HELD {run.held}u",
+            f"#define GOLDEN_STRETCH {run.stretch}u",
+            f"#define GOLDEN_FROZEN 0x{digest(run.frozen.tolist()):016X}u",
             f"static const unsigned char golden_image[] = {{{_list(image)}}};",
             "",
         ]

@@ -50,6 +50,30 @@ static @{number} r[GOLDEN_SAMPLES];
 static @{number} u[GOLDEN_SAMPLES];
 static @{number} y[GOLDEN_SAMPLES];
 
+/*
+ * Return 0 if the check for frozen signals is right, over the golden samples again and again; of four stretches of the
+ * same length, y is held at one value in the second, and u in the last.
+ */
+static size_t check_frozen(void)
+{
+    static @{prefix}_signals signals;
+    uint64_t hash = 14695981039346656037u;
+    size_t k;
+
+    @{prefix}_signals_init(&signals);
+    for (k = 0; k < (4u * GOLDEN_STRETCH); k++) {
+        const size_t at = k % GOLDEN_SAMPLES;
+        const size_t held = GOLDEN_HELD;
+        const size_t stretch = k / GOLDEN_STRETCH;
+        const int found =
+            @{prefix}_frozen(&signals, r[at], u[(stretch == 3u) ? held : at], y[(stretch == 1u) ? held : at]);
+
+        hash ^= (uint64_t)found;
+        hash *= 1099511628211u;
+    }
+    return (hash != GOLDEN_FROZEN) ? 1u : 0u;
+}
+
 int main(void)
 {
     static @{prefix}_state state;
@@ -105,12 +129,14 @@ int main(void)
     if (intact != 0) {
         wrong++;
     }
+    wrong += check_frozen();
     begin = clock();
     for (pass = 0; (pass < MAX_PASSES) && ((pass == 0) || ((clock() - begin) < CLOCKS_PER_SEC)); pass++) {
         evaluations += @{prefix}_block(&state, GOLDEN_SAMPLES, r, u, y, golden_restart, &q, 1);
     }
-    printf("state %lu bytes, saved %lu, constants %lu\n", (unsigned long)sizeof(@{prefix}_state),
-           (unsigned long)@{upper}_IMAGE_BYTES, (unsigned long)@{upper}_CONSTANT_BYTES);
+    printf("state %lu bytes, saved %lu, of signals %lu, constants %lu\n", (unsigned long)sizeof(@{prefix}_state),
+           (unsigned long)@{upper}_IMAGE_BYTES, (unsigned long)sizeof(@{prefix}_signals),
+           (unsigned long)@{upper}_CONSTANT_BYTES);
     printf("%.0f ns per sample\n",
            (1e9 * (double)(clock() - begin)) / (double)CLOCKS_PER_SEC / (double)pass / (double)GOLDEN_SAMPLES);
 #ifdef CYCLES

@@ -165,6 +165,7 @@ size_t @{prefix}_block(@{prefix}_state *state, size_t count, const @{number} *r,
     return found;
 }
 
+@{frozen_functions}
 /* CRC-32 of IEEE 802.3, bit by bit: a table would be a kilobyte of constants. */
 static uint32_t checksum(const unsigned char *bytes, size_t count)
 {

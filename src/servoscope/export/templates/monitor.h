@@ -33,6 +33,38 @@ typedef struct {
     double since;     /* evaluations since the alarm was last raised; no more than the off-delay + 1 */
 } @{prefix}_state;
 
+/*
+ * For how many samples y or u may stay exactly the same while the motion demands a change, and how far r has to move for
+ * y to be expected to follow [@{y_unit}]; 0: a tenth of the range that y itself has covered.
+ */
+#ifndef @{upper}_FROZEN_SAMPLES
+#define @{upper}_FROZEN_SAMPLES @{frozen}u
+#endif
+#ifndef @{upper}_FROZEN_TRAVEL
+#define @{upper}_FROZEN_TRAVEL 0.0
+#endif
+#define @{upper}_FROZEN_Y 1
+#define @{upper}_FROZEN_U 2
+
+/* What @{prefix}_frozen knows of the signals; of r, u, y and, where there are four, r - y. */
+typedef struct {
+    uint32_t samples;     /* since ranges were last forgotten */
+    uint32_t turns;       /* of y at rest */
+    int started;          /* 1: there are values */
+    int noisy;            /* 1: y is known to move at rest */
+    int frozen_y;         /* 1: found */
+    int frozen_u;         /* 1: found */
+    uint64_t same[3];     /* samples for which it has stayed the same */
+    double last[3];
+    double smallest_change[3];
+    double direction;     /* last change of y */
+    double ranges[2][4][2]; /* lowest and highest: since they were last forgotten, and in the time before */
+    double r_while_y[2];  /* lowest and highest of r while y stays the same; */
+    double y_while_u[2];  /* of y while u does; */
+    double e_while_u[2];  /* of r - y while u does; */
+    double y_at_rest[2];  /* of y while r does */
+} @{prefix}_signals;
+
 /* What is known of the actuator. */
 typedef enum {
     @{upper}_WAITING = 0, /* there is no estimate yet */
@@ -95,6 +127,16 @@ int @{prefix}_step(@{prefix}_state *state, @{number} r, @{number} u, @{number} y
  */
 size_t @{prefix}_block(@{prefix}_state *state, size_t count, const @{number} *r, const @{number} *u, const @{number} *y,
                        const unsigned char *restart, @{prefix}_evaluation *q, size_t room);
+
+/* Make what is known of the signals before the first sample. It is not saved: behind a power loss it begins anew. */
+void @{prefix}_signals_init(@{prefix}_signals *signals);
+
+/*
+ * Look at a sample for frozen signals, before or behind @{prefix}_step; NaN or an infinity is a missing sample.
+ *
+ * Return 0, or @{upper}_FROZEN_Y, @{upper}_FROZEN_U or their sum while a signal is frozen. No verdict holds then.
+ */
+int @{prefix}_frozen(@{prefix}_signals *signals, @{number} r, @{number} u, @{number} y);
 
 /* Write the state to an image, the same on every machine: little-endian doubles, fingerprint of this baseline, CRC-32. */
 void @{prefix}_save(const @{prefix}_state *state, unsigned char image[@{upper}_IMAGE_BYTES]);
