@@ -25,10 +25,10 @@ from servoscope.detection.result import (
     Verdict,
 )
 from servoscope.detection.signal_defects import find_signal_defect
-from servoscope.detection.trace import Trace
+from servoscope.detection.trace import UNSEEN, Trace
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
-from servoscope.diagnosis.examine import UNSEEN, Examination
+from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
 from servoscope.diagnosis.ml_refit import (
     disagreement_warnings,
