@@ -273,11 +273,19 @@ def _explain_alarm(
     )
     refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
-        several = trace_timeline(exam, refined, alarm.onset, recursive, SURE, lambda: progress("refit"))
+        from servoscope.isolation.ml import find_outside_onset
+
+        # one change that is no fault comes before several that are
+        outside = find_outside_onset(refined) if refined.is_unknown else None
+        several = (
+            () if outside else trace_timeline(exam, refined, alarm.onset, recursive, SURE, lambda: progress("refit"))
+        )
         if several:
             return several, _onset_of(several, exam, alarm), []
-        candidates, refit = refit_candidates(refined), summarise_refit(refined, exam, recursive)
-        onset = onset if refined.is_unknown else refit_onset(refined, exam)
+        candidates = refit_candidates(refined)
+        refit = summarise_refit(refined, exam, recursive, outside=outside)
+        if outside or not refined.is_unknown:
+            onset = refit_onset(refined, exam, outside)
         doubts = disagreement_warnings(exam, candidates, refit, SURE)
     best, t = candidates[0], exam.recording.t
     wait_s = exam.pipeline.bank.wait / exam.recording.sample_rate
