@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from accuracy import onset, rig
 from accuracy.axis import AXES, RATE, loop, moves, random_motion, record
 
 import servoscope as ss
-from servoscope.core.errors import RecordingError
-from servoscope.detection.motion import WINDOWS, RecordedMotion
+from servoscope.core.errors import BaselineError, RecordingError
+from servoscope.detection.motion import WINDOWS, RecordedMotion, motion_excess
 from servoscope.diagnosis.examine import Examination
 from servoscope.service.examination import examine_blocks
 from servoscope.service.sources.block import Block
@@ -188,3 +189,75 @@ def test_the_onset_is_dated_where_the_residual_is_no_noise(name: str) -> None:
     assert len(seen) >= 5 and inside >= len(seen) - 1
     assert np.median([abs(run["onset"][1] - run["begin"]) for run in seen]) < 0.3
     assert all(len(row) == len(onset.TABLES[1].columns) for row in onset.covered_on_axis(name, found))
+
+
+class TestMonitorWithMotionCheck:
+    """`Monitor(motion_check=True)` beside the examination of the same recording, and beside itself."""
+
+    @pytest.mark.parametrize("words", ["as learned", "random, u at its limits"])
+    def test_it_alarms_as_the_examination_does(self, words: str) -> None:
+        """Up to what the examination knows besides: a window around each sample that also looks ahead."""
+        recording = under(words)
+        exam, watched = Examination.from_recording(belt(), recording), ss.Monitor(belt(), motion_check=True)
+        _, trace = watched.run(watched.init(), recording.r, recording.u, recording.y, recording.restart)
+        plain = ss.Monitor(belt())
+        _, without = plain.run(plain.init(), recording.r, recording.u, recording.y, recording.restart)
+        assert trace.motion is not None and without.motion is None
+        assert (trace.statistic <= without.statistic).all()
+        if words == "as learned":
+            assert np.array_equal(trace.statistic[trace.motion < 0.05], without.statistic[trace.motion < 0.05])
+            assert not trace.exceeded.any()
+        else:
+            assert without.exceeded.any(), "the check has something to do"
+            assert trace.exceeded.sum() < 0.1 * without.exceeded.sum()
+            assert "motion" in trace.table() and "motion" not in without.table()
+        assert not exam.alarm.any()
+
+    def test_its_windows_are_those_of_a_whole_recording(self) -> None:
+        recording, baseline = under("larger"), belt()
+        seen = baseline.limited_motion
+        assert seen is not None
+        whole = RecordedMotion.from_recording(baseline.pipeline(), recording, seen.origin)
+        values, filled = whole.quantities(slice(None))
+        expected = np.abs(motion_excess(baseline.pipeline(), seen, values[:, :1], filled[:, :1])).max(axis=1)
+        watched = ss.Monitor(baseline, motion_check=True)
+        _, trace = watched.run(watched.init(), recording.r, recording.u, recording.y, recording.restart)
+        off = np.abs(trace.motion - expected)
+        assert np.mean(off < 1e-9) > 0.9
+        assert off.max() < 0.005, "around a rest a window begins up to an evaluation's samples elsewhere"
+
+    @pytest.mark.parametrize("cuts", [[7, 2501, 2502], [9_999]])
+    def test_it_is_split_and_resumed_anywhere(self, cuts: list[int]) -> None:
+        """Gaps and missing values included; `step` is a block of one sample."""
+        recording = under("random, 2 Hz")[:12_000]
+        columns, restart = [recording.r, recording.u, recording.y.copy()], recording.restart.copy()
+        columns[2][3_000:3_040], restart[6_000] = np.nan, True
+        watched = ss.Monitor(belt(), motion_check=True)
+        state, whole = watched.run(watched.init(), *columns, restart)
+        part, found = watched.init(), []
+        for begin, end in itertools.pairwise([0, *cuts, 12_000]):
+            part, trace = watched.run(part, *(x[begin:end] for x in columns), restart[begin:end])
+            found.append(trace)
+            watched = ss.Monitor(belt(), motion_check=True)
+        assert np.array_equal(part, state)
+        for name in ("motion", "statistic", "level"):
+            assert np.array_equal(np.concatenate([getattr(one, name) for one in found]), getattr(whole, name))
+
+    def test_sample_by_sample_equals_a_block(self) -> None:
+        recording = under("random, 2 Hz")[:1_500]
+        watched = ss.Monitor(belt(), motion_check=True)
+        end, whole = watched.run(watched.init(), recording.r, recording.u, recording.y)
+        state, found = watched.init(), list[float]()
+        for sample in zip(recording.r, recording.u, recording.y, strict=True):
+            if watched.step(state, *sample):
+                latest = watched.latest(state)
+                assert latest.motion is not None
+                found.append(float(latest.motion[0]))
+        assert np.array_equal(state, end)
+        assert np.array_equal(found, whole.motion)
+
+    def test_refusals(self) -> None:
+        with pytest.raises(BaselineError, match="the motion of a fleet is not checked"):
+            ss.Monitor([belt(), belt()], motion_check=True)
+        with pytest.raises(BaselineError, match="learn it again"):
+            ss.Monitor(belt().model_copy(update={"motion": None}), motion_check=True)

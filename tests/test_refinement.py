@@ -231,7 +231,14 @@ class TestAnswers:
 
 
 def odd_loop(
-    loop: ss.Loop, *, late: bool = False, gain: float = 1.0, play: float = 0.0, **ratios: float
+    loop: ss.Loop,
+    *,
+    late: bool = False,
+    gain: float = 1.0,
+    play: float = 0.0,
+    load: float = 0.0,
+    offset: float = 0.0,
+    **ratios: float,
 ) -> ss.Recording:
     """The reference rig sample by sample, with changes at `AT` that no fault of the plant stands for."""
     samples, rng = 4000, np.random.default_rng(7)
@@ -245,11 +252,11 @@ def odd_loop(
         d = ill if changed else healthy
         half, moved = play / 2.0 if changed else 0.0, float(d.c @ x)
         sensor = min(max(sensor, moved - half), moved + half)
-        y[k] = (gain if changed else 1.0) * sensor + n_y[k]
+        y[k] = (gain if changed else 1.0) * sensor + offset * changed + n_y[k]
         e = r[k] - y[k]
         total += 5.0 * 0.01 * e
         u[k] = 20.0 * e + total
-        x = d.A @ x + d.b_now * ((before if late and changed else u[k]) + n_u[k])
+        x = d.A @ x + d.b_now * ((before if late and changed else u[k]) + load * changed + n_u[k])
         before = u[k]
     return make_recording(loop, r, u, y)
 
@@ -282,6 +289,21 @@ class TestOutsideTheList:
         (told,) = (mimic for mimic in said.refit.mimics if mimic.name == cause)
         assert told.value == pytest.approx(value, rel=0.01)
         assert told.words.casefold() in said.summary.casefold() and told.words in said.explanation[-1]
+
+    @pytest.mark.parametrize(
+        ("change", "cause"),
+        [({"load": 3e-4}, "input_offset"), ({"offset": 5e-4}, "sensor_offset"), ({"late": True}, "delay")],
+    )
+    def test_the_cause_that_explains_it_dates_it(
+        self, learned: ss.Baseline, rig_loop: ss.Loop, change: dict[str, float], cause: str
+    ) -> None:
+        """Not the faults that do not: their onset was up to seconds off, or a course of several faults was told."""
+        said = ss.diagnose(learned, odd_loop(rig_loop, **change))  # type: ignore[arg-type]
+        (one,) = said.intervals
+        assert not one.faults and one.refit is not None and one.onset_s is not None
+        assert one.refit.mimics[0].name == cause
+        low, likely, high = one.onset_s
+        assert low <= AT <= high + 0.01 and high - low < 1.0 and likely == pytest.approx(AT, abs=0.2)
 
 
 class TestGate:

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from servoscope.core import outofcore
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.pipeline import Pipeline, RegressionRunner, Tuning
 from servoscope.models.plants.polynomial import PolynomialPlant
@@ -63,18 +63,14 @@ class RecordedMotion:
     @classmethod
     def from_recording(cls, pipeline: Pipeline, recording: Recording, origin: float) -> RecordedMotion:
         """Read a recording once."""
-        own, (of_r, of_y) = RegressionRunner(pipeline), (_kinematics(pipeline) for _ in range(SIGNALS))
+        runners = [*map(RegressionRunner, motion_pipelines(pipeline))]
         n, every = pipeline.bank.n, pipeline.every
         evaluations = recording.samples // every
         sums = outofcore.empty((evaluations + 2, 1 + SIGNALS * MOMENTS + n * n))
         sums[:] = 0.0
         for rows in outofcore.iter_chunks(0, recording.samples):
             part = recording.rows(rows)
-            r, y = part.r - origin, part.y - origin
-            g = own.advance(part.r, part.u, part.y, part.restart)
-            motion = [runner.advance(x, x, x, part.restart).phi for runner, x in ((of_r, r), (of_y, y))]
-            products = (g.phi[:, :, None] * g.phi[:, None, :]).reshape(len(r), -1)
-            columns = np.column_stack([np.ones_like(r), *(x**2 for x in motion), products]) * g.ok[:, None]
+            columns = motion_columns(runners, part.r, part.u, part.y, part.restart, origin)
             which = np.arange(rows.start, rows.stop) // every
             first = np.flatnonzero(np.diff(which, prepend=-1))
             sums[which[first] + 1] += np.add.reduceat(columns, first, axis=0)
@@ -101,46 +97,84 @@ class RecordedMotion:
         values, filled = [], []
         for memories, centred in WINDOWS:
             means, updates = self._means(at, memories, centred)
-            squares = means[:, : SIGNALS * MOMENTS].reshape(-1, SIGNALS, MOMENTS)
-            amplitude, speed, acceleration = np.moveaxis(np.sqrt(np.maximum(squares, 0.0)), -1, 0)
-            frequency = np.divide(acceleration, 2.0 * np.pi * speed, out=np.zeros_like(speed), where=speed > 0.0)
-            values.append(np.stack([amplitude, speed, acceleration, frequency], axis=-1))
+            values.append(mean_quantities(means))
             filled.append(updates / (memories * self.pipeline.memory))
         return np.stack(values, axis=1), np.stack(filled, axis=1)
 
     def excess(self, seen: MotionRange, at: slice) -> FloatArray:
-        """Return how far each quantity is outside of what was seen, relative, negative below, shape (K, 4).
-
-        r and y must both be outside, and on the same side: a fault changes y alone, and r alone moves nothing.
-        """
-        values, filled = self.quantities(at)
-        least, most = np.array(seen.least), np.array(seen.most)
-        floor = SMALLEST * most.max(axis=(0, 1)) + np.finfo(np.float64).tiny
-        values, least, most = (np.maximum(x, floor) for x in (values, least, most))
-        above, below = ((values / most).min(axis=2) - 1.0, (least / values).min(axis=2) - 1.0)
-        outside = np.where(above > 0.0, above, -np.maximum(below, 0.0))
-        outside[filled < ENOUGH] = 0.0
-        if 0 not in self.pipeline.loop.plant.powers:  # without stiffness one place is like another
-            outside[..., 0] = 0.0
-        larger = np.abs(outside).argmax(axis=1)[:, None]
-        return np.asarray(np.take_along_axis(outside, larger, axis=1)[:, 0])
+        """Return `motion_excess` at evaluations, shape (K, 4)."""
+        return motion_excess(self.pipeline, seen, *self.quantities(at))
 
     def model_error(self, seen: MotionRange, tuning: Tuning, at: slice) -> FloatArray:
-        """Return the covariance that the model's error may add to theta_hat at evaluations, shape (K, n, n).
-
-        It is the bound of this module's first lines times the squared excess beyond `TOLERANCE`, up to 1. What the
-        model leaves out of eta grows with the size of eta.
-        """
-        n, scale, theta = len(tuning.theta), tuning.scale, tuning.theta
+        """Return `model_error_covariance` at evaluations, shape (K, n, n)."""
         means, _ = self._means(at, *WINDOWS[0])
-        normal = means[:, SIGNALS * MOMENTS :].reshape(-1, n, n)
-        healthy = tuning.R / self.pipeline.memory * np.linalg.inv(tuning.P_d)
-        larger = np.maximum((normal @ theta @ theta) / (theta @ healthy @ theta), 1.0)
-        excess = np.abs(self.excess(seen, at)).max(axis=1)
-        growth = np.clip(excess - TOLERANCE, 0.0, 1.0) ** 2
-        units = np.outer(scale, scale)
-        inverse = np.linalg.inv(normal / units + WEAKEST * np.eye(n)) / units
-        return np.asarray((tuning.R * larger * growth)[:, None, None] * inverse)
+        return model_error_covariance(self.pipeline, tuning, means, self.excess(seen, at))
+
+
+def motion_columns(
+    runners: Sequence[RegressionRunner], r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray, origin: float
+) -> FloatArray:
+    """Return what is summed up over the samples of a block, (N, 1 + 6 + n n): see `RecordedMotion.sums`.
+
+    `runners`: of `motion_pipelines`.
+    """
+    own, *kinematics = runners
+    g = own.advance(r, u, y, restart)
+    motion = [
+        runner.advance(x, x, x, restart).phi for runner, x in zip(kinematics, (r - origin, y - origin), strict=True)
+    ]
+    products = (g.phi[:, :, None] * g.phi[:, None, :]).reshape(len(r), -1)
+    used = g.ok[:, None]
+    return np.where(used, np.column_stack([np.ones_like(r), *(x**2 for x in motion), products]), 0.0)
+
+
+def motion_pipelines(pipeline: Pipeline) -> tuple[Pipeline, ...]:
+    """Return what forms the plant's regressors, and the kinematics of r and of y."""
+    plain = _kinematics(pipeline)
+    return pipeline, *(plain for _ in range(SIGNALS))
+
+
+def mean_quantities(means: FloatArray) -> FloatArray:
+    """Return `QUANTITIES` of r and of y, shape (K, 2, 4), from means over a window, (K, 6 + n n)."""
+    squares = means[:, : SIGNALS * MOMENTS].reshape(-1, SIGNALS, MOMENTS)
+    amplitude, speed, acceleration = np.moveaxis(np.sqrt(np.maximum(squares, 0.0)), -1, 0)
+    frequency = np.divide(acceleration, 2.0 * np.pi * speed, out=np.zeros_like(speed), where=speed > 0.0)
+    return np.stack([amplitude, speed, acceleration, frequency], axis=-1)
+
+
+def motion_excess(pipeline: Pipeline, seen: MotionRange, values: FloatArray, filled: FloatArray) -> FloatArray:
+    """Return how far each quantity is outside of what was seen, relative, negative below, shape (K, 4).
+
+    r and y must both be outside, and on the same side: a fault changes y alone, and r alone moves nothing. `values`,
+    `filled`: what `RecordedMotion.quantities` returns, of the first of `WINDOWS` or of all.
+    """
+    windows = values.shape[1]
+    least, most = np.array(seen.least), np.array(seen.most)
+    floor = SMALLEST * most.max(axis=(0, 1)) + np.finfo(np.float64).tiny
+    values, least, most = (np.maximum(x, floor) for x in (values, least[:windows], most[:windows]))
+    above, below = ((values / most).min(axis=2) - 1.0, (least / values).min(axis=2) - 1.0)
+    outside = np.where(above > 0.0, above, -np.maximum(below, 0.0))
+    outside[filled < ENOUGH] = 0.0
+    if 0 not in pipeline.loop.plant.powers:  # without stiffness one place is like another
+        outside[..., 0] = 0.0
+    larger = np.abs(outside).argmax(axis=1)[:, None]
+    return np.asarray(np.take_along_axis(outside, larger, axis=1)[:, 0])
+
+
+def model_error_covariance(pipeline: Pipeline, tuning: Tuning, means: FloatArray, excess: FloatArray) -> FloatArray:
+    """Return the covariance that the model's error may add to theta_hat, shape (K, n, n).
+
+    It is the bound of this module's first lines times the squared excess beyond `TOLERANCE`, up to 1. What the model
+    leaves out of eta grows with the size of eta. `means`: over the first of `WINDOWS`, (K, 6 + n n); `excess`: (K, 4).
+    """
+    n, scale, theta = len(tuning.theta), tuning.scale, tuning.theta
+    normal = means[:, SIGNALS * MOMENTS :].reshape(-1, n, n)
+    healthy = tuning.R / pipeline.memory * np.linalg.inv(tuning.P_d)
+    larger = np.maximum((normal @ theta @ theta) / (theta @ healthy @ theta), 1.0)
+    growth = np.clip(np.abs(excess).max(axis=1) - TOLERANCE, 0.0, 1.0) ** 2
+    units = np.outer(scale, scale)
+    inverse = np.linalg.inv(normal / units + WEAKEST * np.eye(n)) / units
+    return np.asarray((tuning.R * larger * growth)[:, None, None] * inverse)
 
 
 def learn_motion(pipeline: Pipeline, recordings: Sequence[Recording]) -> MotionRange | None:
@@ -164,7 +198,7 @@ def _nested(x: FloatArray) -> Ranges:
     return tuple(tuple(tuple(map(float, row)) for row in window) for window in x)
 
 
-def _kinematics(pipeline: Pipeline) -> RegressionRunner:
+def _kinematics(pipeline: Pipeline) -> Pipeline:
     """Return what forms position, speed and acceleration of a signal behind a filter with the loop's cutoff."""
     loop = pipeline.loop
     plain = {"structure": "svf", "cutoff": filter_cutoff(loop), "estimator": "akf", "two_stage": "none"}
@@ -174,4 +208,4 @@ def _kinematics(pipeline: Pipeline) -> RegressionRunner:
         "input_deadzone": None,
         "delay": 0.0,
     }
-    return RegressionRunner(Pipeline.of(loop.model_copy(update=update)))
+    return Pipeline.of(loop.model_copy(update=update))

@@ -19,6 +19,7 @@ SIGNALS = ("r", "u", "y")
 # units that are confused: powers of ten; inches and mm; degrees and radians; turns and radians; per minute and second
 FACTORS = (*(10.0**k for k in range(1, 7)), 25.4, 180.0 / np.pi, 2.0 * np.pi, 60.0)
 CLEARER = 5.0  # times smaller is the residual of the healthy plant where the signals are put right
+AS_HEALTHY = 2.0  # the same where that residual is the healthy one, and up to how many times that it counts as such
 FROZEN_S = 1.0  # how long y or u stays exactly the same while the motion demands a change [s]
 TRAVEL = 0.1  # of the range of y, that r moves by then
 JUMP = 0.4  # of the range of y, in one sample: a counter that wraps or is reset
@@ -85,7 +86,8 @@ def find_corrections(
     """Yield corrections of the signals under which the plant with theta explains the recording, the likeliest first.
 
     `residual_power`: what the plant leaves of eta^2 when healthy; it tells u in another unit from y in another unit,
-    which are alike to a linear plant. None yields both.
+    which are alike to a linear plant. None yields both. In a tight loop r and y are nearly alike, and exchanging them
+    makes the residual few times smaller: where it comes down to the healthy one, that is enough.
     """
     rows = recording.rows(slice(0, MOST_ROWS))
 
@@ -94,8 +96,9 @@ def find_corrections(
 
     share, _ = residual(Correction())
     tried = {correction: residual(correction) for correction in _single_corrections()}
-    best = min((each for each, _ in tried.values()), default=np.inf)
-    if not best * CLEARER < share:
+    best, left = min(tried.values(), default=(np.inf, np.inf))
+    explained = residual_power is not None and left < AS_HEALTHY * residual_power
+    if not best * (AS_HEALTHY if explained else CLEARER) < share:
         yield from _reference_corrections(rows)
         return
     near = [correction for correction, (each, _) in tried.items() if each < 2.5 * best]

@@ -11,6 +11,8 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.frequency_response import FrequencyResponse
 
+UNSEEN = 0.1  # relative, by which a motion is outside of the baseline's from which on it counts as never seen
+
 
 @dataclass(frozen=True, eq=False)
 class Statistic:
@@ -23,10 +25,20 @@ class Statistic:
 
 
 def detection_statistics(
-    t2: FloatArray, limit: float | FloatArray, cusum: FloatArray, ready: BoolArray, features: FloatArray | None = None
+    t2: FloatArray,
+    limit: float | FloatArray,
+    cusum: FloatArray,
+    ready: BoolArray,
+    features: FloatArray | None = None,
+    motion: FloatArray | None = None,
 ) -> tuple[Statistic, ...]:
-    """Return the statistics that raise the alarm, each with where it is above its limit."""
-    found = Statistic("t2", t2, limit, ready & (t2 > limit)), Statistic("cusum", cusum, 1.0, ready & (cusum >= 1.0))
+    """Return the statistics that raise the alarm, each with where it is above its limit.
+
+    `motion`: how far the motion is outside of the baseline's; the sequential test, which knows no model error, is
+    silent from `UNSEEN` on.
+    """
+    known = ready if motion is None else ready & (motion < UNSEEN)
+    found = Statistic("t2", t2, limit, ready & (t2 > limit)), Statistic("cusum", cusum, 1.0, known & (cusum >= 1.0))
     return found if features is None else (*found, Statistic("features", features, 1.0, features > 1.0))
 
 
@@ -58,6 +70,9 @@ class Trace(ShortRepr):
     ready: BoolArray  # whether the estimator had learned anything by then, shape (K,)
     # score of the features of the spans so far, as a multiple of its limit, shape (K,); None where none were learned
     features: FloatArray | None = None
+    # how far the motion is outside of the baseline's, relative, shape (K,), with `Monitor(motion_check=True)`; T^2 then
+    # knows the model's error there
+    motion: FloatArray | None = None
 
     def _shown_facts(self) -> dict[str, object]:
         span = f"{self.t[0]:.4g} to {self.t[-1]:.4g} s" if self.t.size else "none"
@@ -74,7 +89,7 @@ class Trace(ShortRepr):
     @cached_property
     def statistics(self) -> tuple[Statistic, ...]:
         """The statistics that raise the alarm: T^2, the sequential test and, where they were learned, the features."""
-        return detection_statistics(self.statistic, self.threshold, self.level, self.ready, self.features)
+        return detection_statistics(self.statistic, self.threshold, self.level, self.ready, self.features, self.motion)
 
     @cached_property
     def exceeded(self) -> BoolArray:
@@ -97,4 +112,6 @@ class Trace(ShortRepr):
         columns["level"] = self.level
         if self.features is not None:
             columns["features"] = self.features
+        if self.motion is not None:
+            columns["motion"] = self.motion
         return columns

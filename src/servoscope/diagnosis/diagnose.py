@@ -25,10 +25,10 @@ from servoscope.detection.result import (
     Verdict,
 )
 from servoscope.detection.signal_defects import find_signal_defect
-from servoscope.detection.trace import Trace
+from servoscope.detection.trace import UNSEEN, Trace
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
-from servoscope.diagnosis.examine import UNSEEN, Examination
+from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
 from servoscope.diagnosis.ml_refit import (
     disagreement_warnings,
@@ -273,11 +273,19 @@ def _explain_alarm(
     )
     refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
-        several = trace_timeline(exam, refined, alarm.onset, recursive, SURE, lambda: progress("refit"))
+        from servoscope.isolation.ml import find_outside_onset
+
+        # one change that is no fault comes before several that are
+        outside = find_outside_onset(refined) if refined.is_unknown else None
+        several = (
+            () if outside else trace_timeline(exam, refined, alarm.onset, recursive, SURE, lambda: progress("refit"))
+        )
         if several:
             return several, _onset_of(several, exam, alarm), []
-        candidates, refit = refit_candidates(refined), summarise_refit(refined, exam, recursive)
-        onset = onset if refined.is_unknown else refit_onset(refined, exam)
+        candidates = refit_candidates(refined)
+        refit = summarise_refit(refined, exam, recursive, outside=outside)
+        if outside or not refined.is_unknown:
+            onset = refit_onset(refined, exam, outside)
         doubts = disagreement_warnings(exam, candidates, refit, SURE)
     best, t = candidates[0], exam.recording.t
     wait_s = exam.pipeline.bank.wait / exam.recording.sample_rate

@@ -24,7 +24,7 @@ from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
 from servoscope.detection.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.detection.motion import RecordedMotion
-from servoscope.detection.trace import Statistic, any_exceeded, detection_statistics
+from servoscope.detection.trace import UNSEEN, Statistic, any_exceeded, detection_statistics
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, RegressionRunner, Tuning
@@ -37,7 +37,6 @@ MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip b
 WEAKEST_INSTRUMENT = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
 FALL_BACK = {"estimator": "akf"}
 MIN_NOISE_GROWTH = 1.5  # of the variance; below it counts as none
-UNSEEN = 0.1  # relative, by which a motion is outside of the baseline's from which on it counts as never seen
 AT_ONCE = 4096  # evaluations
 FORGOTTEN = 1e-9  # share of the past below which it counts as forgotten
 MEMORIES = 22.0  # after which it usually is

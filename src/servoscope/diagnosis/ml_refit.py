@@ -16,7 +16,7 @@ from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.warnings import warning_throughout
 
 if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
-    from servoscope.isolation.ml import Hypothesis, RefitResult
+    from servoscope.isolation.ml import Hypothesis, OnsetEstimate, RefitResult
 
 WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
 MAX_SIZE_DISTANCE = 3.0  # standard deviations between two sizes that are called different
@@ -51,9 +51,10 @@ def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:
     return tuple(sorted(candidates, key=lambda candidate: (-candidate.probability, candidate.misfit or 0.0)))
 
 
-def refit_onset(refined: RefitResult, exam: Examination) -> Onset:
-    """Return the onset in the recording's time."""
-    t, first, onset, stride = exam.recording.t, refined.window.first_sample, refined.onset, refined.window.stride
+def refit_onset(refined: RefitResult, exam: Examination, outside: OnsetEstimate | None = None) -> Onset:
+    """Return the onset in the recording's time, of the refit or of the cause outside the list that explains it."""
+    t, first, stride = exam.recording.t, refined.window.first_sample, refined.window.stride
+    onset = outside or refined.onset
     last = len(t) - 1
     low, likely, high = (min(first + k * stride, last) for k in (onset.low, onset.profile.onset, onset.high))
     high = min(high + stride - 1, last)  # it may come anywhere within a sample of the window
@@ -62,9 +63,16 @@ def refit_onset(refined: RefitResult, exam: Examination) -> Onset:
 
 
 def summarise_refit(
-    refined: RefitResult, exam: Examination, recursive: tuple[Candidate, ...], first: int = 0
+    refined: RefitResult,
+    exam: Examination,
+    recursive: tuple[Candidate, ...],
+    first: int = 0,
+    outside: OnsetEstimate | None = None,
 ) -> RefitSummary:
-    """Return the part of a refit that a diagnosis keeps; its samples are counted from sample `first` on."""
+    """Return the part of a refit that a diagnosis keeps; its samples are counted from sample `first` on.
+
+    `outside`: when a cause outside the list of faults came that explains everything.
+    """
     from servoscope.isolation.ml import find_other_causes
 
     t, window = exam.recording.t, refined.window
@@ -81,7 +89,7 @@ def summarise_refit(
         recursive=recursive,
         mimics=tuple(
             Mimic(name=cause.name, description=cause.cause, value=cause.value, unit=units.get(cause.unit, cause.unit))
-            for cause in find_other_causes(refined)
+            for cause in find_other_causes(refined, outside.profile if outside else None)
         ),
     )
 

@@ -8,7 +8,8 @@ from servoscope.core.messages import Message, message
 from servoscope.detection.motion import QUANTITIES
 from servoscope.detection.plant_fit import saturated_share
 from servoscope.detection.result import DiagnosisWarning
-from servoscope.diagnosis.examine import UNSEEN, Examination
+from servoscope.detection.trace import UNSEEN
+from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.warnings import warning_throughout
 
 SATURATED = 0.05  # share of the samples with u at a limit that is worth telling

@@ -267,11 +267,17 @@ def _transform_rows(rows: FloatArray, matrix: npt.NDArray[np.floating[Any]]) -> 
 
 
 class RegressionRunner:
-    """Forms eta, phi and z block by block; the result does not depend on where a recording is cut."""
+    """Forms eta, phi and z block by block; the result does not depend on where a recording is cut.
 
-    def __init__(self, pipeline: Pipeline) -> None:
+    Its `state` is one array, changed in place; one that is given is gone on with.
+    """
+
+    def __init__(self, pipeline: Pipeline, state: FloatArray | None = None) -> None:
         self._pipeline, self._ahead = pipeline, _InputStage(pipeline)
-        self._state = pipeline._plain.start()[0]
+        if state is None:
+            state = np.concatenate([self._ahead.state, pipeline._plain.start()[0]])
+        self.state, size = state, len(self._ahead.state)
+        self._ahead.state, self._state = state[:size], state[size:]
 
     def advance(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
         """Return the regression of the next block, each input of shape (N,)."""
@@ -302,13 +308,14 @@ class EstimationRunner:
 
 
 class _InputStage:
-    """The valve's law and stage 1, which come before the bank, with their states."""
+    """The valve's law and stage 1, which come before the bank, with their state."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._valve, self._stage = pipeline.valve, StageOneRunner(pipeline.loop, pipeline.stage_one)
-        self._of_valve, self._of_stage = self._valve.start(), self._stage.start()
+        self.state = np.concatenate([self._valve.start(), self._stage.start()])
 
     def input(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
         """Return the input of the bank for the next block, shape (N,)."""
-        flow = self._valve.run(self._of_valve, u, y, restart)
-        return self._stage.run(self._of_stage, r, flow, restart)
+        size = self._valve.size
+        flow = self._valve.run(self.state[:size], u, y, restart)
+        return self._stage.run(self.state[size:], r, flow, restart)

@@ -10,7 +10,7 @@ from servoscope import __version__
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.detection.baseline import Baseline
-from servoscope.diagnosis.monitor import MonitorConstants
+from servoscope.diagnosis.monitor_constants import MonitorConstants
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.kernel.sample_steps import ARMED, SAMPLE, KernelSpec
 from servoscope.estimation.recursion import Recursion

@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel
 from servoscope.isolation.ml.kernels import Array, samples_since_restart
 from servoscope.isolation.ml.least_squares import minimise_from_grid
-from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
+from servoscope.isolation.ml.window import RefitWindow
 
 TRIED = 33  # gaps, in even ratios, before the best is refined
 
 
 @kernel
-def backlash_sum_of_squares(
+def backlash_innovations(
     A: Array, b: Array, b_late: Array, c: Array, K: Array, by: Array, age: IntArray,
     half: float, onset: int, u: Array, y: Array, restart: BoolArray,
-) -> float:  # fmt: skip
-    """Return the sum of squared innovations (in standard deviations) of a plant whose sensor lags by half a gap.
+) -> Array:  # fmt: skip
+    """Return the innovations (in standard deviations), (N,), of a plant whose sensor lags by half a gap.
 
     From sample `onset` on the sensor stands where the actuator last pushed it, ``|c x - y| <= half``. While it stands
     still y says nothing about the plant, and the state is not corrected.
     """
     n = len(c)
     x, x_next = np.zeros(n), np.zeros(n)
-    total, sensor, reach = 0.0, 0.0, 0.0
+    e, sensor, reach = np.empty(len(y)), 0.0, 0.0
     for i in range(n):
         reach += c[i] * c[i]
     for k in range(len(y)):
@@ -50,33 +48,24 @@ def backlash_sum_of_squares(
                 x_next[i] += A[i, o] * x[o]
         for i in range(n):
             x[i] = x_next[i]
-        total += (error * by[j]) ** 2
-    return total
+        e[k] = error * by[j]
+    return e
 
 
-class BacklashFit(NamedTuple):
-    """Width of a gap, in the unit of y, and the sum of squares with it."""
-
-    width: float
-    cost: float
-
-
-def fit_backlash(window: RefitWindow, profile: ChangeProfile) -> BacklashFit:
-    """Return the gap that explains a window best.
-
-    The healthy parameters are taken as learned, and a change over some time as one in its middle.
-    """
+def backlash_of_width(window: RefitWindow, onset: int, width: float) -> FloatArray:
+    """Return the innovations (N,) with a gap, in the unit of y, from a sample on; healthy parameters as learned."""
     A, b, b_late, c, K, S = (part[0] for part in window.healthy)
-    age, by = samples_since_restart(window.restart, len(S)), 1.0 / np.sqrt(S)
-    onset = profile.onset + profile.duration // 2
+    age, by, half = samples_since_restart(window.restart, len(S)), 1.0 / np.sqrt(S), 0.5 * width
+    return backlash_innovations(A, b, b_late, c, K, by, age, half, onset, window.u, window.y, window.restart)
+
+
+def fit_backlash(window: RefitWindow, onset: int) -> float:
+    """Return the width of the gap that explains a window best, in the unit of y."""
 
     def cost(log_half: float) -> float:
-        half = float(np.exp(log_half))
-        return float(
-            backlash_sum_of_squares(A, b, b_late, c, K, by, age, half, onset, window.u, window.y, window.restart)
-        )
+        e = backlash_of_width(window, onset, 2.0 * float(np.exp(log_half)))
+        return float(e @ e)
 
     smallest, largest = 0.1 * window.factory.noise.y_std, 0.5 * float(np.ptp(window.y))
     tried: FloatArray = np.linspace(np.log(smallest), np.log(max(largest, 2.0 * smallest)), TRIED)
-    best = minimise_from_grid(cost, tried, 1e-3)
-    return BacklashFit(2.0 * float(np.exp(best)), cost(best))
+    return 2.0 * float(np.exp(minimise_from_grid(cost, tried, 1e-3)))

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message, text_message
-from servoscope.isolation.ml.backlash import fit_backlash
-from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
+from servoscope.isolation.ml.backlash import backlash_of_width, fit_backlash
+from servoscope.isolation.ml.hypothesis import HypothesisFit
 from servoscope.isolation.ml.least_squares import minimise_from_grid, solve_least_squares
 from servoscope.isolation.ml.predictor import Predictor
-from servoscope.isolation.ml.search import RefitResult
 from servoscope.isolation.ml.start_values import fit_further_parameters
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow, delayed, speed_sign
 
-AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
-NEARLY_ALL = 0.95  # of what the healthy plant does not explain
-QUIET = 1.15  # variance of the innovations up to which nothing but noise is left
 TRIED = 9  # delays up to one further sample, before the best is refined
+UNITS = {"delay": "s", "backlash": "of y", "sensor_offset": "of y", "coulomb_friction": "of u", "input_offset": "of u"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OtherCause:
     """Something that would explain the window."""
 
@@ -30,84 +29,111 @@ class OtherCause:
     cause: Message
     value: float  # value, unit: A ratio to the healthy value (unit ``ratio``), or a size
     unit: str
-    cost: float  # sum of squares with it
+    residual: FloatArray  # with it, shape (N + m,)
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of squares with it."""
+        return float(self.residual @ self.residual)
 
 
-def find_other_causes(refined: RefitResult) -> list[OtherCause]:
-    """Return the causes that explain the window, the likeliest first.
+@dataclass(frozen=True, eq=False)
+class CauseWindow:
+    """A window, and what explains it from a sample on that is neither fault nor parameter."""
 
-    Where a fault or a pair is the best explanation, those that are as good. Where none is, the best of the others and
-    those as good as it, if they explain nearly all that the healthy plant does not.
-    """
-    window, best = refined.window, refined.best.fitted
-    found, healthy = _causes_at(refined, best.profile)
-    limit = best.cost
-    if refined.is_unknown:
-        # the onset of an explanation that is none may mean nothing
-        earlier, other = _causes_at(refined, ChangeProfile(refined.initial_onset))
-        if min(cause.cost for cause in earlier) < min(cause.cost for cause in found):
-            found, healthy = earlier, other
-        most = window.samples + (1.0 - NEARLY_ALL) * (healthy - window.samples)
-        enough = min(max(most, QUIET * window.samples), best.cost)
-        limit = min([cause.cost for cause in found if enough >= cause.cost], default=-np.inf)
-    return sorted(
-        (c for c in found if limit + AS_WELL * refined.noise_variance >= c.cost), key=lambda cause: cause.cost
-    )
+    window: ChangeWindow
+
+    @cached_property
+    def healthy(self) -> tuple[FloatArray, FloatArray]:
+        """Jacobian by what is not quite known of the healthy plant, (N + m, m), and residual as learned, (N + m,)."""
+        nothing, always = np.zeros(self.window.nuisance_count), ChangeProfile(self.window.samples)
+        return self.window.jacobian(nothing, (), always), self.window.residual(nothing, (), always)
+
+    @cached_property
+    def healthy_cost(self) -> float:
+        """Sum of squares without any change."""
+        return solve_least_squares(*self.healthy)[1]
+
+    @cached_property
+    def disturbances(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """What a unit of each adds to u and to y, shapes (N,)."""
+        nothing, ones = np.zeros(self.window.samples), np.ones(self.window.samples)
+        moving = delayed(speed_sign(self.window.y), 1)
+        found = {
+            "sensor_offset": (nothing, ones),
+            "coulomb_friction": (-moving, nothing),
+            "input_offset": (ones, nothing),
+        }
+        return {name: both for name, both in found.items() if name not in self.window.plant.names}  # a fault of its own
+
+    @property
+    def nonlinear(self) -> tuple[str, ...]:
+        """Causes whose size is searched."""
+        return ("delay", "backlash") if isinstance(self.window, RefitWindow) else ()
+
+    def fit(self, name: str, onset: int, value: float | None = None) -> OtherCause:
+        """Return a cause with its likeliest size; that of a nonlinear one may be given instead."""
+        if name in self.disturbances:
+            return self._fit_disturbance(name, onset)
+        assert isinstance(self.window, RefitWindow)
+        if name == "backlash":
+            value = fit_backlash(self.window, onset) if value is None else value
+            e = backlash_of_width(self.window, onset, value)
+            return self._told(name, value, np.append(e, np.zeros(self.window.nuisance_count)))
+        value = self._fit_delay(onset) if value is None else value
+        return self._told(name, value, self._later_input(onset, value))
+
+    def _told(self, name: str, value: float, residual: FloatArray) -> OtherCause:
+        return OtherCause(name, message(f"cause.{name}"), value, UNITS[name], residual)
+
+    def _fit_disturbance(self, name: str, onset: int) -> OtherCause:
+        window, where = self.window, np.arange(self.window.samples) >= onset
+        to_u, to_y = self.disturbances[name]
+        column = window.disturbance_response(window.healthy, ChangeProfile(window.samples), to_u * where, to_y * where)
+        J, e = self.healthy
+        J = np.column_stack([J, np.append(column, np.zeros(window.nuisance_count))])
+        step, _ = solve_least_squares(J, e)
+        # a disturbance is taken off y to explain it, so its size has the other sign
+        return self._told(name, float(step[-1]), e + J @ step)
+
+    def _fit_delay(self, onset: int) -> float:
+        """Return by how much later than the loop file says the input acts, up to a sample [s]."""
+        assert isinstance(self.window, RefitWindow)
+        factory, rate = self.window.factory, self.window.sample_rate
+
+        def cost(samples: float) -> float:
+            left = self._later_input(onset, samples / rate)
+            return float(left @ left)
+
+        latest = 1.0 - factory.fractional_delay_s * rate
+        return minimise_from_grid(cost, np.linspace(0.0, latest, TRIED), 1e-4) / rate
+
+    def _later_input(self, onset: int, later_s: float) -> FloatArray:
+        window = self.window
+        assert isinstance(window, RefitWindow)
+        last = window.factory.predictor(window.plant, later_s=later_s)
+        both = Predictor.concatenate([window.healthy, last])
+        e = np.asarray(window.innovations(both, ChangeProfile(onset)), dtype=np.float64)
+        J, _ = self.healthy
+        residual = np.append(e, np.zeros(window.nuisance_count))
+        step, _ = solve_least_squares(J, residual)
+        return np.asarray(residual + J @ step)
 
 
-def _causes_at(refined: RefitResult, profile: ChangeProfile) -> tuple[list[OtherCause], float]:
-    """Return all causes for a change at some time, and the sum of squares of no change at all."""
-    window, best = refined.window, refined.best.fitted
-    healthy = fit_hypothesis(window, [], profile, best.d, [np.zeros(0)], free=True)
-    others = (
-        refined.other_parameters
-        if profile == best.profile
-        else fit_further_parameters(window, profile, best, refined.noise_variance)
-    )
-    return [*map(_ratio, others), *_additive_causes(window, profile, healthy)], healthy.cost
+def parameter_causes(
+    window: ChangeWindow, profile: ChangeProfile, best: HypothesisFit, noise_variance: float
+) -> list[OtherCause]:
+    """Return the parameters outside the list of faults, each as if it alone had changed."""
+    return list(map(parameter_cause, fit_further_parameters(window, profile, best, noise_variance)))
 
 
-def _ratio(other: HypothesisFit) -> OtherCause:
-    (fault,) = other.faults
-    return OtherCause(fault.name, text_message(fault.words), float(np.exp(other.x[0])), "ratio", other.cost)
+def parameter_cause(fitted: HypothesisFit) -> OtherCause:
+    """Return a parameter that changed as a cause."""
+    (fault,) = fitted.faults
+    return OtherCause(fault.name, text_message(fault.words), float(np.exp(fitted.x[0])), "ratio", fitted.residual)
 
 
-def _additive_causes(window: ChangeWindow, profile: ChangeProfile, healthy: HypothesisFit) -> Iterator[OtherCause]:
-    """Try what is no parameter: a later input, backlash, Coulomb friction, offsets."""
-    if isinstance(window, RefitWindow):
-        yield _delay_cause(window, profile, healthy)
-        gap = fit_backlash(window, profile)
-        yield OtherCause("backlash", message("cause.backlash"), gap.width, "of y", gap.cost)
-    predictor = window.predictor(healthy.d, (), np.zeros(0), profile)
-    where = np.arange(window.samples) >= profile.onset
-    nothing, moving, since = np.zeros(window.samples), delayed(speed_sign(window.y), 1), where.astype(np.float64)
-    signals = (nothing, since), (moving * since, nothing), (since, nothing)
-    # a disturbance is taken off y to explain it, so its size has the other sign
-    names = (
-        ("sensor_offset", message("cause.sensor_offset"), "of y", 1.0),
-        ("coulomb_friction", message("cause.coulomb_friction"), "of u", -1.0),
-        ("input_offset", message("cause.input_offset"), "of u", 1.0),
-    )
-    for (name, cause, unit, factor), (to_u, to_y) in zip(names, signals, strict=True):
-        if name in window.plant.names:  # a fault of its own
-            continue
-        column = window.disturbance_response(predictor, profile, to_u, to_y)
-        J = np.column_stack([healthy.jacobian, np.append(column, np.zeros(window.nuisance_count))])
-        step, left = solve_least_squares(J, healthy.residual)
-        yield OtherCause(name, cause, float(factor * step[-1]), unit, left)
-
-
-def _delay_cause(window: RefitWindow, profile: ChangeProfile, healthy: HypothesisFit) -> OtherCause:
-    """Try an input that acts up to a sample later than the loop file says."""
-    rate, factory = window.factory.loop.sample_rate, window.factory
-    nothing = np.zeros(window.nuisance_count)
-
-    def cost(samples: float) -> float:
-        last = factory.predictor(window.plant, later_s=samples / rate)
-        both = Predictor.concatenate([window.healthy, *(last for _ in profile.shares)])
-        e = np.asarray(window.innovations(both, profile), dtype=np.float64)
-        return solve_least_squares(healthy.jacobian, np.concatenate([e, nothing]))[1]
-
-    latest = 1.0 - factory.fractional_delay_s * rate
-    best = minimise_from_grid(cost, np.linspace(0.0, latest, TRIED), 1e-4)
-    return OtherCause("delay", message("cause.delay"), best / rate, "s", cost(best))
+def causes_at(causes: CauseWindow, onset: int) -> list[OtherCause]:
+    """Return everything that is no parameter, from a sample on."""
+    names: Sequence[str] = (*causes.nonlinear, *causes.disturbances)
+    return [causes.fit(name, onset) for name in names]

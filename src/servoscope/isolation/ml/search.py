@@ -66,6 +66,7 @@ class RefitResult:
     onset: OnsetEstimate  # onset, in samples of the window
     noise_variance: float  # variance of the innovations under it, 1 for the baseline's noise
     initial_onset: int  # sample of the window from which the search for the onset started
+    latest: int  # and up to which it went
 
     @property
     def is_unknown(self) -> bool:
@@ -330,6 +331,7 @@ class _HypothesisSearch:
             found,
             self.noise_variance,
             self.initial_onset,
+            self.latest,
         )
 
     def _evidence(self, fitted: HypothesisFit, scales: Mapping[Fault, SizePrior]) -> HypothesisEvidence:

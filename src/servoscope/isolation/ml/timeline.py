@@ -76,10 +76,11 @@ def is_constant(single: RefitResult) -> bool:
     e, J = best.residual[:N] / np.sqrt(single.noise_variance), best.jacobian[:N, -len(best.x) :]
     since = best.profile.onset
     scores = [*(J * e[:, None])[since:].T, (e**2 - 1.0)]
-    return max(map(_bridge_height, scores)) <= INCONSTANT
+    return max(map(bridge_height, scores)) <= INCONSTANT
 
 
-def _bridge_height(score: FloatArray) -> float:
+def bridge_height(score: FloatArray) -> float:
+    """Return the height of the bridge that the sums of a score make, in its own standard deviations."""
     path, growth = np.cumsum(score), np.cumsum(score**2)
     return float(np.abs(path - path[-1] * growth / growth[-1]).max() / np.sqrt(growth[-1]))
 

@@ -1,0 +1,136 @@
+"""Which causes outside the list of faults explain a window, and since when the one that explains all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray, IntArray
+from servoscope.isolation.ml.hypothesis import IN_REACH, HypothesisFit, refit_jointly
+from servoscope.isolation.ml.onset import ALIKE, INTERVAL, NEGLIGIBLE, OnsetEstimate, onset_posterior
+from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes_at, parameter_cause, parameter_causes
+from servoscope.isolation.ml.search import LOOKS, RefitResult
+from servoscope.isolation.ml.timeline import INCONSTANT, bridge_height
+from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
+from servoscope.models.plants import Fault
+
+AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
+NEARLY_ALL = 0.95  # of what the healthy plant does not explain
+QUIET = 1.15  # variance of the innovations up to which nothing but noise is left
+COARSE = 24  # onsets that are tried at first
+STRIDES = 256, 64, 16, 4, 1  # samples by which an onset is moved then,
+REACH = 4  # and at most so many times
+POINTS = 33  # of the likelihood of the onset on either side of the best
+
+
+def find_other_causes(refined: RefitResult, since: ChangeProfile | None = None) -> list[OtherCause]:
+    """Return the causes that explain the window, the likeliest first; `since`: when the one came that explains it.
+
+    Where a fault or a pair is the best explanation, those that are as good. Where none is, the best of the others and
+    those as good as it, if they explain nearly all that the healthy plant does not.
+    """
+    window, best, causes = refined.window, refined.best.fitted, CauseWindow(refined.window)
+    found = _all_causes(refined, causes, since or best.profile)
+    limit = best.cost
+    if refined.is_unknown:
+        if since is None:  # the onset of an explanation that is none may mean nothing
+            earlier = _all_causes(refined, causes, ChangeProfile(refined.initial_onset))
+            found = min(found, earlier, key=lambda each: min(cause.cost for cause in each))
+        most = window.samples + (1.0 - NEARLY_ALL) * (causes.healthy_cost - window.samples)
+        enough = min(max(most, QUIET * window.samples), best.cost)
+        limit = min([cause.cost for cause in found if enough >= cause.cost], default=-np.inf)
+    return sorted(
+        (c for c in found if limit + AS_WELL * refined.noise_variance >= c.cost), key=lambda cause: cause.cost
+    )
+
+
+def find_outside_onset(refined: RefitResult) -> OnsetEstimate | None:
+    """Return since when one cause outside the list of faults explains the whole window down to noise, all else healthy.
+
+    None where none does, or a fault does nearly as well. The onset of an explanation that is none means nothing: every
+    cause is tried at many.
+    """
+    window, causes = refined.window, CauseWindow(refined.window)
+    starts = {min(refined.best.fitted.profile.onset, refined.latest), refined.initial_onset}
+    everywhere = {*starts, *np.linspace(0, refined.latest, COARSE).astype(int).tolist()}
+    tried = [(causes.fit(name, k), k) for name in causes.nonlinear for k in sorted(starts)]
+    tried += [(causes.fit(name, k), k) for name in causes.disturbances for k in sorted(everywhere)]
+    cause, onset = min(tried, key=lambda one: one[0].cost)
+    parameter = min(refined.other_parameters, key=lambda fitted: fitted.cost, default=None)
+    found: OnsetEstimate | None = None
+    if parameter is not None and parameter.cost < cause.cost:
+        found, cause = _parameter_onset(window, parameter, refined.latest)
+    else:
+        found, cause = _disturbance_onset(causes, cause, onset, refined.latest)
+    variance = cause.cost / window.used
+    e = cause.residual[: window.samples]
+    quiet = variance <= QUIET and bridge_height(e**2 / variance - 1.0) <= INCONSTANT
+    return found if quiet and cause.cost + IN_REACH * variance < refined.best.fitted.cost else None
+
+
+def _all_causes(refined: RefitResult, causes: CauseWindow, profile: ChangeProfile) -> list[OtherCause]:
+    window, best = refined.window, refined.best.fitted
+    others = (
+        list(map(parameter_cause, refined.other_parameters))
+        if profile == best.profile
+        else parameter_causes(window, profile, best, refined.noise_variance)
+    )
+    return [*others, *causes_at(causes, profile.onset + profile.duration // 2)]
+
+
+def _parameter_onset(window: ChangeWindow, fitted: HypothesisFit, latest: int) -> tuple[OnsetEstimate, OtherCause]:
+    """Find onset and size of a parameter in turns."""
+    for _ in range(LOOKS):
+        found = onset_posterior(window, fitted, latest, fitted.cost / window.used, drifts=False)
+        if found.profile == fitted.profile:
+            break
+        fitted = refit_jointly(window, _moved(fitted, found.profile))
+    return found, parameter_cause(fitted)
+
+
+def _moved(fitted: HypothesisFit, profile: ChangeProfile) -> HypothesisFit:
+    faults: tuple[Fault, ...] = fitted.faults
+    return HypothesisFit(
+        faults, profile, fitted.d, fitted.x, fitted.cost, fitted.covariance, fitted.jacobian, fitted.residual
+    )
+
+
+def _disturbance_onset(
+    causes: CauseWindow, cause: OtherCause, onset: int, latest: int
+) -> tuple[OnsetEstimate, OtherCause]:
+    """Find onset and size in turns, then how far off the onset may be."""
+
+    def cost(k: int) -> float:
+        return causes.fit(cause.name, k, cause.value).cost
+
+    for _ in range(LOOKS):
+        before = onset
+        for stride in STRIDES:
+            moved = np.clip(onset + stride * np.arange(-REACH, REACH + 1), 0, latest)
+            onset = int(min(np.unique(moved).tolist(), key=cost))
+        cause = causes.fit(cause.name, onset)
+        if onset == before:
+            break
+    variance = cause.cost / causes.window.used
+    low, high = _onset_interval(cost, onset, latest, variance)
+    return OnsetEstimate(ChangeProfile(onset), low, high, {}), cause
+
+
+def _onset_interval(cost: Callable[[int], float], onset: int, latest: int, variance: float) -> tuple[int, int]:
+    """Return the 95 % interval of an onset, by the same rule as `onset_posterior`."""
+    least, negligible = cost(onset), 2.0 * float(np.log(1.0 / NEGLIGIBLE)) * variance
+    ends = []
+    for way, edge in ((-1, 0), (1, latest)):
+        step = 1
+        while (onset + way * step - edge) * way < 0 and cost(onset + way * step) < least + negligible:
+            step *= 2
+        ends.append(int(np.clip(onset + way * step, 0, latest)))
+    onsets: IntArray = np.unique(np.concatenate([np.linspace(end, onset, POINTS) for end in ends]).astype(np.int64))
+    costs: FloatArray = np.array([cost(int(k)) for k in onsets]) - least
+    # each stands for the samples half-way to its neighbours
+    width = np.gradient(onsets.astype(np.float64)) if len(onsets) > 1 else np.ones(1)
+    share = np.cumsum(np.exp(-0.5 * costs / variance) * width)
+    low, high = (int(onsets[np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
+    alike = onsets[costs <= ALIKE * variance]
+    return min(low, int(alike.min())), max(high, int(alike.max()))
