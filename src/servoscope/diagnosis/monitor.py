@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -14,15 +13,14 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.covariate_monitor import CovariateMonitor
 from servoscope.detection.feature_monitor import FeatureMonitor, hold
 from servoscope.detection.trace import Trace
-from servoscope.estimation import frequency_response
+from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key
 from servoscope.estimation.frequency_response import FrequencyResponse
-from servoscope.estimation.pipeline import Pipeline
-from servoscope.estimation.two_stage import StageOneRunner
 
 if TYPE_CHECKING:
-    from servoscope.estimation.recursion import Recursion, RecursionConstants
+    from servoscope.estimation.recursion import Recursion
 
 
 class Monitor:
@@ -76,6 +74,11 @@ class Monitor:
                     f"a monitor follows one operating point, this baseline has {', '.join(each.points)}: give "
                     f"baseline.at({each.points[0]!r})"
                 )
+            if each.covariates is not None and self.fleet:
+                raise BaselineError(
+                    f"a fleet is followed without covariates, this baseline has {', '.join(each.covariates.names)}: "
+                    "give each asset a monitor of its own"
+                )
         if share_budget:
             shared = {key: each.shared(len(self.baselines)) for key, each in distinct.items()}
             self.baselines = tuple(shared[id(each)] for each in self.baselines)
@@ -105,7 +108,11 @@ class Monitor:
         self._features_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
         model = None if self.fleet else self.baselines[0].features
         self._features = None if model is None else FeatureMonitor(model)
-        self._size = self._features_at + (self._features.size if self._features is not None else 0)
+        self._covariates_at = self._features_at + (self._features.size if self._features is not None else 0)
+        self._covariates = None
+        if not self.fleet and (covariates := self.baselines[0].covariates) is not None:
+            self._covariates = CovariateMonitor(self.baselines[0], covariates)
+        self._size = self._covariates_at + (self._covariates.size if self._covariates is not None else 0)
         self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
         self._step_constants = np.zeros(0)
 
@@ -142,7 +149,8 @@ class Monitor:
         Features cut windows of their own, valve laws and stage 1 run one asset after the other.
         """
         ((_, recursion), *others) = self._groups
-        if self.fleet or others or self._prefix_size or self._features is not None or not recursion.has_lanes:
+        single = self._features is not None or self._covariates is not None
+        if self.fleet or others or self._prefix_size or single or not recursion.has_lanes:
             return None
         return recursion.layout, *compatibility_key(self.baselines[0])
 
@@ -175,7 +183,9 @@ class Monitor:
             for row, each in zip(states, self._constants_of, strict=True):
                 row[: each.prefix_size] = np.concatenate([each.pipeline.valve.start(), each.stage.start()])
         if self._features is not None:
-            states[0, self._features_at :] = self._features.start()
+            states[0, self._features_at : self._covariates_at] = self._features.start()
+        if self._covariates is not None:
+            states[0, self._covariates_at :] = self._covariates.start()
         return states if self.fleet else states[0]
 
     def run(
@@ -185,6 +195,8 @@ class Monitor:
         u: npt.ArrayLike,
         y: npt.ArrayLike,
         restart: npt.ArrayLike | None = None,
+        *,
+        channels: Mapping[str, npt.ArrayLike] | None = None,
     ) -> tuple[FloatArray, Trace]:
         """Feed a block of samples of any length.
 
@@ -196,6 +208,9 @@ class Monitor:
             Shape (N,), or (assets, N) for a fleet. A NaN anywhere in a sample is a gap: the estimate is held.
         restart
             True where a sample does not follow its predecessor by one sample time; same shape.
+        channels
+            Covariates by name, shape (N,) each, where the baseline has some. Of NaN, the value before holds; nothing is
+            estimated before the first value, and none is ready outside of the range that was learned.
 
         Returns
         -------
@@ -205,8 +220,10 @@ class Monitor:
         Raises
         ------
         RecordingError
-            If the shapes do not fit together.
+            If the shapes do not fit together, or a covariate is missing.
         """
+        from servoscope.estimation.kernel.sample_steps import SAMPLE
+
         number = np.float32 if self._single_precision else np.float64
         signals = [np.atleast_2d(np.ascontiguousarray(signal, dtype=number)) for signal in (r, u, y)]
         shape = (len(self.baselines), signals[0].shape[1])
@@ -225,6 +242,7 @@ class Monitor:
         if self._size > self._groups[0][1].size:
             rows = rows.copy()
         features = self._follow_features(rows, signals, gaps)
+        averages = self._follow_covariates(rows[0], signals, channels or {})
         if self._prefix_size:
             signals[1] = self._apply_input_stages(rows, signals[0], signals[1], signals[2], gaps)
         if len(self._groups) == 1 and rows.shape[1] == self._groups[0][1].size:
@@ -233,7 +251,10 @@ class Monitor:
             new, out = recursion.run(rows, signals[0], signals[1], signals[2], flags)
         else:
             new, out, index = self._run_groups(rows, signals, flags)
-        return new if self.fleet else new[0], self._trace(out, index, features(index))
+        trace = self._trace(out, index, features(index))
+        if self._covariates is not None:
+            trace = self._covariates.compare(trace, averages[index - int(rows[0, self._prefix_size + SAMPLE])])
+        return new if self.fleet else new[0], trace
 
     def _run_groups(
         self, rows: FloatArray, signals: list[npt.NDArray[Any]], flags: npt.NDArray[np.bool_] | None
@@ -257,6 +278,8 @@ class Monitor:
 
         Read it with `latest`. NaN in any of the three is a gap.
         """
+        if self._covariates is not None:
+            raise RecordingError("step knows no covariates, which this baseline has: use run")
         if self._step is None or len(state) != self._size or state.ndim != 1:
             if state.shape != self._shape or self.fleet or self._single_precision:
                 raise RecordingError(
@@ -288,11 +311,26 @@ class Monitor:
         """Change the features' state in place; return a function: what holds at each of some of the block's samples."""
         if self._features is None:
             return lambda index: None
-        own = rows[0, self._features_at :]
+        own = rows[0, self._features_at : self._covariates_at]
         r, u, y = (np.asarray(signal[0], dtype=np.float64) for signal in signals)
         before, spans = self._features.value(own), self._features.run(own, r, u, y, flags[0])
         ends, values = np.array([span.end - 1 for span in spans], np.int64), np.array([span.value for span in spans])
         return lambda index: hold(values, ends, index, before)
+
+    def _follow_covariates(
+        self, state: FloatArray, signals: list[npt.NDArray[Any]], channels: Mapping[str, npt.ArrayLike]
+    ) -> FloatArray:
+        """Return the averages of the covariates (N, k); changes the state, which starts at their first values."""
+        if self._covariates is None:
+            return np.zeros((0, 0))
+        ((_, recursion),) = self._groups
+        theta = state[self._prefix_size :][recursion.slices["theta"]]
+        averages, start = self._covariates.run(state[self._covariates_at :], channels, signals[0].shape[1])
+        signals[0] = np.where(np.isnan(averages).any(axis=1), np.nan, signals[0])
+        if start is not None:
+            constants = self._constants_of[0].constants
+            theta[:] = np.linalg.solve(constants.basis, start - constants.origin)
+        return averages
 
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of the latest evaluation in a state."""
@@ -302,8 +340,15 @@ class Monitor:
         out = np.empty((len(rows), self._groups[0][1].sizes.row))
         for assets, recursion in self._groups:
             out[assets] = recursion.evaluate(rows[assets, : recursion.size])
-        features = None if self._features is None else np.array([self._features.value(state[self._features_at :])])
-        return self._trace(out[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]), features)
+        features = (
+            None
+            if self._features is None
+            else np.array([self._features.value(state[self._features_at : self._covariates_at])])
+        )
+        trace = self._trace(out[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]), features)
+        if self._covariates is None:
+            return trace
+        return self._covariates.compare(trace, self._covariates.average.latest(state[self._covariates_at :])[None])
 
     @property
     def _shape(self) -> tuple[int, ...]:
@@ -351,37 +396,3 @@ def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
 def _deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
     """Stack arrays; where all are the same object, it stands once, with a first axis of length one."""
     return np.array(values if len({id(value) for value in values}) > 1 else values[:1])
-
-
-def compatibility_key(baseline: Baseline) -> tuple[Hashable, ...]:
-    """Return the properties that all assets of one monitor must share."""
-    loop = baseline.loop
-    return loop.sample_rate, loop.monitor.evaluation_rate, baseline.names, loop.monitor.frequencies
-
-
-@dataclass(frozen=True, eq=False)
-class MonitorConstants:
-    """The part of a monitor that comes from one baseline and never changes."""
-
-    pipeline: Pipeline
-    stage: StageOneRunner
-    prefix_size: int  # of the states of valve law and stage 1
-    constants: RecursionConstants
-    expected_theta: FloatArray
-    healthy: FrequencyResponse
-
-    @classmethod
-    def from_baseline(cls, baseline: Baseline) -> MonitorConstants:
-        """Derive the constants; the bias under the baseline's references is taken out of estimate and expectation."""
-        from servoscope.estimation.recursion import EvaluationConstants
-
-        pipeline, stage = baseline.pipeline(), StageOneRunner(baseline.loop, baseline.stage_one)
-        frequencies, expected = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
-        E = pipeline.bank.E(frequencies)
-        response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
-        evaluation = EvaluationConstants(baseline.covariance_array(), expected, response, baseline.loop.sample_rate)
-        constants = pipeline.constants(baseline.tuning, baseline.cusum_constants(pipeline), evaluation)
-        healthy = frequency_response.frequency_response(
-            pipeline.bank, frequencies, expected, baseline.covariance_array()
-        )
-        return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, expected, healthy)

@@ -10,7 +10,7 @@ from servoscope import __version__
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.detection.baseline import Baseline
-from servoscope.diagnosis.monitor import MonitorConstants
+from servoscope.diagnosis.monitor_constants import MonitorConstants
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.kernel.sample_steps import ARMED, SAMPLE, KernelSpec
 from servoscope.estimation.recursion import Recursion
@@ -51,6 +51,11 @@ class ExportConstants:
             raise BaselineError(
                 f"an exported monitor follows one operating point, this baseline has {', '.join(baseline.points)}: "
                 f"give --point {baseline.points[0]}"
+            )
+        if baseline.covariates is not None:
+            raise BaselineError(
+                f"{loop.name}: an exported monitor knows no covariates, this baseline has "
+                f"{', '.join(baseline.covariates.names)}: export baseline.at(...) their values"
             )
         stage = _input_stage(baseline)
         if stage and not only_coefficients:

@@ -1,0 +1,53 @@
+"""What a monitor takes from a baseline: constants of its chain, and what baselines of one monitor have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.detection.baseline import Baseline
+from servoscope.estimation import frequency_response
+from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.two_stage import StageOneRunner
+
+if TYPE_CHECKING:
+    from servoscope.estimation.recursion import RecursionConstants
+
+
+def compatibility_key(baseline: Baseline) -> tuple[Hashable, ...]:
+    """Return the properties that all assets of one monitor must share."""
+    loop = baseline.loop
+    return loop.sample_rate, loop.monitor.evaluation_rate, baseline.names, loop.monitor.frequencies
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorConstants:
+    """The part of a monitor that comes from one baseline and never changes."""
+
+    pipeline: Pipeline
+    stage: StageOneRunner
+    prefix_size: int  # of the states of valve law and stage 1
+    constants: RecursionConstants
+    expected_theta: FloatArray
+    healthy: FrequencyResponse
+
+    @classmethod
+    def from_baseline(cls, baseline: Baseline) -> MonitorConstants:
+        """Derive the constants; the bias under the baseline's references is taken out of estimate and expectation."""
+        from servoscope.estimation.recursion import EvaluationConstants
+
+        pipeline, stage = baseline.pipeline(), StageOneRunner(baseline.loop, baseline.stage_one)
+        frequencies, expected = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
+        E = pipeline.bank.E(frequencies)
+        response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
+        evaluation = EvaluationConstants(baseline.covariance_array(), expected, response, baseline.loop.sample_rate)
+        constants = pipeline.constants(baseline.tuning, baseline.cusum_constants(pipeline), evaluation)
+        healthy = frequency_response.frequency_response(
+            pipeline.bank, frequencies, expected, baseline.covariance_array()
+        )
+        return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, expected, healthy)
