@@ -80,6 +80,10 @@ def test_wear_while_the_oil_warms_has_its_name_and_size(warm: ss.Baseline, rise:
     (fault,) = diagnosis.faults
     assert fault.name == "leakage"
     assert fault.ratio == pytest.approx(1.1, rel=0.01)
+    # 10 % more leakage is what log(1.1)/0.04 = 2.4 K do: only the thermometer tells
+    (warning,) = [one.description for one in diagnosis.warnings if one.kind == "point"]
+    logged, other = (float(dict(warning.values)[name]) for name in ("logged", "other"))
+    assert other - logged == pytest.approx(2.4, abs=0.4)
     assert diagnosis.onset_s is not None
     assert diagnosis.onset_s[0] - 0.6 <= 30.0 <= diagnosis.onset_s[2] + 0.6
 

@@ -43,7 +43,13 @@ from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
 from servoscope.diagnosis.sensor_check import check_sensors
 from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
 from servoscope.diagnosis.timeline import trace_timeline
-from servoscope.diagnosis.warnings import detectable_sizes, estimate_warnings, power_warnings, warning_throughout
+from servoscope.diagnosis.warnings import (
+    covariate_warnings,
+    detectable_sizes,
+    estimate_warnings,
+    power_warnings,
+    warning_throughout,
+)
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.isolation.isolate import isolate
 from servoscope.signals import MIN_SAMPLES, Recording
@@ -227,6 +233,7 @@ def diagnose_examination(
     if alarm is not None:
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
+        doubts += covariate_warnings(exam, at)
     elif changed is not None:
         unknown = (Candidate(name=UNKNOWN, probability=1.0),)
         doubts = []

@@ -271,8 +271,10 @@ def _assemble_baseline(
     tuning = replace(fit.tuning, theta=theta)
     plant = loop.plant.scaled(ratios) if ratios else loop.plant
     progress("features")
-    features, warnings = learn_features(loop, recordings)
-    notes += warnings
+    features = None
+    if covariates is None:  # features move with covariates too, and nothing says how
+        features, warnings = learn_features(loop, recordings)
+        notes += warnings
     limit = t2_threshold(loop, pipeline.bank.n, fit.dof, calibration, bool(hypotheses), features is not None)
     progress("promises")
     along = [
