@@ -13,6 +13,8 @@ from commands import run
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
 from servoscope.detection.covariates import CovariateAverage, CovariateModel, hold_last
+from servoscope.export.constants import ExportConstants
+from servoscope.fleet.baselines import Baselines
 from servoscope.signals import writers
 from servoscope.simulation import FaultEvent, reference, simulate
 from servoscope.simulation.nonlinear_eha import Rig, simulate_rig
@@ -192,3 +194,18 @@ def test_averages_hold_what_was_known_last() -> None:
     np.testing.assert_array_equal(hold_last(c, np.array([np.nan]))[:, 0], [np.nan, 4.0, 4.0, 2.0])
     average = CovariateAverage(1, 4.0)
     np.testing.assert_allclose(average.run(average.start(), c)[:, 0], [np.nan, 4.0, 4.0, 3.5])
+
+
+def test_who_carries_no_covariates_refuses_them(carried: ss.Baseline, tmp_path: Path) -> None:
+    with pytest.raises(BaselineError, match="knows no covariates"):
+        ExportConstants.of(carried)
+    with pytest.raises(BaselineError, match="depends on load"):
+        Baselines.from_source(carried, 1, 60.0).day_monitor("press")
+    carried.save(tmp_path / "baseline.json")
+    hall = (
+        'name = "hall"\n[sources.line]\nkind = "replay"\n[assets.press]\nbaseline = "baseline.json"\nsource = "line"\n'
+    )
+    (tmp_path / "hall.toml").write_text(f'{hall}files = ["x.csv"]\n', encoding="utf-8")
+    told = run("run", tmp_path / "hall.toml", "--check")
+    assert told.code == 1
+    assert "[assets] press.baseline: baseline.json depends on load" in told.err
