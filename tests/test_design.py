@@ -26,7 +26,8 @@ from servoscope.design.fisher_information import (
 from servoscope.design.isolability import ambiguous_sizes, hypothesis_distances
 from servoscope.design.mimics import match_mimic, mimic_causes
 from servoscope.design.scenario import Scenario
-from servoscope.detection.baseline import Baseline, ExactPredictorFit
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.baseline_parts import ExactPredictorFit
 from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.hypothesis import fit_hypothesis

@@ -11,7 +11,7 @@ import pytest
 
 import servoscope as ss
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.baseline import ExactPredictorFit
+from servoscope.detection.baseline_parts import ExactPredictorFit
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml import RefitResult, find_other_causes, fit_hypotheses
 from servoscope.isolation.ml.hypothesis import SizePrior, fit_hypothesis

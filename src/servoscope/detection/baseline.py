@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
     ValidationError,
@@ -26,11 +24,14 @@ from servoscope.core.files import atomic_write
 from servoscope.core.messages import MessageText
 from servoscope.core.short_repr import ShortRepr
 from servoscope.detection.axis_model import AxisModel
+from servoscope.detection.baseline_parts import BaselineModel, BaselineSource, DetectableChange, ExactPredictorFit
+from servoscope.detection.covariates import CovariateModel
 from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, worst_case_hypotheses
 from servoscope.detection.expectation import Expectation
 from servoscope.detection.feature_model import FeatureModel
 from servoscope.detection.learned_fault import LearnedFault
 from servoscope.detection.motion import MotionRange
+from servoscope.detection.plant_fit import match_ratios
 from servoscope.detection.sensors import SensorModel
 from servoscope.detection.threshold_calibration import SEQUENTIAL, CalibrationFactors, t2_threshold
 from servoscope.estimation.filter_bank import nominal_theta
@@ -46,41 +47,13 @@ if TYPE_CHECKING:
 
 FORMAT = "servoscope-baseline"
 VERSION = 2
+LATER = "motion", "axis", "covariates"  # what earlier versions did not know
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
 
 
-class _BaselineModel(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class BaselineSource(_BaselineModel):
-    """A recording that the baseline was learned from."""
-
-    name: str
-    samples: int
-    duration_s: float
-
-
-class DetectableChange(_BaselineModel):
-    """The smallest change that the baseline promises to see, relative: 0.05 is 5 %; None: none at all."""
-
-    name: str
-    parameter: str
-    change: float | None
-
-
-class ExactPredictorFit(_BaselineModel):
-    """What the exact predictor, of which the refit makes use, says of the healthy recordings."""
-
-    noise: WhiteNoise  # n_u and n_y that make their innovations likeliest
-    # what it leaves unexplained in the worst of them, over what noise leaves in all but one of a thousand: the refit
-    # is made where this is at most 1
-    misfit: float
-
-
-class Baseline(ShortRepr, _BaselineModel):
+class Baseline(ShortRepr, BaselineModel):
     """What a healthy loop looks like to the monitor; everything that `diagnose` needs.
 
     Parameters
@@ -125,6 +98,9 @@ class Baseline(ShortRepr, _BaselineModel):
         The motion that the recordings hold; None in baselines of earlier versions, and where they are very short.
     axis
         The healthy motor axis that the refit starts from; None for other kinds of plants.
+    covariates
+        How the coefficients move with what was logged beside the signals, as temperature or load; theta is theirs in
+        the middle of the learned range. None where the loop file names no covariates.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -169,6 +145,7 @@ class Baseline(ShortRepr, _BaselineModel):
     left_out: Vector = ()
     motion: MotionRange | None = None
     axis: AxisModel | None = None
+    covariates: CovariateModel | None = None
     point: str = ""
     others: tuple[Baseline, ...] = ()
 
@@ -204,9 +181,9 @@ class Baseline(ShortRepr, _BaselineModel):
 
     @model_serializer(mode="wrap")
     def _without_nothing(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what earlier versions did not know, where there is none: their files are written as they were."""
+        """Leave out what is `LATER`, where there is none: files of earlier versions are written as they were."""
         fields: dict[str, Any] = write(self)
-        return {name: value for name, value in fields.items() if value is not None or name not in ("motion", "axis")}
+        return {name: value for name, value in fields.items() if value is not None or name not in LATER}
 
     @cached_property
     def loop(self) -> Loop:
@@ -223,19 +200,48 @@ class Baseline(ShortRepr, _BaselineModel):
         """One baseline per operating point; itself where none was declared."""
         return (self.model_copy(update={"others": ()}), *self.others)
 
-    def at(self, point: str) -> Baseline:
-        """Return the baseline of one operating point.
+    def at(self, point: str | Mapping[str, float]) -> Baseline:
+        """Return the baseline of one operating point: its name, or values of the covariates, ``{"temperature": 47.0}``.
 
         Raises
         ------
         BaselineError
-            If there is no such point.
+            If there is no such point, or a covariate is missing or outside of what was learned.
         """
+        if not isinstance(point, str):
+            return self._at_covariates(point)
         for one in self.per_point:
             if point and one.point == point:
                 return one
         known = f"choose from {', '.join(self.points)}" if self.points else "the baseline has none"
         raise BaselineError(f"there is no operating point {point!r}: {known}")
+
+    def _at_covariates(self, values: Mapping[str, float]) -> Baseline:
+        model = self.covariates
+        if model is None or set(values) != set(model.names):
+            known = f"give {', '.join(model.names)}" if model is not None else "the baseline has none"
+            raise BaselineError(f"there are no covariates {', '.join(values)}: {known}")
+        c = np.array([float(values[name]) for name in model.names])
+        if (outside := model.describe_outside(c[None])) is not None:
+            raise BaselineError(str(outside))
+        origin = np.array(self.theta)
+        theta = model.theta(origin, c)
+        covariance = self.covariance_array() + model.theta_covariance(origin, c)
+        update: dict[str, Any] = {
+            "theta": tuple(theta.tolist()),
+            "covariance": tuple(map(tuple, covariance.tolist())),
+            "covariates": None,
+        }
+        if self.model_theta:
+            update["model_theta"] = tuple((np.array(self.model_theta) + theta - origin).tolist())
+        if self.ratios:
+            wanted = nominal_theta(self.loop, self.plant) + theta - origin
+            update["ratios"] = match_ratios(self.loop, self.ratios, wanted, covariance)
+        if self.axis is not None:
+            shift = dict(zip(self.names, (theta - origin).tolist(), strict=True))
+            moved = {name: value + shift.get(name, 0.0) for name, value in self.axis.coefficients.items()}
+            update["axis"] = self.axis.model_copy(update={"coefficients": moved})
+        return self.model_copy(update=update)
 
     @property
     def plant(self) -> Plant:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from servoscope.models.lti import autocovariances, solve_scaled
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
+FREE = 1.0  # standard deviation of how far covariates may move the logarithm of a parameter
 PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
 
 
@@ -158,6 +159,28 @@ def describe_healthy_plant(
             for g, e in zip(regressions, expectations, strict=True)
         ],
     )
+
+
+def match_ratios(
+    loop: Loop, ratios: Mapping[str, float], theta: FloatArray, covariance: FloatArray
+) -> dict[str, float]:
+    """Return the ratios of the same parameters at which the plant has other coefficients theta (n,), about known ones.
+
+    Least squares weighted by the covariance (n, n) of theta; a parameter that theta does not tell stays where it is.
+    """
+    from scipy.optimize import least_squares as minimise
+
+    before = np.log(list(ratios.values()))
+    size = np.sqrt(np.diag(covariance))
+    factor = np.linalg.cholesky(covariance / np.outer(size, size))
+
+    def misfit(x: FloatArray) -> FloatArray:
+        plant = loop.plant.scaled(dict(zip(ratios, np.exp(before + x).tolist(), strict=True)))
+        off = (nominal_theta(loop, plant) - theta) / size
+        return np.concatenate([np.linalg.solve(factor, off), x / FREE])
+
+    found = minimise(misfit, np.zeros(len(before)), bounds=(-3.0, 3.0))
+    return dict(zip(ratios, np.exp(before + found.x).tolist(), strict=True))
 
 
 def fault_directions(

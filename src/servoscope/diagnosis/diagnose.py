@@ -43,7 +43,13 @@ from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
 from servoscope.diagnosis.sensor_check import check_sensors
 from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
 from servoscope.diagnosis.timeline import trace_timeline
-from servoscope.diagnosis.warnings import detectable_sizes, estimate_warnings, power_warnings, warning_throughout
+from servoscope.diagnosis.warnings import (
+    covariate_warnings,
+    detectable_sizes,
+    estimate_warnings,
+    power_warnings,
+    warning_throughout,
+)
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.isolation.isolate import isolate
 from servoscope.signals import MIN_SAMPLES, Recording
@@ -146,7 +152,13 @@ def _judge_signals(
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     points = baseline.per_point if point is None else (baseline.at(point),)
     recording, sensors = check_sensors(points[0], recording)
+    if (model := points[0].covariates) is not None and (
+        missing := model.describe_missing(recording.channels)
+    ) is not None:
+        raise RecordingError(f"{recording.name}: {missing}")
     exams = [Examination.from_recording(one, recording) for one in points]
+    if exams[0].along is not None and (outside := exams[0].along.outside) is not None:
+        return leave_undetermined(exams[0], outside), exams[0], None
     if recording.y.min() == recording.y.max():  # without the sensor's noise, which every likelihood divides by
         return leave_undetermined(exams[0], message("warning.no_motion")), exams[0], None
     if (own := next(filter(None, map(examine_by_own_past, exams)), None)) is not None and own.alarm.any():
@@ -221,6 +233,7 @@ def diagnose_examination(
     if alarm is not None:
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
+        doubts += covariate_warnings(exam, at)
     elif changed is not None:
         unknown = (Candidate(name=UNKNOWN, probability=1.0),)
         doubts = []
@@ -267,9 +280,9 @@ def _explain_alarm(
     progress("refit")
     last = int(exam.estimates.index[alarm.evaluation])
     # the refit takes the model for exact, but that of an axis follows the recording
-    seen = (
-        exam.change is not None
-        or (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
+    seen = exam.change is not None or (
+        not exam.drifts
+        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
     )
     refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):

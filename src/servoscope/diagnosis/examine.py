@@ -22,6 +22,7 @@ from servoscope.core.errors import RecordingError
 from servoscope.detection import cusum_design
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
+from servoscope.detection.covariates import CovariatePath
 from servoscope.detection.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.detection.motion import RecordedMotion
 from servoscope.detection.trace import UNSEEN, Statistic, any_exceeded, detection_statistics
@@ -37,6 +38,7 @@ MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip b
 WEAKEST_INSTRUMENT = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
 FALL_BACK = {"estimator": "akf"}
 MIN_NOISE_GROWTH = 1.5  # of the variance; below it counts as none
+DRIFTING = 1.0  # T^2 of what covariates do within a recording, from which on no single plant explains it
 AT_ONCE = 4096  # evaluations
 FORGOTTEN = 1e-9  # share of the past below which it counts as forgotten
 MEMORIES = 22.0  # after which it usually is
@@ -57,6 +59,7 @@ class Examination:
     skipped_share: float  # share of the updates that the estimator's guard skipped
     noise_growth: float  # of the noise's variance against the baseline's
     change: AxisChange | None = None  # within the recording, where it is one of a motor axis
+    along: CovariatePath | None = None  # what covariates make of the coefficients; None where none were learned
     replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
 
     @classmethod
@@ -71,21 +74,38 @@ class Examination:
                 f"{recording.name}: sampled at {recording.sample_rate:g} Hz, the baseline's loop at "
                 f"{loop.sample_rate:g} Hz: learn a baseline at this rate"
             )
-        exam = _run_recursion(baseline, recording, baseline.pipeline())
+        along = None
+        if (model := baseline.covariates) is not None:
+            memory = baseline.pipeline().memory_samples
+            along = CovariatePath.of(model, np.array(baseline.theta), recording.channels, memory)
+            place = ", ".join(filter(None, [baseline.point, along.place]))
+            baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
+            baseline = baseline.model_copy(update={"point": place})
+        exam = _run_recursion(baseline, recording, baseline.pipeline(), along)
         skipped = _skipped_share(exam.estimates)
         replaced = _has_failed_instrument(exam)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
-            exam = _run_recursion(baseline, recording, Pipeline.of(other, baseline.stage_one, baseline.still_speed))
+            pipeline = Pipeline.of(other, baseline.stage_one, baseline.still_speed)
+            exam = _run_recursion(baseline, recording, pipeline, along)
         growth = 1.0 if exam.noise is None else _noise_growth(exam.pipeline, exam.estimates)
         if growth > 1.0:  # it shifts the expectation, and the sequential test would take it for steps of a change
-            exam = _run_recursion(baseline, recording, exam.pipeline, growth)
-        change = None
-        if baseline.axis is not None:
+            exam = _run_recursion(baseline, recording, exam.pipeline, along, growth)
+        exam, change = replace(exam, along=along), None
+        if baseline.axis is not None and not exam.drifts:
             from servoscope.isolation.ml.axis_scan import find_axis_change
 
             change = find_axis_change(baseline, recording)
         return replace(exam, skipped_share=skipped, replaced=replaced, change=change)
+
+    @cached_property
+    def drifts(self) -> bool:
+        """Whether covariates move the healthy coefficients within the recording by as much as their uncertainty."""
+        if self.along is None or not self.evaluations:
+            return False
+        theta = self.along.expected(self.estimates.index)
+        C = np.broadcast_to(self.covariance(self.evaluations - 1), self.estimates.S.shape)
+        return bool(t2_statistic(theta, np.broadcast_to(theta[-1], theta.shape), C).max() > DRIFTING)
 
     @property
     def evaluations(self) -> int:
@@ -243,7 +263,13 @@ def _reference_piece(recording: Recording, rows: slice, first: int) -> Reference
     return reference_path(recording.rows(rows), ahead)
 
 
-def _run_recursion(baseline: Baseline, recording: Recording, pipeline: Pipeline, growth: float = 1.0) -> Examination:
+def _run_recursion(
+    baseline: Baseline,
+    recording: Recording,
+    pipeline: Pipeline,
+    along: CovariatePath | None = None,
+    growth: float = 1.0,
+) -> Examination:
     """Read a recording once: the estimates, and in a second thread what a healthy loop would show."""
     tuning, C, noise, walk = baseline.tuning, baseline.covariance_array(), None, None
     if baseline.noise is None:
@@ -262,12 +288,15 @@ def _run_recursion(baseline: Baseline, recording: Recording, pipeline: Pipeline,
             walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.model_theta))
         )
 
-    estimating = EstimationRunner(pipeline, tuning, watch)
+    estimating = EstimationRunner(pipeline, tuning if along is None else replace(tuning, theta=along.start), watch)
     columns = defaultdict[str, outofcore.GrowableArray](outofcore.GrowableArray)
 
     def keep(e: Estimates, path: Future[FloatArray]) -> None:
-        expected = np.broadcast_to(path.result(), e.theta.shape)
-        T2 = np.where(e.updates > 0, t2_statistic(e.theta, expected, growth * e.S + C), 0.0)
+        expected, covariance = np.broadcast_to(path.result(), e.theta.shape), C
+        if along is not None:
+            expected = expected + (along.expected(e.index) - tuning.theta)
+            covariance = C + along.covariance(e.index)
+        T2 = np.where(e.updates > 0, t2_statistic(e.theta, expected, growth * e.S + covariance), 0.0)
         for name, piece in {**vars(e), "expected": expected, "statistic": T2}.items():
             columns[name].append(piece)
 

@@ -52,7 +52,8 @@ class Follower:
 
     def follow(self, state: State, samples: Samples) -> tuple[State, Evaluations]:
         """Process a block of samples, in the order of time; the old state stays valid."""
-        monitor, trace = self.monitor.run(state.monitor, samples.r, samples.u, samples.y, samples.restart)
+        s = samples
+        monitor, trace = self.monitor.run(state.monitor, s.r, s.u, s.y, s.restart, channels=s.channels)
         index = np.rint(trace.t * self.baseline.loop.sample_rate).astype(np.int64) - state.samples
         exceeding = consecutive_exceedances(trace.exceeded, state.exceeding)
         new = replace(

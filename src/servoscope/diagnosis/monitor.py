@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -13,10 +13,9 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.feature_monitor import FeatureMonitor, hold
-from servoscope.detection.motion_monitor import MotionEvidence, MotionMonitor
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key
+from servoscope.diagnosis.side_monitors import SideMonitors, SideValues
 from servoscope.estimation.frequency_response import FrequencyResponse
 
 if TYPE_CHECKING:
@@ -82,6 +81,11 @@ class Monitor:
                     f"a monitor follows one operating point, this baseline has {', '.join(each.points)}: give "
                     f"baseline.at({each.points[0]!r})"
                 )
+            if each.covariates is not None and self.fleet:
+                raise BaselineError(
+                    f"a fleet is followed without covariates, this baseline has {', '.join(each.covariates.names)}: "
+                    "give each asset a monitor of its own"
+                )
         if share_budget:
             shared = {key: each.shared(len(self.baselines)) for key, each in distinct.items()}
             self.baselines = tuple(shared[id(each)] for each in self.baselines)
@@ -95,7 +99,10 @@ class Monitor:
         self._single_precision = precision == "single"
         self._assemble([constants[id(each)] for each in self.baselines])
         if motion_check:
-            self._check_motion()
+            if self._side is None:
+                raise BaselineError("the motion of a fleet is not checked: make one monitor for each asset")
+            self._side.check_motion()
+            self._size = self._side_at + self._side.size
 
     def _assemble(self, constants: Sequence[MonitorConstants]) -> None:
         """Take the constants of each asset."""
@@ -110,25 +117,12 @@ class Monitor:
         }
         self._limits = np.array([each.limit for each in self.baselines])[:, None]
         self._prefix_size = max(each.prefix_size for each in self._constants_of)  # where the state of stage 2 begins
-        self._features_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
-        model = None if self.fleet else self.baselines[0].features
-        self._features = None if model is None else FeatureMonitor(model)
-        self._motion: MotionMonitor | None = None
-        self._motion_at = self._features_at + (self._features.size if self._features is not None else 0)
-        self._size = self._motion_at
+        self._side_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
+        # None in a fleet: each asset cuts its windows elsewhere, and lanes need all of them at the same place
+        self._side = None if self.fleet else SideMonitors(self.baselines[0], self.pipeline)
+        self._size = self._side_at + (0 if self._side is None else self._side.size)
         self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
         self._step_constants = np.zeros(0)
-
-    def _check_motion(self) -> None:
-        """Let a motion never seen make an alarm harder."""
-        one = self.baselines[0]
-        if self.fleet:
-            raise BaselineError("the motion of a fleet is not checked: make one monitor for each asset")
-        if one.motion is None and not one.extrapolates:
-            raise BaselineError("this baseline does not hold the motion of its recordings: learn it again")
-        if one.limited_motion is not None:
-            self._motion = MotionMonitor(self.pipeline, one.tuning, one.limited_motion)
-            self._size += self._motion.size
 
     @classmethod
     def join(cls, monitors: Sequence[Monitor]) -> Self:
@@ -163,7 +157,8 @@ class Monitor:
         Features cut windows of their own, valve laws and stage 1 run one asset after the other.
         """
         ((_, recursion), *others) = self._groups
-        if self.fleet or others or self._prefix_size or self._features is not None or not recursion.has_lanes:
+        alone = self._side is None or not self._side.is_joinable
+        if alone or others or self._prefix_size or not recursion.has_lanes:
             return None
         return recursion.layout, *compatibility_key(self.baselines[0])
 
@@ -195,10 +190,8 @@ class Monitor:
         if self._prefix_size:
             for row, each in zip(states, self._constants_of, strict=True):
                 row[: each.prefix_size] = np.concatenate([each.pipeline.valve.start(), each.stage.start()])
-        if self._features is not None:
-            states[0, self._features_at : self._motion_at] = self._features.start()
-        if self._motion is not None:
-            states[0, self._motion_at :] = self._motion.start()
+        if self._side is not None:
+            states[0, self._side_at :] = self._side.start()
         return states if self.fleet else states[0]
 
     def run(
@@ -208,6 +201,8 @@ class Monitor:
         u: npt.ArrayLike,
         y: npt.ArrayLike,
         restart: npt.ArrayLike | None = None,
+        *,
+        channels: Mapping[str, npt.ArrayLike] | None = None,
     ) -> tuple[FloatArray, Trace]:
         """Feed a block of samples of any length.
 
@@ -219,6 +214,9 @@ class Monitor:
             Shape (N,), or (assets, N) for a fleet. A NaN anywhere in a sample is a gap: the estimate is held.
         restart
             True where a sample does not follow its predecessor by one sample time; same shape.
+        channels
+            Covariates by name, shape (N,) each, where the baseline has some. Of NaN, the value before holds; nothing is
+            estimated before the first value, and none is ready outside of the range that was learned.
 
         Returns
         -------
@@ -228,8 +226,10 @@ class Monitor:
         Raises
         ------
         RecordingError
-            If the shapes do not fit together.
+            If the shapes do not fit together, or a covariate is missing.
         """
+        from servoscope.estimation.kernel.sample_steps import SAMPLE
+
         number = np.float32 if self._single_precision else np.float64
         signals = [np.atleast_2d(np.ascontiguousarray(signal, dtype=number)) for signal in (r, u, y)]
         shape = (len(self.baselines), signals[0].shape[1])
@@ -247,7 +247,8 @@ class Monitor:
         gaps = np.zeros(shape, dtype=np.bool_) if flags is None else flags
         if self._size > self._groups[0][1].size:
             rows = rows.copy()
-        features, motion = self._follow_features(rows, signals, gaps), self._follow_motion(rows, signals, gaps)
+        first = int(rows[0, self._prefix_size + SAMPLE])
+        beside = self._follow_side(rows[0], signals, gaps, channels or {})
         if self._prefix_size:
             signals[1] = self._apply_input_stages(rows, signals[0], signals[1], signals[2], gaps)
         if len(self._groups) == 1 and rows.shape[1] == self._groups[0][1].size:
@@ -256,7 +257,7 @@ class Monitor:
             new, out = recursion.run(rows, signals[0], signals[1], signals[2], flags)
         else:
             new, out, index = self._run_groups(rows, signals, flags)
-        return new if self.fleet else new[0], self._trace(out, index, features(index), motion)
+        return new if self.fleet else new[0], self._trace(out, index, first, beside)
 
     def _run_groups(
         self, rows: FloatArray, signals: list[npt.NDArray[Any]], flags: npt.NDArray[np.bool_] | None
@@ -280,6 +281,8 @@ class Monitor:
 
         Read it with `latest`. NaN in any of the three is a gap.
         """
+        if self._side is not None and self._side.covariates is not None:
+            raise RecordingError("step knows no covariates, which this baseline has: use run")
         if self._step is None or len(state) != self._size or state.ndim != 1:
             if state.shape != self._shape or self.fleet or self._single_precision:
                 raise RecordingError(
@@ -287,9 +290,7 @@ class Monitor:
                 )
             self._step, self._step_constants = self._groups[0][1].stepper
         one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
-        if self._features is not None:
-            self._follow_features(state[None, :], list(one), gap)
-        self._follow_motion(state[None, :], list(one), gap)
+        self._follow_side(state, list(one), gap, {})
         if self._prefix_size:
             u = float(self._apply_input_stages(state[None, :], one[0], one[1], one[2], gap)[0, 0])
             state = state[self._prefix_size :]
@@ -306,26 +307,24 @@ class Monitor:
             flow[i] = each.stage.run(rows[i, valve.size : each.prefix_size], r[i], behind_valve, flags[i])
         return flow
 
-    def _follow_features(
-        self, rows: FloatArray, signals: list[npt.NDArray[Any]], flags: npt.NDArray[np.bool_]
-    ) -> Callable[[npt.NDArray[np.int64]], FloatArray | None]:
-        """Change the features' state in place; return a function: what holds at each of some of the block's samples."""
-        if self._features is None:
-            return lambda index: None
-        own = rows[0, self._features_at : self._motion_at]
-        r, u, y = (np.asarray(signal[0], dtype=np.float64) for signal in signals)
-        before, spans = self._features.value(own), self._features.run(own, r, u, y, flags[0])
-        ends, values = np.array([span.end - 1 for span in spans], np.int64), np.array([span.value for span in spans])
-        return lambda index: hold(values, ends, index, before)
-
-    def _follow_motion(
-        self, rows: FloatArray, signals: Sequence[npt.NDArray[Any]], flags: npt.NDArray[np.bool_]
-    ) -> MotionEvidence | None:
-        """Change the motion's state in place; return what holds at the block's evaluations."""
-        if self._motion is None:
+    def _follow_side(
+        self,
+        state: FloatArray,
+        signals: list[npt.NDArray[Any]],
+        gaps: npt.NDArray[np.bool_],
+        channels: Mapping[str, npt.ArrayLike],
+    ) -> SideValues | None:
+        """Return what is seen beside the recursion; changes its state, and starts theta where covariates say so."""
+        if self._side is None or not self._side.size:
             return None
-        r, u, y = (np.asarray(signal, dtype=np.float64).reshape(-1) for signal in signals)
-        return self._motion.run(rows[0, self._motion_at :], r, u, y, flags[0])
+        found = self._side.run(state[self._side_at :], [signal.reshape(-1) for signal in signals], gaps[0], channels)
+        if found.averages is not None:
+            signals[0] = np.where(np.isnan(found.averages).any(axis=1), np.nan, signals[0])
+        if found.start is not None:
+            ((_, recursion),), constants = self._groups, self._constants_of[0].constants
+            theta = state[self._prefix_size :][recursion.slices["theta"]]
+            theta[:] = np.linalg.solve(constants.basis, found.start - constants.origin)
+        return found
 
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of the latest evaluation in a state."""
@@ -335,13 +334,9 @@ class Monitor:
         out = np.empty((len(rows), self._groups[0][1].sizes.row))
         for assets, recursion in self._groups:
             out[assets] = recursion.evaluate(rows[assets, : recursion.size])
-        features = (
-            None
-            if self._features is None
-            else np.array([self._features.value(state[self._features_at : self._motion_at])])
-        )
-        motion = None if self._motion is None else self._motion.latest(state[self._motion_at :])
-        return self._trace(out[:, None, :], np.array([int(rows[0, SAMPLE]) - 1]), features, motion)
+        beside = None if self._side is None else self._side.latest(state[self._side_at :])
+        last = int(rows[0, SAMPLE]) - 1
+        return self._trace(out[:, None, :], np.array([last]), last, beside)
 
     @property
     def _shape(self) -> tuple[int, ...]:
@@ -351,10 +346,11 @@ class Monitor:
         self,
         out: npt.NDArray[Any],
         index: npt.NDArray[np.int64],
-        features: FloatArray | None = None,
-        motion: MotionEvidence | None = None,
+        first: int,
+        beside: SideValues | None,
     ) -> Trace:
-        """Return complete evaluations, shape (assets, K, row), as a trace."""
+        """Return complete evaluations, shape (assets, K, row), as a trace; the block begins at sample `first`."""
+        motion = None if beside is None else beside.motion
         n, f = len(self._constants_of[0].expected_theta), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)
         shape = out.shape[:2]
         H = out[..., 4 + n + n * n :].reshape(*shape, len(f), 6)
@@ -376,16 +372,17 @@ class Monitor:
                 columns["statistic"] = motion.soften_statistic(**{name: columns[name] for name in JUDGED})
             response, threshold = (response[0][0], response[1][0]), self.baselines[0].limit
         expected = FrequencyResponse(f, columns.pop("H"), columns.pop("covariance of H"))
-        return Trace(
+        trace = Trace(
             t=index / self.loop.sample_rate,
             names=self.pipeline.bank.names,
             threshold=threshold,
             ifrf=FrequencyResponse(f, *response),
             ifrf_expected=expected,
-            features=features,
+            features=None if beside is None else beside.features_at(index),
             motion=None if motion is None else motion.excess,
             **columns,
         )
+        return trace if beside is None or self._side is None else self._side.compare(trace, beside, index - first)
 
 
 def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:

@@ -6,12 +6,13 @@ import numpy as np
 
 from servoscope.core import outofcore
 from servoscope.core.messages import Message, message
-from servoscope.detection.chi2_test import noncentrality, required_noncentrality
+from servoscope.detection.chi2_test import noncentrality, required_noncentrality, t2_statistic
 from servoscope.detection.plant_fit import MOST_SATURATED, fault_directions, saturated_share
 from servoscope.detection.result import DiagnosisWarning
 from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
 
 AT_ONCE = 4096  # evaluations
+VALUES_TRIED = 201  # of a covariate
 MIN_SKIPPED_SHARE = 0.01  # share of updates without an instrument from which a warning is given
 NO_PROMISE = 10.0  # relative change; a baseline that detects nothing smaller promises nothing
 WEAKER = 3.0  # a recording that shows only changes this much larger than promised is called undetermined
@@ -50,6 +51,29 @@ def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]
             if smallest > WEAKER * promised
         ]
     return [warning_throughout(exam, "power", reason) for reason in reasons]
+
+
+def covariate_warnings(exam: Examination, at: int) -> list[DiagnosisWarning]:
+    """Return warnings that another value of a covariate, within its range, would explain an evaluation as well.
+
+    The value as logged speaks against it: only its sensor can settle what motion cannot tell apart.
+    """
+    along, model = exam.along, exam.along.model if exam.along is not None else None
+    if along is None or model is None:
+        return []
+    logged, found = along.averages[exam.estimates.index[at]], []
+    for j, name in enumerate(model.names):
+        values = np.linspace(model.low[j], model.high[j], VALUES_TRIED)
+        c = np.tile(logged, (len(values), 1))
+        c[:, j] = values
+        expected = exam.expected[at] + model.theta(along.theta, c) - model.theta(along.theta, logged)
+        theta, C = (np.broadcast_to(x, (len(c), *x.shape)) for x in (exam.estimates.theta[at], exam.covariance(at)))
+        T2 = t2_statistic(theta, expected, C)
+        best = int(np.argmin(T2))
+        if T2[best] <= exam.baseline.limit:
+            other, said = float(values[best]), float(logged[j])
+            found.append(message("warning.covariate", covariate=name, other=f"{other:.3g}", logged=f"{said:.3g}"))
+    return [warning_throughout(exam, "point", text) for text in found]
 
 
 def estimate_warnings(exam: Examination) -> list[DiagnosisWarning]:

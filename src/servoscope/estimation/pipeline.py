@@ -128,7 +128,12 @@ class Pipeline:
     @property
     def memory(self) -> float:
         """Memory N of the estimator in updates."""
-        return self.loop.monitor.memory * self.loop.sample_rate / self.stride
+        return self.memory_samples / self.stride
+
+    @property
+    def memory_samples(self) -> float:
+        """Memory of the estimator in samples."""
+        return self.loop.monitor.memory * self.loop.sample_rate
 
     def constants(
         self,

@@ -52,6 +52,11 @@ class ExportConstants:
                 f"an exported monitor follows one operating point, this baseline has {', '.join(baseline.points)}: "
                 f"give --point {baseline.points[0]}"
             )
+        if baseline.covariates is not None:
+            raise BaselineError(
+                f"{loop.name}: an exported monitor knows no covariates, this baseline has "
+                f"{', '.join(baseline.covariates.names)}: export baseline.at(...) their values"
+            )
         stage = _input_stage(baseline)
         if stage and not only_coefficients:
             raise BaselineError(

@@ -8,7 +8,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.baseline import DetectableChange
+from servoscope.detection.baseline_parts import DetectableChange
 from servoscope.detection.chi2_test import (
     SECONDS_PER_YEAR,
     noncentrality,

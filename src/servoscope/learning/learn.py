@@ -12,7 +12,9 @@ from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.detection.axis_model import AxisModel
-from servoscope.detection.baseline import Baseline, BaselineSource, digest
+from servoscope.detection.baseline import Baseline, digest
+from servoscope.detection.baseline_parts import BaselineSource
+from servoscope.detection.covariates import CovariateModel, CovariatePath
 from servoscope.detection.cusum_design import CusumHypothesis
 from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system
 from servoscope.detection.homogeneity import describe_outliers, find_outliers, leave_one_out, scatter
@@ -36,6 +38,7 @@ from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, fit_tuning, prefers_white_noise
 from servoscope.isolation.ml.validity import fit_exact_predictor
 from servoscope.learning.axis_fit import fit_axis
+from servoscope.learning.covariates import fit_covariates
 from servoscope.learning.delay import check_delay
 from servoscope.learning.detectability import (
     WORTH_A_LOOK,
@@ -84,6 +87,10 @@ def learn_baseline(
                 f"{rec.name}: u is at a limit in {share:.0%} of the rows: lower the demand, or check input_limits"
             )
     pipeline, regressions, fit, notes = _tune(loop, recordings)
+    covariates = None
+    if loop.columns.covariates:
+        progress("covariates")
+        covariates, regressions, fit = fit_covariates(pipeline, recordings, regressions, fit)
     progress("delay")
     delay_s, warnings = check_delay(pipeline.loop, recordings, accept_delay)
     name = pipeline.loop.monitor.estimator
@@ -93,7 +100,9 @@ def learn_baseline(
         if check in ("mean", "covariance")
     ]
     notes += warnings
-    return _assemble_baseline(pipeline.loop, recordings, pipeline, regressions, fit, delay_s, notes, progress)
+    return _assemble_baseline(
+        pipeline.loop, recordings, pipeline, regressions, fit, delay_s, notes, progress, covariates=covariates
+    )
 
 
 def _check_signals(loop: Loop, recording: Recording) -> None:
@@ -186,6 +195,7 @@ def _assemble_baseline(
     notes: list[Message],
     progress: Progress,
     exact: bool = False,
+    covariates: CovariateModel | None = None,
 ) -> Baseline:
     calibration = CalibrationFactors()
     theta_covariance, deviations_between = fit.covariance, fit.each
@@ -207,7 +217,8 @@ def _assemble_baseline(
             theta = model_theta = expectations[0].batch_estimate(loop.plant)
         else:
             healthy = fit_healthy_plant(expectations, regressions, fit, nominal_theta(loop), fit.tuning.noise)
-            innovations = fit_innovations(loop, recordings, noise)
+            # covariates are taken out of the regressions, not of the recordings
+            innovations = None if covariates is not None else fit_innovations(loop, recordings, noise)
             if innovations is not None and innovations.contradicts(np.log(list(healthy.ratios.values()))):
                 # what y does between the samples is part of the recursion's residual, as if it were noise
                 known = innovations.names, innovations.x, innovations.covariance
@@ -240,7 +251,7 @@ def _assemble_baseline(
             if healthy.misfit <= special.chdtri(pipeline.bank.n, UNLIKELY):
                 # the physics hold: what they say is known better than the coefficients one by one
                 theta, theta_covariance = model_theta, healthy.theta_covariance
-                if loudest and not loop.monitor.model_error:
+                if loudest and not loop.monitor.model_error and covariates is None:
                     progress("rehearsal")
                     calibration, hypotheses, warnings = design_sequential_test(
                         recordings, expectations, plant, healthy.theta, healthy.covariance, loudest
@@ -260,14 +271,27 @@ def _assemble_baseline(
     tuning = replace(fit.tuning, theta=theta)
     plant = loop.plant.scaled(ratios) if ratios else loop.plant
     progress("features")
-    features, warnings = learn_features(loop, recordings)
-    notes += warnings
+    features = None
+    if covariates is None:  # features move with covariates too, and nothing says how
+        features, warnings = learn_features(loop, recordings)
+        notes += warnings
     limit = t2_threshold(loop, pipeline.bank.n, fit.dof, calibration, bool(hypotheses), features is not None)
     progress("promises")
-    estimates = [pipeline.estimate(tuning, rec) for rec in recordings]
+    along = [
+        None if covariates is None else CovariatePath.of(covariates, theta, rec.channels, pipeline.memory_samples)
+        for rec in recordings
+    ]
+    estimates = [
+        pipeline.estimate(tuning if path is None else replace(tuning, theta=path.start), rec)
+        for rec, path in zip(recordings, along, strict=True)
+    ]
     expected = [replace(e, tuning=tuning).healthy_path(plant, model_theta) for e in expectations] or [theta] * len(
         estimates
     )
+    expected = [
+        mean if path is None else mean + (path.expected(e.index) - theta)
+        for mean, e, path in zip(expected, estimates, along, strict=True)
+    ]
     deviations = [e.theta - mean for e, mean in zip(estimates, expected, strict=True)]
     paths = [(d[e.updates > 0], e.S[e.updates > 0]) for d, e in zip(deviations, estimates, strict=True)]
     factor, left_out = leave_one_out(paths, deviations_between, fit.each_covariance, theta_covariance + error, limit)
@@ -325,9 +349,10 @@ def _assemble_baseline(
         left_out=tuple(left_out),
         motion=learn_motion(pipeline, recordings),
         axis=axis,
+        covariates=covariates,
     )
     progress("predictor")
-    predictor = fit_exact_predictor(baseline, recordings)
+    predictor = None if covariates is not None else fit_exact_predictor(baseline, recordings)
     if predictor is not None and predictor.misfit > 1.0:
         notes.append(message("learning.no_refit", misfit=predictor.misfit))
     return baseline.model_copy(update={"exact": predictor, "notes": tuple(notes)})

@@ -10,17 +10,21 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.jit import kernel
 
 
-def lfilter(numerator: FloatArray, denominator: FloatArray, x: FloatArray) -> FloatArray:
+def lfilter(
+    numerator: FloatArray, denominator: FloatArray, x: FloatArray, state: FloatArray | None = None
+) -> FloatArray:
     """Return a signal (N,), or columns (N, m), behind a filter, from rest (transposed direct form II).
 
-    `numerator, denominator`: coefficients from lag 0 on, that of the denominator 1.
+    `numerator, denominator`: coefficients from lag 0 on, that of the denominator 1; `state`: what it goes on from,
+    shape (m, order + 1), which is changed.
     """
     signals = np.ascontiguousarray(x, dtype=np.float64)
     columns = signals[:, None] if signals.ndim == 1 else signals
     order = max(len(numerator), len(denominator)) - 1
     b, a = (np.pad(np.asarray(c, dtype=np.float64), (0, order + 1 - len(c))) for c in (numerator, denominator))
     out = np.empty_like(columns)
-    _lfilter_kernel(b, a, columns, np.zeros((columns.shape[1], order + 1)), out)
+    z = np.zeros((columns.shape[1], order + 1)) if state is None else state
+    _lfilter_kernel(b, a, columns, z, out)
     return out.reshape(signals.shape)
 
 

@@ -48,6 +48,8 @@ class Columns(Settings):
     input: NonEmptyStr = "u"
     # of the output, several of the same quantity may be listed: y is their mean, and they are compared with each other
     output: NonEmptyStr | Annotated[tuple[NonEmptyStr, ...], Field(min_length=2)] = "y"
+    # columns of what the healthy coefficients depend on, by its name, as ``oil_temperature = "T_oil"``
+    covariates: dict[NonEmptyStr, NonEmptyStr] = Field(default_factory=dict)
     time_unit: Literal["s", "ms", "us", "ns", "min"] = "s"  # unit of a numeric time column
     segment: tuple[NonEmptyStr, ...] = ()  # columns whose change starts a new run; a time reset does too
     resample: bool = False  # whether rows are put on the loop's sample rate, where logs come irregularly or at another
@@ -310,7 +312,12 @@ class Loop(ShortRepr, Settings):
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, ready for JSON, that `from_dict` turns into an equal loop."""
         plain: dict[str, Any] = self.model_dump(mode="json")
-        for key in ("text", "resample", "time_zone"):  # came later: hashes of loops without them stay as they were
+        for key in (
+            "text",
+            "resample",
+            "time_zone",
+            "covariates",
+        ):  # came later: hashes of loops without them stay as they were
             if not plain["columns"][key]:
                 del plain["columns"][key]
         if self.implausible == "refuse":

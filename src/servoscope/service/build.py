@@ -134,6 +134,12 @@ def _build_assets(config: ServiceFile) -> dict[str, Asset]:
                 baseline = files[path] if point is None else files[path].at(point)
             except BaselineError as error:
                 raise ConfigError(f"[assets] {name}.point: {path.name}: {error}") from None
+            if baseline.covariates is not None:
+                names = ", ".join(baseline.covariates.names)
+                raise ConfigError(
+                    f"[assets] {name}.baseline: {path.name} depends on {names}, which sources do not carry: learn "
+                    "operating points for the service"
+                )
             try:
                 shared[path, point] = baseline, Monitor(baseline)
             except BaselineError:

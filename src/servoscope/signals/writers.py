@@ -39,6 +39,7 @@ def write_recording(path: str | Path, recording: Recording, columns: Columns | N
             for name, sensor in zip(used.outputs, wanted.outputs, strict=True)
         },
         **{name: recording.run for name in used.segment},
+        **{text: recording.channels[name] for name, text in used.covariates.items() if name in recording.channels},
     }
     write_table(path, assigned)
     return used

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -132,6 +133,8 @@ def _read_table_parts(
     keys = {"reference": columns.reference, "input": columns.input, "output": " and ".join(columns.outputs)}
     sensors = columns.outputs if len(columns.outputs) > 1 else ()
     texts_by_key = {"reference": (columns.reference,), "input": (columns.input,), "output": columns.outputs}
+    texts_by_key |= {f"covariates.{covariate}": (text,) for covariate, text in columns.covariates.items()}
+    carried = (*sensors, *columns.covariates)
     signals = {
         f"[columns] {key}": [_parse_signal(opened, text, f"{name}: [columns] {key}") for text in several]
         for key, several in texts_by_key.items()
@@ -161,7 +164,10 @@ def _read_table_parts(
             what: [_evaluate_signal(table, one, what, unwrappers) for one in several]
             for what, several in signals.items()
         }
-        values = [several[0] if len(several) == 1 else np.mean(several, axis=0) for several in each.values()]
+        values = [
+            several[0] if len(several) == 1 else np.mean(several, axis=0)
+            for several in itertools.islice(each.values(), 3)
+        ]
         if clock is not None:
             values.insert(0, clock.seconds(table))
         if segments:
@@ -170,8 +176,9 @@ def _read_table_parts(
             values.append(runs)
         if sensors:
             values += each["[columns] output"]
+        values += [each[f"[columns] covariates.{covariate}"][0] for covariate in columns.covariates]
         for label, mine in rows.items():
-            parts.setdefault(label, _RecordingBuilder(clock is not None, sensors)).add(table, values, mine)
+            parts.setdefault(label, _RecordingBuilder(clock is not None, carried)).add(table, values, mine)
     chosen.check_matched()
     labels = {
         letter: letter if letter == text else f"{letter} ({text!r})"
@@ -204,10 +211,10 @@ def _without_reference(opened: TableFile, columns: Columns, loop: Loop | None) -
 
 
 class _RecordingBuilder:
-    """The rows of one recording, as they come: time if the file has it, r, u, y, runs if there are some, sensors."""
+    """The rows of one recording, as they come: time if the file has it, r, u, y, runs if there are some, channels."""
 
-    def __init__(self, timed: bool, sensors: tuple[str, ...]) -> None:
-        self._has_time, self._sensors = timed, sensors
+    def __init__(self, timed: bool, channels: tuple[str, ...]) -> None:
+        self._has_time, self._channels = timed, channels
         self._columns: list[GrowableArray] = []
         self._broken: list[tuple[int, float, int, str]] = []
         self._rows = 0
@@ -232,8 +239,8 @@ class _RecordingBuilder:
         columns = [column.to_array() for column in self._columns]
         if not self._has_time:
             columns.insert(0, _uniform_time(self._rows, rate or 1.0))
-        each = dict(zip(self._sensors, columns[len(columns) - len(self._sensors) :], strict=True))
-        t, r, u, y, *runs = columns[: len(columns) - len(self._sensors)]
+        each = dict(zip(self._channels, columns[len(columns) - len(self._channels) :], strict=True))
+        t, r, u, y, *runs = columns[: len(columns) - len(self._channels)]
         run = runs[0] if runs else None
         limits = loop.input_limits if loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]

@@ -1,0 +1,187 @@
+"""Healthy coefficients as functions of logged covariates: temperature, load, supply pressure, time since start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.core.messages import Message, message
+
+EDGE = 0.05  # share of the learned range, by which a covariate may be outside of it
+
+
+class CovariateModel(BaseModel):
+    """How n coefficients move with k covariates c, from their values theta_0 where x = (c - origin)/half_range is 0.
+
+    ::
+
+        theta_i = theta_0i exp(g_i)  where `proportional`,   theta_0i + g_i  elsewhere,   g = B' basis(x)
+
+    with the powers of each x up to its `degrees` as basis, p of them, and B (p, n) known with `covariance`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    names: tuple[str, ...]
+    low: tuple[float, ...]  # low, high: the range that the healthy recordings hold
+    high: tuple[float, ...]
+    degrees: tuple[int, ...]
+    proportional: tuple[bool, ...]
+    slopes: tuple[tuple[float, ...], ...]  # B (p, n)
+    covariance: tuple[tuple[float, ...], ...]  # of B by rows, (p n, p n)
+
+    @cached_property
+    def origin(self) -> FloatArray:
+        """The middle of the learned range, shape (k,)."""
+        return np.asarray(0.5 * (np.array(self.low) + np.array(self.high)))
+
+    def basis(self, c: FloatArray) -> FloatArray:
+        """Return the powers of covariates (..., k), shape (..., p)."""
+        x = (c - self.origin) / (0.5 * (np.array(self.high) - np.array(self.low)))
+        powers = [x[..., j] ** d for j, degree in enumerate(self.degrees) for d in range(1, degree + 1)]
+        return np.asarray(np.stack(powers, axis=-1), dtype=np.float64)
+
+    def theta(self, theta: FloatArray, c: FloatArray) -> FloatArray:
+        """Return the coefficients (n,) of the origin at covariates (..., k), shape (..., n)."""
+        g = self.basis(c) @ np.array(self.slopes)
+        return np.asarray(np.where(self.proportional, theta * np.exp(g), theta + g))
+
+    def theta_covariance(self, theta: FloatArray, c: FloatArray) -> FloatArray:
+        """Return what the uncertain slopes make of the coefficients at covariates (..., k), shape (..., n, n)."""
+        G, n = self.basis(c), len(theta)
+        C = np.array(self.covariance).reshape(G.shape[-1], n, G.shape[-1], n)
+        size = np.where(self.proportional, self.theta(theta, c), 1.0)
+        return np.asarray(np.einsum("...p,piqj,...q->...ij", G, C, G) * size[..., :, None] * size[..., None, :])
+
+    def clip(self, c: FloatArray) -> FloatArray:
+        """Return covariates (..., k) held within the learned range."""
+        return np.asarray(np.clip(c, self.low, self.high))
+
+    def values(self, channels: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the covariates among the channels of a block, shape (N, k); NaN where one is missing."""
+        return np.stack([channels[name] for name in self.names], axis=-1)
+
+    def describe_missing(self, channels: Mapping[str, FloatArray]) -> Message | None:
+        """Return that a covariate was not logged; None where all were."""
+        for name in self.names:
+            if name not in channels or np.isnan(channels[name]).all():
+                return message("covariate.missing", covariate=name)
+        return None
+
+    def is_inside(self, c: FloatArray) -> BoolArray:
+        """Return whether all covariates (..., k) are within the learned range, or next to it."""
+        edge = EDGE * (np.array(self.high) - np.array(self.low))
+        return np.asarray(((c >= self.low - edge) & (c <= self.high + edge)).all(axis=-1))
+
+    def describe_outside(self, c: FloatArray) -> Message | None:
+        """Return that covariates (N, k) leave the learned range; None where they do not."""
+        lowest, highest = np.nanmin(c, axis=0), np.nanmax(c, axis=0)
+        for j in range(len(self.names)):
+            one = np.where(np.arange(len(self.names)) == j, [lowest, highest], self.origin)
+            if self.is_inside(one).all():
+                continue
+            seen, known = _span(lowest[j], highest[j]), _span(self.low[j], self.high[j])
+            return message("covariate.outside", covariate=self.names[j], seen=seen, known=known)
+        return None
+
+
+def _span(low: float, high: float) -> str:
+    ends = f"{low:.3g}", f"{high:.3g}"
+    return ends[0] if ends[0] == ends[1] else f"{ends[0]}\u2013{ends[1]}"
+
+
+def hold_last(c: FloatArray, before: FloatArray) -> FloatArray:
+    """Return covariates (N, k) with the last known value where one is missing; `before` (k,): that of the past."""
+    rows = np.vstack([before, c])
+    known = np.where(np.isnan(rows), 0, np.arange(len(rows))[:, None])
+    return np.take_along_axis(rows, np.maximum.accumulate(known, axis=0), axis=0)[1:]
+
+
+class CovariateAverage:
+    """Averages covariates as the estimator averages what it learns: with its memory, sample by sample.
+
+    theta_hat is an average of what theta was lately, so it is compared with the coefficients of such an average.
+    """
+
+    def __init__(self, covariates: int, memory: float) -> None:
+        """`memory`: in samples."""
+        self.size, self._keep = 3 * covariates, 1.0 - 1.0 / memory
+
+    def start(self) -> FloatArray:
+        """Return the state before the first sample: last known values, and those of the filter, shape (size,)."""
+        return np.full(self.size, np.nan)
+
+    def run(self, state: FloatArray, c: FloatArray) -> FloatArray:
+        """Return the average after each sample, (N, k), NaN before the first value; changes the state."""
+        from servoscope.models.lfilter import lfilter
+
+        last, memory = np.split(state, [c.shape[1]])
+        held, z = hold_last(c, last), memory.reshape(-1, 2)
+        averages = np.full_like(held, np.nan)
+        for j in range(c.shape[1]):
+            known = np.flatnonzero(~np.isnan(held[:, j]))
+            if not known.size:
+                continue
+            first = int(known[0])
+            if np.isnan(z[j, 0]):
+                z[j] = self._keep * held[first, j], 0.0  # as if it had been so for ever
+            b, a = np.array([1.0 - self._keep]), np.array([1.0, -self._keep])
+            averages[first:, j] = lfilter(b, a, held[first:, j], z[j : j + 1])
+        last[:] = held[-1] if len(held) else last
+        return averages
+
+    def latest(self, state: FloatArray) -> FloatArray:
+        """Return the average in a state, shape (k,)."""
+        return state[self.size // 3 :: 2] / self._keep
+
+
+@dataclass(frozen=True, eq=False)
+class CovariatePath:
+    """What the coefficients of a healthy loop would be along one recording."""
+
+    model: CovariateModel
+    theta: FloatArray  # of the model's origin, shape (n,)
+    values: FloatArray  # shape (N, k)
+    averages: FloatArray  # with the estimator's memory, shape (N, k)
+
+    @classmethod
+    def of(
+        cls, model: CovariateModel, theta: FloatArray, channels: Mapping[str, FloatArray], memory: float
+    ) -> CovariatePath:
+        """Follow the covariates of a recording; before the first value of one, that one holds."""
+        c = model.values(channels)
+        for column in c.T:
+            if not np.isnan(column).all():
+                column[0] = column[np.flatnonzero(~np.isnan(column))[0]]
+        average = CovariateAverage(c.shape[1], memory)
+        held = hold_last(c, c[0])
+        return cls(model, theta, held, model.clip(average.run(average.start(), c)))
+
+    @property
+    def start(self) -> FloatArray:
+        """The coefficients at the first sample, shape (n,)."""
+        return self.model.theta(self.theta, self.model.clip(self.values[0]))
+
+    @property
+    def place(self) -> str:
+        """What the covariates were, as ``oil_temperature 44–52``."""
+        ends = zip(self.model.names, self.values.min(axis=0), self.values.max(axis=0), strict=True)
+        return ", ".join(f"{name} {_span(low, high)}" for name, low, high in ends)
+
+    @property
+    def outside(self) -> Message | None:
+        """That the covariates leave the learned range; None where they do not."""
+        return self.model.describe_outside(self.values)
+
+    def expected(self, samples: IntArray) -> FloatArray:
+        """Return the coefficients that theta_hat is compared with at some samples, shape (K, n)."""
+        return self.model.theta(self.theta, self.averages[samples])
+
+    def covariance(self, samples: IntArray) -> FloatArray:
+        """Return what is not known of them, shape (K, n, n)."""
+        return self.model.theta_covariance(self.theta, self.averages[samples])

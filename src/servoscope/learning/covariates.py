@@ -1,0 +1,135 @@
+"""Healthy recordings -> how the coefficients move with the covariates that were logged beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import NotEnoughError
+from servoscope.detection.covariates import CovariateModel, CovariatePath
+from servoscope.estimation.pipeline import Pipeline, Regression
+from servoscope.estimation.tuning import TuningFit, coloured_covariance, fit_tuning, least_squares
+from servoscope.signals import Recording
+
+STRETCH = 2.0  # memories over which coefficients count as constant
+APART = 0.05  # share of the range, by which two values count as two
+HIGHEST_DEGREE = 2
+CLEAR = 10.0  # standard deviations from zero from which a coefficient changes in proportion, as physics do
+ROUNDS = 3  # the first finds the noise, in which the covariates had still counted
+FEWEST_PER_COEFFICIENT = 20  # usable samples of a stretch
+
+
+def fit_covariates(
+    pipeline: Pipeline, recordings: Sequence[Recording], regressions: Sequence[Regression], fit: TuningFit
+) -> tuple[CovariateModel, Sequence[Regression], TuningFit]:
+    """Return the model of the covariates, and regressions and tuning as if these had stayed at its origin.
+
+    Errors are those of `learn_covariates`.
+    """
+    referred = regressions
+    for _ in range(ROUNDS):
+        model = learn_covariates(pipeline, recordings, regressions, fit)
+        referred = at_origin(model, fit.tuning.theta, recordings, regressions)
+        fit = fit_tuning(pipeline, referred)
+    return model, referred, fit
+
+
+def learn_covariates(
+    pipeline: Pipeline, recordings: Sequence[Recording], regressions: Sequence[Regression], fit: TuningFit
+) -> CovariateModel:
+    """Fit the coefficients of short stretches as polynomials of the covariates (generalised least squares).
+
+    What noise does not explain of their scatter widens the covariance (dispersion; McCullagh and Nelder, 1989, 4.5).
+
+    Raises NotEnoughError if a covariate is missing or hardly varies, or if the stretches are too few.
+    """
+    names = tuple(pipeline.loop.columns.covariates)
+    for name in names:
+        for rec in recordings:
+            if name not in rec.channels or np.isnan(rec.channels[name]).all():
+                raise NotEnoughError(f"{rec.name}: no values of covariate {name}, which the loop file names")
+    c, theta, covariance = _stretches(pipeline, recordings, regressions, fit, names)
+    low, high = c.min(axis=0), c.max(axis=0)
+    degrees = []
+    for j, name in enumerate(names):
+        steps = np.diff(np.sort(c[:, j])) if high[j] > low[j] else np.zeros(0)
+        levels = 1 + int((steps > APART * (high[j] - low[j])).sum())
+        wide = high[j] - low[j] > 1e-9 * max(abs(high[j]), abs(low[j]))
+        if not wide:
+            raise NotEnoughError(
+                f"covariate {name} is {low[j]:.4g} in all that is learned from: record while it varies, or leave it out"
+            )
+        degrees.append(HIGHEST_DEGREE if levels == 1 else min(HIGHEST_DEGREE, levels - 1))
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    same_sign = (np.sign(theta) == np.sign(theta[0])).all(axis=0)
+    proportional = same_sign & (np.abs(theta) > CLEAR * std).all(axis=0)
+    n, p = theta.shape[1], sum(degrees)
+    if len(theta) <= 1 + p:
+        raise NotEnoughError(f"{len(theta)} stretches are too few to tell what {', '.join(names)} do: record longer")
+    blank = CovariateModel(
+        names=names,
+        low=tuple(low.tolist()),
+        high=tuple(high.tolist()),
+        degrees=tuple(degrees),
+        proportional=tuple(proportional.tolist()),
+        slopes=((0.0,) * n,) * p,
+        covariance=((0.0,) * (p * n),) * (p * n),
+    )
+    X = np.hstack([np.ones((len(c), 1)), blank.basis(c)])
+    target = np.where(proportional, np.log(np.abs(np.where(proportional, theta, 1.0))), theta)
+    scale = 1.0 / np.where(proportional, theta, 1.0)
+    size = std.mean(axis=0) * np.abs(scale).mean(axis=0)  # keeps units apart
+    W = np.linalg.inv(covariance * scale[:, :, None] * scale[:, None, :] / np.outer(size, size))
+    normal = np.einsum("ma,mb,mij->aibj", X, X, W).reshape((1 + p) * n, (1 + p) * n)
+    known = np.linalg.inv(normal)
+    B = known @ np.einsum("ma,mij,mj->ai", X, W, target / size).ravel()
+    left = target / size - X @ B.reshape(1 + p, n)
+    dispersion = float(np.einsum("mi,mij,mj->", left, W, left)) / (len(theta) * n - B.size)
+    sizes = np.tile(size, p)
+    spread = max(dispersion, 1.0) * known[n:, n:] * np.outer(sizes, sizes)
+    return blank.model_copy(update={"slopes": _rows(B.reshape(1 + p, n)[1:] * size), "covariance": _rows(spread)})
+
+
+def _stretches(
+    pipeline: Pipeline,
+    recordings: Sequence[Recording],
+    regressions: Sequence[Regression],
+    fit: TuningFit,
+    names: Sequence[str],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return covariates (m, k), coefficients (m, n) and their covariances (m, n, n) of all stretches."""
+    length = round(STRETCH * pipeline.loop.monitor.memory * pipeline.loop.sample_rate)
+    found = []
+    for rec, g in zip(recordings, regressions, strict=True):
+        columns = np.column_stack([rec.channels[name] for name in names])
+        for first in range(0, max(rec.samples - length, 0) + 1, length):
+            rows = slice(first, first + length)
+            part = Regression(g.eta[rows], g.phi[rows], g.z[rows], g.ok[rows])
+            c = columns[rows][part.ok]
+            if part.ok.sum() < FEWEST_PER_COEFFICIENT * g.phi.shape[1] or np.isnan(c).all(axis=0).any():
+                continue
+            theta = least_squares(part)
+            found.append((np.nanmean(c, axis=0), theta, coloured_covariance(part, fit.tuning)))
+    if not found:
+        raise NotEnoughError(f"no stretch of {length} samples with {', '.join(names)}: record longer")
+    c, theta, covariance = (np.array(one) for one in zip(*found, strict=True))
+    return c, theta, covariance
+
+
+def at_origin(
+    model: CovariateModel, theta: FloatArray, recordings: Sequence[Recording], regressions: Sequence[Regression]
+) -> list[Regression]:
+    """Return the regressions as if the covariates had been at the origin: eta less phi' (theta(c) - theta)."""
+    referred = []
+    for rec, g in zip(recordings, regressions, strict=True):
+        path = CovariatePath.of(model, theta, rec.channels, 1.0)
+        shift = model.theta(theta, model.clip(path.values)) - theta
+        referred.append(replace(g, eta=g.eta - np.einsum("ki,ki->k", g.phi, shift)))
+    return referred
+
+
+def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in matrix.tolist())
