@@ -128,7 +128,9 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     known = [
         i for i, name in enumerate(names) if name == "inertia" or not plant.columns[i - 1].signed or name == "gravity"
     ]
-    unseen = [names[i] for i in known if np.mean(values[:, i] / stds[:, i]) < SEEN and names[i] != "gravity"]
+    # of all recordings together (Stouffer, 1949)
+    seen = (values / stds).sum(axis=0) / np.sqrt(len(fits))
+    unseen = [names[i] for i in known if seen[i] < SEEN and names[i] != "gravity"]
     if unseen:
         return None, [message("learning.axis_unseen", names=tuple(unseen))]
     covariance = np.zeros((len(known), len(known)))
