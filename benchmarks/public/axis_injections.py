@@ -266,8 +266,8 @@ def main() -> None:
         Table("Axes: changes found", note, ("recording", "detector", "false", *bands), tuple(found_rows)),
         Table(
             "Axes: what was said",
-            "Of the changes that servoscope found. Told: the fewest causes that have 95 % together. Intervals are those of "
-            "the changes named right.",
+            "Of the changes that servoscope found. Told: the fewest causes that have 95 % together. Intervals are "
+            "those of the changes named right.",
             (
                 "recording",
                 "named right",

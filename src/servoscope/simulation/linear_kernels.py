@@ -134,15 +134,24 @@ def run_axis(
         now, late = acting[past + k - m], acting[past + k - 1 - m]
         for step in range(motion.steps):
             arrived = (step + 0.5) / motion.steps >= settings.delay_fraction
-            drive = motion.gain[p] * (now if arrived else late) - motion.offset[p]
-            for w in range(motion.waves.shape[1]):
-                drive -= motion.waves[p, w, 0] * np.sin(motion.waves[p, w, 1] * position + motion.waves[p, w, 2])
-            position, speed = _axis_step(motion, p, position, speed, drive)
+            position, speed = _axis_step(motion, p, position, speed, motion.gain[p] * (now if arrived else late))
     s[HEADER_SIZE], s[HEADER_SIZE + 1], s[INTEGRAL] = position, speed, total
 
 
 @kernel
+def run_free_axis(motion: AxisConstants, position: float, speed: float, u: FloatArray, y: FloatArray) -> None:
+    """Run the first axis driven by what acts on it, u (N,), from a position and a speed on; y (N,) is filled."""
+    for k in range(len(u)):
+        y[k] = position
+        for _ in range(motion.steps):
+            position, speed = _axis_step(motion, 0, position, speed, motion.gain[0] * u[k])
+
+
+@kernel
 def _axis_step(motion: AxisConstants, p: int, position: float, speed: float, drive: float) -> tuple[float, float]:
+    drive -= motion.offset[p]
+    for w in range(motion.waves.shape[1]):
+        drive -= motion.waves[p, w, 0] * np.sin(motion.waves[p, w, 1] * position + motion.waves[p, w, 2])
     push = drive - motion.stiffness[p] * position
     heading = speed if speed != 0.0 and motion.order == 2 else push
     d = 0 if heading >= 0.0 else 1
