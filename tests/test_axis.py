@@ -74,6 +74,35 @@ class TestAxis:
         )
         assert stepped == pytest.approx(exact, abs=1e-9)
 
+    def test_gravity_cogging_and_stribeck_friction_act(self) -> None:
+        """Against an integrator with small steps, whose friction changes its sign over a speed of 1 mm/s."""
+        from scipy.integrate import solve_ivp
+
+        terms = ["viscous", "coulomb", "stribeck", "gravity", "cogging"]
+        values = {"inertia": 2.0, "viscous_friction": 0.3, "coulomb_friction": 0.5, "stribeck_friction": 0.4}
+        values |= {"gravity": 9.0, "cogging_sin": 0.7, "cogging_cos": -0.3}
+        shapes = {"stribeck_speed": 0.2, "period": 0.5, "hanging_at": 0.2}
+        loop = Loop.from_dict({
+            "sample_rate": 500.0,
+            "plant": {"kind": "axis", "terms": terms, **shapes, "coefficients": values},
+            "controller": {"kind": "pi", "k_p": 60.0, "k_i": 0.0},
+        })  # fmt: skip
+        t = np.arange(300) / 500.0
+        u, y = simulate_response(loop, 1.0 + 0.8 * np.sin(2.0 * t))
+        state, expected = np.zeros(2), []
+        for force in u:
+            expected.append(state[0])
+
+            def motion(_: float, x: np.ndarray[Any, Any], force: float = force) -> list[float]:
+                q, v = x
+                friction = np.tanh(v / 1e-3) * (0.5 + 0.4 / (1.0 + (v / 0.2) ** 2)) + 0.3 * v
+                waves = 9.0 * np.sin(q - 0.2) + 0.7 * np.sin(4.0 * np.pi * q) - 0.3 * np.cos(4.0 * np.pi * q)
+                return [v, (force - friction - waves) / 2.0]
+
+            state = solve_ivp(motion, (0.0, 0.002), state, method="LSODA", rtol=1e-8, atol=1e-10).y[:, -1]
+        assert np.abs(y).max() > 1.0
+        assert y == pytest.approx(np.array(expected), abs=3e-4)
+
     def test_order_one(self, rig: dict[str, Any]) -> None:
         plant = {
             "kind": "polynomial",

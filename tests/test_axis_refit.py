@@ -19,7 +19,9 @@ from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals
 from servoscope.isolation.ml.axis_scan import FALSE_ALARMS, TRIM, scan_limit
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.window import ChangeProfile
+from servoscope.learning.output_error import fit_output_error
 from servoscope.models.plants.axis import AxisPlant
+from servoscope.simulation import simulate
 
 LOOP: dict[str, Any] = {
     "sample_rate": 1000.0,
@@ -146,6 +148,23 @@ def added(
     T = 1.0 / recording.sample_rate
     v, a = (savgol_filter(recording.y, 11, 3, deriv=order, delta=T) for order in (1, 2))
     return replace(recording, u=recording.u + np.where(recording.t >= since_s, force(v, a), 0.0) / 35.15)
+
+
+def test_output_error_finds_the_coefficients_and_the_force_of_each_recording() -> None:
+    coefficients = {"inertia": 2.0, "viscous_friction": 3.0, "coulomb_friction": 1.0}
+    plant: dict[str, Any] = {"kind": "axis", "terms": ["viscous", "coulomb"], "coefficients": coefficients}
+    loop = ss.Loop.from_dict(
+        {"sample_rate": 100.0, "plant": plant, "controller": {"kind": "pi", "k_p": 80.0, "k_i": 0.0}}
+    )
+    assert isinstance(loop.plant, AxisPlant)
+    r = 0.5 * np.sin(np.arange(600) * 0.03) + 0.2 * np.sin(np.arange(600) * 0.11)
+    both = [simulate(loop, r[begin:], noise_y_std=1e-6)[0] for begin in (0, 100)]
+    pushed = [replace(one, u=one.u + force) for one, force in zip(both, (0.3, -0.2), strict=True)]
+    wrong = loop.plant.scaled({"inertia": 1.05, "coulomb_friction": 0.93})
+    found = fit_output_error(loop, pushed, wrong, drifts=False, start=20)
+    assert found.offset == pytest.approx([0.3, -0.2], abs=0.01)
+    assert found.plant.coefficients == pytest.approx(coefficients, rel=0.01)
+    assert max(found.rmse) < 1e-3 * float(np.abs(r).max())
 
 
 @pytest.mark.slow

@@ -29,12 +29,16 @@ import servoscope as ss
 from public.servoscope_detector import COLUMNS, ROOT, Count, all_scores, with_coefficient, with_gain
 from public.simple_detectors import halves
 from servoscope.core.arrays import FloatArray
+from servoscope.learning.axis_fit import fit_axis
+from servoscope.learning.output_error import OutputErrorFit, fit_output_error, simulate_free
+from servoscope.models.plants.axis import AxisPlant
 
 SKIPPED = 20  # samples before the score counts
 WINDOW_S = 2.0
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
 AUTHORS = np.array([95.1089, 203.5034, 20.3935, -3.1648])  # Janot, Gautier and Brunot, 2019
 OFFSET_N = 0.1
+STARTS = 1.0, 0.95  # of all coefficients, for the output error is not convex
 PUBLISHED = (("dynoNet, neural", "2.64", "Forgione and Piga, 2021, open-loop simulation of the test file"),)
 
 
@@ -152,6 +156,40 @@ def scores(train: ss.Recording, test: ss.Recording, loop: ss.Loop) -> tuple[list
     ], values
 
 
+def by_direction(train: ss.Recording, test: ss.Recording, loop: ss.Loop) -> tuple[Table, dict[str, str]]:
+    """Return what friction by direction scores by output error: as the protocol has it, and with own forces."""
+    names = ("viscous_by_direction", "coulomb", "offset")
+    axis = ss.Loop.from_dict(
+        loop.to_dict() | {"plant": {"kind": "axis", "terms": list(names), "input_gain": loop.plant.input_gain}}
+    )
+    model, _ = fit_axis(axis, [train])
+    assert model is not None and isinstance(axis.plant, AxisPlant)
+    learned = model.plant(axis.plant)
+    starts = [learned.scaled({"inertia": x, "viscous_friction": x, "coulomb_friction": x}) for x in STARTS]
+
+    def fitted(one: ss.Recording, drifts: bool) -> OutputErrorFit:
+        found = [fit_output_error(axis, [one], start, drifts=drifts, start=SKIPPED) for start in starts]
+        return min(found, key=lambda fit: fit.rmse)
+
+    plain, own = fitted(train, False), {one.name: fitted(one, True) for one in (train, test)}
+    error = simulate_free(axis, test, plain.plant, start=SKIPPED, offset=plain.offset[0]) - test.y[SKIPPED:]
+    official = 1e3 * float(np.sqrt(np.mean(error**2)))
+    force = fit_output_error(axis, [test], plain.plant, free=(), drifts=False, start=SKIPPED)
+    rows = [
+        ("identified on DATA_EMPS, test file simulated: official", plain, official),
+        ("the same, the constant force of the test file estimated on it", plain, 1e3 * force.rmse[0]),
+        *((f"all fitted on {name}, its force with a drift", fit, 1e3 * fit.rmse[0]) for name, fit in own.items()),
+    ]
+    coefficients = ("inertia", "viscous_friction_forward", "viscous_friction_backward", "coulomb_friction")
+    cells = tuple(
+        (name, *(f"{(fit.plant.coefficients or {})[key]:.2f}" for key in coefficients), f"{score:.2f}")
+        for name, fit, score in rows
+    )
+    heads = ("what", "M [kg]", "F_v forward [N s/m]", "F_v backward [N s/m]", "F_c [N]", "rmse [mm]")
+    note = "`fit_output_error` and `simulate_free`, viscous friction by direction, from sample 20 on."
+    return Table("EMPS: friction by direction", note, heads, cells), {"by direction.test": f"{official:.2f}"}
+
+
 def detection(train: ss.Recording, test: ss.Recording, loop: ss.Loop) -> tuple[Table, dict[str, str]]:
     """Return what servoscope and the simple detectors make of halves, changes and the other motion."""
     changes: dict[str, Callable[[ss.Recording], ss.Recording]] = {
@@ -190,8 +228,9 @@ def main() -> None:
     loop = ss.Loop.load(ROOT / "examples" / "emps.toml")
     train, test = (ss.read(folder / f"{name}.mat", loop) for name in ("DATA_EMPS", "DATA_EMPS_PULSES"))
     tables, values = scores(train, test, loop)
+    directions, score = by_direction(train, test, loop)
     table, found = detection(train, test, loop)
-    show([*tables, table], given.json, values | found)
+    show([*tables, directions, table], given.json, values | score | found)
 
 
 if __name__ == "__main__":

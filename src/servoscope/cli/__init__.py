@@ -7,6 +7,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from servoscope.cli import (  # their commands add themselves to the application
     alarms,
+    explore,
     export,
     fleet,
     init,
@@ -23,6 +24,7 @@ group_commands()
 __all__ = [
     "alarms",
     "app",
+    "explore",
     "export",
     "fleet",
     "init",

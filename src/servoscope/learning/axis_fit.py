@@ -38,14 +38,15 @@ class AxisFit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class AxisRegression:
     """One recording: signals, and the columns of its regression."""
 
     signals: AxisSignals
     columns: FloatArray
 
     @classmethod
-    def of(cls, plant: AxisPlant, signals: AxisSignals) -> _Problem:
+    def of(cls, plant: AxisPlant, signals: AxisSignals) -> AxisRegression:
+        """Return the columns of the terms, then those of the recording's own force and its drift."""
         N = len(signals.y)
         own = [-np.linspace(-0.5, 0.5, N)] if "offset" in plant.terms else [-np.ones(N), -np.linspace(-0.5, 0.5, N)]
         return cls(signals, np.vstack([signals.columns(plant), *own]))
@@ -65,7 +66,7 @@ def rest_speed(signals: Sequence[AxisSignals]) -> float:
     return REST_SHARE * float(np.sqrt(np.mean(speed**2)))
 
 
-def fit_axis_noise(problems: Sequence[_Problem], slow: float) -> AxisNoise:
+def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise:
     """Return the noise that makes the innovations likeliest, each recording with coefficients of its own.
 
     Raises LinAlgError where the signals say nothing.
@@ -98,7 +99,7 @@ def fit_axis_noise(problems: Sequence[_Problem], slow: float) -> AxisNoise:
     return AxisNoise(*np.exp(found.x).tolist())
 
 
-def fit_recording(problem: _Problem, noise: AxisNoise, slow: float) -> AxisFit:
+def fit_recording(problem: AxisRegression, noise: AxisNoise, slow: float) -> AxisFit:
     """Return the coefficients of one recording by least squares on its innovations."""
     X, e, _ = problem.regress(noise, slow)
     size = np.linalg.norm(X, axis=0)
@@ -117,7 +118,7 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     assert isinstance(plant, AxisPlant)
     signals = [axis_signals(loop, one, stride) for one in recordings]
     slow = rest_speed(signals)
-    problems = [_Problem.of(plant, one) for one in signals]
+    problems = [AxisRegression.of(plant, one) for one in signals]
     noise = fit_axis_noise(problems, slow)
     fits = [fit_recording(one, noise, slow) for one in problems]
     names = ("inertia", *(column.coefficient for column in plant.columns))
@@ -128,7 +129,9 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     known = [
         i for i, name in enumerate(names) if name == "inertia" or not plant.columns[i - 1].signed or name == "gravity"
     ]
-    unseen = [names[i] for i in known if np.mean(values[:, i] / stds[:, i]) < SEEN and names[i] != "gravity"]
+    # of all recordings together (Stouffer, 1949)
+    seen = (values / stds).sum(axis=0) / np.sqrt(len(fits))
+    unseen = [names[i] for i in known if seen[i] < SEEN and names[i] != "gravity"]
     if unseen:
         return None, [message("learning.axis_unseen", names=tuple(unseen))]
     covariance = np.zeros((len(known), len(known)))

@@ -50,6 +50,9 @@ class AxisConstants(NamedTuple):
     stiffness: FloatArray  # (p,)
     coulomb: FloatArray  # (p,)
     offset: FloatArray  # (p,)
+    # (p, 2), force at no speed and one over the speed of half of it, of Stribeck friction
+    stribeck: FloatArray
+    waves: FloatArray  # (p, w, 3), amplitude, factor on y and phase of each force that is a sine of y
     steps: int  # sub-steps per sample
 
 
@@ -131,13 +134,24 @@ def run_axis(
         now, late = acting[past + k - m], acting[past + k - 1 - m]
         for step in range(motion.steps):
             arrived = (step + 0.5) / motion.steps >= settings.delay_fraction
-            drive = motion.gain[p] * (now if arrived else late) - motion.offset[p]
-            position, speed = _axis_step(motion, p, position, speed, drive)
+            position, speed = _axis_step(motion, p, position, speed, motion.gain[p] * (now if arrived else late))
     s[HEADER_SIZE], s[HEADER_SIZE + 1], s[INTEGRAL] = position, speed, total
 
 
 @kernel
+def run_free_axis(motion: AxisConstants, position: float, speed: float, u: FloatArray, y: FloatArray) -> None:
+    """Run the first axis driven by what acts on it, u (N,), from a position and a speed on; y (N,) is filled."""
+    for k in range(len(u)):
+        y[k] = position
+        for _ in range(motion.steps):
+            position, speed = _axis_step(motion, 0, position, speed, motion.gain[0] * u[k])
+
+
+@kernel
 def _axis_step(motion: AxisConstants, p: int, position: float, speed: float, drive: float) -> tuple[float, float]:
+    drive -= motion.offset[p]
+    for w in range(motion.waves.shape[1]):
+        drive -= motion.waves[p, w, 0] * np.sin(motion.waves[p, w, 1] * position + motion.waves[p, w, 2])
     push = drive - motion.stiffness[p] * position
     heading = speed if speed != 0.0 and motion.order == 2 else push
     d = 0 if heading >= 0.0 else 1
@@ -147,10 +161,11 @@ def _axis_step(motion: AxisConstants, p: int, position: float, speed: float, dri
         step = g[0] * (left if push > 0.0 else -left)
         return position + step, step
     coasting = Phi[1, 0] * position + Phi[1, 1] * speed + g[1] * drive
-    if abs(coasting) <= motion.coulomb[p] * g[1]:
+    coulomb = motion.coulomb[p] + motion.stribeck[p, 0] / (1.0 + (motion.stribeck[p, 1] * speed) ** 2)
+    if abs(coasting) <= coulomb * g[1]:
         force = drive - coasting / g[1]
         return Phi[0, 0] * position + Phi[0, 1] * speed + g[0] * force, 0.0
-    force = drive - motion.coulomb[p] if coasting > 0.0 else drive + motion.coulomb[p]
+    force = drive - coulomb if coasting > 0.0 else drive + coulomb
     return (
         Phi[0, 0] * position + Phi[0, 1] * speed + g[0] * force,
         Phi[1, 0] * position + Phi[1, 1] * speed + g[1] * force,
@@ -175,6 +190,7 @@ def axis_constants(plants: Sequence[Plant], loop: Loop) -> AxisConstants:
     stiffness, coulomb, offset = (
         np.array([value.get(name, 0.0) for value in values]) for name in ("stiffness", "coulomb_friction", "offset")
     )
+    columns = [_shaped_columns(plant) for plant in plants]
     return AxisConstants(
         order=2 if "inertia" in values[0] else 1,
         Phi=np.array([[Phi for Phi, _ in pair] for pair in steps]),
@@ -183,8 +199,18 @@ def axis_constants(plants: Sequence[Plant], loop: Loop) -> AxisConstants:
         stiffness=stiffness,
         coulomb=coulomb,
         offset=offset,
+        stribeck=np.array([each.pop("stribeck_v", (0.0, 0.0, 0.0))[:2] for each in columns]),
+        waves=np.array([list(each.values()) for each in columns]).reshape(len(plants), -1, 3),
         steps=SUB_STEPS,
     )
+
+
+def _shaped_columns(plant: Plant) -> dict[str, tuple[float, float, float]]:
+    """Return coefficient, factor and phase of each column that has a shape."""
+    coefficients = dict(zip(plant.extras, plant.theta()[len(plant.powers) :].tolist(), strict=True))
+    return {
+        name: (coefficients[name], *plant.column_shapes[name]) for name in plant.extras if name in plant.column_shapes
+    }
 
 
 def _sub_step(value: dict[str, float], direction: str, duration: float) -> tuple[FloatArray, FloatArray]:

@@ -231,6 +231,8 @@ class DelaySearch:
         return float(coefficients.get("offset", 0.0)) / self.plant.input_gain
 
     def _point(self, z: FloatArray) -> _Point:
+        if not np.isfinite(z).all():  # LAPACK would say so on the terminal
+            return _Point(z, np.zeros(0), np.inf)
         try:
             e = self.residual(z)
         except (ValueError, np.linalg.LinAlgError):

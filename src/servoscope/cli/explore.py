@@ -1,0 +1,134 @@
+"""The command that compares structures of a motor axis."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from servoscope.cli import arguments
+from servoscope.cli.app import app
+from servoscope.cli.exit import FailureCounter, print_json
+from servoscope.cli.options import JsonOption, LoopArgument, ReadingOptions, with_reading_options
+from servoscope.cli.output_paths import check_output
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from servoscope.learning.axis_structures import AxisStructure
+
+SHOWN = 8  # structures, the supported one first
+
+
+@app.command()
+@with_reading_options()
+def explore(
+    loop: LoopArgument,
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Healthy recordings, two or more.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="LOOP", help="Write the loop file with the plant found.")
+    ] = None,
+    *,
+    reading: ReadingOptions,
+    as_json: JsonOption = False,
+) -> None:
+    """Say which terms of friction, gravity and stiffness the recordings of a motor axis support."""
+    logs = arguments.expand_files(logs)
+    check_output(output, "-o", (".toml",), [loop, *logs])
+
+    from servoscope.cli.progress import show_steps
+    from servoscope.cli.render import results
+    from servoscope.core.errors import LoopError
+    from servoscope.core.files import atomic_write
+    from servoscope.core.settings import parse_toml, read_toml_text
+    from servoscope.learning.axis_structures import explore_structures
+    from servoscope.models.loop import Loop
+    from servoscope.report.page import say
+
+    settings = Loop.load(loop)
+    reader = arguments.RecordingReader.from_options(settings, reading)
+    failures, recordings = FailureCounter(), []
+    with show_steps(len(logs) + 1, 1) as steps:
+        for path in logs:
+            steps.begin(path.name)
+            with failures.catch():
+                recordings += reader.read(path)
+        steps.begin("structures")
+        found = explore_structures(settings, recordings)
+    table = plant_table(found[0])
+    if as_json:
+        print_json({"plant": table, "structures": [_summary(one) for one in found]}, lines=False)
+    else:
+        _print(results.create_console(), found, len(recordings), table)
+    if output is not None:
+        text = replace_plant(read_toml_text(loop, "loop file", LoopError), table)
+        Loop.from_dict(
+            parse_toml(text, output, LoopError), source=str(output)
+        )  # nothing is written that is no loop file
+        atomic_write(output, text.encode())
+        results.print_written_path(results.create_console(stderr=as_json), output)
+    elif not as_json:
+        results.print_notes(results.create_console(), [say("explore.write")])
+    failures.exit_if_any()
+
+
+def plant_table(structure: AxisStructure) -> str:
+    """Return the section of a loop file; the constant force joins, which every recording has of its own."""
+    plant = structure.plant
+    terms = ", ".join(f'"{term}"' for term in (*plant.terms, "offset"))
+    lines = ["[plant]", 'kind = "axis"', f"terms = [{terms}]", f"input_gain = {plant.input_gain!r}"]
+    if plant.stribeck_speed is not None:
+        lines.append(f"stribeck_speed = {plant.stribeck_speed!r}")
+    return "\n".join(lines) + "\n"
+
+
+def replace_plant(text: str, table: str) -> str:
+    """Return a loop file with another section ``[plant]``, in its place."""
+    sections = re.split(r"(?m)^(?=\[)", text)
+    place = next((k for k, one in enumerate(sections) if one.startswith("[plant]")), len(sections))
+    kept = [one for one in sections[place:] if not re.match(r"\[plant[.\]]", one)]
+    return "".join([*sections[:place], table + ("\n" if kept else ""), *kept])
+
+
+def _summary(one: AxisStructure) -> dict[str, object]:
+    return {
+        "terms": list(one.plant.terms),
+        "stribeck_speed": one.plant.stribeck_speed,
+        "excess": one.excess,
+        "excess_std": one.excess_std,
+        "inertia": one.inertia,
+        "over_inertia": one.ratios,
+        "over_inertia_std": one.ratios_std,
+    }
+
+
+def _print(out: Console, found: tuple[AxisStructure, ...], count: int, table: str) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    from servoscope.cli.render import results
+    from servoscope.report.page import say
+
+    shown = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("terms", "Stribeck speed", "worse by", "standard error"):
+        shown.add_column(name, overflow="fold")
+    for one in found[:SHOWN]:
+        speed = "" if one.plant.stribeck_speed is None else f"{one.plant.stribeck_speed:g}"
+        shown.add_row(", ".join(one.plant.terms) or "-", speed, f"{one.excess:.1f}", f"{one.excess_std:.1f}")
+    out.print(shown)
+    best = found[0]
+    notes = [say("explore.found", count=count, structures=len(found))]
+    if best.inertia is None:
+        notes.append(say("explore.no_input"))
+    else:
+        notes.append(say("explore.inertia", inertia=best.inertia))
+    results.print_notes(out, notes)
+    values = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("coefficient over inertia", "value", "95 % between recordings"):
+        values.add_column(name, overflow="fold")
+    for name, value in best.ratios.items():
+        values.add_row(name, f"{value:.4g}", f"± {1.96 * best.ratios_std[name]:.2g}")
+    out.print(values)
+    out.print(Text("\n" + table), soft_wrap=True)
