@@ -2,7 +2,7 @@
 import { get, mayChange, post, query } from "./api.js";
 import { plot } from "./charts.js";
 import { growth as drawn } from "./curves.js";
-import { during, field, h, save, tell, titled } from "./dom.js";
+import { during, field, h, tell, titled } from "./dom.js";
 import { say } from "./marks.js";
 import { change, count, moment, number, plain } from "./words.js";
 
@@ -17,15 +17,11 @@ export function growth(path, name, asset, { session, values, signal }) {
   const which = h("select", { "aria-label": "What is followed" });
   const limit = h("input", { type: "number", step: "any", "aria-label": "Limit, as a ratio to healthy", placeholder: "limit, such as 1.5", value: values.get("limit") ?? "" });
   const buttons = Object.keys(SPANS).map((words) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(words) }, words));
-  const exports = [
-    h("button", { type: "button", class: "filter screen", title: "Save the picture", onclick: () => save(chart.image(), `${name} ${which.value}.png`) }, "PNG"),
-    h("button", { type: "button", class: "filter screen", title: "Save the values", onclick: () => save(table(), `${name} ${which.value}.csv`) }, "CSV"),
-  ];
   const noted = h("ul", { class: "why" });
-  const element = titled("How it grows", [which, limit, ...buttons, ...exports], said, canvas, why, noted, mayChange(session.role, "operator") && noting());
+  const element = titled("How it grows", [which, limit, ...buttons], said, canvas, why, noted, mayChange(session.role, "operator") && noting());
   let span = SPANS[values.get("span")] === undefined ? "60 d" : values.get("span");
   let [curves, forecast, notes] = [[], null, []];
-  const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal);
+  const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal, { csv: table });
 
   // All curves of what is chosen as one, in the order of time.
   function rows() {
@@ -53,8 +49,7 @@ export function growth(path, name, asset, { session, values, signal }) {
   // The values as `servoscope trend` reads them.
   function table() {
     const lines = rows().map((one) => [new Date(1000 * one.t).toISOString(), one.value, one.low, one.high, one.healthy, one.full ? "full" : ""].join());
-    const text = [`time,${which.value},low,high,healthy,diagnosis`, ...lines, ""].join("\n");
-    return URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+    return [`time,${which.value},low,high,healthy,diagnosis`, ...lines, ""].join("\n");
   }
 
   function shown() {

@@ -156,18 +156,19 @@ def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Quer
 
 @router.get("/assets/{asset}/signals")
 def get_signals(context: ContextDep, asset: str, query: Annotated[SignalQuery, Query()]) -> schemas.RecentSignals:
-    """Return its last seconds, as measured."""
+    """Return its last seconds, or those before a time, as measured."""
     units = schemas.signal_units(find_asset(context, asset)[1].metadata.units)
-    sequence, blocks = _read_blocks(context.store, asset, query.seconds)
+    sequence, blocks = _read_blocks(context.store, asset, query.seconds, query.until)
     t, *signals = np.concatenate([block.signals for block in blocks], axis=1) if blocks else np.zeros((4, 0))
-    within = t > t[-1] - query.seconds if t.size else np.zeros(0, dtype=np.bool_)
+    end = query.until if query.until is not None else t[-1] if t.size else 0.0
+    within = (t > end - query.seconds) & (t <= end)
     t, signals = t[within], [signal[within] for signal in signals]
     columns = signal_columns(t, signals, query.points)
     return schemas.RecentSignals(asset=asset, sequence=sequence, samples=int(t.size), units=units, **columns)
 
 
-def _read_blocks(store: Store, asset: str, seconds: float) -> tuple[int | None, list[Block]]:
-    """Return the sequence of the newest block that the store keeps, and the blocks of the last seconds."""
+def _read_blocks(store: Store, asset: str, seconds: float, until: float | None) -> tuple[int | None, list[Block]]:
+    """Return the sequence of the newest block that the store keeps, and the blocks from so long before a time on."""
     table = tables.recent
     newest = sa.select(sa.func.max(table.c.sequence)).where(table.c.asset == asset)
     sequence: int | None = next(iter(store.fetch(newest)[0].values()))
@@ -177,7 +178,8 @@ def _read_blocks(store: Store, asset: str, seconds: float) -> tuple[int | None, 
     while sequence is not None:
         rows = store.fetch(query.limit(limit))
         blocks = [Block.unpack(asset, row["sequence"], row["samples"]) for row in reversed(rows)]
-        if blocks[-1].t[-1] - blocks[0].t[0] >= seconds or len(rows) < limit:
+        end = blocks[-1].t[-1] if until is None else until
+        if end - blocks[0].t[0] >= seconds or len(rows) < limit:
             break
         limit *= 4
     return sequence, blocks
