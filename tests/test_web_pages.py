@@ -39,6 +39,12 @@ def test_the_fleet_shows_the_worst_first(open_page: Open) -> None:
     page.get_by_label("Group").select_option("Test rigs")
     expect(rows.filter(visible=True)).to_have_count(1 + len(screens.HALL["Test rigs"]))
     assert page.url.endswith("group=Test+rigs")  # what is looked at can be sent to somebody
+    page.get_by_label("Group").select_option("")
+    sources = page.get_by_role("group", name="Sources").get_by_role("button")
+    expect(sources).to_contain_text(re.compile(rf"line: (all|\\d+ of) {screens.ASSETS} heard"))
+    page.get_by_role("button", name=re.compile("^Limit within 90 days")).click()
+    expect(page.get_by_text("No asset is like this.")).to_be_visible()  # no limit is set in this hall
+    assert page.url.endswith("show=soon")
 
 
 def test_the_fleet_is_live_and_nothing_jumps(open_page: Open) -> None:
@@ -225,7 +231,7 @@ def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: 
     rows = [[str(i / 100) for _ in range(17)] for i in range(300)]
     heads = ["t", "r", "u", "y", *(f"temperature_sensor_{i}" for i in range(13))]
     wide.write_text("\n".join(map(",".join, [heads, *rows])))
-    page = open_page("/")
+    page = open_page("/", "dark" if width == 800 else "light")
     page.set_viewport_size({"width": width, "height": SIZE["height"]})
     pages = [
         "/",
@@ -246,6 +252,7 @@ def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: 
             last = page.get_by_role("button", name="Out of service: fault of press-1").bounding_box()
             assert last["x"] + last["width"] <= width
         assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+        accessible(page)
 
 
 SAID = {  # by the service: as the pages say it

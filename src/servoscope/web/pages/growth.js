@@ -17,10 +17,11 @@ export function growth(path, name, asset, { session, values, signal }) {
   const which = h("select", { "aria-label": "What is followed" });
   const limit = h("input", { type: "number", step: "any", "aria-label": "Limit, as a ratio to healthy", placeholder: "limit, such as 1.5", value: values.get("limit") ?? "" });
   const buttons = Object.keys(SPANS).map((words) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(words) }, words));
+  const advised = h("p", { class: "note" });
   const noted = h("ul", { class: "why" });
-  const element = titled("How it grows", [which, limit, ...buttons], said, canvas, why, noted, mayChange(session.role, "operator") && noting());
+  const element = titled("How it grows", [which, limit, ...buttons], said, advised, canvas, why, noted, mayChange(session.role, "operator") && noting());
   let span = SPANS[values.get("span")] === undefined ? "60 d" : values.get("span");
-  let [curves, forecast, notes] = [[], null, []];
+  let [curves, forecast, notes, limits] = [[], null, [], []];
   const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal, { csv: table });
 
   // All curves of what is chosen as one, in the order of time.
@@ -104,11 +105,21 @@ export function growth(path, name, asset, { session, values, signal }) {
     await foresee();
   }
 
+  // Where the loop itself would fail: one press takes it as the limit.
+  function advise(last) {
+    const side = last && last.value < last.healthy ? "down" : "up";
+    const own = limits.filter((one) => one.fault === which.value && one[side] !== null);
+    const take = (value) => () => ((limit.value = value), limit.dispatchEvent(new Event("change")));
+    const words = { tracking: "bandwidth below 0.7 of healthy", stability: "margin of stability halved" };
+    advised.replaceChildren(...(own.length ? ["The loop itself suggests as limit: ", ...own.map((one) => h("button", { type: "button", class: "filter", onclick: take(one[side].toPrecision(3)) }, `${one[side].toPrecision(3)}, ${words[one.kind]}`))] : []));
+  }
+
   // Without a limit only the rate is told: it is the same for every limit.
   async function foresee() {
     const all = rows();
     const last = all.at(-1);
     forecast = null;
+    advise(last);
     if (last) {
       const goal = limit.value !== "" ? Number(limit.value) : last.value < last.healthy ? 0.5 : 2;
       forecast = await get(query(`${path}/trend`, { name: which.value, limit: goal }), signal);
@@ -118,6 +129,8 @@ export function growth(path, name, asset, { session, values, signal }) {
     chart.draw();
   }
 
+  const known = get(`${path}/limits`, signal).then((found) => ((limits = found.limits), advise(rows().at(-1))));
+  known.catch(() => {}); // a hint less
   which.addEventListener("change", () => (remember(), foresee().catch(() => {})));
   limit.addEventListener("change", () => (remember(), foresee().catch(() => {})));
   buttons.forEach((button) => button.setAttribute("aria-pressed", String(button.textContent === span)));

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import time
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -10,7 +12,8 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Query
 from starlette.exceptions import HTTPException
 
-from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.core.errors import LoopError, StoreError, StoreUnavailableError
+from servoscope.design.operating_limits import OperatingLimit, operating_limits
 from servoscope.prognosis.forecast import prognose
 from servoscope.service.asset_status import AssetStatus
 from servoscope.service.sources.block import Block
@@ -19,7 +22,7 @@ from servoscope.service.store.queries import query_downsampled, query_history
 from servoscope.service.store.series import FAULT_KINDS, NOTE, query_sizes, read_notes, read_series, thin_columns
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.downsample import signal_columns
-from servoscope.web.routes.baselines import asset_baseline_id
+from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached
 from servoscope.web.schemas import assets as schemas
 from servoscope.web.schemas import sizes
 from servoscope.web.schemas.requests import (
@@ -152,6 +155,23 @@ def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Quer
         raise HTTPException(404, str(error)) from None
     found = prognose(series, query.limit)
     return sizes.Forecast(asset=asset, **found.model_dump(exclude={"headline", "reasons", "effects"}))
+
+
+@router.get("/assets/{asset}/limits")
+def get_limits(context: ContextDep, asset: str) -> sizes.LimitList:
+    """Return the sizes at which its loop loses tracking or its margin of stability; none where that is not known."""
+    find_asset(context, asset)
+    id_ = asset_baseline_id(context, asset)
+    found = _loop_limits(find_baseline(context, id_).path) if id_ is not None else ()
+    return sizes.LimitList(limits=[sizes.LimitRow(**one._asdict()) for one in found])
+
+
+@functools.lru_cache(maxsize=256)  # it takes a second, and every reader of a page asks
+def _loop_limits(baseline: Path) -> tuple[OperatingLimit, ...]:
+    try:
+        return tuple(operating_limits(load_cached(baseline).loop))
+    except LoopError:
+        return ()
 
 
 @router.get("/assets/{asset}/signals")
