@@ -114,6 +114,15 @@ def test_an_asset_says_how_its_fault_grows_and_what_to_check(open_page: Open, tm
     page.get_by_label("What was done").fill("oil filter changed")
     page.get_by_role("button", name="Note it").click()
     expect(page.get_by_text(re.compile("oil filter changed \\(local\\)"))).to_be_visible()
+    page.get_by_role("button", name="Keep samples for a new baseline").click()
+    kept = page.get_by_text(re.compile("samples are kept as a recording"))
+    expect(kept).to_be_visible()
+    assert (
+        int(re.sub(r"\D", "", kept.inner_text().split(":")[1].split("samples")[0])) > 3000
+    )  # the window of 40 s at least
+    page.get_by_role("link", name="Learn a baseline from it").click()
+    expect(page.get_by_label("or one that was uploaded before")).to_contain_text("press-1")
+    page.go_back()
     page.get_by_label("Limit, as a ratio to healthy").fill("1.3")
     page.keyboard.press("Tab")
     page.wait_for_url("**limit=1.3**")  # what is looked at can be sent to somebody

@@ -1,9 +1,10 @@
 // How a fault grows: one curve of its size over months, a limit that may be tried, and when it will be reached.
-import { get, mayChange, post, query } from "./api.js";
+import { get, mayChange, post, query, upload } from "./api.js";
 import { plot } from "./charts.js";
 import { growth as drawn } from "./curves.js";
 import { during, field, h, tell, titled } from "./dom.js";
 import { say } from "./marks.js";
+import { storedSamples } from "./stored_samples.js";
 import { change, count, moment, number, plain } from "./words.js";
 
 const DAY_S = 86400;
@@ -44,7 +45,25 @@ export function growth(path, name, asset, { session, values, signal }) {
       });
     };
     const form = h("form", { onsubmit: submit }, h("div", { class: "fields" }, field("What was done", text), field("When (else: now)", when), h("label", {}, anew, " The trend begins anew")), h("div", { class: "actions" }, button), answer);
-    return h("details", { class: "screen" }, h("summary", {}, "Note what was done, such as: pump replaced"), form);
+    return h("details", { class: "screen" }, h("summary", {}, "Note what was done, such as: pump replaced"), form, renewing());
+  }
+
+  // Another machine needs another baseline: what the store keeps since then becomes a recording to learn from.
+  function renewing() {
+    const [button, answer] = [h("button", { type: "button" }, "Keep samples for a new baseline"), h("p", { class: "working", role: "status" })];
+    const keep = async () => {
+      const since = Math.max(...notes.filter((note) => note.anew).map((note) => note.t));
+      const file = await storedSamples(path, asset(), Number.isFinite(since) ? since : null, signal);
+      if (!file) return ["There are no samples since the machine was renewed."];
+      const kept = await upload(file, signal);
+      return [`${kept.name}: ${count(kept.rows)} samples are kept as a recording. `, h("a", { href: "/learn" }, "Learn a baseline from it"), ", and name its file in the service file."];
+    };
+    button.addEventListener("click", async () => {
+      let told = [];
+      await during(button, answer, async () => (told = await keep()));
+      if (told.length) answer.replaceChildren(...told);
+    });
+    return h("div", {}, h("div", { class: "actions" }, button), answer);
   }
 
   // The values as `servoscope trend` reads them.
