@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 import screens
 from screens import asked, until
@@ -102,7 +103,11 @@ def shot(page: Any, name: str, **how: Any) -> None:
     if folder:
         page.mouse.move(0, 0)
         page.wait_for_timeout(600)
-        page.screenshot(path=str(Path(folder) / f"{name}.png"), **how)
+        path = Path(folder) / f"{name}.png"
+        page.screenshot(path=path, **how)
+        Image.open(path).convert("RGB").quantize(64).save(
+            path, optimize=True
+        )  # a third of the size, in the same colours
 
 
 def accessible(page: Any) -> None:

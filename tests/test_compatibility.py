@@ -25,7 +25,7 @@ WORDS |= {"event", "priority", "unit", "loop", "magic", "baseline", "defect"}
 ADDED = {
     *("headline", "reasons", "intervals", "description", "sensors", "provenance", "instrument", "features", "left_out"),
     # of the service: how samples come in, blocks left out for their time stamps, clocks of a fault that stands
-    *("reception", "late", "future", "fault_at", "diagnosed", "size", "sized"),
+    *("reception", "late", "future", "fault_at", "diagnosed", "size", "sized", "source", "signature"),
 }
 # Where version 0.1.0 fitted a delay of noise, the likelihood says 0 [s].
 TOLERANCE = {"delay_s": 1e-4}

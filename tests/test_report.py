@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import screens
 from pages import PROVENANCE, Reader, make_diagnosis, make_recording, make_trace, read
 from servoscope import report
+from servoscope.cli.output_paths import REPORTS, check_output
 from servoscope.core.errors import OutputError
 from servoscope.detection.result import Candidate, DiagnosisWarning, FaultEstimate, FinalCoefficient
 from servoscope.diagnosis.motion_signature import compare_signatures
@@ -286,6 +288,27 @@ def test_writing_is_all_or_nothing(loop: Loop, tmp_path: Path, monkeypatch: pyte
     report.write_diagnosis_page(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
     assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert path.stat().st_mode & 0o777 == 0o640 and len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_first_page_says_what_to_check(loop: Loop) -> None:
+    text = read(make_diagnosis(), loop).text
+    assert "seals of the piston" in text and "(99.8 %)" in text
+    assert text.index("How sure") < text.index("What to check") < text.index("Candidates") < text.index("Settings")
+    assert "What to check" not in read(make_diagnosis("healthy"), loop).text
+
+
+def test_a_report_is_printed_on_two_sheets(loop: Loop, tmp_path: Path) -> None:
+    if screens.browser() is None:
+        pytest.skip("there is no Chromium: scripts/install-test-servers installs it")
+    path = tmp_path / "report.pdf"
+    report.write_diagnosis_page(path, make_diagnosis(), make_trace(), make_recording(), loop, PROVENANCE)
+    assert re.findall(rb"/Type /Pages\s/Count (\d+)", path.read_bytes()) == [b"2"]
+
+
+def test_without_a_browser_a_pdf_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(OutputError, match=r"a PDF needs Chromium, Chrome or Edge on this machine; write r\.html"):
+        check_output(tmp_path / "r.pdf", "--report", REPORTS, [])
 
 
 def test_the_motion_signature_shows_dry_friction_before_and_after() -> None:

@@ -152,6 +152,16 @@ def test_an_asset_in_detail(client: httpx.Client) -> None:
     signals = client.get("/assets/press/signals", params={"seconds": 5, "points": 100}).json()
     assert 450 < signals["samples"] <= 500 and 50 < len(signals["t"]) <= 110
     assert np.all(np.diff(signals["t"]) > 0.0)
+    end = signals["t"][-1] - 2.0  # a part of them, every sample
+    part = client.get("/assets/press/signals", params={"seconds": 1, "to": end, "points": 1000}).json()
+    assert part["samples"] == 100 and end - 1.0 < part["t"][0] <= part["t"][-1] <= end
+    full = client.get("/diagnoses", params={"asset": "press", "grounds": "full"}).json()["diagnoses"][-1]
+    *_, now = client.get(f"/diagnoses/{full['id']}").json()["signature"]
+    assert now["words"] in ("after", "measured") and len(now["position"]) == len(now["forward"]) > 20
+    limits = {(one["fault"], one["kind"]): one for one in client.get("/assets/press/limits").json()["limits"]}
+    assert limits["pump", "tracking"]["down"] == pytest.approx(0.41, abs=0.01)
+    row = next(one for one in client.get("/assets").json()["assets"] if one["asset"] == "press")
+    assert row["source"] == "line"
 
 
 def test_history_is_thinned_and_keeps_what_was_largest(client: httpx.Client, folder: Path) -> None:

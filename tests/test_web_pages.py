@@ -39,6 +39,12 @@ def test_the_fleet_shows_the_worst_first(open_page: Open) -> None:
     page.get_by_label("Group").select_option("Test rigs")
     expect(rows.filter(visible=True)).to_have_count(1 + len(screens.HALL["Test rigs"]))
     assert page.url.endswith("group=Test+rigs")  # what is looked at can be sent to somebody
+    page.get_by_label("Group").select_option("")
+    sources = page.get_by_role("group", name="Sources").get_by_role("button")
+    expect(sources).to_contain_text(re.compile(rf"line: (all|\\d+ of) {screens.ASSETS} heard"))
+    page.get_by_role("button", name=re.compile("^Limit within 90 days")).click()
+    expect(page.get_by_text("No asset is like this.")).to_be_visible()  # no limit is set in this hall
+    assert page.url.endswith("show=soon")
 
 
 def test_the_fleet_is_live_and_nothing_jumps(open_page: Open) -> None:
@@ -93,23 +99,68 @@ def test_an_asset_says_how_its_fault_grows_and_what_to_check(open_page: Open, tm
     expect(page.get_by_label("What is followed")).to_have_value("leakage")
     expect(page.get_by_role("button", name="7 d").first).to_have_attribute("aria-pressed", "true")
     expect(page.get_by_text("values are shown")).to_be_visible()
+    page.get_by_label("View and save: Size over time").click()
     with page.expect_download() as download:
-        page.get_by_role("button", name="CSV").click()
+        page.get_by_role("button", name="Save the values: Size over time").click()
     path = tmp_path / "sizes.csv"
     download.value.save_as(path)
     series = read_sizes(path, "leakage", interval=("low", "high"))  # as servoscope trend reads it
     assert series.value[-1] == pytest.approx(1.2, abs=0.02) and 0.0 < series.std[-1] < 0.01
     with page.expect_download() as download:
-        page.get_by_role("button", name="PNG").click()
+        page.get_by_role("button", name="Save the picture: Size over time").click()
     download.value.save_as(tmp_path / "sizes.png")
     assert (tmp_path / "sizes.png").read_bytes().startswith(b"\x89PNG")
     page.get_by_text("Note what was done").click()
     page.get_by_label("What was done").fill("oil filter changed")
     page.get_by_role("button", name="Note it").click()
     expect(page.get_by_text(re.compile("oil filter changed \\(local\\)"))).to_be_visible()
+    page.get_by_role("button", name="Keep samples for a new baseline").click()
+    kept = page.get_by_text(re.compile("samples are kept as a recording"))
+    expect(kept).to_be_visible()
+    assert (
+        int(re.sub(r"\D", "", kept.inner_text().split(":")[1].split("samples")[0])) > 3000
+    )  # the window of 40 s at least
+    page.get_by_role("link", name="Learn a baseline from it").click()
+    expect(page.get_by_label("or one that was uploaded before")).to_contain_text("press-1")
+    page.go_back()
     page.get_by_label("Limit, as a ratio to healthy").fill("1.3")
     page.keyboard.press("Tab")
     page.wait_for_url("**limit=1.3**")  # what is looked at can be sent to somebody
+
+
+def test_a_chart_is_zoomed_saved_and_its_address_opens_the_same_view(open_page: Open, tmp_path: Path) -> None:
+    page = open_page("/assets/press-1")
+    label = "Both tests over time, as multiples of their limits"
+    page.get_by_label(f"View and save: {label}").click()
+    with page.expect_response(re.compile("/history\\?.*to=")):  # what is zoomed into is asked for more closely
+        page.get_by_role("button", name=f"Zoom in: {label}").click()
+    page.get_by_role("button", name=f"Earlier: {label}").press("Enter")  # by keyboard too
+    page.wait_for_url("**view-both-tests*=0%2C50")
+    with page.expect_download() as download:
+        page.get_by_role("button", name=f"Save the values: {label}").click()
+    download.value.save_as(tmp_path / "tests.csv")
+    head, first, *_ = (tmp_path / "tests.csv").read_text().splitlines()
+    assert head == "what,x,y" and re.match(r'"(statistic T²|sequential test)",20\d\d-', first)
+    again = open_page(page.url.removeprefix(page.url.split("/assets")[0]))
+    again.get_by_label(f"View and save: {label}").click()
+    again.get_by_role("button", name=f"Later: {label}").click()
+    again.wait_for_url("**view-both-tests*=25%2C75")  # on from where it was
+    again.get_by_role("button", name=f"Show all: {label}").click()
+    again.wait_for_url(lambda url: "view-" not in url)
+
+
+def test_an_asset_shows_before_and_now_and_two_periods(open_page: Open) -> None:
+    page = open_page("/assets/press-1")
+    expect(page.get_by_role("img", name="Magnitude and phase over frequency, before and now")).to_be_visible()
+    expect(page.get_by_role("img", name="Mean input over position and speed, before and now")).to_be_visible()
+    expect(page.get_by_text(re.compile("^Friction band: .* now .* ± "))).to_be_visible()
+    page.get_by_role("button", name="Compare").click()
+    rows = page.get_by_role("region", name="Two periods side by side").get_by_role("row")
+    expect(rows.filter(has_text="leakage")).to_contain_text("1.")
+    expect(page.get_by_role("img", name=re.compile("^Both tests, (first|second) period"))).to_have_count(2)
+    page.reload()
+    expect(page.get_by_role("img", name="Both tests, second period")).to_be_visible()  # the address says which
+    assert painted(page)
 
 
 def test_a_phone_shows_cards_and_is_accessible(open_page: Open) -> None:
@@ -189,7 +240,7 @@ def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: 
     rows = [[str(i / 100) for _ in range(17)] for i in range(300)]
     heads = ["t", "r", "u", "y", *(f"temperature_sensor_{i}" for i in range(13))]
     wide.write_text("\n".join(map(",".join, [heads, *rows])))
-    page = open_page("/")
+    page = open_page("/", "dark" if width == 800 else "light")
     page.set_viewport_size({"width": width, "height": SIZE["height"]})
     pages = [
         "/",
@@ -210,6 +261,7 @@ def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: 
             last = page.get_by_role("button", name="Out of service: fault of press-1").bounding_box()
             assert last["x"] + last["width"] <= width
         assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+        accessible(page)
 
 
 SAID = {  # by the service: as the pages say it

@@ -16,7 +16,7 @@ from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
 
 CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
-SECONDS = int(os.environ.get("SCHEMA_SECONDS", "20"))  # 1800 for the whole measure
+SECONDS = int(os.environ.get("SCHEMA_SECONDS", "40"))  # 1800 for the whole measure
 WEB = """
 [web]
 listen = "127.0.0.1:0"

@@ -48,7 +48,7 @@ AxisOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
 ReportOption = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.html", help="Write a page with plots; for several, one per recording."),
+    typer.Option(metavar="FILE.html", help="Write a page with plots, or print it (.pdf); for several, one each."),
 ]
 TraceOption = Annotated[
     Path | None,

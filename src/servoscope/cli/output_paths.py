@@ -11,7 +11,7 @@ import typer
 from servoscope.core.errors import OutputError
 from servoscope.core.files import make_folder
 
-REPORTS, TRACES, RECORDINGS = (".html", ".htm"), (".parquet", ".pq"), (".csv", ".parquet", ".pq")
+REPORTS, TRACES, RECORDINGS = (".html", ".htm", ".pdf"), (".parquet", ".pq"), (".csv", ".parquet", ".pq")
 
 
 def check_output(
@@ -35,6 +35,10 @@ def check_output(
         return
     if suffixes and path.suffix.lower() not in suffixes:
         raise typer.BadParameter(f"{option} {path}: end the name in {' or '.join(suffixes)}")
+    if path.suffix.lower() == ".pdf":
+        from servoscope.report.page import find_browser
+
+        find_browser(path)
     if not path.parent.is_dir():
         raise OutputError(f"{path}: cannot be written, there is no folder {path.parent}; make it first")
 

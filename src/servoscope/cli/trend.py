@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +13,9 @@ from servoscope.cli.exit import print_json
 from servoscope.cli.options import JsonOption
 from servoscope.cli.output_paths import check_output
 
+if TYPE_CHECKING:
+    from servoscope.prognosis.series import SizeSeries
+
 PICTURES = (".svg", ".png", ".pdf")
 
 
@@ -21,7 +24,10 @@ def trend(
     source: Annotated[
         str, typer.Argument(metavar="SIZES", help="CSV file with a header row; or service file or store, with --asset.")
     ],
-    limit: Annotated[float, typer.Option(metavar="X", help="The value at which the machine is to be stopped.")],
+    limit: Annotated[
+        str,
+        typer.Option(metavar="X", help="Value at which to stop the machine; or tracking or stability, with --loop."),
+    ],
     value: Annotated[
         str | None, typer.Option(metavar="NAME", help="Column with the size; in a store, name of the fault.")
     ] = None,
@@ -37,6 +43,9 @@ def trend(
     ] = None,
     since: Annotated[
         str | None, typer.Option("--from", metavar="TIME", help="From this time on: after a repair, 2026-01-31T12:00.")
+    ] = None,
+    loop: Annotated[
+        Path | None, typer.Option(metavar="LOOP", help="Loop file: the limit is where the loop loses that.")
     ] = None,
     coverage: Annotated[float, typer.Option(metavar="P", help="Probability of the intervals.")] = 0.9,
     as_json: JsonOption = False,
@@ -67,7 +76,7 @@ def trend(
         store = open_store(source)
         check_assets(store, [asset])
         series = query_sizes(store, asset, value, begin)
-    found = prognose(series, limit, coverage)
+    found = prognose(series, _limit(limit, loop, series), coverage)
     if as_json:
         print_json(found.model_dump(mode="json", exclude={"headline", "reasons"}), lines=False)
     else:
@@ -82,3 +91,25 @@ def trend(
 
         write_trend_figure(plot, series, found)
         results.print_written_path(results.create_console(stderr=as_json), plot)
+
+
+def _limit(text: str, path: Path | None, series: SizeSeries) -> float:
+    """Return the limit that was given, or at which the loop no longer tracks or loses its margin of stability."""
+    if text not in ("tracking", "stability"):
+        try:
+            return float(text)
+        except ValueError:
+            raise typer.BadParameter(f"--limit {text}: give a number, tracking or stability") from None
+    if path is None:
+        raise typer.BadParameter(f"--limit {text}: give the loop file, --loop loop.toml")
+
+    from servoscope.design.operating_limits import operating_limits
+    from servoscope.models.loop import Loop
+
+    rows = [one for one in operating_limits(Loop.load(path)) if one.fault == series.name and one.kind == text]
+    if not rows:
+        raise typer.BadParameter(f"--value {series.name}: is no fault of {path}")
+    found = rows[0].up if series.value[-1] >= 1.0 else rows[0].down
+    if found is None:
+        raise typer.BadParameter(f"--limit {text}: {series.name} does not take it from this loop, give a number")
+    return float(f"{found:.3g}")  # no limit is known better

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -86,6 +86,25 @@ def compare_signatures(
     if onset_s is None or onset_s <= start:
         return None, motion_signature(recording, loop, start, end)
     return motion_signature(recording, loop, start, onset_s), motion_signature(recording, loop, onset_s, end)
+
+
+def signature_columns(recording: Recording, loop: Loop, onset_s: float | None) -> list[dict[str, Any]]:
+    """Return the signatures before and after an onset as plain values: null where nothing was measured.
+
+    `words`: ``before`` and ``after``, or ``measured`` where there is one alone; the widths with their standard
+    deviations.
+    """
+    before, after = compare_signatures(recording, loop, onset_s)
+    found = []
+    for words, one in (("before", before), ("after" if before else "measured", after)):
+        if one is not None:
+            widths = {"friction_band": one.friction_band, "lost_motion": one.lost_motion}
+            curves = {name: getattr(one, name) for name in ("position", "forward", "backward", "speed", "by_speed")}
+            plain = {
+                name: [None if math.isnan(x) else float(f"{x:.6g}") for x in curve] for name, curve in curves.items()
+            }
+            found.append({"words": words, **plain, **{name: list(each) for name, each in widths.items() if each}})
+    return found
 
 
 def _smoothed(x: FloatArray, restart: BoolArray, window: int, rate: float) -> tuple[FloatArray, FloatArray, FloatArray]:

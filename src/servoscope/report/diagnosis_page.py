@@ -35,6 +35,7 @@ from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 
 UNLIKELY = 0.05  # a candidate below this probability is not in the headline
+CHECKED = ("leakage", "pump", "friction", "contamination")  # faults whose place the catalogue knows
 LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
 
 
@@ -106,6 +107,7 @@ def render_diagnosis_page(
         size=_recording_size(diagnosis, loop),
         headline=_headline(diagnosis, words),
         notes=list(_fault_notes(diagnosis, words)),
+        checks=list(_checks(diagnosis, words)),
         facts=list(_fault_facts(diagnosis) if diagnosis.verdict == "fault" else _no_fault_facts(diagnosis, trace)),
         meaning=lambda candidate: describe_candidate(candidate, words),
         agreement=_agreement(diagnosis.candidates[0], refit.recursive[0]) if refit is not None else "",
@@ -182,6 +184,24 @@ def _no_fault_facts(diagnosis: Diagnosis, trace: Trace) -> Iterator[Fact]:
         yield Fact("Largest statistic T²", format_number(largest, 3), (share,))
     count = len(diagnosis.warnings)
     yield Fact("Warnings", str(count or "none"), ("listed below" if count else "about this recording",))
+
+
+def _checks(diagnosis: Diagnosis, words: Mapping[str, str]) -> Iterator[str]:
+    """Yield what to look at on the machine, the likeliest first."""
+    if diagnosis.verdict != "fault":
+        return
+    for candidate in (each for each in diagnosis.candidates if each.probability >= UNLIKELY):
+        odds = format_probability(candidate.probability)
+        for fault in candidate.faults:
+            key = fault.name if fault.name in CHECKED else "other"
+            place = say(f"report.check.{key}", fault=describe_fault(fault, words))
+            yield say("report.check.candidate", place=place, probability=odds)
+        if candidate.name == UNKNOWN:
+            yield say("report.check.unknown", probability=odds)
+    if diagnosis.refit is not None and diagnosis.refit.mimics:
+        yield say("report.check.alike", causes=[mimic.words for mimic in diagnosis.refit.mimics])
+    if diagnosis.warnings:
+        yield say("report.check.warnings", count=len(diagnosis.warnings))
 
 
 def _agreement(best: Candidate, other: Candidate) -> str:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import functools
+import os
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
 from servoscope.core.messages import message, render
 from servoscope.report import format_values
@@ -16,6 +21,16 @@ from servoscope.report import format_values
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+BROWSERS = (
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "chrome",
+    "msedge",
+    "microsoft-edge",
+)
+PRINT_S = 120.0  # the longest that printing may take
 FILTERS = {
     "capitalised": lambda text: str(text)[:1].upper() + str(text)[1:],
     "change": format_values.format_change,
@@ -65,12 +80,42 @@ def render_page(template: str, *, package: str = "servoscope.report", **values: 
 
 
 def write_page(path: str | Path, content: str) -> None:
-    """Write a page; nothing half-written stays behind.
+    """Write a page; nothing half-written stays behind. A name that ends in .pdf is printed by a browser.
 
-    Raises OutputError if the file cannot be written.
+    Raises OutputError if the file cannot be written, or there is no browser to print it.
     """
     # A file name that is no valid text must not stop the report on the file.
-    atomic_write(path, content.encode("utf-8", errors="replace"))
+    page = content.encode("utf-8", errors="replace")
+    atomic_write(path, _printed(page, path) if Path(path).suffix.lower() == ".pdf" else page)
+
+
+def find_browser(path: str | Path) -> str:
+    """Return the browser that prints to a path; raises OutputError if there is none."""
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        raise OutputError(say("report.no_browser", path=str(path), page=Path(path).with_suffix(".html").name))
+    return found
+
+
+def _printed(page: bytes, path: str | Path) -> bytes:
+    """Return a page as a browser prints it, as PDF."""
+    command = [find_browser(path), "--headless", "--disable-gpu", "--disable-dev-shm-usage", "--no-pdf-header-footer"]
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        command.append("--no-sandbox")  # it does not start as root otherwise; the page is ours, without scripts
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        source, printed = folder / "page.html", folder / "page.pdf"
+        source.write_bytes(page)
+        try:
+            subprocess.run(
+                [*command, f"--user-data-dir={folder / 'profile'}", f"--print-to-pdf={printed}", source.as_uri()],
+                check=True,
+                capture_output=True,
+                timeout=PRINT_S,
+            )
+            return printed.read_bytes()
+        except (OSError, subprocess.SubprocessError) as error:
+            raise OutputError(say("report.not_printed", path=str(path), error=type(error).__name__)) from None
 
 
 def say(key: str, **values: Any) -> str:

@@ -68,15 +68,16 @@ class Asset:
     """Follows one asset.
 
     `baseline`: of one operating point; `monitor`: of this baseline, shared by all assets that have it; `group`: what
-    the asset belongs to, for users.
+    the asset belongs to; `source`: what it comes from; both for users.
     """
 
-    def __init__(self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "") -> None:
+    def __init__(
+        self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "", source: str = ""
+    ) -> None:
         self.name, self.baseline, self.policy = name, baseline, policy
-        self.monitor, self._rate = monitor, baseline.loop.sample_rate
-        self._phase = examination_phase(name)
+        self.monitor, self._rate, self._phase = monitor, baseline.loop.sample_rate, examination_phase(name)
         self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
-        self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s)
+        self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s, source)
         self._limits = policy.quality.limits(self._rate)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
         alarms, limited = policy.alarms.asset_alarms, bool(policy.limits)
@@ -93,8 +94,7 @@ class Asset:
 
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
-        nothing = np.full(2, np.nan)
-        monitor = self.monitor
+        nothing, monitor = np.full(2, np.nan), self.monitor
         monitor.run(monitor.init(), nothing, nothing, nothing)
         quality.check_block(self._limits, quality.init_state(), np.arange(2.0), nothing, nothing, nothing)
 

@@ -48,6 +48,7 @@ class AssetMetadata(_StatusRecord):
     """What never changes of an asset, and is needed to read its numbers."""
 
     group: str = ""
+    source: str = ""  # its name in the service file
     loop: str | None = None
     plant: str | None = None
     baseline: str | None = None  # its hash
@@ -118,11 +119,12 @@ def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:
     return (ServiceStatus if stored.get("service") else AssetStatus).model_validate(stored)
 
 
-def asset_metadata(baseline: Baseline, group: str, window_s: float) -> AssetMetadata:
+def asset_metadata(baseline: Baseline, group: str, window_s: float, source: str = "") -> AssetMetadata:
     """Return the metadata of an asset with this baseline."""
     loop = baseline.loop
     return AssetMetadata(
         group=group,
+        source=source,
         loop=loop.name,
         plant=loop.plant.kind,
         baseline=baseline.hash,

@@ -150,7 +150,9 @@ def _build_assets(config: ServiceFile) -> dict[str, Asset]:
         if settings.limits is not None:
             _check_names(f"[assets] {name}.limits", f"fault of {name}", settings.limits, faults)
         limits = common if settings.limits is None else settings.limits
-        assets[name] = Asset(name, *shared[path, point], replace(policy, limits=limits), settings.group)
+        assets[name] = Asset(
+            name, *shared[path, point], replace(policy, limits=limits), settings.group, settings.source
+        )
     known = [fault.name for one in assets.values() for fault in one.baseline.loop.plant.all_faults]
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
     for asset in {id(one.baseline): one for one in assets.values()}.values():

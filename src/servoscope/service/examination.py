@@ -131,18 +131,22 @@ def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | N
 def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
     """Diagnose a window, refit included, which takes seconds.
 
-    Times in the document count from the beginning of the window, its key ``began``; those of the headline are dates,
+    The motion signature before and after the onset is the document's key ``signature``. Times in the document count
+    from the beginning of the window, its key ``began``; those of the headline are dates,
     because months later nobody knows when the window began.
     """
     from servoscope.diagnosis.diagnose import diagnose
+    from servoscope.diagnosis.motion_signature import signature_columns
 
     try:
         recording, start = blocks_to_recording(baseline, name, blocks)
         diagnosis = diagnose(baseline, recording)
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
-    onset = start + diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
-    document = {"began": start, **diagnosis.model_dump(mode="json")}
+    since = diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
+    onset = start + since if since is not None else None
+    signature = signature_columns(recording, baseline.loop, since)
+    document = {"began": start, "signature": signature, **diagnosis.model_dump(mode="json")}
     headline = diagnosis.dated_headline(start)
     return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
 

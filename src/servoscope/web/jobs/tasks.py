@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,10 @@ from servoscope.core.settings import parse_toml
 from servoscope.core.workers import Progress
 from servoscope.design import design_study
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.result import Diagnosis
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis import operating_points
 from servoscope.diagnosis.diagnose import diagnose_with_trace
-from servoscope.diagnosis.motion_signature import compare_signatures
+from servoscope.diagnosis.motion_signature import signature_columns
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.learning import inspection
 from servoscope.models.loop import Columns, Loop
@@ -120,19 +119,14 @@ def diagnose_file(
         units=list(plant.units),
         signals=responses.SignalColumns(**_recording_columns(recording)),
         trace=_trace_columns(trace, plant.coefficient_units),
-        signature=list(_signature_columns(diagnosis, recording, used.loop)),
+        signature=[
+            responses.SignatureColumns.model_validate(one)
+            for one in signature_columns(recording, used.loop, diagnosis.onset_s[1] if diagnosis.onset_s else None)
+        ],
     )
     (Path(out) / "data.json").write_text(data.model_dump_json(), encoding="utf-8")
     kept = {"verdict": diagnosis.verdict, "summary": str(diagnosis.summary), "recording": diagnosis.recording}
     return {**kept, "hash": used.hash}
-
-
-def _signature_columns(diagnosis: Diagnosis, recording: Recording, loop: Loop) -> Iterator[responses.SignatureColumns]:
-    both = compare_signatures(recording, loop, diagnosis.onset_s[1] if diagnosis.onset_s else None)
-    for words, one in zip(("before", "after" if both[0] else "measured"), both, strict=True):
-        if one is not None:
-            names = ("position", "forward", "backward", "speed", "by_speed")
-            yield responses.SignatureColumns(words=words, **{name: json_numbers(getattr(one, name)) for name in names})
 
 
 def learn_baseline(

@@ -1,20 +1,22 @@
 // One asset: the verdict in words, where its inverse response is now, both tests, parameters, signals, alarms; live.
 import { get, part, query } from "./api.js";
 import { history as steps } from "./alarms.js";
+import { bode } from "./bode.js";
 import { plot } from "./charts.js";
 import { commands, STATES } from "./commands.js";
-import { signals as drawn, tests } from "./curves.js";
+import { signals as drawn, signature, tests } from "./curves.js";
 import { candidates, mimics } from "./diagnosis.js";
 import { h, section, table, tell, titled } from "./dom.js";
 import { growth } from "./growth.js";
 import { follow } from "./live.js";
 import { badge, mark, priority, prose, say, STATUS, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
+import { periods } from "./periods.js";
 import { planes } from "./planes.js";
 import { capital, count, DASH, duration, moment, multiple, number, plain, size } from "./words.js";
 
 const SPANS = { "1 h": 3600, "24 h": 86400, "7 d": 604800, "30 d": 2592000, "1 y": 31536000 };
-const SIGNALS_S = 30;
+const SIGNALS = { "30 s": 30, "10 min": 600, "1 h": 3600 };
 const SIGNALS_EVERY_MS = 2000;
 const POINTS = 500;
 
@@ -32,9 +34,13 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
   const sure = h("div", {});
   const certainty = section("How sure, and what else it could be", null, sure);
+  const [response, motion, widths] = [h("div", { class: "plot" }), h("div", { class: "plot" }), h("p", { class: "note" })];
+  const signed = section("Motion signature", "Mean input over position, forward (solid) and backward (dashed), and over speed: the gap between the two directions is friction.", motion, widths);
+  const compared = periods(path, () => asset, values, signal);
   const statistic = h("div", { class: "plot tall" });
   const samples = h("div", { class: "plot tall" });
   const spans = Object.entries(SPANS).map(([words, seconds]) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(seconds) }, words));
+  const lengths = Object.entries(SIGNALS).map(([words, seconds]) => h("button", { type: "button", class: "filter", "aria-pressed": String(seconds === 30), onclick: () => looked(seconds) }, words));
   const baseline = asset.baseline && h("a", { href: `/design?baseline=${part(asset.baseline)}` }, "What this baseline can tell apart");
 
   main.replaceChildren(
@@ -46,9 +52,12 @@ export async function show(main, { session, signal, linked, values, part: name, 
       grown.element,
       certainty,
       section("Inverse frequency response", "Input per unit of output, as a complex number: the diamond is healthy, the dot is now, its ellipse holds 95 %. Each panel has its own scales.", plane.element),
+      section("Inverse response over frequency", "Magnitude and phase, before (healthy) and now, with the band that holds 95 %.", response),
+      signed,
       half(titled("Distance from healthy", spans, statistic)),
-      half(titled("Signals", h("small", {}, `the last ${SIGNALS_S} s`), samples)),
+      half(titled("Signals", lengths, samples)),
       half(section("Coefficients", "Against what a healthy loop would show under the same reference.", sizes.element)),
+      compared.element,
       half(section("Alarms", null, standing, said, past)),
       half(section("Diagnoses", null, diagnoses)),
       half(section("Stream", null, counted)),
@@ -59,17 +68,22 @@ export async function show(main, { session, signal, linked, values, part: name, 
   plane.start(began(asset));
   let past24 = null;
   let span = SPANS["1 h"];
+  let closer = null; // of what is zoomed into, with more of its values
   const live = { t: [], statistic: [], level: [] };
-  const both = plot(statistic, "Both tests over time, as multiples of their limits", (c) => tests(c, curves()), signal);
-  let shown = { t: [], r: [], u: [], y: [] };
-  const traces = plot(samples, "Reference, output and input of the last seconds", (c) => drawn(c, { ...relative(shown), units, name: "time before the last sample [s]" }), signal);
+  const both = plot(statistic, "Both tests over time, as multiples of their limits", (c) => tests(c, curves()), signal, { moved: (part) => near(part).catch(() => {}) });
+  let [shown, length, held] = [{ t: [], r: [], u: [], y: [] }, 30, null];
+  const traces = plot(samples, "Reference, output and input of the last seconds", (c) => drawn(c, { ...relative(shown), units, name: "time before the last sample [s]" }), signal, { moved: (part) => hold(part).catch(() => {}) });
+  const gain = plot(response, "Magnitude and phase over frequency, before and now", (c) => bode(c, asset.responses, units), signal);
+  let moved = null; // motion signatures, before and now
+  signed.hidden = true;
 
   function curves() {
     const cut = past24?.t.length ? past24.t.at(-1) : -Infinity;
     const from = live.t.findIndex((t) => t > cut);
     const rest = (values) => (from < 0 ? [] : values.slice(from));
     const marks = began(asset) === null ? [] : [[began(asset), "onset"]];
-    const joined = (key) => [...(past24?.[key] ?? []), ...rest(live[key])];
+    const stored = past24 && spliced(past24, closer, ["t", "statistic", "level"]);
+    const joined = (key) => [...(stored?.[key] ?? []), ...rest(live[key])];
     return { t: joined("t"), statistic: joined("statistic"), level: joined("level"), marks, range: [Math.max(asset.t - span, asset.counted.began), asset.t] };
   }
 
@@ -77,6 +91,13 @@ export async function show(main, { session, signal, linked, values, part: name, 
     span = seconds;
     spans.forEach((button, i) => button.setAttribute("aria-pressed", String(Object.values(SPANS)[i] === seconds)));
     past24 = await get(query(`${path}/history`, { from: asset.t - seconds, points: POINTS }), signal);
+    closer = null;
+    both.draw();
+  }
+
+  // From a year down to every value that is stored: what is zoomed into is asked for anew.
+  async function near(part) {
+    closer = part && (await get(query(`${path}/history`, { from: part[0] / 1000, to: part[1] / 1000, points: POINTS }), signal));
     both.draw();
   }
 
@@ -85,26 +106,60 @@ export async function show(main, { session, signal, linked, values, part: name, 
     past.replaceChildren(steps(alarms.transitions, false));
     diagnoses.replaceChildren(list(found.diagnoses));
     verdict.advise(advice.alarms.find((one) => one.asset === name && one.alarm === "fault")?.operator_action);
-    await explain(found.diagnoses.filter((one) => one.grounds === "full").at(-1));
+    const inFull = found.diagnoses.filter((one) => one.grounds === "full");
+    await explain(inFull.at(-1), inFull.find((one) => one.t >= began(asset)));
     await grown.load();
   }
 
   // The candidates of the last full diagnosis; the numbers behind them are on its own page.
-  async function explain(row) {
+  async function explain(row, first) {
+    signed.hidden = !moved || asset.verdict !== "fault";
     certainty.hidden = !row || asset.verdict !== "fault";
     if (certainty.hidden || sure.dataset.id === row.id) return;
     sure.dataset.id = row.id;
     const full = await get(`/diagnoses/${part(row.id)}`, signal);
     const said = full.document ?? {};
+    await compareMotion(full, first);
     sure.replaceChildren(
       h("p", { class: "note" }, `By the full diagnosis of ${moment(row.t)}: `, h("a", { href: `/diagnoses/${part(row.id)}` }, "all of it, with the reasons"), "."),
       ...[said.candidates?.length && candidates(full, said), said.refit?.mimics?.length && mimics(said)].filter(Boolean),
     );
   }
 
+  // Now is the newest full diagnosis; before, the first one of this fault, whose window holds its onset.
+  async function compareMotion(full, first) {
+    const earliest = first && first.id !== full.id ? await get(`/diagnoses/${part(first.id)}`, signal) : full;
+    const now = full.signature.at(-1);
+    if (!now) return;
+    const before = [...earliest.signature, ...full.signature].find((one) => one.words === "before");
+    const fresh = moved === null;
+    moved = [before, { ...now, words: "after" }].filter(Boolean);
+    signed.hidden = false;
+    if (fresh) plot(motion, "Mean input over position and speed, before and now", (c) => signature(c, { curves: moved, units }), signal);
+    const width = (key, of) => moved.filter((one) => one[key]).map((one) => `${one.words === "before" ? "before" : "now"} ${number(one[key][0], 3)} ± ${number(1.96 * one[key][1], 2)} ${of ?? ""}`);
+    const told = [["Friction band", width("friction_band", units.u)], ["Lost motion", width("lost_motion", units.y)]].filter(([, each]) => each.length);
+    tell(widths, told.map(([words, each]) => `${words}: ${each.join(", ")}.`).join(" "));
+  }
+
   async function sample() {
-    if (document.hidden) return;
-    shown = await get(query(`${path}/signals`, { seconds: SIGNALS_S, points: 600 }), signal);
+    if (document.hidden || held) return;
+    shown = await get(query(`${path}/signals`, { seconds: length, points: 600 }), signal);
+    traces.draw();
+  }
+
+  async function looked(seconds) {
+    length = seconds;
+    lengths.forEach((button) => button.setAttribute("aria-pressed", String(SIGNALS[button.textContent] === seconds)));
+    await sample();
+  }
+
+  // Whoever zooms in looks at samples that stand still, down to each of them.
+  async function hold(part) {
+    held = part;
+    const end = shown.t.at(-1);
+    if (!part) return sample();
+    const fine = await get(query(`${path}/signals`, { seconds: Math.max(part[1] - part[0], 0.1), to: end + part[1], points: 2000 }), signal);
+    shown = spliced(shown, fine, ["t", "r", "u", "y"]);
     traces.draw();
   }
 
@@ -123,6 +178,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
       }
     }
     both.draw();
+    gain.draw();
     tell(counted, `${count(asset.counted.samples)} samples in ${count(asset.counted.blocks)} blocks since ${moment(asset.counted.began)}; ${count(asset.counted.lost)} blocks lost, ${count(asset.counted.repeated)} came twice.`);
     const key = JSON.stringify(asset.alarms);
     if (key !== alarmed) {
@@ -132,6 +188,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   }
 
   take(asset);
+  compared.start();
   spans[0].setAttribute("aria-pressed", "true");
   follow(
     `?asset=${part(name)}`,
@@ -161,6 +218,14 @@ function told(asset) {
 }
 
 const half = (element) => (element.classList.add("half"), element);
+
+// Columns over time, with what is known of a part of them more closely in its place.
+function spliced(coarse, fine, keys) {
+  if (!fine?.t.length) return coarse;
+  const [from, to] = [fine.t[0], fine.t.at(-1)];
+  const outside = (key, side) => coarse[key].filter((_, i) => side(coarse.t[i]));
+  return Object.fromEntries(keys.map((key) => [key, [...outside(key, (t) => t < from), ...fine[key], ...outside(key, (t) => t > to)]]));
+}
 
 function relative({ t, r, u, y }) {
   const end = t.at(-1) ?? 0;

@@ -1,5 +1,6 @@
 // ECharts in the look of the report: its colours, its axes, no animation; drawn anew when the theme changes.
 import "./vendor/echarts.common.min.js";
+import { tools, zoomed } from "./chart_tools.js";
 
 const NAMES = ["paper", "panel", "ink", "muted", "rule", "measured", "healthy", "alarm", "reference", "care", "check"];
 const LETTERS = getComputedStyle(document.documentElement).getPropertyValue("--letters");
@@ -18,13 +19,16 @@ export function colours() {
 }
 
 // A plot in an element of fixed height. `describe(colours)` returns an option; call `draw` when its data have changed.
-export function plot(element, label, describe, signal) {
+// Beneath it stand zoom, pan and export; `csv` returns the values as text, else those that are drawn are saved, and
+// `moved` hears what part of the first axis is looked at: [from, to], null for all of it.
+export function plot(element, label, describe, signal, { csv = null, moved = null } = {}) {
   const chart = globalThis.echarts.init(element, null, { renderer: "canvas" });
   let wanted = 0;
   const now = () => {
     wanted = 0;
     const c = colours();
-    chart.setOption({ ...base(c), ...describe(c) }, { replaceMerge: ["series"] });
+    const option = { ...base(c), ...describe(c) };
+    chart.setOption({ ...option, dataZoom: zoomed(option) }, { replaceMerge: ["series"] });
   };
   const draw = () => {
     wanted ||= requestAnimationFrame(now);
@@ -35,7 +39,7 @@ export function plot(element, label, describe, signal) {
   element.setAttribute("role", "img");
   element.setAttribute("aria-label", label);
   const image = () => (now(), chart.getZr().flush(), chart.getDataURL({ pixelRatio: 2, backgroundColor: colours().paper }));
-  const one = { draw, image, print: () => (now(), chart.getZr().flush()) };
+  const one = { draw, print: () => (now(), chart.getZr().flush()) };
   plots.add(one);
   signal.addEventListener("abort", () => {
     cancelAnimationFrame(wanted);
@@ -44,6 +48,7 @@ export function plot(element, label, describe, signal) {
     chart.dispose();
   });
   now();
+  element.after(tools(chart, label, { image, csv, moved, signal }));
   return one;
 }
 

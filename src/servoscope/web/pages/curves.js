@@ -105,7 +105,6 @@ export function growth(c, { t, value, low, high, full, unit: of, limit, forecast
         return i < 0 ? "" : said(t[i], full.has(i) ? "full diagnosis:" : "size", i);
       },
     }),
-    dataZoom: [{ type: "inside", zoomOnMouseWheel: "ctrl", filterMode: "none" }],
     xAxis: axis(c, "", { type: "time", min: at(range[0], true), max: at(range[1], true), splitNumber: 6 }),
     yAxis: axis(c, `change${unit(of.trim())}`, { type: "value", scale: true, gap: 44, splitNumber: 4, label: { formatter: short } }),
     series: [

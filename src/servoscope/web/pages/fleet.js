@@ -18,15 +18,24 @@ const ORDERS = {
 };
 // Silent or healthy, what has a fault stands above what has none.
 const faulty = (row) => (row.verdict === "fault" ? 0 : 1);
+const SOON_S = 90 * 86400; // a limit that may be reached within this time is told by its filter
+// Further questions that rows answer, each a filter.
+const QUESTIONS = {
+  open: ["To acknowledge", (row) => row.alarms.some((alarm) => OPEN.includes(alarm.state))],
+  growing: ["Growing", (row) => row.outlook?.rate_per_day && row.outlook.rate_per_day[0] * row.outlook.rate_per_day[2] > 0],
+  soon: ["Limit within 90 days", (row) => remaining(row, row.t)?.[0] <= SOON_S],
+  unheard: ["Not heard", (row) => !row.heard],
+};
 const OPEN = ["unacknowledged", "returned_unacknowledged", "latched_unacknowledged"];
 
 export async function show(main, { signal, linked, values }) {
   const assets = new Map(); // name -> { row, tile, line }
-  const filter = { verdict: values.get("verdict") ?? "", search: values.get("search") ?? "", group: values.get("group") ?? "", order: values.get("order") ?? "worst", open: false, unheard: false };
+  const filter = { verdict: values.get("verdict") ?? "", search: values.get("search") ?? "", group: values.get("group") ?? "", order: values.get("order") ?? "worst", source: values.get("source") ?? "", question: values.get("show") ?? "" };
   const map = h("div", { class: "map" });
   const body = h("div", { role: "rowgroup", class: "rows" });
   const none = h("p", { class: "empty" }, "Loading");
   const counts = filters();
+  const sources = overview((name) => ((filter.source = filter.source === name ? "" : name), chosen(), recount()));
   const search = h("input", { type: "search", placeholder: "Search", "aria-label": "Search assets", value: filter.search });
   const groups = h("select", { "aria-label": "Group" }, h("option", { value: "" }, "All groups"));
   const orders = h("select", { "aria-label": "Order" }, Object.entries(ORDERS).map(([key, [words]]) => h("option", { value: key }, words)));
@@ -36,6 +45,7 @@ export async function show(main, { signal, linked, values }) {
 
   main.replaceChildren(
     h("div", { class: "head" }, h("h1", {}, "Fleet"), counts.element, h("span", { class: "gap" }), orders, groups, search),
+    sources.element,
     map,
     grid,
     none,
@@ -52,10 +62,10 @@ export async function show(main, { signal, linked, values }) {
 
   function filters() {
     const element = h("div", { class: "filters", role: "group", "aria-label": "Show" });
-    const made = [["", "All"], ...Object.entries(VERDICTS), ["open", "To acknowledge"], ["unheard", "Not heard"]].map(([key, words]) => {
+    const made = [["", "All"], ...Object.entries(VERDICTS), ...Object.entries(QUESTIONS).map(([key, [words]]) => [key, words])].map(([key, words]) => {
       const amount = h("b", {}, "0");
       const press = () => {
-        for (const one of ["open", "unheard"]) filter[one] = key === one && !filter[one];
+        filter.question = key in QUESTIONS && filter.question !== key ? key : "";
         filter.verdict = key in VERDICTS && filter.verdict !== key ? key : "";
         chosen();
       };
@@ -67,20 +77,21 @@ export async function show(main, { signal, linked, values }) {
   }
 
   function recount() {
-    const found = { "": assets.size, fault: 0, undetermined: 0, healthy: 0, open: 0, unheard: 0 };
+    const found = { "": assets.size, fault: 0, undetermined: 0, healthy: 0 };
+    for (const key of Object.keys(QUESTIONS)) found[key] = 0;
     for (const { row } of assets.values()) {
       found[row.verdict] += 1;
-      found.unheard += row.heard ? 0 : 1;
-      found.open += row.alarms.some((alarm) => OPEN.includes(alarm.state)) ? 1 : 0;
+      for (const [key, [, holds]] of Object.entries(QUESTIONS)) found[key] += holds(row) ? 1 : 0;
     }
+    sources.recount([...assets.values()].map(({ row }) => row), filter.source);
     for (const [key, , amount] of counts.made) tell(amount, String(found[key]));
   }
 
   function wanted({ row }) {
     if (filter.verdict && row.verdict !== filter.verdict) return false;
     if (filter.group && row.group !== filter.group) return false;
-    if (filter.unheard && row.heard) return false;
-    if (filter.open && !row.alarms.some((alarm) => OPEN.includes(alarm.state))) return false;
+    if (filter.source && row.source !== filter.source) return false;
+    if (filter.question in QUESTIONS && !QUESTIONS[filter.question][1](row)) return false;
     const text = filter.search && `${row.asset} ${row.group} ${row.summary} ${row.alarms.map((alarm) => alarm.alarm).join(" ")}`;
     return !filter.search || text.toLowerCase().includes(filter.search.trim().toLowerCase());
   }
@@ -100,8 +111,8 @@ export async function show(main, { signal, linked, values }) {
   }
 
   function chosen() {
-    for (const [key, button] of counts.made) set(button, "aria-pressed", String(key in filter ? filter[key] : !filter.open && !filter.unheard && filter.verdict === key));
-    const told = new URLSearchParams(Object.entries({ verdict: filter.verdict, search: filter.search, group: filter.group, order: filter.order === "worst" ? "" : filter.order }).filter(([, value]) => value));
+    for (const [key, button] of counts.made) set(button, "aria-pressed", String(key in QUESTIONS ? filter.question === key : !filter.question && filter.verdict === key));
+    const told = new URLSearchParams(Object.entries({ verdict: filter.verdict, search: filter.search, group: filter.group, source: filter.source, show: filter.question, order: filter.order === "worst" ? "" : filter.order }).filter(([, value]) => value));
     history.replaceState(null, "", told.size ? `/?${told}` : "/");
     sift();
   }
@@ -204,6 +215,29 @@ function dress({ row, tile }) {
   }
   set(tile, "aria-label", words);
   set(tile, "title", `${row.asset}\n${sentence(row.summary)}`);
+}
+
+// What samples come from: how many assets of each source are heard; a press shows those of one.
+function overview(press) {
+  const element = h("div", { class: "filters sources", role: "group", "aria-label": "Sources" });
+  const made = new Map(); // name -> { button, words }
+  const recount = (rows, chosen) => {
+    for (const name of [...new Set(rows.map((row) => row.source))].filter(Boolean).sort()) {
+      if (!made.has(name)) {
+        const words = h("span", {});
+        const button = h("button", { type: "button", class: "filter", onclick: () => press(name) }, `${name}: `, words);
+        made.set(name, { button, words });
+        element.append(button);
+      }
+      const { button, words } = made.get(name);
+      const own = rows.filter((row) => row.source === name);
+      const heard = own.filter((row) => row.heard).length;
+      tell(words, heard === own.length ? `all ${heard} heard` : `${heard} of ${own.length} heard`);
+      words.classList.toggle("bad", heard === 0);
+      set(button, "aria-pressed", String(chosen === name));
+    }
+  };
+  return { element, recount };
 }
 
 // How long until the limit, [earliest, latest] in s; null: no forecast.

@@ -1,9 +1,10 @@
 // How a fault grows: one curve of its size over months, a limit that may be tried, and when it will be reached.
-import { get, mayChange, post, query } from "./api.js";
+import { get, mayChange, post, query, upload } from "./api.js";
 import { plot } from "./charts.js";
 import { growth as drawn } from "./curves.js";
-import { during, field, h, save, tell, titled } from "./dom.js";
+import { during, field, h, tell, titled } from "./dom.js";
 import { say } from "./marks.js";
+import { storedSamples } from "./stored_samples.js";
 import { change, count, moment, number, plain } from "./words.js";
 
 const DAY_S = 86400;
@@ -17,15 +18,12 @@ export function growth(path, name, asset, { session, values, signal }) {
   const which = h("select", { "aria-label": "What is followed" });
   const limit = h("input", { type: "number", step: "any", "aria-label": "Limit, as a ratio to healthy", placeholder: "limit, such as 1.5", value: values.get("limit") ?? "" });
   const buttons = Object.keys(SPANS).map((words) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(words) }, words));
-  const exports = [
-    h("button", { type: "button", class: "filter screen", title: "Save the picture", onclick: () => save(chart.image(), `${name} ${which.value}.png`) }, "PNG"),
-    h("button", { type: "button", class: "filter screen", title: "Save the values", onclick: () => save(table(), `${name} ${which.value}.csv`) }, "CSV"),
-  ];
+  const advised = h("p", { class: "note" });
   const noted = h("ul", { class: "why" });
-  const element = titled("How it grows", [which, limit, ...buttons, ...exports], said, canvas, why, noted, mayChange(session.role, "operator") && noting());
+  const element = titled("How it grows", [which, limit, ...buttons], said, advised, canvas, why, noted, mayChange(session.role, "operator") && noting());
   let span = SPANS[values.get("span")] === undefined ? "60 d" : values.get("span");
-  let [curves, forecast, notes] = [[], null, []];
-  const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal);
+  let [curves, forecast, notes, limits] = [[], null, [], []];
+  const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal, { csv: table });
 
   // All curves of what is chosen as one, in the order of time.
   function rows() {
@@ -47,14 +45,31 @@ export function growth(path, name, asset, { session, values, signal }) {
       });
     };
     const form = h("form", { onsubmit: submit }, h("div", { class: "fields" }, field("What was done", text), field("When (else: now)", when), h("label", {}, anew, " The trend begins anew")), h("div", { class: "actions" }, button), answer);
-    return h("details", { class: "screen" }, h("summary", {}, "Note what was done, such as: pump replaced"), form);
+    return h("details", { class: "screen" }, h("summary", {}, "Note what was done, such as: pump replaced"), form, renewing());
+  }
+
+  // Another machine needs another baseline: what the store keeps since then becomes a recording to learn from.
+  function renewing() {
+    const [button, answer] = [h("button", { type: "button" }, "Keep samples for a new baseline"), h("p", { class: "working", role: "status" })];
+    const keep = async () => {
+      const since = Math.max(...notes.filter((note) => note.anew).map((note) => note.t));
+      const file = await storedSamples(path, asset(), Number.isFinite(since) ? since : null, signal);
+      if (!file) return ["There are no samples since the machine was renewed."];
+      const kept = await upload(file, signal);
+      return [`${kept.name}: ${count(kept.rows)} samples are kept as a recording. `, h("a", { href: "/learn" }, "Learn a baseline from it"), ", and name its file in the service file."];
+    };
+    button.addEventListener("click", async () => {
+      let told = [];
+      await during(button, answer, async () => (told = await keep()));
+      if (told.length) answer.replaceChildren(...told);
+    });
+    return h("div", {}, h("div", { class: "actions" }, button), answer);
   }
 
   // The values as `servoscope trend` reads them.
   function table() {
     const lines = rows().map((one) => [new Date(1000 * one.t).toISOString(), one.value, one.low, one.high, one.healthy, one.full ? "full" : ""].join());
-    const text = [`time,${which.value},low,high,healthy,diagnosis`, ...lines, ""].join("\n");
-    return URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+    return [`time,${which.value},low,high,healthy,diagnosis`, ...lines, ""].join("\n");
   }
 
   function shown() {
@@ -109,11 +124,21 @@ export function growth(path, name, asset, { session, values, signal }) {
     await foresee();
   }
 
+  // Where the loop itself would fail: one press takes it as the limit.
+  function advise(last) {
+    const side = last && last.value < last.healthy ? "down" : "up";
+    const own = limits.filter((one) => one.fault === which.value && one[side] !== null);
+    const take = (value) => () => ((limit.value = value), limit.dispatchEvent(new Event("change")));
+    const words = { tracking: "bandwidth below 0.7 of healthy", stability: "margin of stability halved" };
+    advised.replaceChildren(...(own.length ? ["The loop itself suggests as limit: ", ...own.map((one) => h("button", { type: "button", class: "filter", onclick: take(one[side].toPrecision(3)) }, `${one[side].toPrecision(3)}, ${words[one.kind]}`))] : []));
+  }
+
   // Without a limit only the rate is told: it is the same for every limit.
   async function foresee() {
     const all = rows();
     const last = all.at(-1);
     forecast = null;
+    advise(last);
     if (last) {
       const goal = limit.value !== "" ? Number(limit.value) : last.value < last.healthy ? 0.5 : 2;
       forecast = await get(query(`${path}/trend`, { name: which.value, limit: goal }), signal);
@@ -123,6 +148,8 @@ export function growth(path, name, asset, { session, values, signal }) {
     chart.draw();
   }
 
+  const known = get(`${path}/limits`, signal).then((found) => ((limits = found.limits), advise(rows().at(-1))));
+  known.catch(() => {}); // a hint less
   which.addEventListener("change", () => (remember(), foresee().catch(() => {})));
   limit.addEventListener("change", () => (remember(), foresee().catch(() => {})));
   buttons.forEach((button) => button.setAttribute("aria-pressed", String(button.textContent === span)));

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import time
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -10,7 +12,8 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Query
 from starlette.exceptions import HTTPException
 
-from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.core.errors import LoopError, StoreError, StoreUnavailableError
+from servoscope.design.operating_limits import OperatingLimit, operating_limits
 from servoscope.prognosis.forecast import prognose
 from servoscope.service.asset_status import AssetStatus
 from servoscope.service.sources.block import Block
@@ -19,7 +22,7 @@ from servoscope.service.store.queries import query_downsampled, query_history
 from servoscope.service.store.series import FAULT_KINDS, NOTE, query_sizes, read_notes, read_series, thin_columns
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.downsample import signal_columns
-from servoscope.web.routes.baselines import asset_baseline_id
+from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached
 from servoscope.web.schemas import assets as schemas
 from servoscope.web.schemas import sizes
 from servoscope.web.schemas.requests import (
@@ -154,20 +157,38 @@ def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Quer
     return sizes.Forecast(asset=asset, **found.model_dump(exclude={"headline", "reasons", "effects"}))
 
 
+@router.get("/assets/{asset}/limits")
+def get_limits(context: ContextDep, asset: str) -> sizes.LimitList:
+    """Return the sizes at which its loop loses tracking or its margin of stability; none where that is not known."""
+    find_asset(context, asset)
+    id_ = asset_baseline_id(context, asset)
+    found = _loop_limits(find_baseline(context, id_).path) if id_ is not None else ()
+    return sizes.LimitList(limits=[sizes.LimitRow(**one._asdict()) for one in found])
+
+
+@functools.lru_cache(maxsize=256)  # it takes a second, and every reader of a page asks
+def _loop_limits(baseline: Path) -> tuple[OperatingLimit, ...]:
+    try:
+        return tuple(operating_limits(load_cached(baseline).loop))
+    except LoopError:
+        return ()
+
+
 @router.get("/assets/{asset}/signals")
 def get_signals(context: ContextDep, asset: str, query: Annotated[SignalQuery, Query()]) -> schemas.RecentSignals:
-    """Return its last seconds, as measured."""
+    """Return its last seconds, or those before a time, as measured."""
     units = schemas.signal_units(find_asset(context, asset)[1].metadata.units)
-    sequence, blocks = _read_blocks(context.store, asset, query.seconds)
+    sequence, blocks = _read_blocks(context.store, asset, query.seconds, query.until)
     t, *signals = np.concatenate([block.signals for block in blocks], axis=1) if blocks else np.zeros((4, 0))
-    within = t > t[-1] - query.seconds if t.size else np.zeros(0, dtype=np.bool_)
+    end = query.until if query.until is not None else t[-1] if t.size else 0.0
+    within = (t > end - query.seconds) & (t <= end)
     t, signals = t[within], [signal[within] for signal in signals]
     columns = signal_columns(t, signals, query.points)
     return schemas.RecentSignals(asset=asset, sequence=sequence, samples=int(t.size), units=units, **columns)
 
 
-def _read_blocks(store: Store, asset: str, seconds: float) -> tuple[int | None, list[Block]]:
-    """Return the sequence of the newest block that the store keeps, and the blocks of the last seconds."""
+def _read_blocks(store: Store, asset: str, seconds: float, until: float | None) -> tuple[int | None, list[Block]]:
+    """Return the sequence of the newest block that the store keeps, and the blocks from so long before a time on."""
     table = tables.recent
     newest = sa.select(sa.func.max(table.c.sequence)).where(table.c.asset == asset)
     sequence: int | None = next(iter(store.fetch(newest)[0].values()))
@@ -177,7 +198,8 @@ def _read_blocks(store: Store, asset: str, seconds: float) -> tuple[int | None, 
     while sequence is not None:
         rows = store.fetch(query.limit(limit))
         blocks = [Block.unpack(asset, row["sequence"], row["samples"]) for row in reversed(rows)]
-        if blocks[-1].t[-1] - blocks[0].t[0] >= seconds or len(rows) < limit:
+        end = blocks[-1].t[-1] if until is None else until
+        if end - blocks[0].t[0] >= seconds or len(rows) < limit:
             break
         limit *= 4
     return sequence, blocks

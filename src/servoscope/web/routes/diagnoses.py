@@ -89,7 +89,7 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     if not rows:
         raise HTTPException(404, f"there is no diagnosis {id_}")
     document = dict(rows[0]["document"])
-    began = document.pop("began", None)
+    began, signature = document.pop("began", None), document.pop("signature", [])
     facts = next((one.metadata for _, one in asset_statuses(read_statuses(context.store, [asset]).values())), None)
     baseline = None
     if facts is not None and facts.model_fields_set:
@@ -98,6 +98,7 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     return responses.DiagnosisDetail(
         **dict(responses.DiagnosisRow.from_stored(rows[0])),
         began=began,
+        signature=signature,
         document=document,
         words=facts.faults if facts is not None else {},
         baseline=baseline,

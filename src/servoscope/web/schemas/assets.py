@@ -123,6 +123,7 @@ class AssetRow(ApiResponse):
 
     asset: str
     group: str
+    source: str
     verdict: Verdict
     summary: str
     since: float
@@ -150,6 +151,7 @@ class AssetRow(ApiResponse):
         derived = {
             "asset": name,
             "group": status.metadata.group,
+            "source": status.metadata.source,
             "quality": list(status.quality),
             "deviation": relative_residual(status),
             "alarms": alarms,

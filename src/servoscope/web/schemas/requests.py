@@ -120,8 +120,9 @@ class DiagnosisQuery(AuditQuery):
 
 
 class SignalQuery(ApiRequest):
-    """How many seconds, at most, and with how many points."""
+    """How many seconds, at most, until when [UTC s] (None: the newest sample), and with how many points."""
 
+    until: UtcSeconds | None = Field(None, alias="to")
     seconds: Annotated[float, Field(gt=0.0, le=3600.0, allow_inf_nan=False)] = 30.0
     points: Annotated[int, Field(ge=10, le=20_000)] = 1000
 

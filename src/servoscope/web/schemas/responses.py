@@ -170,6 +170,8 @@ class SignatureColumns(ApiResponse):
     backward: list[float | None]
     speed: list[float | None]
     by_speed: list[float | None]
+    friction_band: list[float] | None = None  # twice the dry friction, and its standard deviation
+    lost_motion: list[float] | None = None
 
 
 class DiagnosisData(ApiResponse):

@@ -59,3 +59,18 @@ class Forecast(ApiResponse):
     odds: float | None
     summary: str
     explanation: tuple[str, ...]
+
+
+class LimitRow(ApiResponse):
+    """The ratio to healthy, above 1 and below 1, at which the loop loses tracking or its margin of stability."""
+
+    fault: str
+    kind: Literal["tracking", "stability"]
+    up: float | None
+    down: float | None
+
+
+class LimitList(ApiResponse):
+    """Limits by fault."""
+
+    limits: list[LimitRow]
