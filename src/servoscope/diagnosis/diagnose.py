@@ -154,7 +154,7 @@ def _judge_signals(
         return _with_warnings(diagnosis, [own_past_warning(own), *sensors]), own, correction
     last = max(_first_alarm_time(exam) for exam in exams)
     near = last - baseline.loop.monitor.memory if np.isfinite(last) else last
-    rivals = sorted((exam for exam in exams if _first_alarm_time(exam) >= near), key=_largest_statistic_ratio)
+    rivals = sorted((exam for exam in exams if _first_alarm_time(exam) >= near), key=largest_statistic_ratio)
     if np.isinf(last):
         diagnosis, correction = diagnose_examination(rivals[0], progress)
         return _with_warnings(diagnosis, sensors), rivals[0], correction
@@ -187,7 +187,7 @@ def _changed_at(exam: Examination) -> float | None:
     return None if span is None else float(exam.recording.t[span.end - 1])
 
 
-def _largest_statistic_ratio(exam: Examination) -> float:
+def largest_statistic_ratio(exam: Examination) -> float:
     """Return the largest value of all statistics, as a multiple of its limit."""
     ratios = [statistic.value / statistic.limit for statistic in exam.statistics]
     return float(np.maximum.reduce(ratios)[exam.ready].max(initial=0.0))
