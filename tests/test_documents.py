@@ -75,7 +75,7 @@ class TestTutorial:
         monkeypatch.chdir(tutorial)
         plt.switch_backend("agg")
         thing = getattr(ss, name)
-        names = {each: getattr(ss, each) for each in ss.__all__} | {"ss": ss}
+        names = {each: getattr(ss, each) for each in (*ss.__all__, name)} | {"ss": ss}
         runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
         for one in doctest.DocTestFinder().find(thing, name, globs=names):
             runner.run(one)

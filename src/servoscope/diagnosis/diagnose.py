@@ -28,6 +28,7 @@ from servoscope.detection.signal_defects import find_signal_defect
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
+from servoscope.diagnosis.checks import what_to_check
 from servoscope.diagnosis.examine import UNSEEN, Examination
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
 from servoscope.diagnosis.ml_refit import (
@@ -249,6 +250,7 @@ def diagnose_examination(
         verdict=verdict,
         headline=headline,
         reasons=reasons,
+        checks=what_to_check(baseline.loop, interval),
         intervals=intervals,
         parameters=_final_coefficients(end),
         ifrf=_final_response(end),
