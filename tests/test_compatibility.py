@@ -23,7 +23,18 @@ WORDS = {"verdict", "name", "parameter", "kind", "recording", "point", "asset", 
 WORDS |= {"event", "priority", "unit", "loop", "magic", "baseline", "defect"}
 # Keys of results that came later than version 0.1.0.
 ADDED = {
-    *("headline", "reasons", "intervals", "description", "sensors", "provenance", "instrument", "features", "left_out"),
+    *(
+        "checks",
+        "headline",
+        "reasons",
+        "intervals",
+        "description",
+        "sensors",
+        "provenance",
+        "instrument",
+        "features",
+        "left_out",
+    ),
     # of the service: how samples come in, blocks left out for their time stamps, clocks of a fault that stands
     *("reception", "late", "future", "fault_at", "diagnosed", "size", "sized", "source", "signature"),
 }

@@ -70,12 +70,12 @@ class TestTutorial:
     def test_the_page_for_users_of_matlab(self, tutorial: Path) -> None:
         assert run_page(DOCS / "from-matlab.md", tutorial) == 2
 
-    @pytest.mark.parametrize("name", [name for name in ss.__all__ if not name.startswith("_")])
+    @pytest.mark.parametrize("name", [name for name in (*ss.__all__, "NoveltyDetector") if not name.startswith("_")])
     def test_the_examples_of_docstrings(self, name: str, tutorial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tutorial)
         plt.switch_backend("agg")
         thing = getattr(ss, name)
-        names = {each: getattr(ss, each) for each in ss.__all__} | {"ss": ss}
+        names = {each: getattr(ss, each) for each in (*ss.__all__, name)} | {"ss": ss}
         runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
         for one in doctest.DocTestFinder().find(thing, name, globs=names):
             runner.run(one)

@@ -12,7 +12,7 @@ import servoscope as ss
 from logs import as_expected, lines, signals, written
 from servoscope.core.errors import RecordingError
 from servoscope.models.loop import Columns
-from servoscope.simulation import reference, simulate
+from servoscope.simulation import FaultEvent, reference, simulate
 
 RIG = Path(ss.__file__).parent / "simulation" / "reference-rig.toml"
 
@@ -82,6 +82,20 @@ def test_paths_stand_where_objects_do_and_what_comes_is_short(tmp_path: Path) ->
     (axes,) = ss.plot(diagnosis)
     assert len(axes.get_yticks()) == len(baseline.names)
     plt.close("all")
+    # plotly gets the same numbers
+    drawn = ss.plot(baseline, backend="plotly")
+    bands, lines = drawn.data[::2], drawn.data[1::2]
+    np.testing.assert_allclose(lines[0].y, np.abs(H), rtol=1e-6)
+    upper_edge = np.asarray(bands[1].y)[len(H) :][::-1]
+    assert drawn.layout.yaxis.type == "log" and (upper_edge > lines[1].y).all()
+    assert [len(ss.plot(one, backend="plotly").data) for one in (recording, trace, inspection, diagnosis)] == [
+        3,
+        4,
+        2,
+        1,
+    ]
+    with pytest.raises(ValueError, match="not 'gnuplot'"):
+        ss.plot(baseline, backend="gnuplot")  # type: ignore[call-overload]
     with pytest.raises(TypeError, match=r"a plot is made of a Recording, .* not of int"):
         ss.plot(3)  # type: ignore[arg-type]
     judged = ss.write_report(tmp_path / "page.html", tmp_path / "baseline.json", path)
@@ -91,3 +105,27 @@ def test_paths_stand_where_objects_do_and_what_comes_is_short(tmp_path: Path) ->
 def test_a_name_cannot_put_markup_into_a_notebook(tmp_path: Path) -> None:
     found = ss.read(written(tmp_path, lines(), "a&b.csv"))
     assert "a&amp;b.csv" in found._repr_html_() and "a&b" in repr(found)
+
+
+def test_scikit_learn_takes_recordings_as_samples() -> None:
+    from sklearn.base import clone
+    from sklearn.model_selection import StratifiedKFold, cross_val_score
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import FunctionTransformer
+
+    loop = ss.Loop.load(RIG)
+    r = reference("multisine", 20.0, loop.sample_rate)
+    leak = FaultEvent.parse("leakage=1.5@0")
+    runs = [simulate(loop, r, seed=seed, faults=(leak,) if seed >= 6 else ())[0] for seed in range(9)]
+    labels = np.array([1] * 6 + [-1] * 3)
+    detector = ss.NoveltyDetector(loop)
+    assert detector.get_params() == {"loop": loop} and clone(detector).loop == loop
+    pipeline = make_pipeline(FunctionTransformer(lambda runs: [each.part(0.0, 19.0) for each in runs]), detector)
+    scores = cross_val_score(pipeline, runs, labels, cv=StratifiedKFold(3), scoring="balanced_accuracy")
+    np.testing.assert_array_equal(scores, 1.0)
+    fitted = pipeline.fit(runs, labels)[-1]
+    score = fitted.score_samples(runs)
+    np.testing.assert_array_equal(np.sign(fitted.decision_function(runs)), labels)
+    # the score is that of the diagnosis: above the limit in the same recordings
+    assert [ss.diagnose(fitted.baseline_, runs[i]).verdict for i in (0, 8)] == ["healthy", "fault"]
+    assert score[:6].min() > fitted.offset_ > score[6:].max()

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from servoscope.detection.trace import Trace
     from servoscope.diagnosis.diagnose import diagnose
     from servoscope.diagnosis.monitor import Monitor
+    from servoscope.diagnosis.novelty import NoveltyDetector as NoveltyDetector
     from servoscope.diagnosis.operating_points import learn
     from servoscope.learning.inspection import inspect
     from servoscope.models.loop import Loop
@@ -59,6 +60,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "Diagnosis": "detection.result",
         "Loop": "models.loop",
         "Monitor": "diagnosis.monitor",
+        "NoveltyDetector": "diagnosis.novelty",  # not in __all__: it needs scikit-learn
         "Recording": "signals.recording",
         "Trace": "detection.trace",
         "design_study": "design",

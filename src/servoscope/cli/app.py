@@ -51,11 +51,27 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def _choose_language(name: str | None) -> None:
+    from servoscope.core.messages import set_language
+
+    if name is not None:
+        try:
+            set_language(name)
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from None
+
+
 @app.callback()
 def servoscope(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    language: Annotated[
+        str | None,
+        typer.Option(
+            callback=_choose_language, is_eager=True, metavar="en|de", help="Language of results and reports."
+        ),
+    ] = None,
 ) -> None:
     """Say from r, u and y of a servo loop whether its actuator is healthy; if not, what changed, and when."""
 

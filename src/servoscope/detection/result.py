@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, computed_field, model_validator
 
-from servoscope.core.messages import Message, MessageField, message, read_messages, render, text_message
+from servoscope.core.messages import Message, MessageField, MessageText, message, read_messages, render, text_message
 from servoscope.core.short_repr import ShortRepr
 from servoscope.signals import Defect
 
@@ -208,6 +208,8 @@ class Diagnosis(ShortRepr, _ResultModel):
         The verdict in one sentence; as text: `summary`.
     reasons
         Why, sentence by sentence: what moved, what was rejected; as text: `explanation`.
+    checks
+        What to check on the machine, by what the loop file says of the faults, or else by what is known of them.
     intervals
         When the actuator differed from healthy, in order; `onset_s`, `detected_at_s`, `probability`, `faults`,
         `candidates` and `refit` are those of the last one, None or empty where there is none.
@@ -227,6 +229,7 @@ class Diagnosis(ShortRepr, _ResultModel):
     verdict: Verdict
     headline: MessageField
     reasons: tuple[MessageField, ...] = ()
+    checks: tuple[MessageText, ...] = ()
     intervals: tuple[FaultInterval, ...] = ()
     parameters: dict[str, FinalCoefficient]
     ifrf: tuple[ResponsePoint, ...]

@@ -26,17 +26,12 @@ from servoscope.detection.result import (
 )
 from servoscope.detection.signal_defects import find_signal_defect
 from servoscope.detection.trace import UNSEEN, Trace
+from servoscope.diagnosis import ml_refit
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
+from servoscope.diagnosis.checks import what_to_check
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
-from servoscope.diagnosis.ml_refit import (
-    disagreement_warnings,
-    refit_candidates,
-    refit_onset,
-    refit_recording,
-    summarise_refit,
-)
 from servoscope.diagnosis.motion_check import motion_warnings
 from servoscope.diagnosis.output_onset import refine_onset
 from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
@@ -166,7 +161,7 @@ def _judge_signals(
         return _with_warnings(diagnosis, [own_past_warning(own), *sensors]), own, correction
     last = max(_first_alarm_time(exam) for exam in exams)
     near = last - baseline.loop.monitor.memory if np.isfinite(last) else last
-    rivals = sorted((exam for exam in exams if _first_alarm_time(exam) >= near), key=_largest_statistic_ratio)
+    rivals = sorted((exam for exam in exams if _first_alarm_time(exam) >= near), key=largest_statistic_ratio)
     if np.isinf(last):
         diagnosis, correction = diagnose_examination(rivals[0], progress)
         return _with_warnings(diagnosis, sensors), rivals[0], correction
@@ -199,7 +194,7 @@ def _changed_at(exam: Examination) -> float | None:
     return None if span is None else float(exam.recording.t[span.end - 1])
 
 
-def _largest_statistic_ratio(exam: Examination) -> float:
+def largest_statistic_ratio(exam: Examination) -> float:
     """Return the largest value of all statistics, as a multiple of its limit."""
     ratios = [statistic.value / statistic.limit for statistic in exam.statistics]
     return float(np.maximum.reduce(ratios)[exam.ready].max(initial=0.0))
@@ -262,6 +257,7 @@ def diagnose_examination(
         verdict=verdict,
         headline=headline,
         reasons=reasons,
+        checks=what_to_check(baseline.loop, interval),
         intervals=intervals,
         parameters=_final_coefficients(end),
         ifrf=_final_response(end),
@@ -284,7 +280,7 @@ def _explain_alarm(
         not exam.drifts
         and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
     )
-    refined = refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
+    refined = ml_refit.refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
         from servoscope.isolation.ml import find_outside_onset
 
@@ -295,11 +291,11 @@ def _explain_alarm(
         )
         if several:
             return several, _onset_of(several, exam, alarm), []
-        candidates = refit_candidates(refined)
-        refit = summarise_refit(refined, exam, recursive, outside=outside)
+        candidates = ml_refit.refit_candidates(refined)
+        refit = ml_refit.summarise_refit(refined, exam, recursive, outside=outside)
         if outside or not refined.is_unknown:
-            onset = refit_onset(refined, exam, outside)
-        doubts = disagreement_warnings(exam, candidates, refit, SURE)
+            onset = ml_refit.refit_onset(refined, exam, outside)
+        doubts = ml_refit.disagreement_warnings(exam, candidates, refit, SURE)
     best, t = candidates[0], exam.recording.t
     wait_s = exam.pipeline.bank.wait / exam.recording.sample_rate
     interval = FaultInterval(

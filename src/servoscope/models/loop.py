@@ -146,6 +146,16 @@ class Loop(ShortRepr, Settings):
     monitor: MonitorSettings = MonitorSettings()
     # faults that move several parameters at once: by name, the ratios of the parameters at full size
     faults: dict[NonEmptyStr, dict[NonEmptyStr, Positive]] | None = None
+    checks: dict[NonEmptyStr, tuple[NonEmptyStr, ...]] | None = None  # by fault: what to check on the machine
+
+    @field_validator("checks", mode="before")
+    @classmethod
+    def _one_or_several(cls, value: object) -> object:
+        return (
+            {name: [one] if isinstance(one, str) else one for name, one in value.items()}
+            if isinstance(value, Mapping)
+            else value
+        )
 
     @field_validator("plant", mode="before")
     @classmethod

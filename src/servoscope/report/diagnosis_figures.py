@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.messages import translate
 from servoscope.detection.result import Candidate, Diagnosis, FaultEstimate
 from servoscope.detection.trace import Trace
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, FrequencyResponse
@@ -101,7 +102,7 @@ def plot_statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     _marks(ax, diagnosis, factor)
     lines = [
         Line2D([], [], color=MEASURED, label="statistic T²"),
-        Line2D([], [], color=ALARM, linestyle=(0, (5, 2.5)), label=f"threshold {limit:.3g}"),
+        Line2D([], [], color=ALARM, linestyle=(0, (5, 2.5)), label=f"{translate('threshold')} {limit:.3g}"),
     ]
     if sequential:
         lines.insert(1, Line2D([], [], color=HEALTHY, linewidth=1.0, label="sequential test, to the same limit"))
@@ -310,7 +311,7 @@ def _single(one: FaultEstimate, other: FaultEstimate | None) -> Figure:
         _interval(ax, fault, -i, colour)
     ax.set_yticks([-i for i in range(len(shown))], [name for name, _, _ in shown])
     ax.set_ylim(0.6 - len(shown), 0.6)
-    ax.set_xlabel(f"{text_symbol(one.parameter)}, relative to healthy")
+    ax.set_xlabel(f"{text_symbol(one.parameter)}, {translate('relative to healthy')}")
     ax.grid(visible=True, axis="x", color=RULE, linewidth=0.6)
     return figure
 
@@ -324,7 +325,7 @@ def _pair(best: Candidate) -> Figure:
         _interval(ax, fault, 0.0, MEASURED)
         ax.set_yticks([0.0], ["refit"])
         ax.set_ylim(-1.0, 1.0)
-        ax.set_xlabel(f"{text_symbol(fault.parameter)}, relative to healthy")
+        ax.set_xlabel(f"{text_symbol(fault.parameter)}, {translate('relative to healthy')}")
         ax.grid(visible=True, axis="x", color=RULE, linewidth=0.6)
     _joint(axes["both"], best)
     return figure

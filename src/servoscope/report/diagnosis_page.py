@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from servoscope.core.messages import translate
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint
 from servoscope.detection.trace import Trace
@@ -98,12 +99,12 @@ def render_diagnosis_page(
     label, refit = LABELS[diagnosis.verdict], diagnosis.refit
     return render_page(
         "diagnosis.html",
-        title=f"{label}: {diagnosis.recording}",
+        title=f"{translate(label)}: {diagnosis.recording}",
         kind=diagnosis.verdict,
         label=label,
         diagnosis=diagnosis,
         refit=refit,
-        about="" if loop.name == Loop.model_fields["name"].default else f"on {loop.name}",
+        about="" if loop.name == Loop.model_fields["name"].default else f"{translate('on')} {loop.name}",
         size=_recording_size(diagnosis, loop),
         headline=_headline(diagnosis, words),
         notes=list(_fault_notes(diagnosis, words)),
@@ -135,6 +136,7 @@ def _fault_notes(diagnosis: Diagnosis, words: Mapping[str, str]) -> Iterator[str
         # What "more" of something means says nothing of less.
         if aside and (fault.ratio > 1.0 or not what.startswith("more")):
             yield say("report.aside", fault=what, aside=aside)
+    yield from (say("report.check", what=what) for what in diagnosis.checks)
 
 
 def _headline(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:

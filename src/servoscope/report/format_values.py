@@ -10,6 +10,7 @@ import numpy as np
 
 from servoscope.core import number_format
 from servoscope.core.arrays import FloatArray
+from servoscope.core.messages import translate
 from servoscope.detection.result import UNKNOWN, Candidate, FaultEstimate
 
 GREEK = {"theta": "θ", "beta": "β", "rho": "ρ"}
@@ -127,7 +128,7 @@ def format_signed_percent(change: float) -> str:
 def format_change(ratio: float | None) -> str:
     """Return from which ratio on something holds: as +2.5 %, as a factor where it is far from one; None: never."""
     if ratio is None:
-        return "never"
+        return translate("never")
     return _true_minus(f"{100.0 * (ratio - 1.0):+.3g} %") if 0.5 < ratio < 2.0 else f"× {ratio:.3g}"
 
 
@@ -183,17 +184,17 @@ def describe_fault(fault: FaultEstimate, words: Mapping[str, str], *, signed: bo
     `words`: by name of a fault; `signed`: below a ratio of 1, what they call more is less.
     """
     text = words.get(fault.name, plain_name(fault.name)).partition(" (")[0]
-    return re.sub("^more ", "less ", text) if signed and fault.ratio < 1.0 else text
+    return translate(re.sub("^more ", "less ", text) if signed and fault.ratio < 1.0 else text)
 
 
 def describe_candidate(candidate: Candidate, words: Mapping[str, str]) -> str:
     """Return what a candidate means, in plain words; `words`: by name of a fault."""
     if candidate.name == UNKNOWN:
-        return "none of the known faults"
+        return translate("none of the known faults")
     if not candidate.faults:  # a candidate without sizes: of an earlier version
-        return words.get(candidate.name, plain_name(candidate.name)).partition(" (")[0]
+        return translate(words.get(candidate.name, plain_name(candidate.name)).partition(" (")[0])
     alone = len(candidate.faults) == 1
-    return " and ".join(describe_fault(fault, words, signed=alone) for fault in candidate.faults)
+    return f" {translate('and')} ".join(describe_fault(fault, words, signed=alone) for fault in candidate.faults)
 
 
 def time_axis_unit(duration_s: float) -> tuple[str, float]:

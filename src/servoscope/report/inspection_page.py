@@ -82,7 +82,7 @@ def _numbers(inspection: Inspection) -> Iterator[tuple[str, str]]:
         yield f"resolution of {q.signal}", say("report.resolution", grid=grid, share=format_percent(q.repeated))
     for order in inspection.orders:
         model = say("report.stiffness" if order.stiffness else "report.order", n=order.order, friction=order.friction)
-        yield f"generic inverse, {model}", say("report.explains", share=format_percent(order.explained))
+        yield say("report.inverse", model=model), say("report.explains", share=format_percent(order.explained))
     if inspection.fit is not None:
         for name, coefficient in inspection.fit.coefficients.items():
             yield name, say("report.coefficient", value=coefficient.value, std=coefficient.std)

@@ -13,9 +13,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from servoscope.core import messages
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
-from servoscope.core.messages import message, render
+from servoscope.core.messages import message, render, translate, translate_range
 from servoscope.report import format_values
 
 if TYPE_CHECKING:
@@ -40,13 +41,15 @@ FILTERS = {
     "duration": format_values.format_duration,
     "number": format_values.format_number,
     "percent": format_values.format_percent,
-    "plain_name": format_values.plain_name,
+    "plain_name": lambda name: translate(format_values.plain_name(translate(name))),
     "probability": format_values.format_probability,
     "quantity": format_values.format_quantity,
     "ratios": lambda fault: format_values.format_ratios(fault.ratio, *fault.interval),
     "signed_percent": format_values.format_signed_percent,
     "split_symbols": lambda text: format_values.split_symbols(str(text)),
     "symbol_parts": format_values.symbol_parts,
+    "word": translate,
+    "word_range": lambda cell: type(cell)(translate_range(cell)) if isinstance(cell, str) else cell,  # Markup stays so
     "with_std": lambda values: format_values.format_with_std(*values),
 }
 
@@ -76,7 +79,7 @@ def render_page(template: str, *, package: str = "servoscope.report", **values: 
     its ``macros.html``; `values`: what the template names: ``title`` and ``kind`` (a class of report.css that gives
     the tone: ``fault``, ``healthy``, ``care`` or ``undetermined``) of every page, and its own.
     """
-    return _environment(package).get_template(template).render(values)
+    return _environment(package).get_template(template).render(values, language=messages.LANGUAGE)
 
 
 def write_page(path: str | Path, content: str) -> None:

@@ -1,12 +1,17 @@
-"""Pictures for a notebook or a script: one function for recordings, traces, baselines, inspections and diagnoses."""
+"""Pictures for a notebook or a script: one function for recordings, traces, baselines, inspections and diagnoses.
+
+What a picture shows is data, a `Picture`, which matplotlib or plotly draws.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
+from servoscope.core.arrays import FloatArray
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import Diagnosis
 from servoscope.detection.trace import Trace
@@ -18,12 +23,52 @@ from servoscope.signals.recording import Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from plotly.graph_objects import Figure
 
 Z95 = 1.959963984540054  # a normal value is within so many standard deviations in 95 %
+Thing = Recording | Trace | Baseline | Inspection | Diagnosis
 
 
-def plot(thing: Recording | Trace | Baseline | Inspection | Diagnosis) -> tuple[Axes, ...]:
-    """Draw with matplotlib, in the user's own style; a notebook shows the figure by itself.
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A line, or points; with its 95 % band along `low` and `high`, or half of the interval of each x."""
+
+    x: FloatArray
+    y: Any  # numbers, or names
+    name: str = ""
+    low: FloatArray | None = None
+    high: FloatArray | None = None
+    half_width: FloatArray | None = None
+    marks: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One pair of axes, with a line at 1, across (`limit`) or upright (`healthy`)."""
+
+    lines: list[Line]
+    y_label: str = ""
+    log_y: bool = False
+    limit: bool = False
+    healthy: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """Panels one over the other, which share x."""
+
+    x_label: str
+    panels: list[Panel]
+    title: str = ""
+    log_x: bool = False
+
+
+@overload
+def plot(thing: Thing, backend: Literal["matplotlib"] = "matplotlib") -> tuple[Axes, ...]: ...
+@overload
+def plot(thing: Thing, backend: Literal["plotly"]) -> Figure: ...
+def plot(thing: Thing, backend: Literal["matplotlib", "plotly"] = "matplotlib") -> Any:
+    """Draw, in the user's own style; a notebook shows the figure by itself.
 
     Parameters
     ----------
@@ -31,65 +76,108 @@ def plot(thing: Recording | Trace | Baseline | Inspection | Diagnosis) -> tuple[
         A recording: r and y, and u. A trace: the statistics over their limits, for a fleet one line per asset. A
         baseline: the Bode diagram of the healthy inverse, with its 95 % band. An inspection: the coherences at the
         monitored frequencies. A diagnosis: the coefficients over their healthy values, with 95 % intervals.
+    backend
+        What draws: ``"plotly"`` makes a figure that the reader can zoom into.
 
     Returns
     -------
-    tuple of matplotlib.axes.Axes
-        From top to bottom; ``.figure`` of one of them is the figure, ``savefig`` writes it.
+    tuple of matplotlib.axes.Axes, or plotly.graph_objects.Figure
+        Axes from top to bottom; ``.figure`` of one of them is the figure, ``savefig`` writes it.
 
-    Raises TypeError for anything else.
+    Raises TypeError for anything else, ImportError without plotly.
 
     Examples
     --------
     >>> upper, lower = plot(ss.read("friday.csv", "loop.toml"))
     >>> lower.get_ylabel()
     'u'
+    >>> plot(ss.Baseline.load("baseline.json"), backend="plotly").layout.yaxis.title.text
+    '|u/y|'
     """
-    return _draw(thing)
+    drawings = {"matplotlib": _draw_matplotlib, "plotly": _draw_plotly}
+    if backend not in drawings:
+        raise ValueError(f"backend is 'matplotlib' or 'plotly', not {backend!r}")
+    return drawings[backend](_picture(thing))
 
 
-def _axes(rows: int, label: str) -> Any:
+def _draw_matplotlib(picture: Picture) -> tuple[Axes, ...]:
     import matplotlib.pyplot as plt
 
-    _, axes = plt.subplots(rows, sharex=True, layout="constrained", squeeze=False)
-    axes[-1, 0].set_xlabel(label)
-    return tuple(axes[:, 0])
+    _, rows = plt.subplots(len(picture.panels), sharex=True, layout="constrained", squeeze=False)
+    for axes, panel in zip(rows[:, 0], picture.panels, strict=True):
+        for line in panel.lines:
+            if line.half_width is not None:
+                axes.errorbar(line.x, line.y, xerr=line.half_width, fmt="o", label=line.name)
+                continue
+            axes.plot(line.x, line.y, marker="o" if line.marks else None, label=line.name)
+            if line.low is not None and line.high is not None:
+                axes.fill_between(line.x, line.low, line.high, alpha=0.3)
+        if panel.limit:
+            axes.axhline(1.0, color="black", linestyle="--", label="limit")
+        if panel.healthy:
+            axes.axvline(1.0, color="black", linestyle="--")
+        axes.set_ylabel(panel.y_label)
+        axes.set_xscale("log" if picture.log_x else "linear")
+        if panel.log_y:
+            axes.set_yscale("log")
+        if any(line.name for line in panel.lines[1:]):
+            axes.legend()
+    rows[0, 0].set_title(picture.title)
+    rows[-1, 0].set_xlabel(picture.x_label)
+    return tuple(rows[:, 0])
+
+
+def _draw_plotly(picture: Picture) -> Figure:
+    try:
+        from plotly.subplots import make_subplots
+    except ImportError as error:
+        raise ImportError("plotly is missing, pip install 'servoscope[notebook]'") from error
+    figure = make_subplots(rows=len(picture.panels), cols=1, shared_xaxes=True, vertical_spacing=0.05)
+    for row, panel in enumerate(picture.panels, 1):
+        for line in panel.lines:
+            one = {"name": line.name, "showlegend": bool(line.name), "row": row, "col": 1}
+            if line.low is not None and line.high is not None:  # there and back
+                x, y = (np.concatenate([a, b[::-1]]) for a, b in ((line.x, line.x), (line.low, line.high)))
+                band = {"line_width": 0, "fill": "toself", "hoverinfo": "skip", "opacity": 0.3}
+                figure.add_scatter(x=x, y=y, **one | band | {"name": "95 %", "mode": "lines", "showlegend": False})
+            spread = {} if line.half_width is None else {"error_x": {"type": "data", "array": line.half_width}}
+            mode = "markers" if spread else "lines+markers" if line.marks else "lines"
+            figure.add_scatter(x=line.x, y=line.y, mode=mode, **spread, **one)
+        if panel.limit:
+            figure.add_hline(1.0, line_dash="dash", row=row, col=1)
+        if panel.healthy:
+            figure.add_vline(1.0, line_dash="dash", row=row, col=1)
+        figure.update_yaxes(title_text=panel.y_label, type="log" if panel.log_y else None, row=row, col=1)
+    figure.update_xaxes(type="log" if picture.log_x else None)
+    figure.update_xaxes(title_text=picture.x_label, row=len(picture.panels), col=1)
+    return figure.update_layout(title_text=picture.title)
 
 
 @singledispatch
-def _draw(thing: object) -> tuple[Axes, ...]:
+def _picture(thing: object) -> Picture:
     kinds = "a Recording, a Trace, a Baseline, an Inspection or a Diagnosis"
     raise TypeError(f"a plot is made of {kinds}, not of {type(thing).__name__}")
 
 
-@_draw.register(Recording)
-def _recording(thing: Recording) -> tuple[Axes, ...]:
-    upper, lower = _axes(2, "time [s]")
-    upper.set_title(thing.name)
-    for name, axes in (("r", upper), ("y", upper), ("u", lower)):
-        axes.plot(*envelope(thing.t, getattr(thing, name), thing.restart), label=name)
-    upper.legend()
-    lower.set_ylabel("u")
-    return upper, lower
+@_picture.register(Recording)
+def _recording(thing: Recording) -> Picture:
+    r, y, u = (Line(*envelope(thing.t, getattr(thing, name), thing.restart), name) for name in "ryu")
+    return Picture("time [s]", [Panel([r, y]), Panel([u], "u")], title=thing.name)
 
 
-@_draw.register(Trace)
-def _trace(thing: Trace) -> tuple[Axes, ...]:
-    (axes,) = _axes(1, "time [s]")
+@_picture.register(Trace)
+def _trace(thing: Trace) -> Picture:
+    lines = []
     for one in thing.statistics:
         shown = np.where(thing.ready & (one.value > 0.0), one.value / one.limit, np.nan)
         if np.isfinite(shown).any():
-            for i, line in enumerate(np.atleast_2d(shown)):
-                axes.plot(thing.t, line, label=one.name if shown.ndim == 1 else f"{one.name} of {i}")
-    axes.axhline(1.0, color="black", linestyle="--", label="limit")
-    axes.set_yscale("log")
-    axes.set_ylabel("statistic over its limit")
-    axes.legend()
-    return (axes,)
+            names = [one.name] if shown.ndim == 1 else [f"{one.name} of {i}" for i in range(len(shown))]
+            lines += [Line(thing.t, y, name) for y, name in zip(np.atleast_2d(shown), names, strict=True)]
+    return Picture("time [s]", [Panel(lines, "statistic over its limit", log_y=True, limit=True)])
 
 
-@_draw.register(Baseline)
-def _baseline(thing: Baseline) -> tuple[Axes, ...]:
+@_picture.register(Baseline)
+def _baseline(thing: Baseline) -> Picture:
     highest = filter_cutoff(thing.loop)
     f = np.geomspace(0.01 * highest, highest, 200)
     response = frequency_response(thing.pipeline().bank, f, np.array(thing.theta), thing.covariance_array())
@@ -101,36 +189,28 @@ def _baseline(thing: Baseline) -> tuple[Axes, ...]:
     relative, angle = (
         np.sqrt(np.maximum(np.einsum("fi,fij,fj->f", way, C, way), 0.0)) / size for way in (along, across)
     )
-    upper, lower = _axes(2, "frequency [Hz]")
-    upper.loglog(f, size)
-    upper.fill_between(f, size * np.exp(-Z95 * relative), size * np.exp(Z95 * relative), alpha=0.3)
-    upper.set_ylabel("|u/y|")
     phase, band = np.degrees(np.unwrap(np.angle(H))), np.degrees(Z95 * angle)
-    lower.plot(f, phase)
-    lower.fill_between(f, phase - band, phase + band, alpha=0.3)
-    lower.set_ylabel("phase [degrees]")
-    return upper, lower
+    magnitude = Line(f, size, low=size * np.exp(-Z95 * relative), high=size * np.exp(Z95 * relative))
+    shift = Line(f, phase, low=phase - band, high=phase + band)
+    panels = [Panel([magnitude], "|u/y|", log_y=True), Panel([shift], "phase [degrees]")]
+    return Picture("frequency [Hz]", panels, log_x=True)
 
 
-@_draw.register(Inspection)
-def _inspection(thing: Inspection) -> tuple[Axes, ...]:
-    (axes,) = _axes(1, "frequency [Hz]")
-    f = [one.frequency_hz for one in thing.frequencies]
+@_picture.register(Inspection)
+def _inspection(thing: Inspection) -> Picture:
+    f = np.array([one.frequency_hz for one in thing.frequencies])
+    lines = []
     for name in "uy":  # a coherence that could not be judged is left out
         values = [getattr(one, f"coherence_{name}") for one in thing.frequencies]
-        axes.plot(f, np.array(values, dtype=np.float64), marker="o", label=f"coherence r, {name}")
-    axes.set_ylim(0.0, 1.05)
-    axes.legend()
-    return (axes,)
+        lines.append(Line(f, np.array(values, dtype=np.float64), f"coherence r, {name}", marks=True))
+    return Picture("frequency [Hz]", [Panel(lines)])
 
 
-@_draw.register(Diagnosis)
-def _diagnosis(thing: Diagnosis) -> tuple[Axes, ...]:
-    (axes,) = _axes(1, "estimate over what a healthy loop would show")
+@_picture.register(Diagnosis)
+def _diagnosis(thing: Diagnosis) -> Picture:
     shown = {name: one for name, one in thing.parameters.items() if one.nominal != 0.0}
-    ratios = [one.value / one.nominal for one in shown.values()]
-    spread = [Z95 * one.std / abs(one.nominal) for one in shown.values()]
-    axes.errorbar(ratios, list(shown), xerr=spread, fmt="o")
-    axes.axvline(1.0, color="black", linestyle="--")
-    axes.set_title(f"{thing.recording}: {thing.verdict}")
-    return (axes,)
+    ratios = np.array([one.value / one.nominal for one in shown.values()])
+    spread = np.array([Z95 * one.std / abs(one.nominal) for one in shown.values()])
+    panel = Panel([Line(ratios, list(shown), half_width=spread)], healthy=True)
+    title = f"{thing.recording}: {thing.verdict}"
+    return Picture("estimate over what a healthy loop would show", [panel], title=title)

@@ -13,10 +13,12 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
+from servoscope.core.messages import translate
 
 # The light side of palette.css, which reports and pages share.
 COLOURS: dict[str, str] = dict(
@@ -175,6 +177,8 @@ def save_figure(figure: Figure, path: str | Path) -> None:
 def _render_figure(figure: Figure, kind: str, *, fonttype: str) -> bytes:
     buffer = io.BytesIO()
     metadata = {"svg": {"Date": None}, "png": {}, "pdf": {"CreationDate": None}}[kind]
+    for words in figure.findobj(Text):
+        words.set_text(translate(words.get_text()))
     with plot_style(fonttype):
         face = "none" if fonttype == "none" else "white"
         figure.savefig(buffer, format=kind, facecolor=face, dpi=150, metadata=metadata)

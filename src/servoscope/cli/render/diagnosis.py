@@ -1,4 +1,4 @@
-"""How a diagnosis looks in a terminal: the verdict first, then when, what else, and why."""
+"""How a diagnosis looks in a terminal: what it is, what to check, how sure; then why; then the statistics."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, INDENT, print_facts, print_notes, print_table, print_title
+from servoscope.core.messages import translate, translate_range
 from servoscope.core.number_format import format_ratios, format_short
 from servoscope.detection.result import Candidate, Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary
 from servoscope.report.format_values import format_duration, format_probability
@@ -20,23 +21,25 @@ LEAST_SHOWN = 0.01  # probability below which a candidate has no line; the expla
 
 
 def print_diagnosis(out: Console, d: Diagnosis) -> None:
-    """Print a verdict, what it rests on, and the warnings."""
-    print_title(out, d.recording, f": {format_duration(d.duration_s)}, {d.samples} samples")
+    """Print a verdict, what to check, what it rests on, and the warnings."""
+    print_title(out, d.recording, f": {format_duration(d.duration_s)}, {d.samples} {translate('samples')}")
     out.print(Padding(Text(str(d.summary), style=f"bold {COLOURS[d.verdict]}"), INDENT, expand=False))
-    times = []
-    if d.detected_at_s is not None:
-        times.append(("detected", f"{d.detected_at_s:.4g} s"))
+    facts = [("what to check", str(check)) for check in d.checks]
+    if d.faults:
+        facts.append(("how sure", format_probability(d.probability or 0.0)))
     if d.onset_s is not None:
         low, likely, high = d.onset_s
-        times.append(("onset", f"{likely:.4g} s ({low:.4g} to {high:.4g} s, 95 %)"))
-    if times:
-        print_facts(out, times)
+        facts.append(("onset", f"{likely:.4g} s ({low:.4g} to {high:.4g} s, 95 %)"))
+    if d.detected_at_s is not None:
+        facts.append(("detected", f"{d.detected_at_s:.4g} s"))
+    if facts:
+        print_facts(out, facts)
     if d.current.end_interval_s is not None or len(d.intervals) > 1:
         _print_timeline(out, d.intervals)
-    _print_candidates(out, d.candidates)
     if d.explanation:
-        out.print("  Why:")
+        out.print(f"  {translate('Why')}:")
         print_notes(out, d.explanation, "blue", "-")
+    _print_candidates(out, d.candidates)
     if d.refit is not None:
         print_facts(out, _refit_facts(d.refit))
     _print_warnings(out, d.warnings)
@@ -48,7 +51,7 @@ def _print_timeline(out: Console, intervals: Sequence[FaultInterval]) -> None:
     for one in intervals:
         dates = (one.onset_s, one.end_interval_s)
         times = [f"{t[1]:.4g} s ({t[0]:.4g} to {t[2]:.4g})" if t is not None else "" for t in dates]
-        sizes = "\n".join(f"{f.name} x {format_ratios(f.ratio, *f.interval)[0]}" for f in one.faults)
+        sizes = "\n".join(f"{translate(f.name)} x {format_ratios(f.ratio, *f.interval)[0]}" for f in one.faults)
         rows.append((*times, sizes or say("cli.not_named"), format_probability(one.probability or 0.0)))
     print_table(out, ["from", "to", "fault", "probability"], rows)
 
@@ -60,7 +63,8 @@ def _refit_facts(refit: RefitSummary) -> Iterator[tuple[str, str]]:
     yield "refit", say("cli.refit", **known)
     first = refit.recursive[0]
     sizes = ["{} {} ({} to {})".format(f.parameter, *format_ratios(f.ratio, *f.interval)) for f in first.faults]
-    yield "recursion", ", ".join((first.name, format_probability(first.probability), *sizes))
+    names = " + ".join(map(translate, first.names))
+    yield "recursion", ", ".join((names, format_probability(first.probability), *sizes))
 
 
 def _print_candidates(out: Console, candidates: Sequence[Candidate]) -> None:
@@ -70,7 +74,7 @@ def _print_candidates(out: Console, candidates: Sequence[Candidate]) -> None:
         return
     faults = [fault for c in shown for fault in c.faults]
     columns = {
-        "candidate": ["\n+ ".join(fault.name for fault in c.faults) or c.name for c in shown],
+        "candidate": ["\n+ ".join(map(translate, c.names)) for c in shown],
         "probability": [format_probability(c.probability) for c in shown],
     }
     if any(fault.name != fault.parameter for fault in faults):
@@ -89,7 +93,7 @@ def _print_candidates(out: Console, candidates: Sequence[Candidate]) -> None:
 def _print_warnings(out: Console, warnings: Sequence[DiagnosisWarning]) -> None:
     texts = []
     for w in warnings:
-        when = f"at {w.from_s:.6g} s" if w.from_s == w.to_s else f"{w.from_s:.6g} to {w.to_s:.6g} s"
+        when = f"{w.from_s:.6g} s" if w.from_s == w.to_s else translate_range(f"{w.from_s:.6g} to {w.to_s:.6g} s")
         # What the recording can show at all is no matter of time.
         texts.append(str(w.message) if w.kind == "power" else f"{when}: {w.message}")
     more = len(texts) - MOST_WARNINGS

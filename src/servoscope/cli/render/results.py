@@ -14,6 +14,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from servoscope.core.messages import translate, translate_range
 from servoscope.report.format_values import DASH, format_duration, format_percent
 from servoscope.report.page import say
 
@@ -71,15 +72,15 @@ def print_table(out: Console, header: Sequence[str], rows: Iterable[Sequence[str
     """Print a table whose first `words` columns are text and whose others are numbers."""
     grid = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_edge=False)
     for i, name in enumerate(header):
-        grid.add_column(name, justify="left" if i < words else "right", overflow="fold")
+        grid.add_column(translate(name), justify="left" if i < words else "right", overflow="fold")
     for row in rows:
-        grid.add_row(*(Text(cell) for cell in row))
+        grid.add_row(*(Text(translate_range(cell)) for cell in row))
     out.print(Padding(grid, INDENT, expand=False))
 
 
 def print_result_table(out: Console, table: ResultTable) -> None:
     """Print a table that pages show too, with the headings of a terminal, which are lower case."""
-    header = [name if name[1:2].isupper() else name[:1].lower() + name[1:] for name in table.head]
+    header = [name if name[1:2].isupper() else name[:1].lower() + name[1:] for name in map(translate, table.head)]
     print_table(out, header, table.rows, table.words)
 
 
@@ -89,7 +90,7 @@ def print_facts(out: Console, pairs: Iterable[tuple[str, str]]) -> None:
     grid.add_column(style="dim", no_wrap=True)
     grid.add_column(overflow="fold")
     for name, value in pairs:
-        grid.add_row(name, Text(value))
+        grid.add_row(translate(name), Text(translate_range(value)))
     out.print(Padding(grid, INDENT, expand=False))
 
 
@@ -252,7 +253,7 @@ def print_inspection(out: Console, i: Inspection) -> None:
     for finding in i.findings:
         print_notes(out, [finding.message], COLOURS[finding.severity], "-" if finding.severity == "note" else "!")
     if i.recommendations:
-        out.print("  What to do:")
+        out.print(f"  {translate('What to do')}:")
         print_notes(out, i.recommendations, "green", "-")
 
 

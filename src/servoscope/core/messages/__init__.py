@@ -8,12 +8,16 @@ format specifications are Python's or one of `FORMATS` and `JOINS`::
 
     render(message("diagnosis.candidate", names=("pump", "leakage"), probability=0.86))
 
-A value that is None leaves nothing, so an optional part of a sentence is a message of its own, or None.
+A value that is None leaves nothing, so an optional part of a sentence is a message of its own, or None. Words that are
+no sentences, headings and names of faults, are looked up by their English in the table ``word`` of another language:
+where its template says ``{name!w}``, and by `translate`.
 """
 
 from __future__ import annotations
 
 import functools
+import os
+import re
 import string
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -32,15 +36,40 @@ __all__ = [
     "MessageField",
     "MessageText",
     "catalogue",
+    "languages",
     "message",
     "read_messages",
     "render",
+    "set_language",
     "text_message",
+    "translate",
+    "translate_range",
 ]
 
-LANGUAGE = "en"  # of what is rendered without another one being named
 FOLDER = files("servoscope.core.messages")
+SETTING = "SERVOSCOPE_LANGUAGE"
 PLAIN_TEXT = "text"  # the key of a message that is its text: from outside, or of a file of an earlier version
+
+
+def languages() -> tuple[str, ...]:
+    """Return the languages that there is a catalogue of."""
+    names = sorted(each.name for each in FOLDER.iterdir() if each.name.endswith(".toml"))
+    return tuple(name.removesuffix(".toml") for name in names)
+
+
+def set_language(name: str) -> None:
+    """Let this process and those that it starts speak a language, as ``de``.
+
+    Raises ValueError if there is no catalogue of it.
+    """
+    global LANGUAGE
+    if name not in languages():
+        raise ValueError(f"there is no language {name!r}, choose from {', '.join(languages())}")
+    LANGUAGE = os.environ[SETTING] = name
+
+
+# Of what is rendered without another one being named; de_DE is German too, and what nobody translated English.
+LANGUAGE = next((each for each in languages() if each == os.environ.get(SETTING, "")[:2].lower()), "en")
 
 
 class Message(BaseModel):
@@ -161,7 +190,15 @@ class _Renderer(string.Formatter):
         self._language = language
 
     def convert_field(self, value: Any, conversion: str | None) -> Any:
+        if conversion == "w":
+            several = isinstance(value, (list, tuple))
+            return [self._word(each) for each in value] if several else self._word(value)
         return None if value is None else super().convert_field(value, conversion)
+
+    def _word(self, value: Any) -> Any:
+        if isinstance(value, Message) and value.key == PLAIN_TEXT:  # of a plant
+            value = str(value)
+        return translate(value, self._language) if isinstance(value, str) else value
 
     def format_field(self, value: Any, spec: str) -> str:
         if value is None:
@@ -200,6 +237,29 @@ def template(key: str, language: str) -> str:
     """Return the template of a key; in English where the language has none."""
     found = catalogue(language).get(key)
     return found if found is not None else catalogue("en")[key]
+
+
+def translate(words: str, language: str | None = None) -> str:
+    """Return a heading or a name in a language; as it is in English, and where there is no translation.
+
+    A unit in brackets behind it stays.
+    """
+    language = language or LANGUAGE
+    if language == "en":
+        return words
+    known = catalogue(language)
+    if f"word.{words}" in known:
+        return known[f"word.{words}"]
+    if " + " in words:  # a pair of faults
+        return " + ".join(translate(each, language) for each in words.split(" + "))
+    what, bracket, unit = words.partition(" [")
+    return known.get(f"word.{what}", what) + bracket + unit
+
+
+def translate_range(cell: str) -> str:
+    """Return what stands in a cell of a table, 1.19 to 1.20 for example, in the language of this process."""
+    to = translate("to")
+    return cell if to == "to" else re.sub(r"(?<=[\d%s]) to (?=[\d−×-])", f" {to} ", cell)
 
 
 @functools.cache

@@ -1,0 +1,27 @@
+"""What to check on the machine: for each fault what its loop file says, or the plant's own words of the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from servoscope.core.messages import Message, catalogue, message, text_message
+from servoscope.detection.result import FaultInterval
+from servoscope.models.loop import Loop
+
+LIKELY = 0.05  # probability from which an explanation is worth a look where none is certain
+
+
+def what_to_check(loop: Loop, interval: FaultInterval | None) -> tuple[Message, ...]:
+    """Return what to check for the faults of an interval, the likeliest first; nothing without an interval."""
+    if interval is None:
+        return ()
+    likely = [one for one in interval.candidates if one.probability >= LIKELY]
+    names = [one.name for one in interval.faults] or [name for one in likely for name in one.names]
+    return tuple(found for name in dict.fromkeys(names) for found in _of_fault(loop, name))
+
+
+def _of_fault(loop: Loop, name: str) -> Iterator[Message]:
+    if name in (loop.checks or {}):
+        yield from map(text_message, (loop.checks or {})[name])
+    elif f"check.{name}" in catalogue():
+        yield message(f"check.{name}")
