@@ -16,7 +16,7 @@ from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
 
 CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
-SECONDS = int(os.environ.get("SCHEMA_SECONDS", "40"))  # 1800 for the whole measure
+SECONDS = int(os.environ.get("SCHEMA_SECONDS", "0"))  # 1800: the whole measure; 0: a few of each
 WEB = """
 [web]
 listen = "127.0.0.1:0"
@@ -30,16 +30,8 @@ def test_no_request_makes_the_server_fail(tmp_path: Path) -> None:
     config = ServiceFile.load(halls.hall(tmp_path, "done", more=WEB))
     Service(config, build_components(config)).run()
     with Served(tmp_path, "serve", "done.toml") as served:
-        command = [
-            "--checks",
-            CHECKS,
-            "--max-time",
-            str(SECONDS),
-            "--max-examples",
-            str(max(20, SECONDS)),
-            "--seed",
-            "1",
-        ]
+        command = ["--checks", CHECKS, "--max-examples", str(SECONDS or 10), "--seed", "1"]
+        command += ["--max-time", str(SECONDS)] if SECONDS else []
         command += ["--phases", "coverage,fuzzing,stateful", "--generation-database", "none", "--request-timeout", "60"]
         command += ["--exclude-path", "/api/v1/live", "--no-color", "--continue-on-failure"]
         done = subprocess.run(
@@ -48,7 +40,7 @@ def test_no_request_makes_the_server_fail(tmp_path: Path) -> None:
             env={**os.environ, "PYTHONWARNINGS": "default"},
             capture_output=True,
             text=True,
-            timeout=8 * SECONDS,
+            timeout=600 + 2 * SECONDS,
             check=False,
         )
     print(done.stdout[-1500:])  # how many requests: pytest -s
