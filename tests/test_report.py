@@ -292,7 +292,7 @@ def test_writing_is_all_or_nothing(loop: Loop, tmp_path: Path, monkeypatch: pyte
 
 def test_the_first_page_says_what_to_check(loop: Loop) -> None:
     text = read(make_diagnosis(), loop).text
-    assert "seals of the piston" in text and "(99.8 %)" in text
+    assert "piston seal and valve edges" in text and "(99.8 %)" in text
     assert text.index("How sure") < text.index("What to check") < text.index("Candidates") < text.index("Settings")
     assert "What to check" not in read(make_diagnosis("healthy"), loop).text
 

@@ -17,10 +17,11 @@ def what_to_check(loop: Loop, interval: FaultInterval | None) -> tuple[Message, 
         return ()
     likely = [one for one in interval.candidates if one.probability >= LIKELY]
     names = [one.name for one in interval.faults] or [name for one in likely for name in one.names]
-    return tuple(found for name in dict.fromkeys(names) for found in _of_fault(loop, name))
+    return tuple(found for name in dict.fromkeys(names) for found in checks_of_fault(loop, name))
 
 
-def _of_fault(loop: Loop, name: str) -> Iterator[Message]:
+def checks_of_fault(loop: Loop, name: str) -> Iterator[Message]:
+    """Yield what to check for one fault; nothing where nobody has said it."""
     if name in (loop.checks or {}):
         yield from map(text_message, (loop.checks or {})[name])
     elif f"check.{name}" in catalogue():

@@ -12,6 +12,7 @@ from servoscope.core.messages import translate
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.checks import checks_of_fault
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
 from servoscope.diagnosis.motion_signature import SignatureWidth, compare_signatures
@@ -36,7 +37,6 @@ from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 
 UNLIKELY = 0.05  # a candidate below this probability is not in the headline
-CHECKED = ("leakage", "pump", "friction", "contamination")  # faults whose place the catalogue knows
 LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
 
 
@@ -108,7 +108,7 @@ def render_diagnosis_page(
         size=_recording_size(diagnosis, loop),
         headline=_headline(diagnosis, words),
         notes=list(_fault_notes(diagnosis, words)),
-        checks=list(_checks(diagnosis, words)),
+        checks=list(_checks(diagnosis, loop, words)),
         facts=list(_fault_facts(diagnosis) if diagnosis.verdict == "fault" else _no_fault_facts(diagnosis, trace)),
         meaning=lambda candidate: describe_candidate(candidate, words),
         agreement=_agreement(diagnosis.candidates[0], refit.recursive[0]) if refit is not None else "",
@@ -136,7 +136,6 @@ def _fault_notes(diagnosis: Diagnosis, words: Mapping[str, str]) -> Iterator[str
         # What "more" of something means says nothing of less.
         if aside and (fault.ratio > 1.0 or not what.startswith("more")):
             yield say("report.aside", fault=what, aside=aside)
-    yield from (say("report.check", what=what) for what in diagnosis.checks)
 
 
 def _headline(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
@@ -188,20 +187,20 @@ def _no_fault_facts(diagnosis: Diagnosis, trace: Trace) -> Iterator[Fact]:
     yield Fact("Warnings", str(count or "none"), ("listed below" if count else "about this recording",))
 
 
-def _checks(diagnosis: Diagnosis, words: Mapping[str, str]) -> Iterator[str]:
+def _checks(diagnosis: Diagnosis, loop: Loop, words: Mapping[str, str]) -> Iterator[str]:
     """Yield what to look at on the machine, the likeliest first."""
     if diagnosis.verdict != "fault":
         return
     for candidate in (each for each in diagnosis.candidates if each.probability >= UNLIKELY):
         odds = format_probability(candidate.probability)
         for fault in candidate.faults:
-            key = fault.name if fault.name in CHECKED else "other"
-            place = say(f"report.check.{key}", fault=describe_fault(fault, words))
-            yield say("report.check.candidate", place=place, probability=odds)
+            what, places = describe_fault(fault, words), [str(each) for each in checks_of_fault(loop, fault.name)]
+            for place in places or [say("report.check.other")]:
+                yield say("report.check.candidate", fault=what, place=place, probability=odds)
         if candidate.name == UNKNOWN:
             yield say("report.check.unknown", probability=odds)
     if diagnosis.refit is not None and diagnosis.refit.mimics:
-        yield say("report.check.alike", causes=[mimic.words for mimic in diagnosis.refit.mimics])
+        yield say("report.check.alike", causes=[translate(mimic.words) for mimic in diagnosis.refit.mimics])
     if diagnosis.warnings:
         yield say("report.check.warnings", count=len(diagnosis.warnings))
 
