@@ -132,7 +132,12 @@ def _environment(package: str) -> Environment:
 
     loaders = [PackageLoader(name) for name in dict.fromkeys((package, "servoscope.report"))]
     environment = Environment(
-        loader=ChoiceLoader(loaders), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=ChoiceLoader(loaders),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        optimized=False,  # else words are translated once, into the language of the first page
     )
     environment.filters |= FILTERS
     folder = files("servoscope.report")
