@@ -112,7 +112,7 @@ def test_a_wrong_command_line_exits_with_2(made: Path, tmp_path: Path) -> None:
         ("diagnose", baseline, healthy, "--jsn"),
         ("diagnose", baseline, healthy, "--where", "load"),
         ("diagnose", baseline, healthy, "--columns", "output"),
-        ("diagnose", baseline, healthy, "--report", tmp_path / "r.pdf"),
+        ("diagnose", baseline, healthy, "--report", tmp_path / "r.docx"),
         ("diagnose", baseline, healthy, "--trace", tmp_path / "t.csv"),
         ("learn", loop, "-o", tmp_path / "b.json"),
         ("learn", loop, healthy, "--nominal", "-o", tmp_path / "b.json"),

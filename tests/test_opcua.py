@@ -23,6 +23,7 @@ from reliability.servers import Cable
 from brokers import BEGAN, until
 from opcua_plant import NODES
 from servoscope.core.errors import ConfigError, MessageError
+from servoscope.service.opcua.monitored_items import _AnswerRecorder
 from servoscope.service.opcua.resample import Resampler
 from servoscope.service.opcua.server import OpcuaServer, OpcuaServerSettings
 from servoscope.service.opcua.settings import OpcuaNodes
@@ -309,3 +310,9 @@ def test_verdicts_are_offered_signed_and_encrypted(tmp_path: Path) -> None:
             source(cert_file="nowhere", key_file="nowhere")
     finally:
         outlet.close()
+
+
+def test_values_that_come_while_nodes_are_subscribed_reach_the_session() -> None:
+    """The library reports them to what it takes for the session: it once wrote a traceback into the log."""
+    session = SimpleNamespace(observer=object())
+    assert _AnswerRecorder(session).observer is session.observer

@@ -27,6 +27,10 @@ class _AnswerRecorder:
     def __init__(self, session: Any) -> None:
         self._session, self.answers = session, list[Any]()
 
+    def __getattr__(self, name: str) -> Any:
+        # the first values may come before the last item is created; they are the session's
+        return getattr(self._session, name)
+
     async def create_monitored_items(self, parameters: Any) -> Any:
         """Create them, and keep the answers."""
         self.answers = await self._session.create_monitored_items(parameters)
