@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes
 from servoscope.isolation.ml.search import LOOKS, RefitResult
 from servoscope.isolation.ml.timeline import INCONSTANT, bridge_height
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
-from servoscope.models.plants import Fault
 
 AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
 NEARLY_ALL = 0.95  # of what the healthy plant does not explain
@@ -58,7 +58,6 @@ def find_outside_onset(refined: RefitResult) -> OnsetEstimate | None:
     tried += [(causes.fit(name, k), k) for name in causes.disturbances for k in sorted(everywhere)]
     cause, onset = min(tried, key=lambda one: one[0].cost)
     parameter = min(refined.other_parameters, key=lambda fitted: fitted.cost, default=None)
-    found: OnsetEstimate | None = None
     if parameter is not None and parameter.cost < cause.cost:
         found, cause = _parameter_onset(window, parameter, refined.latest)
     else:
@@ -85,15 +84,8 @@ def _parameter_onset(window: ChangeWindow, fitted: HypothesisFit, latest: int) -
         found = onset_posterior(window, fitted, latest, fitted.cost / window.used, drifts=False)
         if found.profile == fitted.profile:
             break
-        fitted = refit_jointly(window, _moved(fitted, found.profile))
+        fitted = refit_jointly(window, replace(fitted, profile=found.profile))
     return found, parameter_cause(fitted)
-
-
-def _moved(fitted: HypothesisFit, profile: ChangeProfile) -> HypothesisFit:
-    faults: tuple[Fault, ...] = fitted.faults
-    return HypothesisFit(
-        faults, profile, fitted.d, fitted.x, fitted.cost, fitted.covariance, fitted.jacobian, fitted.residual
-    )
 
 
 def _disturbance_onset(

@@ -162,12 +162,15 @@ def get_limits(context: ContextDep, asset: str) -> sizes.LimitList:
     """Return the sizes at which its loop loses tracking or its margin of stability; none where that is not known."""
     find_asset(context, asset)
     id_ = asset_baseline_id(context, asset)
-    found = _loop_limits(find_baseline(context, id_).path) if id_ is not None else ()
+    if id_ is None:
+        return sizes.LimitList(limits=[])
+    path = find_baseline(context, id_).path
+    found = _loop_limits(path, load_cached(path).hash)
     return sizes.LimitList(limits=[sizes.LimitRow(**one._asdict()) for one in found])
 
 
 @functools.lru_cache(maxsize=256)  # it takes a second, and every reader of a page asks
-def _loop_limits(baseline: Path) -> tuple[OperatingLimit, ...]:
+def _loop_limits(baseline: Path, _: str) -> tuple[OperatingLimit, ...]:
     try:
         return tuple(operating_limits(load_cached(baseline).loop))
     except LoopError:
