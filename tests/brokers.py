@@ -109,6 +109,18 @@ class Sender:
         self.client.loop_stop()
 
 
+def kafka_cluster() -> Any:
+    """Return a producer whose library simulates a Kafka of one broker, as long as it lives."""
+    import confluent_kafka
+
+    return confluent_kafka.Producer({"test.mock.num.brokers": 1, "bootstrap.servers": "none", "log_level": 0})
+
+
+def kafka_brokers(producer: Any) -> list[str]:
+    """Return the addresses of the simulated brokers."""
+    return [f"{one.host}:{one.port}" for one in producer.list_topics(timeout=10.0).brokers.values()]
+
+
 def publisher(folder: Path, port: int, *, speed: float = 0.0, files: str = "press.csv", more: str = "") -> ReplayClient:
     """Return a publisher of a recording in a folder, in blocks of half a second."""
     path = folder / "publish.toml"

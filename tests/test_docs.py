@@ -124,6 +124,7 @@ def test_every_key_of_the_service_file_is_documented() -> None:
     from servoscope.service.access.oidc import OidcSettings
     from servoscope.service.config import ServiceFile
     from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
+    from servoscope.service.mapping.settings import PayloadSettings
 
     kinds = {"sources": find_kinds(SOURCES), "outlets": find_kinds(PUBLISHERS)}
     elsewhere = ("quality", "alarms", "actions")
@@ -134,6 +135,8 @@ def test_every_key_of_the_service_file_is_documented() -> None:
         inside = [name for model in models for name in model.model_fields] if models else [key]
         if key not in elsewhere:
             missing += [f"{key}: {name}" for name in inside if not has_line(text, name)]
+    text = section("service-file.md", r"\[sources\.NAME\.payload\]") or ""
+    missing += [f"payload: {name}" for name in PayloadSettings.model_fields if not has_line(text, name)]
     text = section("service-file.md", r"\[web\.oidc\]") or ""
     missing += [f"web.oidc: {name}" for name in OidcSettings.model_fields if not has_line(text, name)]
     assert not missing, f"not in docs/reference/service-file.md: {', '.join(missing)}"

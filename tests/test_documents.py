@@ -143,7 +143,13 @@ def is_read(settings: dict[str, Any]) -> bool:
         return True
     if settings.keys() <= ServiceFile.model_fields.keys():
         replay = {"sources": {"bench": {"kind": "replay"}}}
-        asset = {"assets": {"press": {"baseline": "press.json", "source": "bench", "files": ["healthy.csv"]}}}
+        asset: dict[str, Any] = {
+            "assets": {"press": {"baseline": "press.json", "source": "bench", "files": ["healthy.csv"]}}
+        }
+        for one in settings.get("sources", {}).values():
+            if one.keys() == {"payload"}:  # of a source that the page shows further above
+                one |= {"kind": "mqtt", "host": "broker.example"}
+                asset["assets"]["press"] = {"baseline": "press.json", "source": "plant"}
         parts = {"name": "hall"} | (replay | asset if "assets" not in settings else {}) | settings
         ServiceFile.model_validate(parts)
         return True

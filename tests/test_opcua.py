@@ -24,12 +24,12 @@ from brokers import BEGAN, until
 from opcua_plant import NODES
 from servoscope.core.errors import ConfigError, MessageError
 from servoscope.service.opcua.monitored_items import _AnswerRecorder
-from servoscope.service.opcua.resample import Resampler
 from servoscope.service.opcua.server import OpcuaServer, OpcuaServerSettings
 from servoscope.service.opcua.settings import OpcuaNodes
 from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
 from servoscope.service.opcua.subscriptions import parse_block, parse_value, read_history
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.resample import Resampler
 
 RATE = 20.0
 # asyncua leaves sockets of connections that were cut to the garbage collector
@@ -57,7 +57,7 @@ def test_values_that_change_now_and_then_are_held_on_one_clock(data: st.DataObje
     found.append(aligner.take_samples(t[-1] + 0.009))
     assert np.array_equal(np.concatenate([one.t for one in found]), t)
     assert np.array_equal(np.concatenate([one.values for one in found], axis=1), truth)
-    assert not aligner.late and not any(one.gaps for one in found)
+    assert not aligner.take_late() and not any(one.gaps for one in found)
 
 
 def test_a_constant_signal_goes_on_while_the_server_lives_and_a_gap_is_a_gap() -> None:
@@ -68,7 +68,7 @@ def test_a_constant_signal_goes_on_while_the_server_lives_and_a_gap_is_a_gap() -
     first = aligner.take_samples(BEGAN + 2.0)
     assert np.allclose(first.t, BEGAN + 1.0 + 0.1 * np.arange(10)) and (first.values == [[1.0], [2.0]]).all()
     aligner.add(1, BEGAN + 1.5, 9.0)
-    assert not aligner.take_samples(BEGAN + 1.9).t.size and aligner.late == 1
+    assert not aligner.take_samples(BEGAN + 1.9).t.size and aligner.take_late() == 1
     aligner.add(1, BEGAN + 1.95, 7.0)  # heard last, and part of no sample yet: nobody knows how long it held
     aligner.restart(BEGAN + 5.0)
     aligner.add(0, BEGAN + 4.0, 3.0)

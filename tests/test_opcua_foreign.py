@@ -16,13 +16,13 @@ from brokers import until
 from oidc_provider import found_node
 from servoscope.core.errors import ConfigError
 from servoscope.service.opcua.monitored_items import ItemGrant
-from servoscope.service.opcua.resample import Resampler
 from servoscope.service.opcua.settings import OpcuaNodes, describe_expiry
 from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
 from servoscope.service.opcua.subscriptions import ScalarSubscription
-from servoscope.service.opcua.update_rate import STEPS, UpdateRate
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.resample import Resampler
+from servoscope.service.sources.update_rate import STEPS, UpdateRate
 from test_opcua import certificate, free_port
 
 SERVER = Path(__file__).with_name("opcua_server") / "plant.js"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import time
 import tomllib
@@ -16,7 +17,7 @@ import pytest
 from reliability.servers import Mosquitto, mosquitto
 
 import halls
-from brokers import Sender, until
+from brokers import Sender, kafka_brokers, kafka_cluster, until
 from brokers import block as mqtt_block
 from commands import one_line, run
 from servoscope.models.loop import Loop
@@ -100,6 +101,51 @@ def mqtt(tmp_path: Path) -> Iterator[Harness]:
     server.stop()
 
 
+TIMES = 1767225600.0 + 0.01 * np.arange(50 * (BLOCKS + 1))
+PAYLOAD = {"topics": ["line/{asset}"], "time": {"t": "s"}, "block": 0.5}
+AXIS = SourceAsset(SimpleNamespace(sample_rate=100.0), None)  # type: ignore[arg-type]
+
+
+def rows() -> list[bytes]:
+    """Return messages of one sample each."""
+    return [json.dumps({"t": t, "r": k, "u": k + 1, "y": k + 2}).encode() for k, t in enumerate(TIMES.tolist())]
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Harness]:
+    """A source of kind mqtt that reads a plant's own messages."""
+    program = mosquitto()
+    if program is None:
+        pytest.skip("Mosquitto is not on this machine: scripts/install-test-servers installs it")
+    server = Mosquitto(tmp_path, program)
+    server.start()
+    harness = Harness("mqtt", {"host": "127.0.0.1", "port": server.port, "payload": PAYLOAD}, AXIS, tmp_path)
+    first = harness.open()
+    until(lambda: first.connected)
+    time.sleep(0.2)
+    first.close()
+    sender = Sender(server.port)
+    for one in rows():
+        last = sender.client.publish("line/press", one, qos=1)
+    last.wait_for_publish(30.0)
+    sender.close()
+    yield harness
+    server.stop()
+
+
+@pytest.fixture
+def kafka(tmp_path: Path) -> Iterator[Harness]:
+    """A source of kind kafka, beside the cluster that the client library simulates."""
+    producer = kafka_cluster()
+    for one in rows():
+        producer.produce("line", key=b"press", value=one)
+    producer.flush(30.0)
+    yield Harness(
+        "kafka", {"brokers": kafka_brokers(producer), "start": "beginning", "payload": PAYLOAD}, AXIS, tmp_path
+    )
+    producer.flush(1.0)
+
+
 @pytest.fixture
 def opcua(tmp_path: Path) -> Iterator[Harness]:
     plant = Plant("history")
@@ -163,7 +209,7 @@ def check_closing(harness: Harness) -> None:
 
 
 @pytest.mark.parametrize("check", CHECKS)
-@pytest.mark.parametrize("kind", sorted(find_kinds(SOURCES)))
+@pytest.mark.parametrize("kind", sorted([*find_kinds(SOURCES), "plant"]))
 def test_a_source_keeps_its_contract(kind: str, check: str, request: pytest.FixtureRequest) -> None:
     harness: Harness = request.getfixturevalue(kind)
     harness.start = time.time() if kind != "replay" else harness.settings.start.timestamp()
@@ -231,7 +277,7 @@ def test_the_recipe_for_a_source_works(follow: Callable[[str], Path]) -> None:
     (folder / "wrong.toml").write_text(text)
     one_line(
         run("run", folder / "wrong.toml", "--check"),
-        "[sources] line.kind: 'sin' is unknown, choose from mqtt, opcua, replay, sine",
+        "[sources] line.kind: 'sin' is unknown, choose from kafka, mqtt, opcua, replay, sine",
     )
     (folder / "wrong.toml").write_text(text.replace('"sin"', '"sine"').replace("blocks", "block"))
     one_line(run("run", folder / "wrong.toml", "--check"), "[sources] line.block: unknown key, did you mean 'blocks'?")

@@ -165,7 +165,9 @@ def _build_sources(config: ServiceFile, assets: dict[str, Asset]) -> dict[str, B
     for name, settings in config.sources.items():
         own = {
             each: SourceAsset(
-                assets[each].baseline.loop, getattr(one, settings.asset_key) if settings.asset_key else None
+                assets[each].baseline.loop,
+                getattr(one, settings.asset_key) if settings.asset_key else None,
+                config.service.ahead_s,
             )
             for each, one in config.assets.items()
             if one.source == name

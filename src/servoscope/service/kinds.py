@@ -18,6 +18,7 @@ BUILT_IN = tuple(  # written like the entry points of other packages, and loaded
         (SOURCES, "replay", "sources.replay:ReplaySettings"),
         (SOURCES, "mqtt", "mqtt.source:MqttSourceSettings"),
         (SOURCES, "opcua", "opcua.source:OpcuaSourceSettings"),
+        (SOURCES, "kafka", "kafka.source:KafkaSourceSettings"),
         (PUBLISHERS, "mqtt", "mqtt.publisher:MqttPublisherSettings"),
         (PUBLISHERS, "opcua", "opcua.server:OpcuaServerSettings"),
     )

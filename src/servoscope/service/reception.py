@@ -15,7 +15,7 @@ ALARMED_STATES: tuple[ReceptionState, ...] = ("unheard", "slow", "refused")  # s
 class AssetTrouble(NamedTuple):
     """What a source knows of an asset that it cannot follow, though it is connected."""
 
-    state: Literal["slow", "refused"]
+    state: Literal["slow", "refused", "silent"]
     why: str
 
 

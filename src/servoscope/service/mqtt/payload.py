@@ -108,7 +108,7 @@ def _decode_binary(asset: str, message: bytes, received_at: float) -> DecodedBlo
 
 def _decode_json(asset: str, message: bytes, received_at: float) -> DecodedBlock:
     try:
-        plain = _parse_json(message)
+        plain = parse_json(message)
     except (ValueError, RecursionError) as error:
         raise MessageError("not a block", f"no JSON: {' '.join(str(error).split())[:100]}") from None
     if not isinstance(plain, dict):
@@ -127,7 +127,8 @@ def _decode_json(asset: str, message: bytes, received_at: float) -> DecodedBlock
     return _build_block(asset, stream, sequence, oldest, t, numbers, received_at)
 
 
-def _parse_json(message: bytes) -> Any:
+def parse_json(message: bytes) -> Any:
+    """Return what a JSON text holds; raises ValueError or RecursionError if it is none."""
     import msgspec
 
     try:

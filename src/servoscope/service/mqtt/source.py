@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
@@ -14,9 +16,13 @@ from pydantic import Field
 
 from servoscope.core.errors import MessageError
 from servoscope.service.config_types import Seconds
+from servoscope.service.mapping.collector import MessageCollector
+from servoscope.service.mapping.settings import PayloadSettings
+from servoscope.service.mapping.sparkplug import encode_rebirth
 from servoscope.service.mqtt import topics
 from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_mqtt_client
 from servoscope.service.mqtt.payload import DecodedBlock, decode_block
+from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
 
@@ -25,6 +31,8 @@ if TYPE_CHECKING:
 
 
 POLL_S = 0.02
+REBIRTH_EVERY_S = 10.0  # how often a node of Sparkplug is asked for its births
+TOPICS_AT_ONCE = 100  # that one message subscribes to
 OVERSIZE_FACTOR = 4  # times the largest message: so far it is received and rejected, beyond that the broker drops it
 
 
@@ -39,6 +47,7 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
     largest: Annotated[int, Field(strict=True, ge=1024, le=2**28)] = 2**20  # longest message that is accepted [bytes]
     # how long the broker keeps the session, and what comes for it, while we are disconnected [s]
     session_s: Annotated[Seconds, Field(lt=2**32 - 1)] = 7 * 86400.0
+    payload: PayloadSettings | None = None  # where the samples are in a plant's own messages; None: blocks are sent
 
     def for_visit(self) -> Self:
         """Return the settings of a client with a session of its own, which the broker does not keep."""
@@ -46,7 +55,9 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
         """Return the source."""
-        return MqttSource(self, frozenset(assets), folder, name)
+        if self.payload is None:
+            return MqttSource(self, frozenset(assets), folder, name)
+        return PlantSource(self, assets, folder, name)
 
 
 class _AckHandle(NamedTuple):
@@ -97,7 +108,14 @@ class MqttSource(BlockSource):
         if not self._broker.handle_connect(reason):
             return
         # also where the broker has the session: that of a killed process may have an old subscription
-        self._client.subscribe(topics.data_topic(self.settings.topic, "+"), qos=1)
+        self._client.unsubscribe(topics.data_topic(self.settings.topic, "+"))
+        wanted = self._topic_filters()
+        for k in range(0, len(wanted), TOPICS_AT_ONCE):
+            self._client.subscribe([(topic, 1) for topic in wanted[k : k + TOPICS_AT_ONCE]])
+
+    def _topic_filters(self) -> list[str]:
+        """Return what to subscribe to: another service at this broker may follow other assets."""
+        return [topics.data_topic(self.settings.topic, asset) for asset in sorted(self._assets)]
 
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         with self._lock:
@@ -121,10 +139,13 @@ class MqttSource(BlockSource):
 
     def _on_message(self, _client: Any, _data: Any, message: MQTTMessage) -> None:
         """Queue a message, in the client's thread."""
-        handle = _AckHandle(message.mid, message.qos, self._connection, None)
+        self._receive(message, _AckHandle(message.mid, message.qos, self._connection, None))
+
+    def _receive(self, message: MQTTMessage, handle: _AckHandle) -> None:
         try:
             asset = topics.parse_asset(message.topic)
-            if asset not in self._assets:
+            if asset not in self._assets:  # an earlier service file had it, and the broker has kept that
+                self._client.unsubscribe(message.topic)
                 raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
             if len(message.payload) > self.settings.largest:
                 raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
@@ -193,3 +214,73 @@ class MqttSource(BlockSource):
         """Disconnect; the broker keeps what comes meanwhile."""
         self._client.disconnect()
         self._client.loop_stop()
+
+
+class PlantSource(MqttSource):
+    """Receives a plant's own messages, as `settings.payload` describes them."""
+
+    def __init__(
+        self, settings: MqttSourceSettings, assets: Mapping[str, SourceAsset], folder: Path, client: str
+    ) -> None:
+        super().__init__(settings, frozenset(assets), folder, client)
+        assert settings.payload is not None, "what is sent is blocks"
+        self._collector = MessageCollector(settings.payload, assets, self.rejections, settings.in_flight)
+        self._asked: dict[tuple[str, str], float] = {}  # by node, when it was asked for its births, monotonic [s]
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Connect, now or as soon as the broker is there."""
+        self._collector.open(resume)
+        super().open(resume)
+
+    def _topic_filters(self) -> list[str]:
+        return self._collector.mapping.topic_filters
+
+    def _receive(self, message: MQTTMessage, handle: _AckHandle) -> None:
+        mapping, acknowledge = self._collector.mapping, partial(self._ack, handle)
+        try:
+            if len(message.payload) > self.settings.largest:
+                raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
+            if not message.qos and self._collector.waiting >= self.settings.in_flight:
+                raise MessageError("overflow", "sent without acknowledgement, faster than it can be processed")
+        except MessageError as error:
+            self.rejections.add(mapping.find_asset(message.topic), error.kind, str(error))
+            acknowledge()
+            return
+        start = time.thread_time()
+        self._collector.add(message.topic, bytes(message.payload), acknowledge, old=message.retain)
+        self._thread_s = time.thread_time()
+        self._decode_s += self._thread_s - start
+        if mapping.missing_births:
+            self._ask_for_births()
+
+    def _ask_for_births(self) -> None:
+        """Ask nodes of Sparkplug for the births that we have not heard."""
+        missing, now = self._collector.mapping.missing_births, time.monotonic()
+        for group, node in list(missing):
+            missing.discard((group, node))
+            if now - self._asked.get((group, node), -math.inf) >= REBIRTH_EVERY_S:
+                self._asked[group, node] = now
+                self._client.publish(f"spBv1.0/{group}/NCMD/{node}", encode_rebirth(time.time()))
+
+    def poll(self, limit: int) -> list[Block]:
+        """Return blocks that are complete."""
+        return self._collector.poll(limit)
+
+    def acknowledge(self, asset: str, blocks: int) -> None:
+        """Acknowledge to the broker the messages of which every sample is stored."""
+        self._collector.acknowledge(asset, blocks)
+
+    @property
+    def asset_troubles(self) -> Mapping[str, AssetTrouble]:
+        """Assets that come too slowly, or whose sender has said that it is gone."""
+        return self._collector.troubles
+
+    @property
+    def update_intervals_s(self) -> Mapping[tuple[str, str], float]:
+        """Time between two updates, as measured, by asset and signal [s]."""
+        return self._collector.update_intervals_s
+
+    @property
+    def next_block_s(self) -> float:
+        """How long until the next block may be due [s]."""
+        return 0.0 if self._collector.waiting else POLL_S

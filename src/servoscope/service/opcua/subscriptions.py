@@ -15,11 +15,12 @@ from servoscope.core.errors import MessageError
 from servoscope.core.messages import message, render
 from servoscope.service.mqtt.payload import MAX_TIME_S
 from servoscope.service.opcua.monitored_items import ItemGrant
-from servoscope.service.opcua.resample import CLOCK_STEP_S, Resampler, SampleGap
-from servoscope.service.opcua.update_rate import SLOW_PERIODS, UpdateRate
 from servoscope.service.reception import AssetTrouble
+from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.resample import CLOCK_STEP_S
+from servoscope.service.sources.update_rate import SLOW_PERIODS
 
 CLOCK_MARGIN_S = 10.0  # a server's clock may stand still for a second or more
 OVERFLOW_BITS = 0x480  # info type "data value" and its bit "overflow": the server's queue was too short
@@ -30,7 +31,6 @@ TRANSIENT_STATUSES = {  # status codes, the library's among them, of trouble tha
     "BadSecureChannelClosed", "BadSecureChannelIdInvalid", "BadCommunicationError", "BadServerNotConnected",
     "BadShutdown", "BadServerHalted", "BadDisconnect", "BadNotConnected", "BadTooManyOperations", "BadTcpServerTooBusy",
 }  # fmt: skip
-SIGNALS = ("r", "u", "y")  # what the nodes of single values hold, in this order
 HELD_S = 60.0  # of samples that wait for the decision whether they come too slowly
 MAX_EXACT_INT = 2.0**53  # beyond, a binary64 cannot count
 
@@ -121,11 +121,9 @@ class ScalarSubscription(_Subscription):
         size: int,
     ) -> None:
         super().__init__(asset, nodes, resume, emit, rejections)
-        self.value_s, self.sampling_ms, self._size = 1.0 / rate, 1000.0 / rate, size
-        self._resampler = Resampler(len(nodes), 1.0 / rate, resume.last_t)
-        self._t, self._values = np.zeros(0), np.zeros((len(nodes), 0))
+        self.value_s, self.sampling_ms = 1.0 / rate, 1000.0 / rate
+        self._assembler = BlockAssembler(asset, resume, rejections, rate, size)
         self._read_until = [-math.inf] * len(nodes)  # the last time that was read from the history of each node
-        self._rates = [UpdateRate() for _ in nodes]
         self._granted_ms: dict[int, float] = {}  # what the server says of signals that it would sample too slowly
         self._short_queues, self._undecided = "", False
 
@@ -137,7 +135,7 @@ class ScalarSubscription(_Subscription):
     def check_grants(self, grants: Mapping[str, ItemGrant], publishing_s: float) -> None:
         """Take what the server grants: slower than the samples it has no samples for us."""
         super().check_grants(grants, publishing_s)
-        self._rates = [UpdateRate() for _ in self.nodes]
+        self._assembler.restart_rates()
         needed = math.ceil(publishing_s / self.value_s)
         granted = [grants[node] for node in self.nodes]
         limit_ms = SLOW_PERIODS * self.sampling_ms
@@ -155,44 +153,41 @@ class ScalarSubscription(_Subscription):
     @property
     def intervals_s(self) -> dict[str, float]:
         """Time between two updates of each signal, as measured [s]; without those of which too few have come."""
-        found = {name: rate.interval_s for name, rate in zip(SIGNALS, self._rates, strict=True)}
-        return {name: interval for name, interval in found.items() if not math.isnan(interval)}
+        return self._assembler.intervals_s
 
     def _follow_rates(self) -> None:
         """Judge how often values come: of what is too slow no samples are made, since they would look like a fault."""
-        told = [self._rates[k].contradicts(granted_ms / 1000.0) for k, granted_ms in self._granted_ms.items()]
+        rates = self._assembler.rates
+        told = [rates[k].contradicts(granted_ms / 1000.0) for k, granted_ms in self._granted_ms.items()]
         if True in told:
             self._granted_ms = {}  # a server that is wrong of one signal is of all
-        slow = dict(self._granted_ms)
-        for k, one in enumerate(self._rates):
-            if k not in slow and one.is_too_slow(self.value_s):
-                slow[k] = float(f"{1000.0 * one.interval_s:.2g}")  # more digits would change with each look
-        words = [describe_slow(SIGNALS[k], interval_ms, self.sampling_ms) for k, interval_ms in sorted(slow.items())]
+        slow = self._assembler.slow_ms | self._granted_ms
+        words = [self._assembler.describe_slow(k, interval_ms) for k, interval_ms in sorted(slow.items())]
         words += [self._short_queues] if self._short_queues else []
         self.trouble = AssetTrouble("slow", ", ".join(words)) if words else None
         self._undecided = bool(self._granted_ms) and False not in told
 
     async def read_missed(self, client: Any, now: float) -> None:
         """Read the values that were missed; without a history, there is a gap."""
-        last = self._resampler.last_t
+        last = self._assembler.resampler.last_t
         histories = []
         if not math.isnan(last):
             histories = [await read_history(client, node, last, now + CLOCK_MARGIN_S) for node in self.nodes]
         if None in histories or not any(histories):  # one signal alone may have none: it did not change
-            self._resampler.restart(now)
+            self._assembler.resampler.restart(now)
             return
         for k, node in enumerate(self.nodes):  # what held then: the subscription reports what holds now
             for value in await read_history(client, node, last, 0.0, limit=1) or []:
                 self._add(k, value)
         for k, values in enumerate(histories):
             self._read_until[k] = max((self._add(k, value) for value in values or []), default=-math.inf)
-        self._resampler.restart(last, complete=True, history_until=max(self._read_until))
+        self._assembler.resampler.restart(last, complete=True, history_until=max(self._read_until))
 
     def add_value(self, node: int, value: Any) -> None:
         """Take a value, unless it was read from history."""
         t = self._add(node, value, self._read_until[node])
         if math.isfinite(t):
-            self._rates[node].add(t, parse_value(value)[1])
+            self._assembler.rates[node].add(t, parse_value(value)[1])
 
     def _add(self, node: int, value: Any, read_until: float = -math.inf) -> float:
         """Take a value unless it was read already; return its time [UTC s]."""
@@ -206,43 +201,20 @@ class ScalarSubscription(_Subscription):
         status = value.StatusCode.value if value.StatusCode is not None else 0
         if status & OVERFLOW_BITS == OVERFLOW_BITS:
             self._rejections.add(self.asset, "overflow", f"the server's queue of {self.nodes[node]} was too short")
-        self._resampler.add(node, t, number)
+        self._assembler.add(node, t, number)
         return t
 
     def emit_blocks(self, alive_until: float) -> None:
         """Make blocks of what is complete."""
         if self.trouble is None or self.trouble.state == "slow":
             self._follow_rates()
-        t, values, gaps = self._resampler.take_samples(alive_until)
-        for gap in gaps:
-            self._rejections.add(self.asset, "gap", describe_gap(gap), gap.samples)
-        if self._resampler.late:
-            self._rejections.add(self.asset, "late", "values came after their samples were made", self._resampler.late)
-            self._resampler.late = 0
-        self._t, self._values = np.append(self._t, t), np.append(self._values, values, axis=1)
+        self._assembler.collect(alive_until)
         if self.trouble is not None:  # until it is known what a server's word is worth, a minute of samples waits
             kept = round(HELD_S / self.value_s) if self._undecided else 0
-            lost = max(0, self._t.size - kept)
-            if lost:
-                self._rejections.add(self.asset, self.trouble.state, self.trouble.why, lost)
-            self._t, self._values = self._t[lost:], self._values[:, lost:]
+            self._assembler.discard(kept, self.trouble.state, self.trouble.why)
             return
-        while self._t.size >= self._size:
-            self._sequence += 1
-            r, u, y = self._values[:, : self._size].copy()
-            self._emit(Block(self.asset, self._sequence, self._t[: self._size].copy(), r, u, y, time.monotonic()))
-            self._t, self._values = self._t[self._size :], self._values[:, self._size :]
-
-
-def describe_slow(signal: str, interval_ms: float, needed_ms: float) -> str:
-    """Return that a signal comes too slowly."""
-    return render(message("service.trouble.slow", signal=signal, interval_ms=interval_ms, needed_ms=needed_ms))
-
-
-def describe_gap(gap: SampleGap) -> str:
-    """Return when a gap was."""
-    start, end = (datetime.fromtimestamp(t, UTC).isoformat(timespec="milliseconds") for t in gap[:2])
-    return f"{gap.samples} samples between {start} and {end} are missing"
+        for block in self._assembler.take_blocks():
+            self._emit(block)
 
 
 def timestamp(stamp: datetime) -> float:

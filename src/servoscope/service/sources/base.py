@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -118,6 +119,7 @@ class SourceAsset(NamedTuple):
 
     loop: Loop
     address: Any
+    ahead_s: float = math.inf  # how far its time stamps may be ahead of our clock [s]
 
 
 class SourceSettings(Settings):

@@ -35,11 +35,14 @@ class Resampler:
     """Makes samples of single values, of `signals` nodes at a sample time `period` [s], behind `last_t` [UTC s].
 
     A value holds until the next one: a source reports only changes. What lies between two changes is filled as long
-    as the source is known to be alive; after `restart` it is not, and the next sample begins anew.
+    as the source is known to be alive; after `restart` it is not, and the next sample begins anew. Where a source
+    repeats its values, one holds for `hold_s` only [s]: later it is missing, and a longer pause is a gap; and what is
+    older than the last sample is late, however much.
     """
 
-    def __init__(self, signals: int, period: float, last_t: float = math.nan) -> None:
+    def __init__(self, signals: int, period: float, last_t: float = math.nan, hold_s: float = math.inf) -> None:
         self._period, self._values = period, np.full(signals, math.nan)
+        self._value_t, self._hold_s = np.full(signals, -math.inf), hold_s
         self._known = np.zeros(signals, dtype=np.bool_)
         self._pending: list[tuple[float, int, int, float]] = []  # a heap: time, order, signal, value
         self._order = 0
@@ -49,7 +52,7 @@ class Resampler:
         self._samples: list[tuple[float, FloatArray]] = []
         self._gaps: list[SampleGap] = []
         self.last_t = last_t  # time of the last sample that was made
-        self.late = 0  # values that came after their sample had been made
+        self._late = 0  # values that came after their sample had been made
 
     def restart(self, t: float, *, complete: bool = False, history_until: float = -math.inf) -> None:
         """Continue with a subscription from `t` on; older values only say what holds, and make no samples.
@@ -69,13 +72,24 @@ class Resampler:
         self._newest = max(self._newest, t)
         heapq.heappush(self._pending, (t, self._order, signal, value))
 
-    def take_samples(self, alive_until: float) -> ResampledSignals:
+    def take_late(self) -> int:
+        """Return how many values came after their sample had been made, since the last call."""
+        late, self._late = self._late, 0
+        return late
+
+    @property
+    def pending_times(self) -> list[float]:
+        """Times of values of which no sample was made yet, in no order [UTC s]."""
+        return [one[0] for one in self._pending]
+
+    def take_samples(self, alive_until: float, settled: float | None = None) -> ResampledSignals:
         """Return the samples that are complete: those older than the newest value, and all up to `alive_until` [UTC s].
 
         A source reports changes in their order. Where none comes any more, something else has to show that it is
-        alive, and has reported all changes up to `alive_until`.
+        alive, and has reported all changes up to `alive_until`. Where signals come in messages of their own, the
+        newest value of one says nothing of others: all values up to `settled` have come [UTC s].
         """
-        settled = max(alive_until, self._newest)
+        settled = max(alive_until, self._newest) if settled is None else settled
         while self._pending and self._pending[0][0] + 0.5 * self._period <= settled:
             t, group = self._pending[0][0], dict[int, float]()
             while self._pending and self._pending[0][0] < t + 0.5 * self._period:
@@ -96,15 +110,20 @@ class Resampler:
 
     def _add_group(self, t: float, group: dict[int, float]) -> None:
         """Take values of one moment."""
-        if t < self.last_t - CLOCK_STEP_S and not (self._restarted and t < self._restart_t):
+        if (
+            self._hold_s == math.inf
+            and t < self.last_t - CLOCK_STEP_S
+            and not (self._restarted and t < self._restart_t)
+        ):
             self.restart(t, complete=True)
             self.last_t = math.nan
         behind = t <= self.last_t + 0.5 * self._period
         if behind and not self._restarted:
-            self.late += len(group)
+            self._late += len(group)
         is_new = not behind and not (self._restarted and t < self._restart_t)
         steps = round((t - self.last_t) / self._period) if is_new and not self._restarted else 1
-        if steps > 1 and t <= self._history_until and t - self.last_t > HOLE_S:
+        unheld = t - self.last_t > self._hold_s + 1.5 * self._period
+        if steps > 1 and (unheld or (t <= self._history_until and t - self.last_t > HOLE_S)):
             self._restarted, self._restart_t = True, t  # a gap: held values would look like a machine that stood still
         elif steps > MAX_FILL_SAMPLES:
             self.restart(t, complete=True)  # a clock that was set, or a source whose end was not noticed in time
@@ -112,7 +131,7 @@ class Resampler:
             for between in np.linspace(self.last_t, t, steps + 1)[1:-1].tolist():
                 self._add_sample(between)
         for signal, value in group.items():
-            self._values[signal], self._known[signal] = value, True
+            self._values[signal], self._known[signal], self._value_t[signal] = value, True, t
         if is_new and self._known.all():
             self._add_sample(t)
 
@@ -121,5 +140,6 @@ class Resampler:
         missing = round((t - self.last_t) / self._period) - 1 if first else 0
         if missing > 0:
             self._gaps.append(SampleGap(self.last_t, t, missing))
-        self._samples.append((t, self._values.copy()))
+        held = t - self._value_t <= self._hold_s + 0.5 * self._period
+        self._samples.append((t, np.where(held, self._values, math.nan)))
         self.last_t, self._restarted = t, False

@@ -1,0 +1,1 @@
+"""Kafka: a plant's messages as blocks."""

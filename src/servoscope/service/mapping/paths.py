@@ -1,0 +1,109 @@
+"""Where things are in a message: paths into its tree of tables and lists, and patterns of texts with names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+NAME = re.compile(r"\{(\w+)\}")  # in a pattern: a part of a text, or a key of a table, that has a name
+ASSET, SIGNAL = "asset", "signal"  # names that mean something; what others hold does not matter
+
+
+class _Missing:
+    """Where nothing is: not even null."""
+
+
+MISSING = _Missing()
+
+
+class TextPattern:
+    """A text with names, ``plant/{line}/{asset}``; a name stands for what holds no ``/``."""
+
+    def __init__(self, text: str) -> None:
+        self.text, self.names = text, frozenset(NAME.findall(text))
+        parts = NAME.split(text)
+        seen = set[str]()
+        regex = ""
+        for k, part in enumerate(parts):
+            if k % 2 == 0:
+                regex += re.escape(part)
+            else:
+                regex += f"(?P={part})" if part in seen else f"(?P<{part}>[^/]+)"
+                seen.add(part)
+        self._regex = re.compile(regex)
+
+    def match(self, text: str) -> dict[str, str] | None:
+        """Return what the names stand for; None where the text is another one."""
+        found = self._regex.fullmatch(text)
+        return None if found is None else found.groupdict()
+
+    def filters(self, values: Mapping[str, frozenset[str]]) -> set[str]:
+        """Return the topics to subscribe to: with the `values` of names that have some, and any level for others."""
+        found = {self.text}
+        for name in self.names:
+            choices = values.get(name, {f"{{{name}}}"})
+            found = {text.replace(f"{{{name}}}", value) for text in found for value in choices}
+        return {"/".join("+" if NAME.search(level) else level for level in text.split("/")) for text in found}
+
+
+def split_path(path: str) -> tuple[str | int, ...]:
+    """Return the steps of a path, ``values.0``: keys of tables, and numbers of elements; empty: the thing itself."""
+    return tuple(int(step) if step.isdecimal() else step for step in path.split(".")) if path else ()
+
+
+def find(tree: Any, path: tuple[str | int, ...]) -> Any:
+    """Return what is at a path; MISSING where nothing is."""
+    for step in path:
+        if isinstance(tree, dict):
+            tree = tree.get(step if isinstance(step, str) else str(step), MISSING)
+        elif isinstance(tree, list) and isinstance(step, int) and step < len(tree):
+            tree = tree[step]
+        else:
+            return MISSING
+    return tree
+
+
+class RowPath:
+    """Where the rows of a message are: a path whose steps may be ``*``, all elements, or ``{name}``, all keys.
+
+    A list at its end is a list of rows.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._steps = path.split(".") if path else []
+        self.names = frozenset(NAME.findall(path))
+
+    def rows(self, tree: Any) -> Iterator[tuple[list[Any], dict[str, str]]]:
+        """Yield each row with all that encloses it, itself first, and what the names stand for."""
+        yield from self._walk(tree, 0, [tree], {})
+
+    def _walk(
+        self, tree: Any, depth: int, around: list[Any], names: dict[str, str]
+    ) -> Iterator[tuple[list[Any], dict[str, str]]]:
+        if depth == len(self._steps):
+            if isinstance(tree, list):
+                for one in tree:
+                    yield [one, *around], names
+            elif tree is not MISSING:
+                yield around, names
+            return
+        step = self._steps[depth]
+        name = NAME.fullmatch(step)
+        if name or step == "*":
+            entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+            for key, one in entries:
+                found = {**names, name[1]: str(key)} if name else names
+                yield from self._walk(one, depth + 1, [one, *around], found)
+        else:
+            one = find(tree, split_path(step))
+            if one is not MISSING:
+                yield from self._walk(one, depth + 1, [one, *around], names)
+
+
+def find_around(around: list[Any], path: tuple[str | int, ...]) -> Any:
+    """Return what is at a path in a row, or else in what encloses it."""
+    for tree in around:
+        if (found := find(tree, path)) is not MISSING:
+            return found
+    return MISSING

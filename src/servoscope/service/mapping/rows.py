@@ -1,0 +1,264 @@
+"""Messages to values of r, u and y by asset, as a table ``[sources.NAME.payload]`` says where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
+
+from servoscope.core.errors import ConfigError, MessageError
+from servoscope.service.mapping.influx import parse_lines
+from servoscope.service.mapping.paths import (
+    ASSET,
+    MISSING,
+    SIGNAL,
+    RowPath,
+    TextPattern,
+    find,
+    find_around,
+    split_path,
+)
+from servoscope.service.mapping.settings import PayloadSettings
+from servoscope.service.mapping.sparkplug import SparkplugDecoder
+from servoscope.service.mqtt.payload import MAX_TIME_S, parse_json
+from servoscope.service.sources.assembly import SIGNALS
+
+PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts
+MAX_STAMP = 10**30  # beyond any time, in any unit
+SHOWN = 8  # names that a message lists
+Reject = Callable[[str, str, str], None]  # counts what cannot be used: of which asset, of which kind, why
+
+
+class SignalValue(NamedTuple):
+    """A value of one signal."""
+
+    signal: int  # place in `SIGNALS`
+    t: float  # [UTC s]
+    value: float  # NaN: it is known to be bad
+
+
+class MessageContent(NamedTuple):
+    """What a message holds: values by asset; assets whose sender is gone; whether each row has r, u and y."""
+
+    values: dict[str, list[SignalValue]]
+    gone: frozenset[str] = frozenset()
+    complete: bool = False
+
+
+class MessageMapping:
+    """Reads the messages of some assets, given with their sample rates [Hz].
+
+    Raises ConfigError if the settings do not say of which asset a message is, or name one that there is not.
+    """
+
+    def __init__(self, settings: PayloadSettings, rates: Mapping[str, float], reject: Reject) -> None:
+        self.settings, self._rates, self._reject = settings, rates, reject
+        if strange := set(settings.called) - set(rates):
+            raise ConfigError(f"payload.called: there is no asset {min(strange)!r} of this source")
+        if not settings.names_assets and len(rates) > 1:
+            raise ConfigError(
+                "payload: nothing says of which asset a message is, write {asset} into topics, rows or match"
+            )
+        self._assets = {settings.called.get(name, name): name for name in rates}
+        if len(self._assets) < len(rates):
+            raise ConfigError("payload.called: two assets of this source are called the same")
+        self._only = next(iter(rates), "") if not settings.names_assets else ""
+        self._topics = [TextPattern(one) for one in settings.topics]
+        self._rows = RowPath(settings.rows)
+        self._match = [(split_path(path), TextPattern(text)) for path, text in settings.match.items()]
+        self._good = [
+            (split_path(path), one if isinstance(one, list) else [one]) for path, one in settings.good.items()
+        ]
+        self._time = [(split_path(path), unit) for path, unit in settings.time.items()]
+        self._fields = [split_path(one) for one in settings.fields.all]
+        self._by_name = {name: k for k, name in enumerate(settings.fields.all)} if settings.has_signal_names else {}
+        self._value = split_path(settings.value)
+        self._scale = (settings.scale.r, settings.scale.u, settings.scale.y)
+        self._sparkplug = SparkplugDecoder() if settings.decoder == "sparkplug" else None
+        self._senders: dict[str, dict[str, str]] = {}  # by asset, what its last topic said
+        # where nothing but r, u and y is expected: the table of all of them, and what else may stand in it
+        parents = {one[:-1] for one in self._fields}
+        self._table = next(iter(parents)) if len(parents) == 1 and not self._by_name else None
+        beside = (*self._time, *self._match, *self._good)
+        self._expected = {str(one[-1]) for one in self._fields} | {str(path[0]) for path, _ in beside}
+
+    @property
+    def topic_filters(self) -> list[str]:
+        """What to subscribe to: the topics of these assets, as far as topics tell them."""
+        values = {ASSET: frozenset(self._assets)}
+        if self._by_name:
+            values[SIGNAL] = frozenset(self._by_name)
+        return sorted(set().union(*(one.filters(values) for one in self._topics)))
+
+    @property
+    def missing_births(self) -> set[tuple[str, str]]:
+        """Nodes of Sparkplug that have to send their births again: group and node; whoever asks them removes them."""
+        return self._sparkplug.missing_births if self._sparkplug is not None else set()
+
+    def find_asset(self, topic: str) -> str:
+        """Return the asset that a topic tells, or the only one; empty: it tells none."""
+        names = next((found for one in self._topics if (found := one.match(topic)) is not None), {})
+        return self._assets.get(names.get(ASSET, ""), "") or self._only
+
+    def read(self, topic: str, message: bytes, received_at: float) -> MessageContent:
+        """Return what a message holds that came at `received_at` [UTC s].
+
+        A row that cannot be used is counted and left out; raises MessageError if nothing of the message can be read.
+        """
+        names = next((found for one in self._topics if (found := one.match(topic)) is not None), None)
+        if names is None:
+            raise MessageError("unknown topic", f"{topic[:100]!r} fits none of the topics of this source")
+        tree, gone = self._decode(names, message)
+        values: dict[str, list[SignalValue]] = {}
+        extra, complete, rows = set[str](), True, 0
+        for around, found in self._rows.rows(tree):
+            rows += 1
+            row_names = self._match_row(around, {**names, **found})
+            asset = self._only if row_names is not None else ""
+            if row_names is not None and ASSET in row_names:
+                asset = self._assets.get(row_names[ASSET], "")
+            if row_names is None or not asset:
+                extra.add(
+                    f"row of {row_names[ASSET]!r}" if row_names and ASSET in row_names else "row that matches nothing"
+                )
+                continue
+            self._senders[asset] = names
+            try:
+                signals = self._read_signals(around, row_names, extra)
+                if signals:
+                    made = self._read_values(around, signals, received_at, self._rates[asset])
+                    values.setdefault(asset, []).extend(made)
+                complete = complete and len(signals) == len(SIGNALS)
+            except MessageError as error:
+                self._reject(asset, error.kind, str(error))
+        if not rows and not gone and self._sparkplug is None:
+            raise MessageError("keys", f"no rows at {self.settings.rows!r}, {describe_keys(tree)}")
+        if extra and not self.settings.ignore_extra:
+            text = ", ".join(sorted(extra)[:SHOWN])[:200]
+            self._reject(self.find_asset(topic), "extra", f"is not mapped: {text} (ignore_extra = true leaves it out)")
+        return MessageContent(values, gone, complete and bool(values))
+
+    def _decode(self, names: dict[str, str], message: bytes) -> tuple[Any, frozenset[str]]:
+        if self._sparkplug is not None:
+            rows = self._sparkplug.decode(names, message)
+            gone = frozenset[str]()
+            if self._sparkplug.is_dead(names, message):
+                sender = {key: value for key, value in names.items() if key != "message"}
+                gone = frozenset(asset for asset, last in self._senders.items() if sender.items() <= last.items())
+            return rows, gone
+        if self.settings.decoder == "influx":
+            return parse_lines(message), frozenset()
+        try:
+            return parse_json(message), frozenset()
+        except (ValueError, RecursionError) as error:
+            raise MessageError("not a block", f"no JSON: {' '.join(str(error).split())[:100]}") from None
+
+    def _match_row(self, around: list[Any], names: dict[str, str]) -> dict[str, str] | None:
+        """Return what all names of a row stand for; None where its texts are others."""
+        for path, pattern in self._match:
+            text = find_around(around, path)
+            if not isinstance(text, str | int) or (found := pattern.match(str(text))) is None:
+                return None
+            names |= found
+        return names
+
+    def _read_signals(self, around: list[Any], names: dict[str, str], extra: set[str]) -> dict[int, Any]:
+        """Return the signals of a row as they stand there: numbers, or lists."""
+        if self._by_name:
+            signal = self._by_name.get(names.get(SIGNAL, ""))
+            if signal is None:
+                extra.add(f"signal {names.get(SIGNAL, '')!r}")
+                return {}
+            value = find(around[0], self._value)
+            if value is MISSING:
+                raise MessageError("keys", f"no {self.settings.value!r}, {describe_keys(around[0])}")
+            return {signal: value}
+        table = find(around[0], self._table) if self._table is not None else None
+        if isinstance(table, dict):
+            extra.update(f"field {key!r}" for key in table.keys() - self._expected)
+        found = {k: find(around[0], path) for k, path in enumerate(self._fields)}
+        signals = {k: value for k, value in found.items() if value is not MISSING}
+        if not signals:
+            wanted = ", ".join(self.settings.fields.all)
+            raise MessageError("keys", f"none of {wanted} is there, {describe_keys(around[0])}")
+        return signals
+
+    def _read_values(
+        self, around: list[Any], signals: dict[int, Any], received_at: float, rate: float
+    ) -> Iterable[SignalValue]:
+        stamps = self._read_times(around, received_at)
+        good = all(find_around(around, path) in contents for path, contents in self._good)
+        if not any(isinstance(one, list) for one in signals.values()) and isinstance(stamps, float):
+            return [SignalValue(k, stamps, self._number(k, one, good)) for k, one in signals.items()]
+        lengths = {len(one) if isinstance(one, list) else 1 for one in signals.values()}
+        if len(lengths) > 1:
+            raise MessageError("lengths", f"lists of {' and '.join(map(str, sorted(lengths)))} values in one row")
+        n = lengths.pop()
+        if isinstance(stamps, float):
+            step = self.settings.step_s or 1.0 / rate
+            first = stamps if self.settings.stamp == "first" else stamps - (n - 1) * step
+            stamps = [first + k * step for k in range(n)]
+        if len(stamps) != n:
+            raise MessageError("lengths", f"{len(stamps)} time stamps, {n} samples")
+        return [
+            SignalValue(k, t, self._number(k, value, good))
+            for k, one in signals.items()
+            for t, value in zip(stamps, one if isinstance(one, list) else [one], strict=True)
+        ]
+
+    def _read_times(self, around: list[Any], received_at: float) -> float | list[float]:
+        """Return the time stamp of a row, or of each of its samples [UTC s]."""
+        if not self._time:
+            return received_at
+        total: float | list[float] = 0.0
+        for path, unit in self._time:
+            stamp = find_around(around, path)
+            if stamp is MISSING:
+                where = ".".join(map(str, path))
+                raise MessageError("times", f"no time stamp at {where!r}, {describe_keys(around[0])}")
+            if isinstance(stamp, list):
+                many = [_parse_time(one, unit) for one in stamp]
+                before = total if isinstance(total, list) else [total] * len(many)
+                if len(before) != len(many):
+                    raise MessageError("lengths", "time stamps of different numbers")
+                total = [one + other for one, other in zip(before, many, strict=True)]
+            else:
+                one = _parse_time(stamp, unit)
+                total = [other + one for other in total] if isinstance(total, list) else total + one
+        if not all(0.0 <= t < MAX_TIME_S for t in (total if isinstance(total, list) else [total])):
+            raise MessageError("times", "a time stamp outside of the years 1970 to 9999: is its unit right?")
+        return total
+
+    def _number(self, signal: int, value: Any, good: bool) -> float:
+        if value is None or not good:
+            return float("nan")
+        return _parse_number(value, SIGNALS[signal]) * self._scale[signal]
+
+
+def describe_keys(tree: Any) -> str:
+    """Return what there is instead, in words."""
+    if isinstance(tree, dict):
+        return f"only {', '.join(sorted(map(str, tree))[:SHOWN])[:200] or 'an empty table'}"
+    return f"only a list of {len(tree)}" if isinstance(tree, list) else f"only {type(tree).__name__} {str(tree)[:40]}"
+
+
+def _parse_number(value: Any, what: str) -> float:
+    """Return a number, or that of a text: long integers, and whatever templates put into quotes, come as texts."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise MessageError("wrong type", f"{what}: {str(value)[:40]!r} is no number")
+    try:
+        return float(value)
+    except (ValueError, OverflowError):
+        raise MessageError("wrong type", f"{what}: {str(value)[:40]!r} is no number that a computer can hold") from None
+
+
+def _parse_time(value: Any, unit: str) -> float:
+    if unit != "iso" and not (type(value) is int and abs(value) < MAX_STAMP):
+        return _parse_number(value, "time stamp") / PER_SECOND[unit]
+    if unit != "iso":
+        return float(value / PER_SECOND[unit])
+    try:
+        found = datetime.fromisoformat(value)
+        return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+    except (TypeError, ValueError, OverflowError):
+        raise MessageError("times", f"{str(value)[:40]!r} is no date") from None

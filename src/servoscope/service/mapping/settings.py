@@ -1,0 +1,131 @@
+"""What a plant's messages look like: topics, rows, fields, times, as the service file names them; known forms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings
+from servoscope.service.config_types import Seconds
+from servoscope.service.mapping.paths import ASSET, SIGNAL, RowPath, TextPattern
+
+TimeUnit = Literal["s", "ms", "us", "ns", "iso"]
+FORMS: dict[str, dict[str, Any]] = {  # keys that a form brings; those of the service file take their place
+    "thingsboard": {
+        "topics": ("v1/gateway/telemetry",),
+        "rows": "{asset}",
+        "fields": {"r": "values.r", "u": "values.u", "y": "values.y"},
+        "time": {"ts": "ms"},
+    },
+    "telegraf": {
+        "match": {"tags.asset": "{asset}"},
+        "fields": {"r": "fields.r", "u": "fields.u", "y": "fields.y"},
+        "time": {"timestamp": "s"},
+    },
+    "influx": {
+        "decoder": "influx",
+        "match": {"tags.asset": "{asset}"},
+        "fields": {"r": "fields.r", "u": "fields.u", "y": "fields.y"},
+        "time": {"timestamp": "ns"},
+    },
+    "sparkplug": {
+        "decoder": "sparkplug",
+        "topics": ("spBv1.0/{group}/{message}/{node}/{asset}", "spBv1.0/{group}/{message}/{node}"),
+        "match": {"name": "{signal}"},
+        "value": "value",
+        "time": {"timestamp": "ms"},
+        "hold_s": 60.0,  # a node reports changes, and its death
+        "ignore_extra": True,  # births name whatever a node has
+    },
+}
+
+
+def _check_pattern(value: str) -> str:
+    if "+" in value or "#" in value or "\0" in value:
+        raise ValueError("write a name in braces for a level that may be anything: plant/{line}/{asset}/data")
+    return value
+
+
+Topic = Annotated[str, Field(strict=True, min_length=1, max_length=500), AfterValidator(_check_pattern)]
+Text = Annotated[str, Field(strict=True)]
+
+
+class SignalNames(Settings):
+    """Where r, u and y are: paths in a row; where a message has one value of one signal, what {signal} is for them."""
+
+    r: NonEmptyStr = "r"
+    u: NonEmptyStr = "u"
+    y: NonEmptyStr = "y"
+
+    @property
+    def all(self) -> tuple[str, str, str]:
+        """Those of r, u and y."""
+        return self.r, self.u, self.y
+
+
+class SignalScales(Settings):
+    """Factors that turn the plant's units into those of the loop."""
+
+    r: Finite = 1.0
+    u: Finite = 1.0
+    y: Finite = 1.0
+
+
+class PayloadSettings(Settings):
+    """The table ``[sources.NAME.payload]``."""
+
+    # keys of a known form: thingsboard, telegraf, influx, sparkplug; none: all keys are given
+    form: Literal["thingsboard", "telegraf", "influx", "sparkplug"] | None = None
+    decoder: Literal["json", "influx", "sparkplug"] = "json"  # how bytes become a tree of tables and lists
+    # patterns of topics; {asset} and {signal} mean something, other names in braces stand for any level
+    topics: Annotated[tuple[Topic, ...], Field(min_length=1)]
+    rows: Text = (
+        ""  # path to the rows; ``*``: all elements, ``{asset}``: all keys; empty: the message is one, or a list
+    )
+    match: dict[NonEmptyStr, NonEmptyStr] = Field(
+        default_factory=dict
+    )  # texts of a row, and the patterns they must have
+    fields: SignalNames = SignalNames()  # paths of r, u, y in a row: numbers, or lists of as many samples
+    value: Text = ""  # path of the value, where {signal} says of which signal it is
+    # paths of the time stamp, with their units: s, ms, us, ns, iso; several are added; none: when the message came
+    time: dict[NonEmptyStr, TimeUnit] = Field(default_factory=dict)
+    stamp: Literal["first", "last"] = "first"  # which sample of a list a single time stamp is of
+    step_s: Positive | None = None  # time between two samples of a list with one time stamp [s]; None: that of the loop
+    good: dict[NonEmptyStr, Any] = Field(default_factory=dict)  # what tells that a value is good: paths and contents
+    scale: SignalScales = SignalScales()
+    called: dict[NonEmptyStr, NonEmptyStr] = Field(default_factory=dict)  # by asset, what the plant calls it
+    hold_s: Annotated[NonNegative, Field(le=3600.0)] = 0.0  # how long a value holds where only changes are sent [s]
+    block: Seconds = 1.0  # length of the blocks that are made of the samples [s]
+    ignore_extra: Annotated[bool, Field(strict=True)] = False  # whether what is not mapped is left out without a word
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, data: Any) -> Any:
+        form = FORMS.get(data["form"]) if isinstance(data, Mapping) and isinstance(data.get("form"), str) else None
+        return data if form is None else {**form, **data}
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Self:
+        inside = RowPath(self.rows).names.union(*(TextPattern(one).names for one in self.match.values()))
+        signal = [SIGNAL in inside or SIGNAL in TextPattern(topic).names for topic in self.topics]
+        if any(signal) and not all(signal):
+            raise ValueError("topics: {signal} must stand in all of them, or in none")
+        if len(set(self.fields.all)) < len(self.fields.all):
+            raise ValueError("fields: r, u and y must be three different ones")
+        if self.value and not any(signal):
+            raise ValueError("value: leave it out, or say by {signal} in topics, rows or match of which signal it is")
+        return self
+
+    @property
+    def has_signal_names(self) -> bool:
+        """Whether a row is one value of one signal, which topic, rows or match name."""
+        patterns = (TextPattern(one).names for one in (*self.topics, *self.match.values()))
+        return SIGNAL in RowPath(self.rows).names.union(*patterns)
+
+    @property
+    def names_assets(self) -> bool:
+        """Whether messages tell of which asset they are."""
+        patterns = (TextPattern(one).names for one in (*self.topics, *self.match.values()))
+        return ASSET in RowPath(self.rows).names.union(*patterns)

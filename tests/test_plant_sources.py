@@ -1,0 +1,109 @@
+"""A plant's own messages, as fourteen makers document them, followed through a real broker into the store."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reliability.servers import Mosquitto, mosquitto
+
+import halls
+import plant_writers as plants
+from brokers import Running, Sender, until
+from halls import asked
+from servoscope.service.build import build_components
+from servoscope.service.config import ServiceFile
+from servoscope.service.mapping import collector
+from servoscope.service.service import Service
+from servoscope.service.sources.block import Block
+
+RATE = 100.0
+SECONDS = 4.0
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mosquitto]:
+    program = mosquitto()
+    if program is None:
+        pytest.skip("Mosquitto is not on this machine: scripts/install-test-servers installs it")
+    server = Mosquitto(tmp_path_factory.mktemp("broker"), program)
+    server.start()
+    yield server
+    server.stop(signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("hall")
+    halls.files(made)
+    return made
+
+
+def service_file(folder: Path, name: str, port: int, payload: str, assets: tuple[str, ...] = ("press", "lift")) -> Path:
+    tables = "\n".join(f'[assets.{one}]\nbaseline = "baseline.json"\nsource = "plant"' for one in assets)
+    path = folder / f"{name}.toml"
+    path.write_text(
+        f'name = "{name}"\n[service]\nlisten = ""\ncommit_every_s = 0.05\nlog = "error"\n'
+        f'[store]\nurl = "{name}.sqlite"\n'
+        f'[sources.plant]\nkind = "mqtt"\nhost = "127.0.0.1"\nport = {port}\n'
+        f"[sources.plant.payload]\nblock = 0.25\n{payload}\n"
+        f"{tables}\n"
+    )
+    return path
+
+
+def start(path: Path) -> Running:
+    config = ServiceFile.load(path)
+    service = Service(config, build_components(config))
+    until(lambda: service.sources["plant"].connected)
+    time.sleep(0.2)  # the broker has the subscriptions by then
+    return Running(service)
+
+
+def stored(path: Path, asset: str) -> np.ndarray:
+    """Return t, r, u, y of all samples of an asset in the store, shape (4, N)."""
+    rows = asked(path, f"SELECT sequence, samples FROM recent WHERE asset = '{asset}' ORDER BY sequence")
+    blocks = [Block.unpack(asset, *row).signals for row in rows]
+    return np.concatenate(blocks, axis=1) if blocks else np.zeros((4, 0))
+
+
+def send(sender: Sender, messages: Iterator[plants.Message] | list[plants.Message]) -> None:
+    last = None
+    for topic, payload in messages:
+        last = sender.client.publish(topic, payload, qos=1)
+    if last is not None:
+        last.wait_for_publish(30.0)
+
+
+@pytest.mark.parametrize("name", plants.WRITERS)
+def test_what_a_plant_sends_is_in_the_store_and_what_is_broken_costs_itself(
+    name: str, folder: Path, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(collector, "QUIET_S", 0.5)
+    path = service_file(folder, f"hall{list(plants.WRITERS).index(name)}", broker.port, plants.form(name)[0])
+    running, sender = start(path), Sender(broker.port)
+    begin = round(time.time()) - 60.0
+    rows = {asset: plants.signals(asset, SECONDS, RATE, begin) for asset in ("press", "lift")}
+    sent = {asset: list(plants.WRITERS[name](asset, rows[asset])) for asset in rows}
+    topic, good = sent["press"][-1][0], sent["press"][0][1]
+    broken = [b"", b"\xff\xfe\xfd", good[: len(good) // 2], b'{"what": "is this"}']
+    half = len(sent["press"]) // 2
+    send(sender, sent["press"][:half])
+    send(sender, [(topic, one) for one in broken])
+    send(sender, sent["press"][half:] + sent["lift"])
+    short = 1.0 / RATE  # the last moment of single values is open until the next one
+    until(lambda: all(stored(path, a)[0, -1:].sum() >= rows[a][0, -1] - 1.5 * short for a in rows), 30.0)
+    told = until(lambda: {who for (who,) in asked(path, "SELECT asset FROM audit WHERE what = 'refused'")}, 30.0)
+    running.end(stop=True)
+    sender.close()
+    for asset, true in rows.items():
+        found = stored(path, asset)
+        n = found.shape[1]
+        assert n >= true.shape[1] - 1
+        np.testing.assert_allclose(found[0], true[0, :n], rtol=0.0, atol=1e-3)
+        np.testing.assert_array_equal(found[1:], true[1:, :n])
+    assert told == ({"press"} if "press" in topic else {"plant"})  # where no topic says of whom they are, the source
