@@ -72,7 +72,7 @@ def test_the_examples_of_the_page_are_read_as_they_stand(name: str) -> None:
     )
     topic = next(
         one
-        for one in mapping.topic_filters
+        for one in mapping.topic_filters()
         if "press" in one or not found.names_assets or "+" in one or "/" not in one or "press" in example
     )
     topic = topic.replace("press/r", "press/y").replace("+", "north")
@@ -270,7 +270,7 @@ def test_an_alias_needs_its_birth_and_after_a_death_nothing_holds() -> None:
         ),
         round(time.time()) - 10.0,
     )
-    assert "spBv1.0/+/+/+/press" in line.collector.mapping.topic_filters
+    assert "spBv1.0/+/+/+/press" in line.collector.mapping.topic_filters()
 
     def data(k: int) -> bytes:
         return metrics(*({"alias": a, "double_value": float(k)} for a in (1, 2, 3)), t=t0 + 0.01 * k)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ import plant_writers as plants
 from brokers import Running, Sender, until
 from halls import asked
 from servoscope.service.build import build_components
+from servoscope.service.commissioning import listen
 from servoscope.service.config import ServiceFile
 from servoscope.service.mapping import collector
 from servoscope.service.service import Service
@@ -107,3 +109,51 @@ def test_what_a_plant_sends_is_in_the_store_and_what_is_broken_costs_itself(
         np.testing.assert_allclose(found[0], true[0, :n], rtol=0.0, atol=1e-3)
         np.testing.assert_array_equal(found[1:], true[1:, :n])
     assert told == ({"press"} if "press" in topic else {"plant"})  # where no topic says of whom they are, the source
+
+
+def test_two_services_at_one_broker_each_receive_their_own_assets_only(
+    folder: Path, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(collector, "QUIET_S", 0.5)
+    table, begin = plants.form("Insights Hub")[0], round(time.time()) - 60.0
+    paths = {one: service_file(folder, f"only-{one}", broker.port, table, (one,)) for one in ("press", "lift")}
+    running, sender = {one: start(path) for one, path in paths.items()}, Sender(broker.port)
+    for asset in paths:
+        send(sender, plants.insights(asset, plants.signals(asset, 2.0, RATE, begin)))
+    until(lambda: all(stored(path, asset).shape[1] == 200 for asset, path in paths.items()), 30.0)
+    sender.close()
+    for asset, path in paths.items():
+        running[asset].end(stop=True)
+        assert {who for (who,) in asked(path, "SELECT DISTINCT asset FROM recent")} == {asset}
+        assert not asked(path, "SELECT * FROM audit WHERE what = 'refused'")  # what is not its own did not come
+
+
+def test_a_visit_tells_what_came_instead_of_an_asset_that_is_never_heard(folder: Path, broker: Mosquitto) -> None:
+    table = plants.form("Insights Hub")[0]
+    path, sender = service_file(folder, "visit", broker.port, table, ("press",)), Sender(broker.port)
+    messages = list(plants.insights("presse", plants.signals("presse", 10.0, RATE, time.time())))
+
+    def talk() -> None:
+        for one in messages:
+            send(sender, [one])
+            time.sleep(0.2)
+
+    talking = threading.Thread(target=talk)
+    talking.start()
+    (row,) = listen(ServiceFile.load(path), 3.0)
+    talking.join()
+    sender.close()
+    assert row.reception.state == "unheard" and "row of 'presse'" in row.reception.why
+
+
+def test_a_node_whose_births_were_missed_is_asked_for_them(folder: Path, broker: Mosquitto) -> None:
+    path = service_file(folder, "rebirth", broker.port, plants.form("Sparkplug B")[0], ("press",))
+    running, sender, asked_for = start(path), Sender(broker.port), list[str]()
+    sender.client.on_message = lambda *words: asked_for.append(words[-1].topic)
+    sender.client.subscribe("spBv1.0/+/NCMD/+")
+    rows = plants.signals("press", 1.0, RATE, time.time() - 10.0)
+    send(sender, [one for one in plants.sparkplug("press", rows) if "BIRTH" not in one[0]])
+    until(lambda: asked_for, 30.0)
+    running.end(stop=True)
+    sender.close()
+    assert asked_for == ["spBv1.0/hall/NCMD/plc1"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import random
 import struct
 import zipfile
@@ -25,6 +26,9 @@ from servoscope.service.alarms import AlarmSettings
 from servoscope.service.asset import Asset, AssetPolicy
 from servoscope.service.checkpoint import pack_state, unpack_state
 from servoscope.service.config import DiagnosisSettings, ServiceFile
+from servoscope.service.mapping.rows import MessageMapping
+from servoscope.service.mapping.settings import PayloadSettings
+from servoscope.service.mapping.sparkplug import payload_class
 from servoscope.service.mqtt import payload, topics
 from servoscope.service.mqtt.replay_client import ReplayClientSettings
 from servoscope.service.opcua.subscriptions import parse_block, parse_value
@@ -255,7 +259,26 @@ def _messages(recording: Recording) -> list[Target]:
         topics.decode_ack(data)
         return "read"
 
+    def plant(form: str) -> Callable[[bytes, random.Random], str]:
+        settings = PayloadSettings.model_validate({"form": form, "topics": ["a/{message}/{asset}"]})
+        mapping = MessageMapping(settings, {"press": 100.0}, lambda *_: None)
+
+        def feed(data: bytes, _: random.Random) -> str:
+            mapping.read("a/DBIRTH/press", data, BEGAN)
+            return "read"
+
+        return feed
+
+    row = {"fields": {"r": 0.1, "u": 2.3, "y": 0.099}, "name": "axis", "tags": {"asset": "press"}}
+    plain = [json.dumps([{**row, "timestamp": BEGAN + k} for k in range(20)]).encode()]
+    lines = [b'axis,asset=press r=0.1,u=2.3,y=0.099,on=t,text="a b" 1767225600000000000\n' * 20]
+    birth = payload_class()(timestamp=round(1e3 * BEGAN))
+    for k, name in enumerate("ruy"):
+        birth.metrics.add(name=name, alias=k, datatype=10, double_value=0.5 * k)
     return [
+        Target("plant's message, JSON", plain, plant("telegraf")),
+        Target("plant's message, line protocol", lines, plant("influx")),
+        Target("plant's message, Sparkplug B", [birth.SerializeToString()], plant("sparkplug")),
         Target("MQTT block, binary", [payload.encode_binary(block, 3) for block in blocks], binary),
         Target("MQTT block, JSON", [payload.encode_json(block, 3) for block in blocks], text),
         Target("MQTT acknowledgement", [topics.encode_ack(5, 7)], ack),

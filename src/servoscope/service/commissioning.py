@@ -40,18 +40,21 @@ def listen(config: ServiceFile, seconds: float) -> list[CommissioningRow]:
     assets, sources = build_visit(config)
     logs = {name: ReceptionLog(heard_before=False) for name in assets}
     blocks: dict[str, list[Block]] = defaultdict(list)
+    strange: dict[str, str] = {}  # by source, why the last message that is of no asset was refused
     start = time.monotonic()
     for source in sources.values():
         source.open({})
     try:
         while (now := time.monotonic() - start) < seconds:
-            for source in sources.values():
+            for name, source in sources.items():
                 for block in source.poll(1000):
                     blocks[block.asset].append(block)
                     logs[block.asset].hear(now)
                 for one in source.rejections.take():
                     if one.asset:
                         logs[one.asset].refuse(now, one.reason)
+                    else:
+                        strange[name] = one.reason
             if all(len(blocks[name]) >= ENOUGH_BLOCKS for name in assets):
                 break
             time.sleep(POLL_S)
@@ -60,6 +63,9 @@ def listen(config: ServiceFile, seconds: float) -> list[CommissioningRow]:
             source_name, needed = config.assets[name].source, asset.baseline.loop.sample_rate
             source = sources[source_name]
             reception = logs[name].evaluate(now, 2.0 * seconds, source.trouble, source.asset_troubles.get(name))
+            if reception.state == "unheard" and source_name in strange and not reception.source_down:
+                words = message("service.reception.strange", why=reception.why, reason=strange[source_name])
+                reception = Reception("unheard", render(words))
             rate, age = _measure(blocks[name])
             if reception.state == "followed" and source.clock_rate == 1.0:
                 reception = _judge(reception, rate, needed, age, config.service.ahead_s)

@@ -82,10 +82,9 @@ class MessageMapping:
         beside = (*self._time, *self._match, *self._good)
         self._expected = {str(one[-1]) for one in self._fields} | {str(path[0]) for path, _ in beside}
 
-    @property
-    def topic_filters(self) -> list[str]:
-        """What to subscribe to: the topics of these assets, as far as topics tell them."""
-        values = {ASSET: frozenset(self._assets)}
+    def topic_filters(self, *, everyone: bool = False) -> list[str]:
+        """Return what to subscribe to: the topics of these assets, as far as topics tell them, or of `everyone`."""
+        values = {} if everyone else {ASSET: frozenset(self._assets)}
         if self._by_name:
             values[SIGNAL] = frozenset(self._by_name)
         return sorted(set().union(*(one.filters(values) for one in self._topics)))

@@ -12,7 +12,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from servoscope.core.errors import MessageError
 from servoscope.service.config_types import Seconds
@@ -48,10 +48,18 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
     # how long the broker keeps the session, and what comes for it, while we are disconnected [s]
     session_s: Annotated[Seconds, Field(lt=2**32 - 1)] = 7 * 86400.0
     payload: PayloadSettings | None = None  # where the samples are in a plant's own messages; None: blocks are sent
+    _is_visit: bool = PrivateAttr(default=False)
 
     def for_visit(self) -> Self:
         """Return the settings of a client with a session of its own, which the broker does not keep."""
-        return self.model_copy(update={"client": None, "session_s": 1.0})
+        visit = self.model_copy(update={"client": None, "session_s": 1.0})
+        visit._is_visit = True
+        return visit
+
+    @property
+    def is_visit(self) -> bool:
+        """Whether the client only listens, and may hear what is not for its assets, too."""
+        return self._is_visit
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
         """Return the source."""
@@ -233,7 +241,7 @@ class PlantSource(MqttSource):
         super().open(resume)
 
     def _topic_filters(self) -> list[str]:
-        return self._collector.mapping.topic_filters
+        return self._collector.mapping.topic_filters(everyone=self.settings.is_visit)
 
     def _receive(self, message: MQTTMessage, handle: _AckHandle) -> None:
         mapping, acknowledge = self._collector.mapping, partial(self._ack, handle)
