@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 import time
@@ -14,7 +15,7 @@ from reliability.servers import Mosquitto, mosquitto
 
 import halls
 import plant_writers as plants
-from brokers import Running, Sender, until
+from brokers import Running, Sender, kafka_brokers, kafka_cluster, until
 from halls import asked
 from servoscope.service.build import build_components
 from servoscope.service.commissioning import listen
@@ -157,3 +158,27 @@ def test_a_node_whose_births_were_missed_is_asked_for_them(folder: Path, broker:
     running.end(stop=True)
     sender.close()
     assert asked_for == ["spBv1.0/hall/NCMD/plc1"]
+
+
+def test_kafka_gives_a_service_its_own_assets_and_what_is_broken_costs_itself(folder: Path) -> None:
+    producer, begin = kafka_cluster(), round(time.time()) - 60.0
+    for asset in ("press", "lift"):
+        for _, payload in plants.insights(asset, plants.signals(asset, 2.0, RATE, begin)):
+            producer.produce("axes", key=asset.encode(), value=payload)
+        producer.produce("axes", key=asset.encode(), value=b"{")
+    producer.flush(30.0)
+    payload = 'topics = ["axes/{asset}"]\ntime = { _time = "iso" }'
+    path = service_file(folder, "kafka", 1, payload, ("press",))
+    path.write_text(
+        path.read_text().replace(
+            'kind = "mqtt"\nhost = "127.0.0.1"\nport = 1',
+            f'kind = "kafka"\nstart = "beginning"\nbrokers = {json.dumps(kafka_brokers(producer))}',
+        )
+    )
+    running = start(path)
+    until(lambda: stored(path, "press").shape[1] == 200, 60.0)
+    told = until(lambda: asked(path, "SELECT asset, document FROM audit WHERE what = 'refused'"), 30.0)
+    running.end(stop=True)
+    np.testing.assert_array_equal(stored(path, "press")[1:], plants.signals("press", 2.0, RATE, begin)[1:])
+    assert [who for who, _ in told] == ["press"] and json.loads(told[0][1])["count"] == 1
+    producer.flush(1.0)

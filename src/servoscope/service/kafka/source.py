@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, PrivateAttr
 
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
@@ -54,13 +54,22 @@ class KafkaSourceSettings(TlsSettings, SourceSettings):
     in_flight: Annotated[int, Field(strict=True, ge=1, le=10**7)] = 100_000  # most messages that wait to be stored
     largest: Annotated[int, Field(strict=True, ge=1024, le=2**28)] = 2**20  # longest message that is accepted [bytes]
 
+    _is_visit: bool = PrivateAttr(default=False)
+
     def identity(self, name: str) -> str:
         """Return what no other source may share: the group at these brokers."""
         return f"group {self.client or name} at {', '.join(sorted(self.brokers))}"
 
     def for_visit(self) -> Self:
         """Return the settings of a client with a group of its own."""
-        return self.model_copy(update={"client": None, "start": "now"})
+        visit = self.model_copy(update={"client": None, "start": "now"})
+        visit._is_visit = True
+        return visit
+
+    @property
+    def is_visit(self) -> bool:
+        """Whether the client only listens, and tells what is not for its assets, too."""
+        return self._is_visit
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> KafkaSource:
         """Return the source."""
@@ -122,6 +131,8 @@ class KafkaSource(BlockSource):
             raise ConfigError(
                 "[network] refuses addresses, which Kafka's client cannot be held to: allow it by a table"
             )
+        named = all("{asset}" in topic for topic in settings.payload.topics)
+        self._keys_name_assets = named and not settings.is_visit
         self._collector = MessageCollector(settings.payload, assets, self.rejections, settings.in_flight)
         self._client_settings = settings.client_settings(client, folder)
         self._lock = threading.Lock()
@@ -201,7 +212,9 @@ class KafkaSource(BlockSource):
             offsets = self._offsets.setdefault((topic, partition), _PartitionOffsets())
             offsets.open[offset], offsets.next = None, offset + 1
         acknowledge = partial(self._settle, offsets, offset)
-        if len(content) > self.settings.largest:
+        if self._keys_name_assets and not self._collector.mapping.find_asset(address):
+            acknowledge()  # another service's: a topic comes as a whole
+        elif len(content) > self.settings.largest:
             reason = f"{len(content)} bytes, largest = {self.settings.largest}"
             self.rejections.add(self._collector.mapping.find_asset(address), "oversized", reason)
             acknowledge()

@@ -91,7 +91,7 @@ class _AssetStream:
         self._complete, self.is_flushed = complete, False
         if math.isnan(self._from):
             self._from = values[0].t
-        if not 0.0 <= values[-1].t - self._from < self._span_s or self.values >= len(SIGNALS) * MAX_VALUES:
+        if abs(values[-1].t - self._from) >= self._span_s or self.values >= len(SIGNALS) * MAX_VALUES:
             self.collect(short=False)
 
     def collect(self, *, short: bool) -> None:
