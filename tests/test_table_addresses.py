@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import sqlite3
 import threading
@@ -82,10 +83,10 @@ def test_sqlite(tmp_path: Path, rows: dict[str, Any], monkeypatch: pytest.Monkey
     naive = rows | {"time": [time.replace(tzinfo=None) for time in rows["time"]]}
     fill("sqlite:///plant.db", naive)
     check("sql:plant.db/log")
-    with sqlite3.connect("plant.db") as connection:  # seconds since 1970, as many loggers write
-        connection.execute(
-            "CREATE TABLE plain AS SELECT (julianday(time) - 2440587.5) * 86400.0 AS ts, r, u, y FROM log WHERE asset = 'press'"
-        )
+    with contextlib.closing(sqlite3.connect("plant.db")) as connection:  # seconds since 1970, as many loggers write
+        seconds = "(julianday(time) - 2440587.5) * 86400.0"
+        connection.execute(f"CREATE TABLE plain AS SELECT {seconds} AS ts, r, u, y FROM log WHERE asset = 'press'")
+        connection.commit()
     part = readers.read(
         "sql:plant.db/plain?from=2026-01-01T00:00:10&to=2026-01-01T00:00:20", columns=Columns(time="ts")
     )

@@ -60,8 +60,8 @@ def reload_components(
     }
     commit()
     store, new = running.store, {name: one for name, one in assets.items() if one is not running.assets.get(name)}
-    store.acquire_lock([config.name, *assets])
     try:
+        store.acquire_lock([config.name, *assets])
         rows = store.checkpoints([config.name, *assets])
         resumed = {name: rows[name] for name in new if name in rows}
         anew = tuple(

@@ -168,14 +168,20 @@ class WriterLock:
             self._lock_assets(self._assets)
 
     def change(self, assets: Sequence[str]) -> None:
-        """Hold it for these assets instead; raises StoreError if another process has one of them, and changes nothing.
+        """Hold it for these assets instead; a file is locked as a whole, whoever is in it.
 
-        A file is locked as a whole, whoever is in it.
+        Raises StoreError if another process has one of them; then nothing has changed. If the connection is lost,
+        StoreUnavailableError: the next `acquire` is for these assets.
         """
         before = self._assets
-        if self._connection is not None:
-            self._lock_assets([name for name in assets if name not in before])
-            self._unlock_assets([name for name in before if name not in assets])
+        try:
+            if self._connection is not None:
+                self._lock_assets([name for name in assets if name not in before])
+                self._unlock_assets([name for name in before if name not in assets])
+        except StoreUnavailableError:
+            self.release()
+            self._assets = tuple(assets)
+            raise
         self._assets = tuple(assets)
 
     def _lock_assets(self, assets: Sequence[str]) -> None:

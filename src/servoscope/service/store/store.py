@@ -152,7 +152,7 @@ class Store:
     def acquire_lock(self, assets: Sequence[str]) -> None:
         """Acquire the right to write about these assets and no others, until `close` or the end of the process.
 
-        Raises StoreError if another process has it; then all is as it was.
+        Raises StoreError if another process has it; then nothing has changed.
         """
         if self._lock is not None:
             self._lock.change(assets)
