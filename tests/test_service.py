@@ -238,12 +238,14 @@ def test_a_webhook_is_told_once_and_after_a_restart(folder: Path) -> None:
 
 
 def test_health_and_metrics(folder: Path) -> None:
-    service = service_of(hall(folder, "served", speed=50.0))
+    config = hall(folder, "served", speed=50.0)
+    service = service_of(config)
     server = serve_health(service, "127.0.0.1:0")
     running = threading.Thread(target=service.run)
     running.start()
     try:
-        time.sleep(1.0)
+        while not asked(config, "SELECT 1 FROM checkpoints WHERE asset = 'press' AND sequence > 20"):
+            time.sleep(0.01)
         root = f"http://127.0.0.1:{server.server_address[1]}"
         for path in ("/health/live", "/health/ready"):
             with urllib.request.urlopen(root + path, timeout=5.0) as answer:

@@ -14,6 +14,7 @@ from servoscope.cli import (  # their commands add themselves to the application
     recordings,
     service,
     simulate_design,
+    store,
     trend,
     web,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "recordings",
     "service",
     "simulate_design",
+    "store",
     "trend",
     "web",
 ]

@@ -19,7 +19,18 @@ CONTEXT = {"help_option_names": ["-h", "--help"]}
 GROUPS = {
     "Begin": ("demo", "tutorial", "init", "inspect", "explore", "docs", "help"),
     "Judge recordings": ("learn", "diagnose", "verify"),
-    "Follow machines for months": ("run", "watch", "history", "trend", "alarms", "serve", "users", "publish", "fleet"),
+    "Follow machines for months": (
+        "run",
+        "watch",
+        "history",
+        "trend",
+        "alarms",
+        "store",
+        "serve",
+        "users",
+        "publish",
+        "fleet",
+    ),
     "Before deployment, and in the drive": ("simulate", "design", "export"),
     "Check servoscope itself": ("reproduce", "bench"),
 }

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
     from servoscope.service.config import ServiceFile
+    from servoscope.service.network import NetworkSettings
     from servoscope.service.store import Store
 
 
@@ -72,7 +73,10 @@ def run(
         float, typer.Option("--for", metavar="S", min=0.1, help="With --online: listen for so long at most, in s.")
     ] = 10.0,
 ) -> None:
-    """Follow assets until stopped: what their sources say goes to the store, alarms go out; logs on stderr."""
+    """Follow assets until stopped: what their sources say goes to the store, alarms go out; logs on stderr.
+
+    SIGHUP reads the service file again: what has not changed in it goes on without losing a block.
+    """
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # nothing has begun yet
     from servoscope.service import log
     from servoscope.service.build import build_components, check_service_file
@@ -100,6 +104,8 @@ def run(
         server = serve_health(service, settings.service.listen) if settings.service.listen else None
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
+    if not sys.stderr.isatty():  # a terminal that is closed ends what runs in it
+        signal.signal(signal.SIGHUP, lambda *_: service.reload(config))
     pages = WebSupervisor(config) if settings.web is not None else None
     try:
         if pages is not None:
@@ -205,16 +211,30 @@ def prefix_file_name(config: Path) -> Iterator[None]:
         raise ConfigError(f"{config}: {error}") from None
 
 
+class StoreAddress(NamedTuple):
+    """Where a store is."""
+
+    url: str
+    folder: Path | None = None
+    network: NetworkSettings | None = None
+
+
+def parse_store_address(text: str) -> StoreAddress:
+    """Return where a store is, by a service file or by itself."""
+    if not text.endswith(".toml"):
+        return StoreAddress(text)
+    from servoscope.service.config import ServiceFile
+
+    config = ServiceFile.load(text)
+    return StoreAddress(config.store.url, config.folder, config.store.rules)
+
+
 def open_store(text: str) -> Store:
     """Open a store for reading, by a service file or by itself; a locked one is waited for."""
     from servoscope.service.store import Store
 
-    if text.endswith(".toml"):
-        from servoscope.service.config import ServiceFile
-
-        config = ServiceFile.load(text)
-        return Store.open(config.store.url, config.folder, lock_timeout_s=5.0, network=config.store.rules)
-    return Store.open(text, lock_timeout_s=5.0)
+    url, folder, network = parse_store_address(text)
+    return Store.open(url, folder, lock_timeout_s=5.0, network=network)
 
 
 def check_assets(store: Store, assets: Sequence[str]) -> None:

@@ -74,7 +74,7 @@ class Asset:
     def __init__(
         self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "", source: str = ""
     ) -> None:
-        self.name, self.baseline, self.policy = name, baseline, policy
+        self.name, self.baseline, self.policy, self.source = name, baseline, policy, source
         self.monitor, self._rate, self._phase = monitor, baseline.loop.sample_rate, examination_phase(name)
         self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
         self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s, source)

@@ -33,8 +33,8 @@ class _LaneEntry(NamedTuple):
 class AssetGroups:
     """Follows the blocks of several assets, each as if it were alone, to the last bit."""
 
-    def __init__(self, assets: Mapping[str, Asset]) -> None:
-        self._assets, self.layers = assets, LayerTimes()
+    def __init__(self, assets: Mapping[str, Asset], layers: LayerTimes | None = None) -> None:
+        self._assets, self.layers = assets, layers or LayerTimes()
         members: dict[Hashable, dict[int, Monitor]] = defaultdict(dict)
         kinds: dict[int, Hashable | None] = {}  # of the monitors, which assets share
         for monitor in {id(asset.monitor): asset.monitor for asset in assets.values()}.values():

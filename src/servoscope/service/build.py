@@ -26,7 +26,7 @@ from servoscope.service.publishers.base import StatusPublisher
 from servoscope.service.reception import UNHEARD
 from servoscope.service.sources.base import BlockSource, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
-from servoscope.service.store import Store
+from servoscope.service.store import CheckpointRow, Store
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
     known = [*config.assets, config.name]
     if strange := set(restarted) - set(known):
         raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(known)}")
-    assets = _build_assets(config)
+    assets = build_assets(config)
     check_actions(config, assets)
     sources, publishers = _build_sources(config, assets), _build_publishers(config)
     store = Store.open(config.store.url, config.folder, write=True, network=config.store.rules)
@@ -64,23 +64,10 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
             notifier.begin(rows[config.name]["sequence"])
         elif config.name in rows:
             notifier.resume(rows[config.name]["state"])
-        groups, uncounted = AssetGroups(assets), list[Block]()
-        for name, asset in assets.items():
-            blocks = [Block.unpack(name, *one) for one in store.recent_samples(name)] if name in rows else []
-            if name in restarted and name in rows:
-                position = StreamPosition(**rows[name]["status"]["counted"])
-                for block in blocks[bisect.bisect_left(blocks, position.blocks, key=lambda one: one.sequence) :]:
-                    position = position.skip(block.t, block.pack())
-                asset.begin(position)
-            elif name in rows:
-                uncounted += asset.resume(unpack_state(rows[name]["state"], name), blocks)
-            if not asset.heard:
-                asset.expect(time.time())
-                asset.reception = UNHEARD
-        # their checkpoints waited; all that they lead to is the state after them
-        deque(groups.process(BlockOffer(block, math.inf) for block in uncounted), maxlen=0)
+        groups = AssetGroups(assets)
+        resume_assets(groups, assets, store, rows, restarted)
         for name, source in sources.items():
-            source.open(_resume_positions(config, name, assets))
+            source.open(resume_positions(config, name, assets))
         for publisher in publishers.values():
             publisher.open({name: row["status"] for name, row in rows.items()})
     except BaseException:
@@ -90,23 +77,52 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
     return ServiceComponents(assets, groups, notifier, sources, publishers, store, order)
 
 
+def resume_assets(
+    groups: AssetGroups,
+    assets: Mapping[str, Asset],
+    store: Store,
+    rows: Mapping[str, CheckpointRow],
+    restarted: Collection[str],
+) -> None:
+    """Let assets go on from their rows in the store; those in `restarted` with a new state behind what was counted.
+
+    Raises StateError if a saved state cannot be used.
+    """
+    uncounted = list[Block]()
+    for name, asset in assets.items():
+        blocks = [Block.unpack(name, *one) for one in store.recent_samples(name)] if name in rows else []
+        if name in restarted and name in rows:
+            position = StreamPosition(**rows[name]["status"]["counted"])
+            for block in blocks[bisect.bisect_left(blocks, position.blocks, key=lambda one: one.sequence) :]:
+                position = position.skip(block.t, block.pack())
+            asset.begin(position)
+        elif name in rows:
+            uncounted += asset.resume(unpack_state(rows[name]["state"], name), blocks)
+        if not asset.heard:
+            asset.expect(time.time())
+            asset.reception = UNHEARD
+    # their checkpoints waited; all that they lead to is the state after them
+    deque(groups.process(BlockOffer(block, math.inf) for block in uncounted), maxlen=0)
+
+
 def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, BlockSource]]:
     """Return the assets and sources of a service file, these as visitors: a service that runs loses nothing to them."""
     sources = {name: settings.for_visit() for name, settings in config.sources.items()}
     visit = config.model_copy(update={"name": f"{config.name}.check", "sources": sources})
-    assets = _build_assets(config)
+    assets = build_assets(config)
     return assets, _build_sources(visit, assets)
 
 
 def check_service_file(config: ServiceFile) -> None:
     """Read all that a service file names but the store; raises ServoscopeError if something cannot be used."""
-    assets = _build_assets(config)
+    assets = build_assets(config)
     check_actions(config, assets)
     _build_sources(config, assets)
     _build_publishers(config)
 
 
-def _resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:
+def resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:
+    """Return where the assets of a source, by its name, go on."""
     found = {}
     for name, asset in assets.items():
         if config.assets[name].source == source and asset.state is not None and asset.heard:
@@ -115,7 +131,8 @@ def _resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Ass
     return found
 
 
-def _build_assets(config: ServiceFile) -> dict[str, Asset]:
+def build_assets(config: ServiceFile) -> dict[str, Asset]:
+    """Return the assets of a service file, without a state; raises ConfigError if a baseline cannot be used."""
     policy = AssetPolicy(
         config.diagnosis, config.quality, config.alarms, config.store.residual_every_s, config.prognosis
     )
@@ -160,25 +177,33 @@ def _build_assets(config: ServiceFile) -> dict[str, Asset]:
     return assets
 
 
-def _build_sources(config: ServiceFile, assets: dict[str, Asset]) -> dict[str, BlockSource]:
-    sources: dict[str, BlockSource] = {}
-    for name, settings in config.sources.items():
-        own = {
-            each: SourceAsset(
-                assets[each].baseline.loop,
-                getattr(one, settings.asset_key) if settings.asset_key else None,
-                config.service.ahead_s,
-            )
-            for each, one in config.assets.items()
-            if one.source == name
-        }
-        sources[name] = settings.create(config.client_names()["sources", name], own, config.folder)
-    return sources
+def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str) -> dict[str, SourceAsset]:
+    """Return what a source is told of its assets."""
+    key = config.sources[source].asset_key
+    return {
+        name: SourceAsset(assets[name].baseline.loop, getattr(one, key) if key else None, config.service.ahead_s)
+        for name, one in config.assets.items()
+        if one.source == source
+    }
+
+
+def build_source(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> BlockSource:
+    """Return a source, not yet open; raises ServoscopeError if something that it names cannot be used."""
+    client = config.client_names()["sources", name]
+    return config.sources[name].create(client, source_assets(config, assets, name), config.folder)
+
+
+def _build_sources(config: ServiceFile, assets: Mapping[str, Asset]) -> dict[str, BlockSource]:
+    return {name: build_source(config, assets, name) for name in config.sources}
+
+
+def build_publisher(config: ServiceFile, name: str) -> StatusPublisher:
+    """Return an outlet, not yet open; raises ServoscopeError if something that it names cannot be used."""
+    return config.outlets[name].create(config.client_names()["outlets", name], config.folder)
 
 
 def _build_publishers(config: ServiceFile) -> dict[str, StatusPublisher]:
-    names = config.client_names()
-    return {name: one.create(names["outlets", name], config.folder) for name, one in config.outlets.items()}
+    return {name: build_publisher(config, name) for name in config.outlets}
 
 
 def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:

@@ -43,7 +43,9 @@ class StoreSettings(ConnectionSettings):
     # A file for SQLite, relative to the service file, or ``postgresql://user@host/database``
     url: NonEmptyStr = "history.sqlite"
     residual_every_s: Seconds = 60.0  # time between two stored residuals of an asset [s]
-    residual_days: Seconds = 400.0  # how long they are kept; diagnoses, alarms and audit are kept for ever
+    residual_days: Seconds = 400.0  # how long they are kept
+    # how long diagnoses, alarms, audit, commands and deliveries are kept; None: for ever
+    event_days: Seconds | None = None
     size_days: Seconds = 7300.0  # how long sizes and coefficients are kept, thinned to one a day
 
 

@@ -11,10 +11,12 @@ from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.alarms import LifecycleEvent, OperatorCommand
 from servoscope.service.asset import Asset
 from servoscope.service.clock import SteadyClock
+from servoscope.service.config import ServiceFile
 from servoscope.service.log import log
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.notifications import Notifier
 from servoscope.service.records import StepResult, audit_row
+from servoscope.service.retention import delete_old_rows
 from servoscope.service.sources.base import BlockSource, RejectionCounter
 from servoscope.service.store import CommandOutcome, CommandRow, Store
 from servoscope.service.store.series import thin_sizes
@@ -22,12 +24,12 @@ from servoscope.service.writer import StoreWriter
 
 RETENTION_EVERY_S = 3600.0
 REJECTIONS_EVERY_S = 60.0  # between two audit rows about a flood of bad messages
-DAY_S = 86400.0
 
 
 class HousekeepingContext(Protocol):
     """What housekeeping needs of a service."""
 
+    config: ServiceFile
     assets: dict[str, Asset]
     clock: SteadyClock
     sources: dict[str, BlockSource]
@@ -36,8 +38,6 @@ class HousekeepingContext(Protocol):
     notifier: Notifier
     dispatcher: OutboxDispatcher
     metrics: ServiceMetrics
-    residual_days: float  # residual_days, size_days: how long residuals and sizes are kept
-    size_days: float
 
     @property
     def troubles(self) -> Mapping[str, str]:
@@ -144,12 +144,11 @@ class Housekeeping:
         if now < self._next_retention:
             return
         self._next_retention = now + RETENTION_EVERY_S
-        store, assets = self._service.store, self._service.assets
-        clocks = {name: one.state.position.t for name, one in assets.items() if one.state is not None}
-        for table, days in (("residuals", self._service.residual_days), ("sizes", self._service.size_days)):
-            before = {name: t - days * DAY_S for name, t in clocks.items()}
-            if count := store.delete_before(table, before):
-                log("info", f"old {table} deleted", rows=count)
+        service, store = self._service, self._service.store
+        clocks = {name: one.state.position.t for name, one in service.assets.items() if one.state is not None}
+        deleted = delete_old_rows(store, service.config.store, service.config.name, clocks, service.clock.now())
+        for table, count in deleted.items():
+            log("info", f"old {table} deleted", rows=count)
         thinned = sum(thin_sizes(store, name, t, self._thinned.get(name)) for name, t in clocks.items())
         self._thinned = clocks
         if thinned:

@@ -38,11 +38,16 @@ class _JsonFormatter(logging.Formatter):
         return json.dumps(_hide(entry), default=str)
 
 
+def set_level(level: str) -> None:
+    """Log what is at least that important: debug, info, warning, error."""
+    LOGGER.setLevel(level.upper())
+
+
 def set_up_logging(level: str, stream: TextIO | None = None) -> None:
     """Send the logs of this process to a stream, by default stderr."""
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(_JsonFormatter())
-    LOGGER.setLevel(level.upper())
+    set_level(level)
     for logger in (LOGGER, *map(logging.getLogger, LIBRARIES)):
         logger.handlers[:] = [handler]
         logger.propagate = False

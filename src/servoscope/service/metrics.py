@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Protocol
 
 from servoscope.core.errors import ConfigError
 from servoscope.service.asset import Asset
-from servoscope.service.config import ServiceFile
 from servoscope.service.health import status_gauges
 from servoscope.service.layer_times import LayerTimes
 from servoscope.service.sources.base import BlockSource, Rejection
@@ -33,12 +32,10 @@ STREAM_COUNTERS = {
 class MetricsContext(Protocol):
     """What the metrics read of a service."""
 
-    config: ServiceFile
     assets: dict[str, Asset]
     sources: dict[str, BlockSource]
     writer: StoreWriter
     layers: LayerTimes
-    buffer: int  # how many blocks may wait to be stored
     last_turn: float  # when it last polled its sources, by the monotonic clock [s]
 
     @property
@@ -105,7 +102,7 @@ class ServiceMetrics:
             "servoscope_reception", "1 for how an asset's samples come in", labels=["asset", "source", "state"]
         )
         for name, asset in service.assets.items():
-            receptions.add_metric([name, service.config.assets[name].source, asset.reception.state], 1.0)
+            receptions.add_metric([name, asset.source, asset.reception.state], 1.0)
         trouble = GaugeMetricFamily(
             "servoscope_connection_trouble", "Whether something is wrong with a source or outlet", labels=["name"]
         )
@@ -138,7 +135,7 @@ class ServiceMetrics:
         for name, words, value in (
             ("store_up", "Whether the last attempt to store succeeded", service.writer.unavailable_since is None),
             ("buffered_blocks", "Blocks that wait to be stored", service.writer.waiting),
-            ("buffer_blocks", "How many may wait", service.buffer),
+            ("buffer_blocks", "How many may wait", service.writer.capacity),
             ("last_turn_age_seconds", "Since the service last looked for blocks", time.monotonic() - service.last_turn),
         ):
             yield GaugeMetricFamily(f"servoscope_{name}", words, value=float(value))

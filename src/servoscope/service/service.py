@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future
+from pathlib import Path
 
 from servoscope import __version__
 from servoscope.core.errors import ServoscopeError, StoreUnavailableError
@@ -21,13 +22,15 @@ from servoscope.service.diagnosis_worker import DiagnosisWorker, find_due_progno
 from servoscope.service.examination import StoredDiagnosis
 from servoscope.service.examination_schedule import PendingDiagnosis
 from servoscope.service.housekeeping import Housekeeping
-from servoscope.service.log import log
+from servoscope.service.log import log, set_level
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.publishers.base import publisher_trouble
 from servoscope.service.reception import FOLLOWED, ReceptionLog
 from servoscope.service.records import StepResult, audit_row
+from servoscope.service.reload import reload_components
 from servoscope.service.sources.base import BlockSource
 from servoscope.service.sources.block import Block
+from servoscope.service.systemd import notify_systemd
 from servoscope.service.writer import StoreWriter
 
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
@@ -40,13 +43,8 @@ class Service:
     """Runs until it is stopped, or until all sources have ended; it closes its components at the end."""
 
     def __init__(self, config: ServiceFile, components: ServiceComponents) -> None:
-        self.config, self.sources, self.store = config, components.sources, components.store
-        self.assets, self.notifier = components.assets, components.notifier
-        self._groups = components.groups
-        self._publishers, self._restarted = components.publishers, components.restarted
-        self.buffer, self.residual_days = config.service.buffer, config.store.residual_days
-        self.size_days = config.store.size_days
-        self.writer = StoreWriter(self.store, config.name, self.buffer)
+        self._take_components(config, components)
+        self.writer = StoreWriter(self.store, config.name, config.service.buffer)
         self.metrics = ServiceMetrics(self)
         self.clock = SteadyClock()
         actions = config.actions.resolve_paths(config.folder)
@@ -61,8 +59,19 @@ class Service:
         self._housekeeping = Housekeeping(self)
         self._next_commit = self._next_housekeeping = 0.0
         self._stopping = False
+        self._reload_from: Path | None = None
         self.layers = components.groups.layers
         self.last_turn = time.monotonic()  # a service that hangs is not alive
+
+    def _take_components(self, config: ServiceFile, components: ServiceComponents) -> None:
+        self.config, self._components = config, components
+        self.sources, self.store = components.sources, components.store
+        self.assets, self.notifier = components.assets, components.notifier
+        self._groups, self._publishers = components.groups, components.publishers
+
+    def reload(self, path: Path) -> None:
+        """Change to what the service file says now, soon; for a signal's handler or another thread."""
+        self._reload_from = path
 
     def stop(self) -> None:
         """Stop soon; for a signal's handler or another thread. Blocks in hand are finished and committed."""
@@ -85,15 +94,18 @@ class Service:
         document = {"version": __version__, "assets": len(self.assets), "store": self.store.name}
         log("info", "started", service=self.config.name, **document)
         self.writer.add(self.config.name, [audit_row("started", document)])
-        for name in self._restarted:  # written at once: if no block comes, the next start must not find the torn state
-            self.writer.add(name, [audit_row("began anew", {})])
-            if name in self.assets:
-                self.writer.set_checkpoint(self.assets[name])
+        self._add_restarts(self._components)
         self.dispatcher.start()
+        notify_systemd("READY=1", self._systemd_status)
         try:
             while not self._stopping and not self._ended:
+                if self._reload_from is not None:
+                    path, self._reload_from = self._reload_from, None
+                    self._reload(path)
                 self._run_once()
                 time.sleep(self._pause_s)
+            self.writer.add(self.config.name, [audit_row("stopped", {"why": self._stop_reason})])
+            notify_systemd("STOPPING=1")
             self._commit_all()
         finally:
             self.dispatcher.stop()
@@ -104,6 +116,45 @@ class Service:
                 publisher.close()
             self.store.close()
         log("info", "stopped", service=self.config.name, why=self._stop_reason)
+
+    def _add_restarts(self, components: ServiceComponents) -> None:
+        """Write new states at once: if no block comes, the next start must not find the torn or old one."""
+        for name in components.restarted:
+            self.writer.add(name, [audit_row("began anew", {})])
+            if name in components.assets:
+                self.writer.set_checkpoint(components.assets[name])
+
+    @property
+    def _systemd_status(self) -> str:
+        return f"STATUS={len(self.assets)} assets, {self.degraded_reason or 'all followed'}"
+
+    def _reload(self, path: Path) -> None:
+        """Change to what the service file says now; where that cannot be used, go on as before."""
+        notify_systemd("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        try:
+            found = reload_components(ServiceFile.load(path), self.config, self._components, self._commit_all)
+        except ServoscopeError as error:
+            log("error", "reload refused", why=str(error))
+            self.writer.add(self.config.name, [audit_row("reload refused", {"why": str(error)})])
+            notify_systemd("READY=1", f"STATUS=reload refused: {error}")
+            return
+        before = self.assets
+        self._take_components(found.config, found.components)
+        self.writer.capacity = found.config.service.buffer
+        set_level(found.config.service.log)
+        self.dispatcher.change(found.config.actions.resolve_paths(found.config.folder))
+        # a diagnosis that is still due is asked for again
+        jobs = self._diagnosis_jobs.items()
+        self._diagnosis_jobs = {key: job for key, job in jobs if self.assets.get(key[0]) is before[key[0]]}
+        self._prognosis_jobs = {name: job for name, job in self._prognosis_jobs.items() if name in self.assets}
+        self._receptions = {
+            name: self._receptions.get(name) or ReceptionLog(heard_before=asset.heard, now=self._listening_s)
+            for name, asset in self.assets.items()
+        }
+        self._add_restarts(found.components)
+        log("info", "reloaded", **found.changes)
+        self.writer.add(self.config.name, [audit_row("reloaded", found.changes)])
+        notify_systemd("READY=1", self._systemd_status)
 
     @property
     def _stop_reason(self) -> str:
@@ -121,6 +172,7 @@ class Service:
         self.layers.enter("other")
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + HOUSEKEEPING_EVERY_S
+            notify_systemd("WATCHDOG=1")
             self._check_reception()
             self._run_prognoses()
             self._housekeeping.run_due()
@@ -295,8 +347,7 @@ class Service:
         return min(due, MAX_PAUSE_S, max(0.0, self._next_commit - time.monotonic()))
 
     def _commit_all(self) -> None:
-        """Commit what is in hand, with the end in the audit."""
-        self.writer.add(self.config.name, [audit_row("stopped", {"why": self._stop_reason})])
+        """Commit what is in hand; raises StoreUnavailableError if the store does not take it in time."""
         self.writer.finish()
         deadline = time.monotonic() + self.config.service.stop_within_s
         while not self.writer.empty:

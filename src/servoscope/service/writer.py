@@ -40,7 +40,7 @@ class StoreWriter:
     """
 
     def __init__(self, store: Store, owner: str, capacity: int) -> None:
-        self._store, self._owner, self._capacity = store, owner, capacity
+        self._store, self._owner, self.capacity = store, owner, capacity
         self._number = store.last_commit(owner)
         self._gathered = PendingCommit()
         self._sealed: PendingCommit | None = None  # on its way: nothing is added to it any more
@@ -59,12 +59,12 @@ class StoreWriter:
     @property
     def free(self) -> int:
         """How many more blocks may be taken."""
-        return max(0, self._capacity - self.waiting)
+        return max(0, self.capacity - self.waiting)
 
     @property
     def fill_ratio(self) -> float:
         """How full it is; 1: no further block is taken."""
-        return self.waiting / self._capacity
+        return self.waiting / self.capacity
 
     @property
     def empty(self) -> bool:

@@ -30,8 +30,14 @@ class OutboxDispatcher:
 
     def start(self) -> None:
         """Start, if there is any sink."""
-        if self._settings.sinks:
+        if self._settings.sinks and not self._thread.is_alive():
             self._thread.start()
+
+    def change(self, settings: ActionSettings) -> None:
+        """Deliver by other settings from now on."""
+        self._settings = settings
+        self.wake()
+        self.start()
 
     def stop(self) -> None:
         """Stop; what is in progress may be delivered once more later."""

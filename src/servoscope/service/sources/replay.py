@@ -19,7 +19,7 @@ from servoscope.service.config_types import Seconds
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.signals import Recording
-from servoscope.signals.readers import read
+from servoscope.signals.readers import is_address, read
 
 SEPARATION_SAMPLES = 2  # sample times between two recordings, or two rounds: a gap, for they do not join
 
@@ -38,7 +38,10 @@ class ReplaySettings(SourceSettings):
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> ReplaySource:
         """Return the source of these recordings."""
-        files = {each: (tuple(folder / file for file in one.address), one.loop) for each, one in assets.items()}
+        files = {
+            each: (tuple(Path(file) if is_address(file) else folder / file for file in one.address), one.loop)
+            for each, one in assets.items()
+        }
         return ReplaySource(self, files)
 
 

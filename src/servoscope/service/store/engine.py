@@ -163,13 +163,41 @@ class WriterLock:
             self._acquire_file()
         elif not self._is_connected():
             self.release()
-            where = display_url(self._url)
             with translate_errors(self._url):
                 self._connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
-                for asset in self._assets:
-                    lock = sa.select(sa.func.pg_try_advisory_lock(_advisory_lock_key(asset)))
-                    if not self._connection.execute(lock).scalar():
-                        raise StoreError(f"{where}: another servoscope run follows {asset}, stop it first")
+            self._lock_assets(self._assets)
+
+    def change(self, assets: Sequence[str]) -> None:
+        """Hold it for these assets instead; a file is locked as a whole, whoever is in it.
+
+        Raises StoreError if another process has one of them; then nothing has changed. If the connection is lost,
+        StoreUnavailableError: the next `acquire` is for these assets.
+        """
+        before = self._assets
+        try:
+            if self._connection is not None:
+                self._lock_assets([name for name in assets if name not in before])
+                self._unlock_assets([name for name in before if name not in assets])
+        except StoreUnavailableError:
+            self.release()
+            self._assets = tuple(assets)
+            raise
+        self._assets = tuple(assets)
+
+    def _lock_assets(self, assets: Sequence[str]) -> None:
+        assert self._connection is not None, "acquire comes first"
+        with translate_errors(self._url):
+            for i, asset in enumerate(assets):
+                lock = sa.select(sa.func.pg_try_advisory_lock(_advisory_lock_key(asset)))
+                if not self._connection.execute(lock).scalar():
+                    self._unlock_assets(assets[:i])
+                    raise StoreError(f"{display_url(self._url)}: another servoscope run follows {asset}, stop it first")
+
+    def _unlock_assets(self, assets: Sequence[str]) -> None:
+        assert self._connection is not None, "acquire comes first"
+        with translate_errors(self._url):
+            for asset in assets:
+                self._connection.execute(sa.select(sa.func.pg_advisory_unlock(_advisory_lock_key(asset))))
 
     def _acquire_file(self) -> None:
         if self._file is not None:

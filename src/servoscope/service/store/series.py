@@ -17,14 +17,13 @@ from servoscope.core.errors import StoreError
 from servoscope.core.settings_errors import suggest_name
 from servoscope.prognosis.series import NORMAL_95, SizeSeries
 from servoscope.service.store import tables
-from servoscope.service.store.rows import Row
+from servoscope.service.store.rows import NOTE, Row
 from servoscope.service.store.store import Store
 
 Series = FloatArray  # of a fault or coefficient: t, value, low, high, healthy, shape (5, N)
 HOUR_S, DAY_S = 3600.0, 86400.0
 DENSE_S, HOURLY_S = 7 * DAY_S, 60 * DAY_S
 TIERS = ((DENSE_S, HOUR_S), (HOURLY_S, DAY_S))  # from which age on, into parts of which width
-NOTE = "note"  # in the audit: what somebody noted about an asset
 FAULT_KINDS = ("full", "live")
 
 

@@ -17,7 +17,15 @@ from sqlalchemy.engine import URL
 from servoscope.core.errors import EmptyStoreError, StoreError, StoreUnavailableError
 from servoscope.service.network import NetworkSettings
 from servoscope.service.store import engine, schema, tables
-from servoscope.service.store.rows import CheckpointRow, CommandDocument, CommandOutcome, CommandRow, OutboxRow, Row
+from servoscope.service.store.rows import (
+    NOTE,
+    CheckpointRow,
+    CommandDocument,
+    CommandOutcome,
+    CommandRow,
+    OutboxRow,
+    Row,
+)
 
 OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
 
@@ -142,10 +150,13 @@ class Store:
         return self.version >= schema.SIZES_FROM
 
     def acquire_lock(self, assets: Sequence[str]) -> None:
-        """Acquire the right to write about these assets, until `close` or the end of the process.
+        """Acquire the right to write about these assets and no others, until `close` or the end of the process.
 
-        Raises StoreError if another process has it.
+        Raises StoreError if another process has it; then nothing has changed.
         """
+        if self._lock is not None:
+            self._lock.change(assets)
+            return
         self._lock = engine.WriterLock(self._url, self._engine, assets)
         self._lock.acquire()
 
@@ -159,6 +170,15 @@ class Store:
     def _transaction(self) -> Iterator[sa.Connection]:
         with engine.translate_errors(self._url), self._engine.begin() as connection:
             yield connection
+
+    @contextmanager
+    def snapshot(self) -> Iterator[sa.Connection]:
+        """Yield a connection that sees the store as it is now, whatever is written meanwhile."""
+        with engine.translate_errors(self._url), self._engine.connect() as connection:
+            if self._url.get_backend_name() == "postgresql":  # SQLite has nothing else
+                connection = connection.execution_options(isolation_level="REPEATABLE READ")
+            with connection.begin():
+                yield connection
 
     def last_commit(self, owner: str) -> int:
         """Return the number of an owner's last transaction, 0 before the first."""
@@ -251,6 +271,23 @@ class Store:
                 old = (chosen.c.asset == asset) & (chosen.c.t < t)
                 count += connection.execute(chosen.delete().where(old)).rowcount
         return count
+
+    def delete_events(self, service: str, assets: Sequence[str], before: float) -> dict[str, int]:
+        """Delete audit, executed commands and finished deliveries of a service that are older [UTC s]; notes stay.
+
+        Returns how many rows of which table.
+        """
+        audit, commands, outbox = tables.audit.c, tables.commands.c, tables.outbox.c
+        names = [service, *assets]
+        old = {
+            tables.audit: (audit.at < before) & audit.asset.in_(names) & (audit.what != NOTE),
+            tables.commands: (commands.at < before) & commands.asset.in_(names) & commands.outcome.is_not(None),
+            tables.outbox: (outbox.created < before)
+            & outbox.due.is_(None)
+            & (outbox.event["service"].as_string() == service),
+        }
+        with self._transaction() as connection:
+            return {table.name: connection.execute(table.delete().where(rows)).rowcount for table, rows in old.items()}
 
     def replace_sizes(self, means: Sequence[Row]) -> None:
         """Replace the sizes of each row's asset, kind and name from `from_t` and before `to_t` by the row itself."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, TypeVar
 
 from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.addresses import is_address
 from servoscope.signals.readers.table import Table, TableFile, shorten_error
 
 _T = TypeVar("_T")
@@ -32,7 +33,9 @@ def expand_paths(paths: Sequence[Path], suffixes: Collection[str]) -> list[Path]
     """
     found: list[Path] = []
     for path in paths:
-        if path.is_dir():
+        if is_address(path):
+            found.append(path)
+        elif path.is_dir():
             files = sorted(each for each in path.iterdir() if each.is_file() and each.suffix.lower() in suffixes)
             if not files:
                 raise RecordingError(f"{path}: holds no recordings; readable are {', '.join(suffixes)}")

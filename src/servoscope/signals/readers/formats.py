@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from servoscope.core.errors import RecordingError
 from servoscope.models.loop import TextLayout
+from servoscope.signals.readers.addresses import open_address
 from servoscope.signals.readers.archives import ARCHIVES, archive_of, unpack
 from servoscope.signals.readers.csv import is_utf16, open_csv
 from servoscope.signals.readers.reader_process import open_bounded
@@ -98,13 +99,15 @@ def readable_suffixes() -> list[str]:
 
 
 def open_file(path: str | Path, text: TextLayout | None = None) -> TableFile:
-    """Open a file, also one in an archive (``log.zip/day.csv``, ``log.csv.gz``); its rows are not read yet.
+    """Open a file, also one in an archive (``log.zip/day.csv``, ``log.csv.gz``), or a table by its address.
 
-    `text`: what the user says of the layout of a text file.
+    Its rows are not read yet. `text`: what the user says of the layout of a text file.
 
     Raises RecordingError if the file cannot be read, is empty, or is not what its suffix says.
     """
-    path = Path(path)
+    path, table = Path(path), open_address(str(path))
+    if table is not None:
+        return table
     if path.is_dir():
         raise RecordingError(f"{path}: is a directory, give a recording in it")
     if archive_of(path) is not None:

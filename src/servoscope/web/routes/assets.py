@@ -19,7 +19,8 @@ from servoscope.service.asset_status import AssetStatus
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store, tables
 from servoscope.service.store.queries import query_downsampled, query_history
-from servoscope.service.store.series import FAULT_KINDS, NOTE, query_sizes, read_notes, read_series, thin_columns
+from servoscope.service.store.rows import NOTE
+from servoscope.service.store.series import FAULT_KINDS, query_sizes, read_notes, read_series, thin_columns
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.downsample import signal_columns
 from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached

@@ -1,0 +1,141 @@
+"""Tables of Delta Lake and Iceberg as recordings, through deltalake and pyiceberg."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.addresses import TableAddress
+from servoscope.signals.readers.table import TableFile, shorten_error
+
+
+def open_delta(address: TableAddress) -> TableFile:
+    """Open ``delta:FOLDER``, or a URL of an object store; its newest version."""
+    address.require("deltalake", "lake")
+    import pyarrow as pa
+    from deltalake import DeltaTable
+
+    try:
+        rows = DeltaTable(_location(address.place)).to_pyarrow_dataset()
+    except Exception as error:  # of several kinds, Rust's among them
+        raise _unreadable(address, "Delta", error) from None
+    time = address.time_column(rows.schema.names)
+
+    def read(wanted: Sequence[str]) -> Iterator[dict[str, Any]]:
+        import pyarrow.dataset as ds
+
+        chosen: Any = ds.scalar(True)
+        for column, value in address.equal.items():
+            chosen &= ds.field(column) == _scalar(address, rows.schema.field(column).type, value)
+        for limit, after in ((address.since, True), (address.until, False)):
+            if limit is not None and time is not None:
+                bound = _scalar(address, rows.schema.field(time).type, limit)
+                chosen &= ds.field(time) >= bound if after else ds.field(time) < bound
+        try:
+            found = rows.to_table(columns=_with_time(wanted, time), filter=chosen)
+        except (pa.ArrowException, OSError) as error:
+            raise _unreadable(address, "Delta", error) from None
+        yield _ordered(found, wanted, time)
+
+    return address.table(rows.schema.names, read)
+
+
+def open_iceberg(address: TableAddress) -> TableFile:
+    """Open ``iceberg:FOLDER``, ``iceberg:....metadata.json``, or ``iceberg:CATALOG/NAMESPACE.TABLE``.
+
+    What a catalog is stands in pyiceberg's own settings.
+    """
+    address.require("pyiceberg", "lake")
+    expressions: Any = import_module("pyiceberg.expressions")  # takes names and texts, which its types do not say
+    try:
+        table = _iceberg_table(address.place)
+    except Exception as error:  # of several kinds
+        raise _unreadable(address, "Iceberg", error) from None
+    names = [field.name for field in table.schema().fields]
+    time = address.time_column(names)
+
+    def read(wanted: Sequence[str]) -> Iterator[dict[str, Any]]:
+        chosen: Any = expressions.AlwaysTrue()
+        for column, value in address.equal.items():
+            chosen = expressions.And(chosen, expressions.EqualTo(column, value))
+        for limit, compare in (
+            (address.since, expressions.GreaterThanOrEqual),
+            (address.until, expressions.LessThan),
+        ):
+            if limit is not None and time is not None:
+                chosen = expressions.And(chosen, compare(time, _bound(address, table, time, limit)))
+        try:
+            found = table.scan(row_filter=chosen, selected_fields=tuple(_with_time(wanted, time))).to_arrow()
+        except Exception as error:  # of several kinds
+            raise _unreadable(address, "Iceberg", error) from None
+        yield _ordered(found, wanted, time)
+
+    return address.table(names, read)
+
+
+def _iceberg_table(place: str) -> Any:
+    folder = Path(place)
+    if folder.is_dir() or place.endswith(".metadata.json"):
+        from pyiceberg.table import StaticTable
+
+        if folder.is_dir():  # the newest version, as its number says
+            found = sorted(folder.glob("metadata/*.metadata.json"), key=lambda path: _version(path.name))
+            if not found:
+                raise FileNotFoundError("holds no metadata/*.metadata.json")
+            return StaticTable.from_metadata(str(found[-1].absolute()))
+        return StaticTable.from_metadata(_location(place))
+    from pyiceberg.catalog import load_catalog
+
+    catalog, _, name = place.partition("/")
+    return load_catalog(catalog).load_table(name)
+
+
+def _version(name: str) -> int:
+    found = re.match(r"v?(\d+)", name)
+    return int(found[1]) if found else -1
+
+
+def _location(place: str) -> str:
+    """Return a path or URL; paths of Python write ``s3://bucket`` with one stroke."""
+    return re.sub(r"^([a-z][a-z0-9]+):/(?!/)", r"\1://", place)
+
+
+def _unreadable(address: TableAddress, kind: str, error: Exception) -> RecordingError:
+    return RecordingError(f"{address.text}: cannot be read as a table of {kind} ({shorten_error(error)})")
+
+
+def _with_time(wanted: Sequence[str], time: str | None) -> list[str]:
+    return list(wanted) if time is None or time in wanted else [*wanted, time]
+
+
+def _ordered(table: Any, wanted: Sequence[str], time: str | None) -> dict[str, Any]:
+    """Return the wanted columns in the order of time: the files of a table have none."""
+    ordered = table if time is None else table.sort_by(time)
+    return {name: ordered.column(name) for name in wanted}
+
+
+def _scalar(address: TableAddress, kind: Any, value: str) -> Any:
+    import pyarrow as pa
+
+    try:
+        if pa.types.is_timestamp(kind):
+            moment = address.moment(value)
+            return pa.scalar(moment if kind.tz else moment.replace(tzinfo=None), kind)
+        return pa.scalar(value).cast(kind)
+    except pa.ArrowException as error:
+        raise RecordingError(
+            f"{address.text}: {value!r} does not go with the column ({shorten_error(error)})"
+        ) from None
+
+
+def _bound(address: TableAddress, table: Any, time: str, value: str) -> str:
+    """Return a limit of the time as Iceberg reads it."""
+    kind = str(table.schema().find_field(time).field_type)
+    if not kind.startswith("timestamp"):
+        return value
+    moment = address.moment(value)
+    return (moment if kind.startswith("timestamptz") else moment.replace(tzinfo=None)).isoformat()
