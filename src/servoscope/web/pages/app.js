@@ -6,6 +6,7 @@ const PAGES = {
   "": ["Fleet", () => import("./fleet.js")],
   assets: ["Asset", () => import("./asset.js")],
   alarms: ["Alarms", () => import("./alarms.js")],
+  begin: ["Begin with a log", () => import("./begin.js")],
   diagnose: ["Diagnose a recording", () => import("./diagnose.js")],
   diagnoses: ["Diagnosis", () => import("./diagnosis.js")],
   learn: ["Learn a baseline", () => import("./learn.js")],
@@ -15,6 +16,7 @@ const PAGES = {
 const NAVIGATION = [
   ["/", "Fleet", ["", "assets"]],
   ["/alarms", "Alarms", ["alarms"]],
+  ["/begin", "Begin", ["begin"]],
   ["/diagnose", "Diagnose", ["diagnose", "diagnoses"]],
   ["/learn", "Learn", ["learn"]],
   ["/design", "Design", ["design"]],

@@ -76,7 +76,7 @@ export async function show(main, { session, signal, values }) {
     }, enable),
   );
   work.append(
-    section("Loop", "What is known of it: sampling, plant, controller. A baseline has it inside.", loop.element),
+    section("Loop", ["What is known of it: sampling, plant, controller. A baseline has it inside. Without a loop file ", h("a", { href: "/begin" }, "begin with a log"), "."], loop.element),
     section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, h("div", { class: "actions" }, learn, look, said)),
     result,
   );

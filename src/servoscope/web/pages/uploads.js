@@ -69,15 +69,15 @@ export function preview(one) {
 
 // Which column is what; `read()` returns it as the interface wants it. `suit` takes the columns of the loop that the
 // recording is compared with (null: nothing is known of them; true: they stand in its text, which the server reads): a
-// guess by names must not overrule what somebody has said. What was typed in stays.
-export function mapping(one) {
+// guess by names must not overrule what somebody has said. What was typed in stays. `loopless`: no loop is known yet.
+export function mapping(one, loopless = false) {
   const names = one.columns.map((column) => column.name);
   const id = `columns-${one.id}`;
   const typed = new Set();
   const input = (key, more) => h("input", { name: key, autocomplete: "off", ...more, oninput: () => typed.add(key) });
   const fields = Object.fromEntries(SIGNALS.map(([key]) => [key, input(key, { list: id })]));
   const segment = input("segment", { placeholder: "none" });
-  const unit = h("select", { name: "time_unit", onchange: () => typed.add("time_unit") }, h("option", { value: "" }, "as in the loop file"), UNITS.map((name) => h("option", { value: name }, name)));
+  const unit = h("select", { name: "time_unit", onchange: () => typed.add("time_unit") }, !loopless && h("option", { value: "" }, "as in the loop file"), UNITS.map((name) => h("option", { value: name }, name)));
   const origin = h("p", { class: "note" });
   const element = h(
     "div",
@@ -85,7 +85,7 @@ export function mapping(one) {
     h("datalist", { id }, names.map((name) => h("option", { value: name }))),
     h("div", { class: "fields" }, SIGNALS.map(([key, words]) => field(words, fields[key])), field("Unit of time", unit), field("New run where this changes", segment)),
     origin,
-    h("p", { class: "note" }, "A column, or a combination of columns: 0.025 * counts, set_point - error. Units are those that the baseline was learned in."),
+    h("p", { class: "note" }, "A column, or a combination of columns: 0.025 * counts, set_point - error. ", loopless ? "In SI units where you can: 0.001 * position_mm." : "Units are those that the baseline was learned in."),
   );
   const suit = (columns) => {
     const own = columns === true;
