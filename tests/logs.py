@@ -76,3 +76,24 @@ def mat73(folder: Path, data: dict[str, Any]) -> Path:
     content = (folder / "x.mat").read_bytes()
     (folder / "x.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + content[512:])
     return folder / "x.mat"
+
+
+GERMAN_RATE = 200.0
+
+
+def german_axis(path: Path) -> Path:
+    """Write a log of a mass of 2 with viscous and dry friction, moved along four sines; names in German, ms and mm."""
+    t = np.arange(0.0, 60.0, 1.0 / GERMAN_RATE)
+    rng = np.random.default_rng(3)
+    w = 2.0 * np.pi * np.array([0.2, 0.7, 1.9, 3.7])
+    a = np.array([0.05, 0.02, 0.008, 0.003])
+    y = (a[:, None] * np.sin(w[:, None] * t)).sum(axis=0)
+    v = ((a * w)[:, None] * np.cos(w[:, None] * t)).sum(axis=0)
+    acceleration = -((a * w**2)[:, None] * np.sin(w[:, None] * t)).sum(axis=0)
+    u = 2.0 * acceleration + 3.0 * v + 0.4 * np.sign(v) + 0.1 + 0.01 * rng.standard_normal(t.size)
+    r = y + 1e-3 * v
+    rows = np.column_stack([1e3 * t, 1e3 * r, u, 1e3 * (y + 2e-6 * rng.standard_normal(t.size))])
+    lines = ["Achse 7, nach der Wartung", "Zeit;Sollposition;Drehmoment;Istposition", "ms;mm;Nm;mm"]
+    lines += [";".join(f"{cell:.6f}".replace(".", ",") for cell in row) for row in rows]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from commands import run
+from commands import one_line, run
 from logs import as_expected, lines, written
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers import archives, read, readable_suffixes, reader_process
@@ -38,6 +38,23 @@ def test_folders_patterns_and_archives_stand_for_their_files(tmp_path: Path) -> 
         expand_paths([tmp_path / "z*.csv"], suffixes)
     told = run("inspect", tmp_path / "*.csv")
     assert told.code == 0 and "a.csv" in told.out and "b.csv" in told.out
+
+
+def test_the_directory_of_an_archive_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, opened = packed(tmp_path / "many.zip", *map("{}.csv".format, range(9))), []
+    original = zipfile.ZipFile
+    monkeypatch.setattr(archives.zipfile, "ZipFile", lambda *given: opened.append(given) or original(*given))
+    for each in expand_paths([path], readable_suffixes()):
+        as_expected(read(each))
+    assert len(opened) == 1
+    packed(path, "other.csv")  # a new archive under the same name is another one
+    assert expand_paths([path], readable_suffixes()) == [path]
+    as_expected(read(path))
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "log.csv")
+    one_line(run("inspect", tmp_path / "log.csv"), "is a pipe", "to a file first")
 
 
 def test_what_swells_when_unpacked_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,7 +151,10 @@ def test_diagnose_writes_json_report_and_trace(made: Path, tmp_path: Path) -> No
 def test_two_faults_at_once_are_told_with_why_and_beside_the_recursion(made: Path, tmp_path: Path) -> None:
     faults = ("--fault", "p_s=0.9@30", "--fault", "C_ie=1.2@30")
     assert run("simulate", made / "loop.toml", "-o", tmp_path / "x.csv", *faults, "--seed", 5).code == 0
-    result = run("diagnose", made / "baseline.json", tmp_path / "x.csv")
+    folded = run("diagnose", made / "baseline.json", tmp_path / "x.csv").out
+    assert "Fault: pump and leakage." in folded and "--details" in folded and "misfit" in folded  # in words, under Why
+    assert "recursion" not in folded and "95 % interval" not in folded
+    result = run("diagnose", made / "baseline.json", tmp_path / "x.csv", "-v")
     lines = [" ".join(line.split()) for line in result.out.splitlines()]
     assert "Fault: pump and leakage." in result.out
     first = next(i for i, line in enumerate(lines) if line.startswith("pump > 99.9 % p_s "))

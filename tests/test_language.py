@@ -33,9 +33,16 @@ def fields(template: str) -> Iterator[tuple[str, str]]:
 @pytest.mark.parametrize("language", OTHERS)
 def test_a_language_says_all_that_english_says_with_the_same_values(language: str) -> None:
     english, other = catalogue("en"), catalogue(language)
-    assert english.keys() == {key for key in other if not key.startswith("word.")}
+    assert english.keys() == {key for key in other if not key.startswith(("word.", "page."))}
     differ = {key: language for key in english if sorted(set(fields(english[key]))) != sorted(set(fields(other[key])))}
     assert differ == {}
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_what_pages_say_keeps_its_values(language: str) -> None:
+    known = {key.removeprefix("page."): text for key, text in catalogue(language).items() if key.startswith("page.")}
+    place = re.compile(r"\{\d")
+    assert [one for one, text in known.items() if sorted(place.findall(one)) != sorted(place.findall(text))] == []
 
 
 def visible(page: str) -> str:
@@ -67,6 +74,7 @@ def test_the_terminal_is_german(tmp_path: Path) -> None:
         "--language",
         "de",
         "diagnose",
+        "--details",
         FOLDER / "rig.json",
         FOLDER / "suspect.parquet",
     ]

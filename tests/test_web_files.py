@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 import screens
+from commands import run
+from logs import german_axis
 from opening import LONG_MS, THEMES, Open, accessible, shot
 from screens import asked, until
 
@@ -76,6 +79,34 @@ def test_what_cannot_be_read_is_said(open_page: Open, eha_cases: Path, tmp_path:
     page.get_by_label("Drop a recording here").set_input_files(broken)
     expect(page.get_by_role("alert")).to_contain_text("broken.csv")
     expect(page.get_by_role("heading", name="What is what")).to_have_count(0)  # that was of another file
+
+
+def test_from_a_log_to_a_baseline_without_a_line_of_toml(open_page: Open, tmp_path: Path) -> None:
+    log = german_axis(tmp_path / "achse.csv")
+    page = open_page("/begin")
+    page.get_by_label("Drop a log here").set_input_files(log)
+    proposed = page.get_by_role("region", name="Proposed settings")
+    expect(proposed).to_contain_text("mm in the name, factor to SI units", timeout=LONG_MS)
+    expect(page.get_by_role("heading", name="Is the log usable?")).to_be_visible()
+    expect(page.get_by_text("Usable with care", exact=True)).to_be_visible()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save loop.toml").click()
+    download.value.save_as(tmp_path / "page.toml")
+    assert run("init", log, "-o", tmp_path / "terminal.toml", "--yes").code == 0
+    assert (tmp_path / "page.toml").read_bytes() == (tmp_path / "terminal.toml").read_bytes()
+    accessible(page)
+    page.get_by_label("Cutoff [Hz]").fill("much")
+    page.get_by_role("button", name="Inspect with these").click()
+    expect(page.get_by_role("alert")).to_have_text("Cutoff [Hz]: much is no number")
+    page.get_by_label("Cutoff [Hz]").fill("0.75")
+    page.get_by_role("button", name="Inspect with these").click()
+    expect(page.get_by_role("alert")).to_have_count(0)
+    shot(page, "begin", full_page=True)
+    page.get_by_role("button", name="Learn a baseline with these").click()
+    expect(page.get_by_role("region", name="Recordings to learn from")).to_contain_text("achse.csv")
+    expect(page.get_by_label("Loop file (TOML)").last).to_have_value(re.compile("cutoff = 0.75  # changed by hand"))
+    page.get_by_role("button", name="Learn", exact=True).click()
+    expect(page.get_by_role("heading", name="What was learned")).to_be_visible(timeout=LONG_MS)
 
 
 def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: Path, project: Path) -> None:

@@ -222,7 +222,7 @@ def test_a_diagnosis_prints_in_black_on_white(open_page: Open, base: str, tmp_pa
 
 @pytest.mark.parametrize("theme", THEMES)
 @pytest.mark.parametrize(
-    "path", ["/", "/assets/press-1", "/alarms", "/diagnose", "/learn", "/design", "/nowhere", "diagnosis"]
+    "path", ["/", "/assets/press-1", "/alarms", "/begin", "/diagnose", "/learn", "/design", "/nowhere", "diagnosis"]
 )
 def test_every_page_is_accessible(open_page: Open, base: str, path: str, theme: str) -> None:
     page = open_page(f"/diagnoses/{diagnosis_of(base, 'press-1')}" if path == "diagnosis" else path, theme)
@@ -246,6 +246,7 @@ def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: 
         "/",
         "/assets/press-1",
         "/alarms",
+        "/begin",
         "/diagnose",
         "/learn",
         "/design",
@@ -254,7 +255,7 @@ def test_no_page_is_wider_than_its_window(open_page: Open, base: str, tmp_path: 
     for path in pages:
         page.goto(base + path)
         expect(page.get_by_role("heading", level=1)).to_be_visible()
-        if path in ("/diagnose", "/learn"):
+        if path in ("/begin", "/diagnose", "/learn"):
             page.locator("input[type=file]").set_input_files(wide)
             expect(page.get_by_role("region", name="The first rows of wide.csv")).to_be_visible()
         if path == "/alarms":

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from starlette.datastructures import Headers
 
 from servoscope.core.workers import ProcessLimits, WorkerError
 from servoscope.service.store import Batch, Store
@@ -15,6 +16,7 @@ from servoscope.signals.readers.guess_columns import guess_mapping
 from servoscope.web.downsample import downsample_indices
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import run_task
+from servoscope.web.middleware import request_language
 from servoscope.web.schemas.requests import DesignRequest, LoopRef
 
 
@@ -81,3 +83,18 @@ def test_columns_are_guessed_by_their_names(names: list[str], found: tuple[str |
     said = guess_mapping(names)
     assert tuple(said[key] for key in ("time", "reference", "input", "output")) == found
     assert said["time_unit"] == ("ms" if "ms" in names[0] else "s")
+
+
+@pytest.mark.parametrize(
+    ("cookie", "asked", "language"),
+    [
+        ("", "de-DE,de;q=0.9,en;q=0.8", "de"),
+        ("", "fr;q=0.9, en-GB;q=0.4, de;q=0.5", "de"),
+        ("", "fr, *;q=0.1", "en"),
+        ("", "de;q=much", "en"),
+        ("language=en", "de-DE", "en"),
+        ("language=../secret", "de-DE", "de"),
+    ],
+)
+def test_the_language_is_the_readers_choice_or_the_browsers(cookie: str, asked: str, language: str) -> None:
+    assert request_language(Headers({"cookie": cookie, "accept-language": asked})) == language

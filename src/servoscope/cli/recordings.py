@@ -187,6 +187,7 @@ def diagnose(
     report: ReportOption = None,
     trace: TraceOption = None,
     fail_on_fault: Annotated[bool, typer.Option("--fail-on-fault", help="Exit with 3 if there is a fault.")] = False,
+    details: Annotated[bool, typer.Option("--details", "-v", help="Print the statistics behind it too.")] = False,
 ) -> None:
     """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure."""
     recordings = arguments.expand_files(recordings)
@@ -229,7 +230,7 @@ def diagnose(
                             if as_json:
                                 print_json(plain_values.to_plain_values(result), lines=several)
                             else:
-                                diagnosis.print_diagnosis(out, result)
+                                diagnosis.print_diagnosis(out, result, details)
                         stem = recording_stem(path, recording.name)
                         if traces is not None and course is not None:
                             target = traces.path(stem)

@@ -79,7 +79,7 @@ def render_page(template: str, *, package: str = "servoscope.report", **values: 
     its ``macros.html``; `values`: what the template names: ``title`` and ``kind`` (a class of report.css that gives
     the tone: ``fault``, ``healthy``, ``care`` or ``undetermined``) of every page, and its own.
     """
-    return _environment(package).get_template(template).render(values, language=messages.LANGUAGE)
+    return _environment(package).get_template(template).render(values, language=messages.current_language())
 
 
 def write_page(path: str | Path, content: str) -> None:

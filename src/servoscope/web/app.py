@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
 from collections.abc import AsyncIterator
 from importlib.resources import as_file, files
@@ -18,6 +19,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from servoscope import __version__
+from servoscope.core.messages import catalogue, current_language, languages
 from servoscope.service.health import HEALTH_PATHS, HealthReport
 from servoscope.web import errors
 from servoscope.web.dependencies import Context
@@ -97,6 +99,17 @@ def _add_pages(app: FastAPI) -> None:
     @app.get("/static/palette.css", include_in_schema=False)
     async def get_palette() -> Response:
         return _file_response(palette)
+
+    @app.get("/static/language.js", include_in_schema=False)
+    async def get_language() -> Response:
+        known = catalogue(current_language())
+        words = {key.partition(".")[2]: text for key, text in known.items() if key.startswith(("word.", "page."))}
+        said = {"LANGUAGE": current_language(), "LANGUAGES": languages(), "WORDS": words}
+        text = "".join(
+            f"export const {name} = {json.dumps(value, ensure_ascii=False)};\n" for name, value in said.items()
+        )
+        headers = {"Cache-Control": "no-cache", "Vary": "Accept-Language, Cookie"}
+        return Response(text, media_type="text/javascript", headers=headers)
 
     app.mount("/static", GZipMiddleware(_NoCacheFiles(directory=folder, check_dir=False), minimum_size=1000))
 

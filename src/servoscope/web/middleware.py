@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterable
 from hmac import compare_digest
@@ -12,6 +13,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from servoscope.core.messages import current_language, languages, speak
 from servoscope.service.access import AllowedHosts, Role, Session, Sessions, Users, WebSettings
 from servoscope.service.access.oidc import CALLBACK
 from servoscope.web.dependencies import LOCAL_PRINCIPAL, Principal
@@ -23,6 +25,7 @@ CSRF = "x-csrf-token"
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 LOGIN_PATH = f"{API}/session/oidc"
 PUBLIC_PATHS = (f"{API}/session", LOGIN_PATH, CALLBACK)  # asked without login: how one logs in
+LANGUAGE_COOKIE = "language"  # which the page sets, and whose value is checked
 MAX_BODY_BYTES = 1_000_000  # bytes, but for uploads
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -78,7 +81,8 @@ class SecurityMiddleware:
 
         try:
             most = self._authorise(scope)
-            await self._app(scope, _limit_body(receive, most), answer)
+            with speak(request_language(Headers(scope=scope))):
+                await self._app(scope, _limit_body(receive, most), answer)
         except RequestRejection as rejection:
             await problem_response(rejection.status_code, rejection.detail, scope["path"])(scope, receive, answer)
         finally:
@@ -150,6 +154,18 @@ def _current_role(session: Session, users: Users | None) -> Role | None:
     # role and password as they are now: a session ends with its user, and with the user's password
     role = users.all().get(session.user)
     return role if users.stamp(session.user) == session.stamp else None
+
+
+def request_language(headers: Headers) -> str:
+    """Return the language that a reader has chosen on the page, else the browser's, else the server's own."""
+    chosen = _read_cookie(headers.getlist("cookie"), LANGUAGE_COOKIE)
+    wanted = []
+    for each in headers.get("accept-language", "").split(","):
+        name, _, weight = each.partition(";q=")
+        with contextlib.suppress(ValueError):
+            wanted.append((-float(weight or 1.0), name.strip()[:2].lower()))
+    asked = [chosen, *(name for _, name in sorted(wanted, key=lambda one: one[0]))]
+    return next((name for name in asked if name in languages()), current_language())
 
 
 def _read_cookie(headers: Iterable[str], name: str) -> str | None:

@@ -1,4 +1,4 @@
-"""How a diagnosis looks in a terminal: what it is, what to check, how sure; then why; then the statistics."""
+"""How a diagnosis looks in a terminal: what it is, what to check, how sure; then why; the statistics on request."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ MOST_WARNINGS = 12
 LEAST_SHOWN = 0.01  # probability below which a candidate has no line; the explanation says why it was rejected
 
 
-def print_diagnosis(out: Console, d: Diagnosis) -> None:
-    """Print a verdict, what to check, what it rests on, and the warnings."""
+def print_diagnosis(out: Console, d: Diagnosis, details: bool = False) -> None:
+    """Print a verdict, what to check, what it rests on, and the warnings; with `details` the statistics too."""
     print_title(out, d.recording, f": {format_duration(d.duration_s)}, {d.samples} {translate('samples')}")
     out.print(Padding(Text(str(d.summary), style=f"bold {COLOURS[d.verdict]}"), INDENT, expand=False))
     facts = [("what to check", str(check)) for check in d.checks]
@@ -39,10 +39,14 @@ def print_diagnosis(out: Console, d: Diagnosis) -> None:
     if d.explanation:
         out.print(f"  {translate('Why')}:")
         print_notes(out, d.explanation, "blue", "-")
-    _print_candidates(out, d.candidates)
-    if d.refit is not None:
+    shown = [c for i, c in enumerate(d.candidates) if c.probability >= LEAST_SHOWN or not i]
+    if details or len(shown) > 1:  # what else it could be concerns everybody
+        _print_candidates(out, shown)
+    if details and d.refit is not None:
         print_facts(out, _refit_facts(d.refit))
     _print_warnings(out, d.warnings)
+    if d.candidates and not details:
+        out.print(Padding(Text(say("cli.folded"), style="dim"), INDENT, expand=False))
 
 
 def _print_timeline(out: Console, intervals: Sequence[FaultInterval]) -> None:
@@ -67,9 +71,8 @@ def _refit_facts(refit: RefitSummary) -> Iterator[tuple[str, str]]:
     yield "recursion", ", ".join((names, format_probability(first.probability), *sizes))
 
 
-def _print_candidates(out: Console, candidates: Sequence[Candidate]) -> None:
-    """Print the explanations that are worth a line; of a pair, one line per fault."""
-    shown = [c for i, c in enumerate(candidates) if c.probability >= LEAST_SHOWN or not i]
+def _print_candidates(out: Console, shown: Sequence[Candidate]) -> None:
+    """Print explanations; of a pair, one line per fault."""
     if not shown:
         return
     faults = [fault for c in shown for fault in c.faults]

@@ -15,12 +15,14 @@ where its template says ``{name!w}``, and by `translate`.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import re
 import string
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from datetime import UTC, datetime
 from importlib.resources import files
 from typing import Annotated, Any
@@ -36,11 +38,13 @@ __all__ = [
     "MessageField",
     "MessageText",
     "catalogue",
+    "current_language",
     "languages",
     "message",
     "read_messages",
     "render",
     "set_language",
+    "speak",
     "text_message",
     "translate",
     "translate_range",
@@ -51,6 +55,7 @@ SETTING = "SERVOSCOPE_LANGUAGE"
 PLAIN_TEXT = "text"  # the key of a message that is its text: from outside, or of a file of an earlier version
 
 
+@functools.cache
 def languages() -> tuple[str, ...]:
     """Return the languages that there is a catalogue of."""
     names = sorted(each.name for each in FOLDER.iterdir() if each.name.endswith(".toml"))
@@ -70,6 +75,24 @@ def set_language(name: str) -> None:
 
 # Of what is rendered without another one being named; de_DE is German too, and what nobody translated English.
 LANGUAGE = next((each for each in languages() if each == os.environ.get(SETTING, "")[:2].lower()), "en")
+
+
+_spoken: ContextVar[str | None] = ContextVar("spoken", default=None)
+
+
+def current_language() -> str:
+    """Return the language of what is rendered here and now: that of `speak`, else of the process."""
+    return _spoken.get() or LANGUAGE
+
+
+@contextlib.contextmanager
+def speak(name: str) -> Iterator[None]:
+    """Speak another language than the process for a while, in this thread or task and those that it starts."""
+    before = _spoken.set(name)
+    try:
+        yield
+    finally:
+        _spoken.reset(before)
 
 
 class Message(BaseModel):
@@ -229,7 +252,7 @@ def render(given: Message, language: str | None = None) -> str:
     """
     if given.key == PLAIN_TEXT:
         return str(given.values["text"])
-    language = language or LANGUAGE
+    language = language or current_language()
     return _Renderer(language).vformat(template(given.key, language), (), given.values)
 
 
@@ -244,7 +267,7 @@ def translate(words: str, language: str | None = None) -> str:
 
     A unit in brackets behind it stays.
     """
-    language = language or LANGUAGE
+    language = language or current_language()
     if language == "en":
         return words
     known = catalogue(language)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gzip
 import lzma
 import tempfile
@@ -66,12 +67,23 @@ def archive_of(path: Path) -> tuple[Path, str] | None:
 
 def list_members(path: Path) -> list[str]:
     """Return the names of the files in an archive; raises RecordingError if it is damaged."""
+    return list(_open_archive(path)[1])
+
+
+def _open_archive(path: Path) -> tuple[zipfile.ZipFile, list[str]]:
+    """Return an archive and the names of its files; raises RecordingError if it is damaged."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = [info.filename for info in archive.infolist() if not info.is_dir()]
+        found = path.stat()
+        return _open_version(path, found.st_mtime_ns, found.st_size)
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise RecordingError(f"{path}: is a damaged ZIP archive ({shorten_error(error)}), pack it again") from None
-    return sorted(name for name in names if not Path(name).name.startswith((".", "_")))
+
+
+@functools.lru_cache(maxsize=1)  # its directory is not read again for each of its thousands of files
+def _open_version(path: Path, _changed: int, _size: int) -> tuple[zipfile.ZipFile, list[str]]:
+    archive = zipfile.ZipFile(path)
+    names = [info.filename for info in archive.infolist() if not info.is_dir()]
+    return archive, sorted(name for name in names if not name.rpartition("/")[2].startswith((".", "_")))
 
 
 def unpack(path: Path, open_plain: Callable[[Path], TableFile]) -> TableFile:
@@ -89,17 +101,16 @@ def unpack(path: Path, open_plain: Callable[[Path], TableFile]) -> TableFile:
             with gzip.open(archive) as source:
                 _copy(source, inside, path, archive.stat().st_size)
         else:
-            names = list_members(archive)
+            opened, names = _open_archive(archive)
             if not member and len(names) != 1:
                 shown = ", ".join(f"{archive.name}/{name}" for name in names[:3]) or "none"
                 raise RecordingError(f"{path}: holds {len(names)} files, name one of them: {shown}")
-            with zipfile.ZipFile(archive) as opened:
-                name = member or names[0]
-                if name not in names:
-                    raise RecordingError(f"{path}: {archive.name} holds no {name}, but {', '.join(names[:5])}")
-                inside = Path(folder.name) / (Path(name).name or "log.csv")
-                with opened.open(name) as packed:
-                    _copy(packed, inside, path, opened.getinfo(name).compress_size)
+            name = member or names[0]
+            if name not in names:
+                raise RecordingError(f"{path}: {archive.name} holds no {name}, but {', '.join(names[:5])}")
+            inside = Path(folder.name) / (Path(name).name or "log.csv")
+            with opened.open(name) as packed:
+                _copy(packed, inside, path, opened.getinfo(name).compress_size)
         table = _renamed(path, inside, lambda: open_plain(inside))
     except RecordingError:
         folder.cleanup()

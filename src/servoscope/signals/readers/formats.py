@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import stat
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -117,6 +118,8 @@ def open_file(path: str | Path, text: TextLayout | None = None) -> TableFile:
 
 def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
     try:
+        if not stat.S_ISREG(path.stat().st_mode):  # nobody may ever write into a pipe
+            raise RecordingError(f"{path}: is a pipe or a device, write what comes out of it to a file first")
         with path.open("rb") as file:
             head = file.read(65536)
     except FileNotFoundError:

@@ -38,6 +38,7 @@ WORDS = {
     "u": (
         *("u", "input", "control", "controller", "valve", "servo", "stell", "stellgrosse", "stellsignal", "stellwert"),
         *("ventil", "torque", "current", "voltage", "force", "pwm", "effort", "vir", "iq", "moment", "drehmoment"),
+        *("motorspannung", "motormoment", "antriebsmoment", "stellspannung", "stellstrom", "ventilspannung"),
         *("strom", "motorstrom", "spannung", "kraft", "couple", "courant", "tension", "commande", "coppia", "corrente"),
         *("tensione", "comando", "forza", "par", "corriente", "tensionsalida", "mando", "fuerza", "voltaje"),
         *("电流", "转矩", "扭矩", "力矩", "电压", "控制量", "阀", "tau", "duty", "load"),

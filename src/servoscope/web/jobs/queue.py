@@ -16,7 +16,7 @@ from typing import Any, Literal
 from starlette.exceptions import HTTPException
 
 from servoscope.core.errors import ServoscopeError
-from servoscope.core.messages import message, render
+from servoscope.core.messages import SETTING, current_language, message, render
 from servoscope.core.workers import ProcessLimits, Progress, Worker
 from servoscope.web import errors
 from servoscope.web.schemas.responses import JobResponse, JsonObject
@@ -152,4 +152,4 @@ def _environment() -> dict[str, str]:
     environment = {name: os.environ[name] for name in INHERITED_VARIABLES if name in os.environ}
     if paths := environment.get("PYTHONPATH"):  # it runs in another folder
         environment["PYTHONPATH"] = os.pathsep.join(str(Path(path).absolute()) for path in paths.split(os.pathsep))
-    return {**environment, "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
+    return {**environment, SETTING: current_language(), "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}

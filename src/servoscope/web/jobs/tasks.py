@@ -25,9 +25,11 @@ from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.motion_signature import signature_columns
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.learning import inspection
+from servoscope.learning.proposal import propose
 from servoscope.models.loop import Columns, Loop
 from servoscope.report import plain_values
 from servoscope.signals import Recording, readers
+from servoscope.signals.readers.axes import find_axes, signal_names
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import guess_mapping
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
@@ -47,7 +49,8 @@ def preview_file(progress: Progress, file: str) -> JsonObject:
     progress("columns")
     opened, count, first = open_file(file), 0, None
     _check_width(file, opened.columns)
-    channels: Any = plain_values.channels_summary(file, readers.list_channels(file))["channels"]
+    listed = readers.list_channels(file)
+    channels: Any = plain_values.channels_summary(file, listed)["channels"]
     names = [str(channel["name"]) for channel in channels]
     most = max(1, min(PREVIEW_ROWS, PREVIEW_CELLS // len(names)))
     for table in opened.iter_chunks(opened.columns):
@@ -56,8 +59,13 @@ def preview_file(progress: Progress, file: str) -> JsonObject:
     assert first is not None, "a file without rows was refused"
     head = [[_preview_cell(x) for x in first.columns[name].slice(0, most).to_pylist()] for name in names]
     preview = responses.TablePreview(columns=names, rows=[list(row) for row in zip(*head, strict=True)])
+    signals = signal_names(listed)
     return responses.FilePreview(
-        rows=count, columns=channels, preview=preview, mapping=guess_mapping(names)
+        rows=count,
+        columns=channels,
+        preview=preview,
+        mapping=guess_mapping(signals),
+        axes={axis: guess_mapping(columns) for axis, columns in find_axes(signals).items()},
     ).model_dump()
 
 
@@ -84,7 +92,23 @@ def inspect_file(
     settings = load_loop(loop) if loop is not None else None
     recording = read_recording(file, settings, request)
     progress("inspecting")
-    result = inspection.inspect(recording, settings)
+    return _inspection_result(inspection.inspect(recording, settings), recording)
+
+
+def propose_file(progress: Progress, file: str, request: requests.ProposalRequest) -> JsonObject:
+    """Propose a loop file for a recording as `servoscope init` does, and inspect the recording with it."""
+    progress("proposing")
+    columns = _merge_columns(request.columns, None) if request.columns is not None else None
+    proposal, result = propose(file, columns)
+    lines = [
+        {"section": one.section, "key": one.key, "value": one.value, "why": str(one.why), "doubtful": one.doubtful}
+        for one in proposal.lines
+    ]
+    found = _inspection_result(result, readers.read(file, proposal.loop))
+    return {"toml": proposal.to_toml(file), "lines": lines, **found}
+
+
+def _inspection_result(result: inspection.Inspection, recording: Recording) -> JsonObject:
     spectra = result.traces.spectra if result.traces is not None else None
     columns = None
     if spectra is not None:

@@ -1,7 +1,7 @@
 // Alarms that are not normal, the most urgent first, with what to do about them; and what has happened to alarms.
 import { get, part, query } from "./api.js";
 import { commands, STATES } from "./commands.js";
-import { h, section, table, tell } from "./dom.js";
+import { h, section, table, tell, translate } from "./dom.js";
 import { follow } from "./live.js";
 import { priority, prose } from "./marks.js";
 import { DASH, duration, moment, plain } from "./words.js";
@@ -16,7 +16,7 @@ export async function show(main, { session, signal, linked, values }) {
   const flood = h("p", { class: "complaint", hidden: true, role: "status" });
   const state = h("select", {}, h("option", { value: "" }, "All"), h("option", { value: "open" }, "To acknowledge"), h("option", { value: "aside" }, "Shelved, suppressed, out of service"));
   const search = h("input", { type: "search", value: asset, placeholder: "Search", "aria-label": "Search alarms" });
-  state.setAttribute("aria-label", "Show");
+  state.setAttribute("aria-label", translate("Show"));
   let alarms = [];
   let now = 0;
 

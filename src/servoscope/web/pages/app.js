@@ -1,11 +1,13 @@
 // Around every page: navigation, theme, person, the state of the live link; then the page itself.
 import * as api from "./api.js";
-import { complaint, h, mark, tell } from "./dom.js";
+import { complaint, h, mark, translate, tell } from "./dom.js";
+import { LANGUAGE, LANGUAGES } from "./language.js";
 
 const PAGES = {
   "": ["Fleet", () => import("./fleet.js")],
   assets: ["Asset", () => import("./asset.js")],
   alarms: ["Alarms", () => import("./alarms.js")],
+  begin: ["Begin with a log", () => import("./begin.js")],
   diagnose: ["Diagnose a recording", () => import("./diagnose.js")],
   diagnoses: ["Diagnosis", () => import("./diagnosis.js")],
   learn: ["Learn a baseline", () => import("./learn.js")],
@@ -15,6 +17,7 @@ const PAGES = {
 const NAVIGATION = [
   ["/", "Fleet", ["", "assets"]],
   ["/alarms", "Alarms", ["alarms"]],
+  ["/begin", "Begin", ["begin"]],
   ["/diagnose", "Diagnose", ["diagnose", "diagnoses"]],
   ["/learn", "Learn", ["learn"]],
   ["/design", "Design", ["design"]],
@@ -48,7 +51,20 @@ function change() {
   dispatchEvent(new Event("themechange"));
 }
 
+// Of its own, so that somebody at a foreign computer finds it.
+function languageSwitch() {
+  const name = (code) => new Intl.DisplayNames([code], { type: "language" }).of(code);
+  const select = h("select", { class: "quiet", "aria-label": "Language", translate: "no" }, LANGUAGES.map((code) => h("option", { value: code, lang: code, selected: code === LANGUAGE, translate: "no" }, name(code))));
+  select.addEventListener("change", () => {
+    document.cookie = `language=${select.value}; path=/; max-age=31536000; samesite=strict`;
+    location.reload();
+  });
+  return select;
+}
+
 function surround() {
+  document.documentElement.lang = LANGUAGE;
+  tell(document.querySelector(".skip"), "Skip to content");
   named();
   const pages = name === "login" ? [] : NAVIGATION.map(([address, words, of]) => h("a", { href: address, "aria-current": of.includes(name) && "page" }, words));
   document
@@ -58,6 +74,7 @@ function surround() {
       h("nav", { "aria-label": "Pages" }, pages),
       link,
       person,
+      LANGUAGES.length > 1 && languageSwitch(),
       theme,
     );
 }
@@ -93,7 +110,7 @@ function linked(state) {
 }
 
 function entitle(title) {
-  document.title = `${title} · servoscope`;
+  document.title = `${translate(title)} · servoscope`;
 }
 
 async function start() {

@@ -1,5 +1,6 @@
 // The inverse response over frequency, before and now: magnitude and phase with their 95 % bands.
 import { axis, legend, line, tooltip } from "./charts.js";
+import { translate } from "./dom.js";
 import { number, unit } from "./words.js";
 
 const ONE_OF_TWO = 1.959964 / Math.sqrt(5.991465); // of an ellipse that holds 95 % in two directions, the half width in one
@@ -30,7 +31,7 @@ export function bode(c, responses, units) {
       { left: "54%", right: 14, top: 30, bottom: 40 },
     ],
     legend: legend(c, ["before", "now"]),
-    tooltip: tooltip(c, { formatter: (drawn) => [`${number(drawn[0].value[0], 4)} Hz`, ...drawn.filter((one) => ["before", "now"].includes(one.seriesName)).map((one) => `${one.seriesName} ${number(one.value[1], 4)}`)].join("\n") }),
+    tooltip: tooltip(c, { formatter: (drawn) => [`${number(drawn[0].value[0], 4)} Hz`, ...drawn.filter((one) => ["before", "now"].map(translate).includes(one.seriesName)).map((one) => `${one.seriesName} ${number(one.value[1], 4)}`)].join("\n") }),
     xAxis: [gain(0, "frequency [Hz]"), gain(1, "frequency [Hz]")],
     yAxis: [
       axis(c, `magnitude${y}`, { type: "value", scale: true, gridIndex: 0, gap: 52, splitNumber: 4, label: { formatter: short } }),

@@ -1,5 +1,5 @@
 // What every chart can do: zoom and pan by buttons or by hand, save as PNG or CSV, and an address that opens the same view.
-import { h, save } from "./dom.js";
+import { h, save, translate } from "./dom.js";
 
 const STEP = 0.5; // of what is seen, by one press
 
@@ -21,7 +21,7 @@ export function tools(chart, label, { image, csv, moved, signal }) {
     return [middle - half, middle + half];
   };
   const step = (width, shift = 0) => () => go(all().map((span, i) => seen(span, width, i ? 0 : shift)));
-  const button = (words, title, press) => h("button", { type: "button", class: "filter", "aria-label": `${title}: ${label}`, title, onclick: press }, words);
+  const button = (words, title, press) => h("button", { type: "button", class: "filter", "aria-label": `${translate(title)}: ${translate(label)}`, title, onclick: press }, words);
   const text = () => (csv ? csv() : drawn(chart));
   const name = label.replace(/[^\w.-]+/g, " ").trim();
 
@@ -44,7 +44,7 @@ export function tools(chart, label, { image, csv, moved, signal }) {
   return h(
     "details",
     { class: "tools screen" },
-    h("summary", { "aria-label": `View and save: ${label}` }, "View, save"),
+    h("summary", { "aria-label": `${translate("View and save")}: ${translate(label)}` }, "View, save"),
     h(
       "div",
       {},

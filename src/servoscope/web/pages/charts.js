@@ -1,6 +1,7 @@
 // ECharts in the look of the report: its colours, its axes, no animation; drawn anew when the theme changes.
 import "./vendor/echarts.common.min.js";
 import { tools, zoomed } from "./chart_tools.js";
+import { translate } from "./dom.js";
 
 const NAMES = ["paper", "panel", "ink", "muted", "rule", "measured", "healthy", "alarm", "reference", "care", "check"];
 const LETTERS = getComputedStyle(document.documentElement).getPropertyValue("--letters");
@@ -37,7 +38,7 @@ export function plot(element, label, describe, signal, { csv = null, moved = nul
   const watcher = new ResizeObserver(() => matchMedia("print").matches || chart.resize());
   watcher.observe(element);
   element.setAttribute("role", "img");
-  element.setAttribute("aria-label", label);
+  element.setAttribute("aria-label", translate(label));
   const image = () => (now(), chart.getZr().flush(), chart.getDataURL({ pixelRatio: 2, backgroundColor: colours().paper }));
   const one = { draw, print: () => (now(), chart.getZr().flush()) };
   plots.add(one);
@@ -95,12 +96,12 @@ export function tooltip(c, rest = {}) {
 }
 
 export function legend(c, data) {
-  return { data, top: 0, left: 0, itemWidth: 18, itemHeight: 8, icon: "roundRect", textStyle: { color: c.ink, fontSize: 12 }, inactiveColor: c.muted };
+  return { data: data.map(translate), top: 0, left: 0, itemWidth: 18, itemHeight: 8, icon: "roundRect", textStyle: { color: c.ink, fontSize: 12 }, inactiveColor: c.muted };
 }
 
 export function axis(c, name, rest = {}) {
   return {
-    name,
+    name: translate(name),
     nameLocation: "middle",
     nameGap: rest.gap ?? 26,
     nameTextStyle: { color: c.ink, fontSize: 12 },
@@ -113,7 +114,7 @@ export function axis(c, name, rest = {}) {
 }
 
 export function line(name, data, colour, rest = {}) {
-  return { type: "line", name, data, color: colour, showSymbol: false, lineStyle: { width: 1.4, color: colour, ...rest.stroke }, ...rest };
+  return { type: "line", name: translate(name), data, color: colour, showSymbol: false, lineStyle: { width: 1.4, color: colour, ...rest.stroke }, ...rest };
 }
 
 // The outline of an ellipse around a point: half axes, and the angle of the first of them.

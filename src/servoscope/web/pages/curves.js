@@ -1,5 +1,6 @@
 // Curves over time: both tests against their limit, and signals; live or of a recording, they look the same.
 import { axis, legend, line, tooltip } from "./charts.js";
+import { translate } from "./dom.js";
 import { moment, multiple, number, unit } from "./words.js";
 
 // Both tests as multiples of their limits, on a logarithmic axis; marks are [time, words] of what happened.
@@ -44,7 +45,7 @@ export function signals(c, { t, r, u, y, units, name = "time [s]", marks = [] })
       { left: 70, right: 14, bottom: 40, height: "32%" },
     ],
     legend: legend(c, ["output y", "reference r"]),
-    tooltip: tooltip(c, { formatter: (points) => [`${number(points[0].value[0], 5)} s`, ...points.map((one) => `${one.seriesName} ${number(one.value[1], 4)} ${one.seriesName === "input u" ? (units?.u ?? "") : (units?.y ?? "")}`)].join("\n") }),
+    tooltip: tooltip(c, { formatter: (points) => [`${number(points[0].value[0], 5)} s`, ...points.map((one) => `${one.seriesName} ${number(one.value[1], 4)} ${one.seriesName === translate("input u") ? (units?.u ?? "") : (units?.y ?? "")}`)].join("\n") }),
     axisPointer: { link: [{ xAxisIndex: "all" }] },
     xAxis: [upper, axis(c, name, { ...time, gridIndex: 1, label: { formatter: short, showMinLabel: false } })],
     yAxis: [axis(c, `r, y${unit(units?.y)}`, { type: "value", scale: true, gridIndex: 0, gap: 52, splitNumber: 3, label: { formatter: short } }), axis(c, `u${unit(units?.u)}`, { type: "value", scale: true, gridIndex: 1, gap: 52, splitNumber: 3, label: { formatter: short } })],
@@ -91,18 +92,18 @@ export function growth(c, { t, value, low, high, full, unit: of, limit, forecast
     symbol: "none",
     label: { show: true, position: "insideStartTop", color: c.ink, formatter: ({ name }) => name },
     data: [
-      ...(limit === null ? [] : [{ yAxis: limit, name: "limit", lineStyle: { color: c.alarm, type: [6, 3], width: 1.2 } }]),
+      ...(limit === null ? [] : [{ yAxis: limit, name: translate("limit"), lineStyle: { color: c.alarm, type: [6, 3], width: 1.2 } }]),
       ...marks.map(([at, words]) => ({ xAxis: 1000 * at, name: words, lineStyle: { color: c.ink, type: [2, 3], width: 1 } })),
     ],
   };
-  const said = (at, words, i) => `${moment(at, { seconds: false })}\n${words} ${number(value[i], 3)}${of} (${number(low[i], 3)} to ${number(high[i], 3)})`;
+  const said = (at, words, i) => `${moment(at, { seconds: false })}\n${words} ${number(value[i], 3)}${of} (${number(low[i], 3)} ${translate("to")} ${number(high[i], 3)})`;
   return {
     grid: { left: 62, right: 14, top: 30, bottom: 28 },
     legend: legend(c, ["size", "full diagnosis"]),
     tooltip: tooltip(c, {
       formatter: ([{ value: [at] }]) => {
         const i = t.indexOf(at / 1000);
-        return i < 0 ? "" : said(t[i], full.has(i) ? "full diagnosis:" : "size", i);
+        return i < 0 ? "" : said(t[i], translate(full.has(i) ? "full diagnosis" : "size"), i);
       },
     }),
     xAxis: axis(c, "", { type: "time", min: at(range[0], true), max: at(range[1], true), splitNumber: 6 }),
@@ -111,7 +112,7 @@ export function growth(c, { t, value, low, high, full, unit: of, limit, forecast
       { ...band, name: "low", data: pairs(low) },
       { ...band, name: "width", data: t.map((at, i) => [1000 * at, high[i] - low[i]]), areaStyle: { color: c.measured, opacity: 0.2 } },
       line("size", pairs(value), c.measured, { markLine: drawn, showSymbol: t.length < 2 }),
-      { type: "scatter", name: "full diagnosis", data: [...full].map((i) => [1000 * t[i], value[i]]), symbolSize: 7, color: c.ink },
+      { type: "scatter", name: translate("full diagnosis"), data: [...full].map((i) => [1000 * t[i], value[i]]), symbolSize: 7, color: c.ink },
       ...ways,
     ],
   };
@@ -127,7 +128,7 @@ export function coefficient(c, { t, one }) {
   const band = { showSymbol: false, silent: true, lineStyle: { opacity: 0 }, stack: "band", stackStrategy: "all", symbol: "none", type: "line" };
   return {
     grid: { left: 62, right: 10, top: 10, bottom: 38 },
-    tooltip: tooltip(c, { formatter: (points) => `${number(points[0].value[0], 5)} s\n${number(points.find((p) => p.seriesName === "estimate")?.value[1], 3)} ${relative ? "%" : one.unit}` }),
+    tooltip: tooltip(c, { formatter: (points) => `${number(points[0].value[0], 5)} s\n${number(points.find((p) => p.seriesName === translate("estimate"))?.value[1], 3)} ${relative ? "%" : one.unit}` }),
     xAxis: axis(c, "time [s]", { type: "value", min: t[0], max: t.at(-1), label: { formatter: short, showMinLabel: false, showMaxLabel: false } }),
     yAxis: axis(c, `deviation${unit(relative ? "%" : one.unit)}`, { type: "value", scale: true, gap: 44, splitNumber: 3, label: { formatter: short } }),
     series: [

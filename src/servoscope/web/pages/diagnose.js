@@ -64,7 +64,7 @@ function steps(one, baselines, wanted, signal) {
     null,
     preview(one),
     columns.element,
-    h("div", { class: "fields" }, baselines.length ? field("Compare with the baseline", baseline) : h("p", { class: "complaint" }, "There is no baseline yet: ", h("a", { href: "/learn" }, "learn one"), "."), pointed, field("From [s]", from), field("To [s]", to)),
+    h("div", { class: "fields" }, baselines.length ? field("Compare with the baseline", baseline) : h("p", { class: "complaint" }, "There is no baseline yet: ", h("a", { href: `/begin?upload=${encodeURIComponent(one.id)}` }, "begin with a log of the healthy machine"), "."), pointed, field("From [s]", from), field("To [s]", to)),
     h("div", { class: "actions" }, diagnose, look, said),
   );
   kept(one.id, asked);

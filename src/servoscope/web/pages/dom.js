@@ -1,5 +1,10 @@
-// Elements without markup in strings: what comes from outside is text, never HTML.
+// Elements without markup in strings: what comes from outside is text, never HTML. What stands in the catalogue is shown in the
+// reader's language; what is data, the name of a column for example, goes into an element with translate="no".
+import { translate } from "./translate.js";
 
+export { translate };
+
+const SPOKEN = ["aria-label", "title", "placeholder", "data-name"];
 const SVG = "http://www.w3.org/2000/svg";
 
 // h("p", { class: "note", onclick: f }, "text", element, [more]) -> an element; null and false are left out.
@@ -16,26 +21,31 @@ function filled(element, attributes, children) {
     if (value === null || value === undefined || value === false) continue;
     if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
     else if (name === "value") element.value = value;
-    else element.setAttribute(name, value === true ? "" : value);
+    else element.setAttribute(name, value === true ? "" : SPOKEN.includes(name) ? translate(value) : value);
   }
-  element.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined && child !== false));
+  const shown = children.flat(Infinity).filter((child) => child !== null && child !== undefined && child !== false);
+  if (element.tagName === "OPTION" && attributes.value === undefined) element.value = shown.join(""); // in no language
+  element.append(...(attributes.translate === "no" ? shown : shown.map(translate)));
   return element;
 }
 
 // Text is only touched where it changes, so that a page at rest costs nothing.
 export function tell(element, text) {
-  if (element.textContent !== text) element.textContent = text;
+  const said = translate(text);
+  if (element.textContent !== said) element.textContent = said;
 }
 
 export function mark(element, name, value) {
-  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+  const said = SPOKEN.includes(name) ? translate(value) : value;
+  if (element.getAttribute(name) !== said) element.setAttribute(name, said);
 }
 
 // A table: head is a list of names, "*Name" for numbers; rows are lists of cells, elements or text.
 export function table(caption, head, rows, attributes = {}) {
   const numeric = head.map((name) => name.startsWith("*"));
   // On a phone rows are cards, and each value says by itself what it is.
-  const named = (element, i) => (element.setAttribute("data-name", head[i]?.replace("*", "") ?? ""), element);
+  const data = attributes.translate === "no" ? { translate: "no" } : {};
+  const named = (element, i) => (element.setAttribute("data-name", data.translate ? head[i] : translate(head[i]?.replace("*", "") ?? "")), element);
   const cell = (content, i) =>
     content instanceof HTMLTableCellElement
       ? named(content, i)
@@ -49,7 +59,7 @@ export function table(caption, head, rows, attributes = {}) {
       "table",
       attributes,
       h("caption", { class: "hidden" }, caption),
-      h("thead", {}, h("tr", {}, head.map((name, i) => h("th", { scope: "col", class: numeric[i] && "n" }, name.replace("*", ""))))),
+      h("thead", {}, h("tr", {}, head.map((name, i) => h("th", { scope: "col", class: numeric[i] && "n", ...data }, data.translate ? name : name.replace("*", ""))))),
       h("tbody", {}, rows.map((row) => h("tr", {}, row.map(cell)))),
     ),
   );

@@ -1,6 +1,6 @@
 // All assets at a glance, worst first: a map of marks by group, and a table beneath it; both live.
 import { get } from "./api.js";
-import { h, mark as set, tell } from "./dom.js";
+import { h, mark as set, translate, tell } from "./dom.js";
 import { follow } from "./live.js";
 import { mark, say, VERDICTS } from "./marks.js";
 import { DASH, duration, moment, multiple, plain, recent, sentence, signed, size } from "./words.js";
@@ -121,7 +121,7 @@ export async function show(main, { signal, linked, values }) {
   function order(forced = false) {
     if (!forced && (body.matches(":hover") || body.contains(document.activeElement))) return;
     const [words, key] = ORDERS[orders.value];
-    set(grid, "aria-label", `Assets, ${words.toLowerCase()}`);
+    set(grid, "aria-label", `Assets, ${words[0].toLowerCase()}${words.slice(1)}`);
     const by = (a, b) => (key(a.row) < key(b.row) ? -1 : key(a.row) > key(b.row) ? 1 : 0);
     const worst = [...assets.values()].sort((a, b) => faulty(a.row) - faulty(b.row) || by(a, b) || rank(b.row) - rank(a.row) || (a.row.asset < b.row.asset ? -1 : 1));
     worst.forEach(({ line }, i) => body.children[i] !== line.element && body.insertBefore(line.element, body.children[i] ?? null));
@@ -129,13 +129,13 @@ export async function show(main, { signal, linked, values }) {
 
   function chart() {
     const named = [...new Set([...assets.values()].map(({ row }) => row.group))].sort();
-    groups.replaceChildren(h("option", { value: "" }, "All groups"), ...named.filter(Boolean).map((name) => h("option", { value: name }, name)));
+    groups.replaceChildren(h("option", { value: "" }, "All groups"), ...named.filter(Boolean).map((name) => h("option", { value: name, translate: "no" }, name)));
     groups.value = filter.group;
     groups.hidden = named.filter(Boolean).length < 2;
     map.replaceChildren(
       ...named.map((name) => {
         const tiles = [...assets.values()].filter(({ row }) => row.group === name).sort((a, b) => (a.row.asset < b.row.asset ? -1 : 1));
-        return h("div", { class: "group" }, name && h("h2", {}, name), h("div", { class: "tiles" }, tiles.map(({ tile }) => tile)));
+        return h("div", { class: "group" }, name && h("h2", { translate: "no" }, name), h("div", { class: "tiles" }, tiles.map(({ tile }) => tile)));
       }),
     );
     const first = map.querySelector("a");
@@ -257,7 +257,12 @@ function limitIn(row, now) {
 // What is known, without the verdict, which stands beside it.
 function known(row) {
   const named = (row.sizes ?? []).map((one) => `${one.words.replace(/ \(.*/, "")}, ${one.parameter} ${size({ ...one, interval: [one.low, one.high] })[0]}`);
-  return row.verdict === "fault" && named.length ? named.join("; ") : sentence(row.summary).replace(/^(Fault|Healthy|Undetermined): /, "");
+  return row.verdict === "fault" && named.length ? named.join("; ") : withoutVerdict(sentence(row.summary));
+}
+
+function withoutVerdict(words) {
+  const verdict = ["Fault", "Healthy", "Undetermined", ...Object.values(VERDICTS)].find((one) => words.startsWith(`${one}: `)); // a service may speak another language
+  return verdict ? words.slice(verdict.length + 2) : words;
 }
 
 function gauge() {
@@ -269,13 +274,13 @@ function gauge() {
 // One asset's row; only what has changed is touched.
 function lineOf(first) {
   const cell = (kind = "") => h("span", { role: "cell", class: kind });
-  const name = h("a", { href: `/assets/${encodeURIComponent(first.asset)}` }, first.asset);
+  const name = h("a", { href: `/assets/${encodeURIComponent(first.asset)}`, translate: "no" }, first.asset);
   const state = cell("state");
   const [group, what, since, deviation, growth, limit, data, alarms, last] = [cell(), cell("what"), cell(), cell("n"), cell("n"), cell("n"), cell(), cell(), cell("n")];
   const statistic = gauge();
   const level = gauge();
   const element = h("div", { role: "row", class: "line" }, state, h("span", { role: "cell", class: "name" }, name), group, what, since, statistic.element, level.element, deviation, growth, limit, data, alarms, last);
-  [...element.children].forEach((one, i) => one.setAttribute("data-name", COLUMNS[i]));
+  [...element.children].forEach((one, i) => set(one, "data-name", COLUMNS[i]));
   const drawn = (one, value) => {
     tell(one.value, multiple(value));
     const share = Math.round(Math.min((value ?? 0) / 1.5, 1) * 48); // px; the limit is at 32
@@ -305,7 +310,7 @@ function lineOf(first) {
     tell(growth, row.outlook?.rate_per_day ? `${signed(100 * WEEK * row.outlook.rate_per_day[1], 2)} %` : DASH);
     tell(limit, limitIn(row, row.t));
     set(limit, "title", row.outlook?.summary ?? "no limit is set, or no fault is named");
-    tell(data, row.quality.map(plain).join(", ") || "sound");
+    tell(data, row.quality.map(plain).map(translate).join(", ") || "sound");
     data.classList.toggle("bad", row.quality.length > 0);
     tell(alarms, open ? `${open} to answer` : row.alarms.length ? `${row.alarms.length} answered` : DASH);
     alarms.classList.toggle("bad", open > 0);

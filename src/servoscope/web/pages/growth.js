@@ -2,7 +2,7 @@
 import { get, mayChange, post, query, upload } from "./api.js";
 import { plot } from "./charts.js";
 import { growth as drawn } from "./curves.js";
-import { during, field, h, tell, titled } from "./dom.js";
+import { during, field, h, translate, tell, titled } from "./dom.js";
 import { say } from "./marks.js";
 import { storedSamples } from "./stored_samples.js";
 import { change, count, moment, number, plain } from "./words.js";
@@ -61,7 +61,7 @@ export function growth(path, name, asset, { session, values, signal }) {
     button.addEventListener("click", async () => {
       let told = [];
       await during(button, answer, async () => (told = await keep()));
-      if (told.length) answer.replaceChildren(...told);
+      if (told.length) answer.replaceChildren(...told.map(translate));
     });
     return h("div", {}, h("div", { class: "actions" }, button), answer);
   }

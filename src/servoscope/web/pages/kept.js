@@ -13,12 +13,17 @@ export function kept(name, element) {
   }
   element.addEventListener("input", ({ target }) => {
     typed[target.name] = target.value;
-    try {
-      sessionStorage.setItem(name, JSON.stringify(typed));
-    } catch {
-      // storage may be forbidden, or full: it holds until the page is left
-    }
+    keep(name, typed);
   });
+}
+
+// Keeps what fields of these names shall hold, on this page or on the next.
+export function keep(name, typed) {
+  try {
+    sessionStorage.setItem(name, JSON.stringify(typed));
+  } catch {
+    // storage may be forbidden, or full: it holds until the page is left
+  }
 }
 
 function read(name) {

@@ -1,6 +1,6 @@
 // Healthy recordings to a baseline: choose the loop, choose recordings, see excitation and quality, learn, save.
 import { get, job, mayChange, part, post } from "./api.js";
-import { complaint, during, field, h, section, table, tell } from "./dom.js";
+import { complaint, during, field, h, section, translate, table, tell } from "./dom.js";
 import { findings, inspected } from "./inspection.js";
 import { kept } from "./kept.js";
 import { loopChoice } from "./loops.js";
@@ -76,7 +76,7 @@ export async function show(main, { session, signal, values }) {
     }, enable),
   );
   work.append(
-    section("Loop", "What is known of it: sampling, plant, controller. A baseline has it inside.", loop.element),
+    section("Loop", ["What is known of it: sampling, plant, controller. A baseline has it inside. Without a loop file ", h("a", { href: "/begin" }, "begin with a log"), "."], loop.element),
     section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, h("div", { class: "actions" }, learn, look, said)),
     result,
   );
@@ -99,7 +99,7 @@ function learned(found, refresh) {
     event.preventDefault();
     try {
       const made = await post("/baselines", { name: name.value, learning: found.learning });
-      link.replaceChildren(`Saved as ${made.name}: `, h("a", { href: `/diagnose?baseline=${part(made.id)}` }, "diagnose a recording with it"));
+      link.replaceChildren(translate(`Saved as ${made.name}: `), h("a", { href: `/diagnose?baseline=${part(made.id)}` }, "diagnose a recording with it"));
       said.replaceChildren();
       button.disabled = true; // the name is taken now, by this
       await refresh();

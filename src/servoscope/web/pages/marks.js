@@ -1,5 +1,5 @@
 // States as shapes: colour is never the only thing that tells them apart.
-import { h, s } from "./dom.js";
+import { h, s, translate } from "./dom.js";
 import { sentence } from "./words.js";
 
 const SHAPES = {
@@ -15,13 +15,13 @@ const SHAPES = {
   care: ["M12 2 23 21.5H1Z", "M12 9v6M12 17.4v1.6"],
   note: ["M12 1a11 11 0 1 0 0 22a11 11 0 1 0 0-22Z", "M12 10.5v7M12 6.500v1.6"],
 };
-export const VERDICTS = { fault: "Fault", undetermined: "Undetermined", healthy: "Healthy" };
+export const VERDICTS = { fault: translate("Fault"), undetermined: translate("Undetermined"), healthy: translate("Healthy") };
 export const STATUS = {
-  failure: "Failure",
-  function_check: "Function check",
-  out_of_specification: "Out of specification",
-  maintenance_required: "Maintenance required",
-  good: "Good",
+  failure: translate("Failure"),
+  function_check: translate("Function check"),
+  out_of_specification: translate("Out of specification"),
+  maintenance_required: translate("Maintenance required"),
+  good: translate("Good"),
 };
 export const PRIORITIES = ["critical", "high", "medium", "low"];
 
@@ -39,12 +39,12 @@ export function badge(kind, words) {
 
 export function priority(name) {
   const bars = PRIORITIES.length - Math.max(PRIORITIES.indexOf(name), 0);
-  return h("span", { class: `priority ${name}` }, h("span", { class: "bars", "aria-hidden": "true" }, "▮".repeat(bars) + "▯".repeat(4 - bars)), ` ${name}`);
+  return h("span", { class: `priority ${name}` }, h("span", { class: "bars", "aria-hidden": "true" }, "▮".repeat(bars) + "▯".repeat(4 - bars)), " ", name);
 }
 
 // A sentence, or a name, with its parameters as symbols: C_ie with a subscript.
 export function prose(text) {
-  return sentence(text)
+  return sentence(translate(text))
     .split(/\b([A-Za-z]{1,2}_[A-Za-z]\w{0,2})\b/)
     .map((part, i) => {
       if (i % 2 === 0) return part;

@@ -1,5 +1,5 @@
 // Estimated coefficients with their intervals, as a table whose numbers move without the page moving.
-import { h, tell } from "./dom.js";
+import { h, mark, tell } from "./dom.js";
 import { prose } from "./marks.js";
 import { DASH, signed, withStd } from "./words.js";
 
@@ -13,7 +13,7 @@ export function parameters(first) {
     const dot = h("b");
     const picture = h("td", {}, h("span", { class: "interval", "aria-hidden": "true" }, band, dot));
     const unit = h("td", { class: "unit" }, one.unit || DASH);
-    [cells.value, unit, cells.nominal, cells.change, cells.sigma, picture].forEach((cell, i) => cell.setAttribute("data-name", HEADS[i + 1]));
+    [cells.value, unit, cells.nominal, cells.change, cells.sigma, picture].forEach((cell, i) => mark(cell, "data-name", HEADS[i + 1]));
     return { name: one.name, cells, band, dot, element: h("tr", {}, h("th", { scope: "row" }, prose(one.name)), cells.value, unit, cells.nominal, cells.change, cells.sigma, picture) };
   });
   const element = h(

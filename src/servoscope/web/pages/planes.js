@@ -1,6 +1,6 @@
 // The inverse frequency response in the complex plane, a panel per frequency: healthy, where it is now with its ellipse, and its trail.
 import { axis, outline, plot, tooltip } from "./charts.js";
-import { h } from "./dom.js";
+import { h, translate } from "./dom.js";
 import { general, number, ticks } from "./words.js";
 
 const TRAIL = 400; // points of a trail
@@ -72,15 +72,15 @@ function described(one, c, unit, onset) {
   const path = (name, data, colour) => ({ type: "line", name, data, showSymbol: false, silent: true, lineStyle: { color: colour, width: 0.8, opacity: 0.45 } });
   return {
     grid: { left: 66, right: 12, top: 8, bottom: 40 },
-    tooltip: tooltip(c, { trigger: "item", formatter: ({ seriesName, value }) => `${seriesName}\nreal ${number(value[0], 5)}\nimaginary ${number(value[1], 5)}` }),
+    tooltip: tooltip(c, { trigger: "item", formatter: ({ seriesName, value }) => `${seriesName}\n${translate("real part")} ${number(value[0], 5)}\n${translate("imaginary part")} ${number(value[1], 5)}` }),
     xAxis: axis(c, `real part${unit && ` [${unit}]`}`, { type: "value", min: one.x[0], max: one.x[1], splitNumber: 3, label: { formatter: ticks(...one.x), showMinLabel: false, showMaxLabel: false } }),
     yAxis: axis(c, `imaginary part${unit && ` [${unit}]`}`, { type: "value", min: one.y[0], max: one.y[1], splitNumber: 4, gap: 50, label: { formatter: ticks(...one.y), showMinLabel: false, showMaxLabel: false } }),
     series: [
       path("trail", one.trail.slice(0, cut + 1), c.measured),
       path("trail since the onset", one.trail.slice(cut), tone),
       { type: "line", name: "ellipse", data: around, showSymbol: false, silent: true, lineStyle: { color: tone, width: 1.2 } },
-      { type: "scatter", name: "healthy", data: [healthy], z: 6, symbol: "diamond", symbolSize: 12, itemStyle: { opacity: 1, color: c.paper, borderColor: c.ink, borderWidth: 1.3 } },
-      { type: "scatter", name: "now", data: now.real === null ? [] : [here], z: 7, symbolSize: 9, itemStyle: { opacity: 1, color: tone, borderColor: c.paper, borderWidth: 1 } },
+      { type: "scatter", name: translate("healthy"), data: [healthy], z: 6, symbol: "diamond", symbolSize: 12, itemStyle: { opacity: 1, color: c.paper, borderColor: c.ink, borderWidth: 1.3 } },
+      { type: "scatter", name: translate("now"), data: now.real === null ? [] : [here], z: 7, symbolSize: 9, itemStyle: { opacity: 1, color: tone, borderColor: c.paper, borderWidth: 1 } },
     ],
   };
 }

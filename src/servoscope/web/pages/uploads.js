@@ -1,6 +1,6 @@
 // Recordings on their way in: dropped or chosen files, what is in them, which column is what.
 import { get, part, upload } from "./api.js";
-import { complaint, field, h, table } from "./dom.js";
+import { complaint, field, h, translate, table, tell } from "./dom.js";
 import { count, moment, number } from "./words.js";
 
 const UNITS = ["s", "ms", "us", "ns", "min"];
@@ -26,7 +26,7 @@ export function dropzone(words, several, taken, signal, begun = () => {}) {
   const take = async (files) => {
     begun();
     for (const file of several ? files : [...files].slice(0, 1)) {
-      said.replaceChildren(`Reading ${file.name}`);
+      tell(said, `Reading ${file.name}`);
       try {
         await taken(await upload(file, signal));
         said.replaceChildren();
@@ -51,7 +51,7 @@ export function dropzone(words, several, taken, signal, begun = () => {}) {
 export async function earlier(chosen, signal) {
   const { uploads } = await get("/uploads", signal);
   if (!uploads.length) return null;
-  const select = h("select", {}, h("option", { value: "" }, "choose"), [...uploads].reverse().map((one) => h("option", { value: one.id }, `${one.name}, ${moment(one.at)}`)));
+  const select = h("select", {}, h("option", { value: "" }, "choose"), [...uploads].reverse().map((one) => h("option", { value: one.id, translate: "no" }, `${one.name}, ${moment(one.at)}`)));
   select.addEventListener("change", async () => select.value && chosen(await get(`/uploads/${part(select.value)}`, signal)));
   return field("or one that was uploaded before", select);
 }
@@ -59,25 +59,26 @@ export async function earlier(chosen, signal) {
 export function preview(one) {
   const about = h("p", { class: "note" }, `${one.name}: ${count(one.rows)} rows, ${(one.bytes / 1e6).toFixed(2)} MB. The first rows, and the range of each column:`);
   const range = (column) => (column.min === null ? column.type : `${number(column.min, 3)} to ${number(column.max, 3)}`);
-  const head = one.preview.columns.map((name) => `*${name}`);
+  const data = (words) => h("span", { translate: "no" }, words);
+  const head = one.preview.columns;
   const ranges = one.preview.columns.map((name) => h("td", { class: "n" }, h("small", {}, range(one.columns.find((each) => each.name === name) ?? { min: null, type: "" }))));
-  const rows = one.preview.rows.map((row) => row.map((cell) => h("td", { class: "n" }, typeof cell === "number" ? number(cell, 5) : String(cell ?? ""))));
-  const made = table(`The first rows of ${one.name}`, head, [ranges, ...rows]);
+  const rows = one.preview.rows.map((row) => row.map((cell) => h("td", { class: "n" }, typeof cell === "number" ? number(cell, 5) : data(String(cell ?? "")))));
+  const made = table(`The first rows of ${one.name}`, head, [ranges, ...rows], { translate: "no" });
   made.classList.add("preview");
   return h("div", {}, about, made);
 }
 
 // Which column is what; `read()` returns it as the interface wants it. `suit` takes the columns of the loop that the
 // recording is compared with (null: nothing is known of them; true: they stand in its text, which the server reads): a
-// guess by names must not overrule what somebody has said. What was typed in stays.
-export function mapping(one) {
+// guess by names must not overrule what somebody has said. What was typed in stays. `loopless`: no loop is known yet.
+export function mapping(one, loopless = false) {
   const names = one.columns.map((column) => column.name);
   const id = `columns-${one.id}`;
   const typed = new Set();
   const input = (key, more) => h("input", { name: key, autocomplete: "off", ...more, oninput: () => typed.add(key) });
   const fields = Object.fromEntries(SIGNALS.map(([key]) => [key, input(key, { list: id })]));
   const segment = input("segment", { placeholder: "none" });
-  const unit = h("select", { name: "time_unit", onchange: () => typed.add("time_unit") }, h("option", { value: "" }, "as in the loop file"), UNITS.map((name) => h("option", { value: name }, name)));
+  const unit = h("select", { name: "time_unit", onchange: () => typed.add("time_unit") }, !loopless && h("option", { value: "" }, "as in the loop file"), UNITS.map((name) => h("option", { value: name }, name)));
   const origin = h("p", { class: "note" });
   const element = h(
     "div",
@@ -85,19 +86,19 @@ export function mapping(one) {
     h("datalist", { id }, names.map((name) => h("option", { value: name }))),
     h("div", { class: "fields" }, SIGNALS.map(([key, words]) => field(words, fields[key])), field("Unit of time", unit), field("New run where this changes", segment)),
     origin,
-    h("p", { class: "note" }, "A column, or a combination of columns: 0.025 * counts, set_point - error. Units are those that the baseline was learned in."),
+    h("p", { class: "note" }, "A column, or a combination of columns: 0.025 * counts, set_point - error. ", loopless ? "In SI units where you can: 0.001 * position_mm." : "Units are those that the baseline was learned in."),
   );
   const suit = (columns) => {
     const own = columns === true;
     const fit = !own && columns !== null && SIGNALS.every(([key]) => fits(columns[key], names));
     const found = own ? {} : fit ? columns : one.mapping;
     for (const [key] of SIGNALS) {
-      fields[key].placeholder = own ? "as in the loop file" : "";
+      fields[key].placeholder = own ? translate("as in the loop file") : "";
       if (!typed.has(key)) fields[key].value = found[key] ?? "";
     }
     if (!typed.has("segment")) segment.value = (found.segment ?? []).join(", ");
     if (!typed.has("time_unit")) unit.value = found.time_unit ?? "";
-    origin.textContent = own ? "As the loop file says." : fit ? "As the loop says." : "Guessed from the names: look whether this is so.";
+    tell(origin, own ? "As the loop file says." : fit ? "As the loop says." : "Guessed from the names: look whether this is so.");
   };
   suit(null);
   const read = () => {

@@ -16,7 +16,7 @@ from servoscope.signals.readers import readable_suffixes
 from servoscope.web.dependencies import VIEWER, ContextDep, Operator
 from servoscope.web.jobs.queue import Job
 from servoscope.web.routes.baselines import resolve_loop
-from servoscope.web.schemas.requests import InspectionRequest, JobQuery, UploadQuery
+from servoscope.web.schemas.requests import InspectionRequest, JobQuery, ProposalRequest, UploadQuery
 from servoscope.web.schemas.responses import FilePreview, JobResponse, UploadDetail, UploadList, UploadRow
 
 router = APIRouter(tags=["uploads"], dependencies=[VIEWER])
@@ -102,6 +102,15 @@ async def start_inspection(context: ContextDep, who: Operator, request: Inspecti
     arguments = file.name, request, loop
     return context.jobs.submit(
         Job("inspection", who.user, "inspect_file", arguments, file.parent, lambda result: result)
+    )
+
+
+@router.post("/proposals", status_code=HTTP_202_ACCEPTED)
+async def start_proposal(context: ContextDep, who: Operator, request: ProposalRequest) -> JobResponse:
+    """Propose a loop file for an upload, with the evidence for each line, and inspect the upload with it; a job."""
+    file = await asyncio.to_thread(context.storage.upload, request.upload)
+    return context.jobs.submit(
+        Job("proposal", who.user, "propose_file", (file.name, request), file.parent, lambda result: result)
     )
 
 

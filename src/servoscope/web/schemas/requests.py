@@ -185,6 +185,13 @@ class InspectionRequest(RecordingSelection):
     loop: LoopRef | None = None
 
 
+class ProposalRequest(ApiRequest):
+    """An upload to propose a loop file for; without columns by the names that the file has."""
+
+    upload: Id
+    columns: ColumnMapping | None = None
+
+
 class DiagnosisRequest(RecordingSelection):
     """An upload to diagnose with a baseline."""
 

@@ -109,6 +109,7 @@ class FilePreview(ApiResponse):
     columns: list[JsonObject]
     preview: TablePreview
     mapping: JsonObject
+    axes: dict[str, JsonObject] = {}  # the mapping of each, where the names show several
 
 
 class UploadDetail(UploadRow, FilePreview):
