@@ -21,10 +21,12 @@ from servoscope.prognosis.series import SizeSeries
 
 COURSES, QUIET = 200, 200
 LIMIT = 1.0
+STEPS = 5000  # of a simulated course
 SHARES = (0.5, 0.7, 0.9)  # of the life, at which is looked
 LOOKS = 6  # at a history without wear
 ALPHA = 0.2  # of the alpha-lambda accuracy
 KINDS = ("linear", "power", "exponential", "stick")
+OTHERS = ("none", "two rates", "slowing")  # no wear, and wear that the method does not know
 Interval = tuple[float, float, float]
 Forecaster = Callable[[SizeSeries], Interval | None]
 
@@ -50,11 +52,12 @@ def cut(series: SizeSeries, t: float) -> SizeSeries:
 
 
 def course(seed: int, kind: str, temperature: bool) -> Course:
-    """Draw a life of 60 to 500 days with 60 to 400 values, one of ten of its own wear random, noise of 0.2 to 2 %."""
-    rng = np.random.default_rng([seed, KINDS.index(kind) if kind in KINDS else 9])
+    """Draw a life of 60 to 500 days with 60 to 400 values, up to 3 % of its wear random, noise of 0.2 to 2 %."""
+    rng = np.random.default_rng([seed, KINDS.index(kind) if kind in KINDS else 9 + OTHERS.index(kind)])
     days, count = rng.uniform(60.0, 500.0), int(rng.integers(60, 400))
-    t = np.sort(rng.uniform(0.0, 1.3, count)) * days
-    share = t / days
+    # the size goes on between its values, and may reach the limit there
+    share = np.linspace(0.0, 1.3, STEPS)
+    measured = np.sort(rng.choice(STEPS, count, replace=False))
     if kind == "linear":
         x = share
     elif kind == "power":
@@ -65,18 +68,24 @@ def course(seed: int, kind: str, temperature: bool) -> Course:
     elif kind == "stick":
         begin = rng.uniform(0.1, 0.45)
         x = np.maximum(share - begin, 0.0) / (1.0 - begin)
+    elif kind == "two rates":
+        bend, ratio = rng.uniform(0.2, 0.6), rng.uniform(0.5, 2.5)
+        x = np.minimum(share, bend) + ratio * np.maximum(share - bend, 0.0)
+        x = x / (bend + ratio * (1.0 - bend))
+    elif kind == "slowing":
+        x = share ** rng.uniform(0.6, 0.9)
     else:
-        x = np.zeros_like(t)
+        x = np.zeros(STEPS)
     growth = np.diff(x, prepend=0.0)
-    x = x + np.cumsum(rng.uniform(0.0, 0.03) * np.sqrt(growth) * rng.standard_normal(count))
+    x = x + np.cumsum(rng.uniform(0.0, 0.03) * np.sqrt(growth) * rng.standard_normal(STEPS))
+    reached, t = x >= LIMIT, share[measured] * days
     std = math.exp(rng.uniform(math.log(0.002), math.log(0.02)))
     warm = 5.0 * np.sin(2.0 * np.pi * t / rng.uniform(1.0, 365.0)) + 2.0 * rng.standard_normal(count)
     effect = rng.normal(0.0, 0.005) if temperature else 0.0
-    value = x + effect * warm + std * rng.standard_normal(count)
+    value = x[measured] + effect * warm + std * rng.standard_normal(count)
     covariates = {"temperature": warm} if temperature else {}
     series = SizeSeries(kind, t * DAY_S, value, np.full(count, std), covariates)
-    reached = x >= LIMIT
-    return Course(kind, series, float(series.t[np.argmax(reached)]) if reached.any() else math.inf)
+    return Course(kind, series, float(share[np.argmax(reached)]) * days * DAY_S if reached.any() else math.inf)
 
 
 def ours(series: SizeSeries) -> Interval | None:

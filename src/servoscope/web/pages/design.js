@@ -97,6 +97,11 @@ function studied(study, drawn, signal) {
       h("div", { class: "half" }, section("Time to detection", "Half of all changes of a size are announced by then.", picture("Time to detection over size of the change", (c) => delays(c, sides)))),
       h("div", { class: "half" }, section("How sure a size becomes", "Cramér-Rao bound, with the healthy parameters as well known as they are.", picture("Standard deviation of the size over time", (c) => sizes(c, faults)))),
     ),
+    section(
+      "When the loop fails",
+      "Tracking lost: its bandwidth falls to 0.7 of the healthy one. Stability lost: its distance to instability is halved. Such a size is a limit for the trend of an asset.",
+      table("Limits of faults", ["Change, as a ratio to healthy", "*Tracking lost at", "*Stability lost at"], sides.map(([fault, way, side]) => [`${capital(plain(fault.name))} ${way}`, ...[side.tracking, side.stability].map((at) => (at ? general(at) : "never"))])),
+    ),
     names.length > 1 && section("How alike they look", "Cosine between what small changes do: 1 or −1 cannot be told apart, 0 is as different as can be.", table("Cosines between faults", ["Change", ...names.map((name) => `*${plain(name)}`)], names.map((one) => [plain(one), ...names.map((other) => heat(study.cosines[one][other]))]))),
     study.mimics?.length > 0 && section("What else it could be", "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart.", table("Mimics", ["Change", "Is most like", "*Cosine", "*So much", "*Looks like", "*Told apart from"], study.mimics.map((one) => [h("span", {}, one.words, / |^delay$/.test(one.name) || h("small", {}, " ", prose(one.name))), one.imitates, number(one.cosines[one.imitates], 3), amount(one.amount, one.unit), change(one.looks_like), amount(one.told_apart, one.unit)]))),
     section("Frequencies to monitor", `Standard deviation of each size as one frequency shows it. The best set the faults ${number(study.frequencies.gain, 3)} times as far apart, on average.`, table("Frequencies", ["Frequency", "", ...names.map((name) => `*${plain(name)}`)], [["monitored", study.frequencies.own], ["best", study.frequencies.best]].flatMap(([what, several]) => several.map((one) => [`${general(one.frequency_hz)} Hz`, what, ...names.map((name) => percent(one.apart[name]))])))),
