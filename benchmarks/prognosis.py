@@ -2,7 +2,8 @@
 
 python benchmarks/prognosis.py [--share 0.1] [--alone] [--json]
 
-ProgPy and SurPyval have to be installed (pip install progpy surpyval), or --alone leaves them out.
+ProgPy and SurPyval have to be installed (pip install -r benchmarks/requirements-prognosis.txt), or --alone leaves them
+out.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.prognosis.forecast import DAY_S, prognose
 from servoscope.prognosis.series import SizeSeries
 
-COURSES, QUIET = 200, 200
+COURSES, QUIET, UNKNOWN = 200, 200, 50
 LIMIT = 1.0
 STEPS = 5000  # of a simulated course
 SHARES = (0.5, 0.7, 0.9)  # of the life, at which is looked
@@ -219,12 +220,14 @@ def main() -> None:
     command.add_argument("--alone", action="store_true", help="without the other libraries")
     given = command.parse_args()
     if missing := [name for name in ("progpy", "surpyval") if find_spec(name) is None and not given.alone]:
-        command.error(f"{' and '.join(missing)}: not installed; pip install them, or say --alone")
+        command.error(f"{' and '.join(missing)}: pip install -r benchmarks/requirements-prognosis.txt, or --alone")
     count = round(COURSES * given.share)
     drawn = [course(seed, KINDS[seed % len(KINDS)], temperature=bool(seed // len(KINDS) % 2)) for seed in range(count)]
     drawn = [each for each in drawn if math.isfinite(each.life)]
     groups = {"all": drawn, **{kind: [each for each in drawn if each.kind == kind] for kind in KINDS}}
     groups["with temperature"] = [each for each in drawn if each.series.covariates]
+    for kind in OTHERS[1:]:
+        groups[kind] = [course(seed, kind, temperature=bool(seed % 2)) for seed in range(round(UNKNOWN * given.share))]
     forecasters = {"servoscope": ours, "straight line": line}
     if not given.alone:
         forecasters["ProgPy"] = progpy_forecaster()
@@ -249,7 +252,10 @@ def main() -> None:
         "median width at half of the life",
     )
     looks = ", ".join(f"{100 * share:.0f}" for share in SHARES)
-    note = f"Looked at after {looks} % of the life; widths in shares of what remains."
+    note = (
+        f"Looked at after {looks} % of the life; widths in shares of what remains. Two rates and slowing are no part "
+        "of all: the method does not know such courses."
+    )
     show(
         [
             Table("Remaining time", note, (*columns, "median within 20 % (%), by look"), tuple(rows)),

@@ -54,8 +54,8 @@ class Courses:
             exponent=1.0 + 3.0 * np.maximum(2.0 * u[:, 1] - 1.0, 0.0),
             growth=5.0 * np.maximum(2.0 * u[:, 2] - 1.0, 0.0),
             diffusion=0.003 * 30.0 ** u[:, 3],
-            # below 0.01 it is none
-            walk=0.002 * 250.0 ** u[:, 4],
+            # below 0.01 it is none: for half of them
+            walk=0.0002 * 2500.0 ** u[:, 4],
             noise=0.8 * 1.6 ** u[:, 5],
         )
 
