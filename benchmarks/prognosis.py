@@ -8,6 +8,7 @@ out.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ Interval = tuple[float, float, float]
 Forecaster = Callable[[SizeSeries], Interval | None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Course:
     """A size that reaches `LIMIT` at `life` [s], as it is measured."""
 
@@ -182,13 +183,18 @@ def correct_covariates(series: SizeSeries) -> FloatArray:
     return np.asarray(series.value - A[:, 2:] @ fit[2:])
 
 
+@functools.cache
+def look(one: Course, forecaster: Forecaster) -> list[tuple[float, float, Interval | None]]:
+    """Return for each share of the life what remains of it [s], and the forecast."""
+    known = [(share, one.until(share)) for share in SHARES]
+    return [(share, one.life - float(series.t[-1]), forecaster(series)) for share, series in known]
+
+
 def score(courses: Sequence[Course], forecaster: Forecaster) -> list[str]:
     """Return the cells of a forecaster: given, interval holds, width at half of the life, alpha-lambda accuracy."""
     given, held, widths, close = 0, 0, [], {share: 0 for share in SHARES}
     for one in courses:
-        for share in SHARES:
-            series = one.until(share)
-            truth, found = one.life - float(series.t[-1]), forecaster(series)
+        for share, truth, found in look(one, forecaster):
             width = math.inf
             if found is not None:
                 given += 1
