@@ -119,6 +119,8 @@ def test_a_study_says_what_can_be_told_apart(open_page: Open) -> None:
     expect(page.get_by_role("heading", name="How alike they look")).to_be_visible(timeout=LONG_MS)
     expect(page.get_by_role("region", name="Radii of faults")).to_contain_text("Leakage up")
     limits = page.get_by_role("region", name="Limits of faults").get_by_role("row")
+    mimics = page.get_by_role("region", name="Mimics").get_by_role("rowheader")
+    assert "a further delay" in mimics.all_inner_texts()
     expect(limits.filter(has_text="Pump down")).to_contain_text("0.41")  # where tracking is lost
     shot(page, "design", full_page=True)
     fits(page, 1440, 800, 390)
