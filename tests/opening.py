@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -111,13 +112,49 @@ def shot(page: Any, name: str, **how: Any) -> None:
 
 
 def accessible(page: Any) -> None:
-    """No serious finding of axe-core: contrast, names, roles, order of headings and so on."""
+    """No finding of axe-core: contrast, names, roles, order of headings and so on."""
     from axe_playwright_python.sync_playwright import Axe
 
     found = Axe().run(page, options={"resultTypes": ["violations"]}).response["violations"]
-    serious = [one for one in found if one["impact"] in ("serious", "critical")]
-    told = [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes'][:3]]}" for one in serious]
+    told = [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes'][:3]]}" for one in found]
     assert told == []
+
+
+def fits(page: Any, *widths: int) -> None:
+    """At each width nothing scrolls sideways, and axe finds nothing at the last one, in light and dark."""
+    for width in widths:
+        page.set_viewport_size({"width": width, "height": 844})
+        page.wait_for_timeout(300)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, (page.url, width)
+    for theme in THEMES:
+        page.emulate_media(color_scheme=theme)
+        page.wait_for_timeout(300)
+        accessible(page)
+
+
+def tab_to(page: Any, name: str) -> None:
+    """Press Tab until what is focused is called so."""
+    seen = []
+    for _ in range(250):
+        page.keyboard.press("Tab")
+        one = page.evaluate(
+            "(e => e.getAttribute('aria-label') ?? e.labels?.[0]?.innerText ?? e.innerText)(document.activeElement)"
+        )
+        seen.append(str(one)[:80])
+        if re.search(name, seen[-1]):
+            return
+    raise AssertionError(f"Tab does not come to {name}: {seen}")
+
+
+def drag(page: Any, box: dict[str, float], dx: float, dy: float) -> None:
+    """Drag one finger from the middle of a box."""
+    touch = page.context.new_cdp_session(page)
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for k in range(11):
+        points = [{"x": x + dx * k / 10, "y": y + dy * k / 10}]
+        touch.send("Input.dispatchTouchEvent", {"type": "touchMove" if k else "touchStart", "touchPoints": points})
+        page.wait_for_timeout(16)
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
 
 def painted(page: Any) -> bool:

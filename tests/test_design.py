@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy import linalg
 
 import servoscope as ss
 from commands import one_line, run
+from servoscope.cli.render.design import print_study
 from servoscope.core.errors import LoopError, SimulationError
 from servoscope.design import DesignStudy, explanation_distances, study
 from servoscope.design.detection_delay import AlarmSimulator, detectability_radius
@@ -25,6 +28,7 @@ from servoscope.design.fisher_information import (
 )
 from servoscope.design.isolability import ambiguous_sizes, hypothesis_distances
 from servoscope.design.mimics import match_mimic, mimic_causes
+from servoscope.design.operating_limits import operating_limits
 from servoscope.design.scenario import Scenario
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.baseline_parts import ExactPredictorFit
@@ -248,6 +252,14 @@ class TestCommand:
         assert fault.down.isolable < 1.0
         assert fault.sizes[-1].together is None  # input_gain scales both coefficients
         assert [each.share for each in said.dither] == [0.0, 0.01, 0.05]
+        lost = {(one.fault, one.kind): one for one in operating_limits(Loop.load(loop))}
+        for name, each in said.faults.items():
+            assert (each.up.tracking, each.down.tracking) == lost[name, "tracking"][2:]
+            assert (each.up.stability, each.down.stability) == lost[name, "stability"][2:]
+        out = io.StringIO()
+        print_study(Console(file=out, width=100), said)
+        heavy = fault.up.tracking  # a heavier axis follows worse
+        assert heavy is not None and f"inertia up {heavy:g}" in " ".join(out.getvalue().split())
         html = page.read_text(encoding="utf-8")
         assert html == design_page.render_design_page(said)
         assert html.count("<svg") == 3

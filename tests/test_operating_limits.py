@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,8 +13,15 @@ from typer.testing import CliRunner
 
 import halls
 from servoscope.cli import app
+from servoscope.core.errors import ConfigError
 from servoscope.design.operating_limits import BANDWIDTH_LEFT, operating_limits
 from servoscope.models.loop import Loop
+from servoscope.service.build import build_visit
+from servoscope.service.config import ServiceFile
+from servoscope.service.diagnosis_worker import find_due_prognosis
+from servoscope.service.outlook import DuePrognosis
+from servoscope.service.sources.block import Block
+from servoscope.service.store import Batch, Store
 from servoscope.simulation.stability import closed_loop_poles
 
 
@@ -70,6 +78,42 @@ def test_half_the_margin_leaves_so_much_less_gain() -> None:
         return math.inf
 
     assert 1.0 / (1.0 - 0.5 * 0.62) - 0.02 < gain_margin(ratio) < 0.7 * gain_margin(1.0)
+
+
+def test_a_service_file_names_what_the_loop_loses_and_trend_takes_its_loop(tmp_path: Path) -> None:
+    """A weak pump slows the loop down; a stronger one has no limit, and a leak none at all."""
+    halls.files(tmp_path)
+    named = 'limits = { pump = "tracking", leakage = 1.5 }'
+    path = halls.hall(tmp_path, "hall", more=named)
+    assets, _ = build_visit(ServiceFile.load(path))
+    assert assets["press"].policy.limits == {}
+    asset = assets["lift"]
+    asset.process(Block("lift", 0, np.arange(100) / 100.0, *np.zeros((3, 100))))
+    assert asset.state is not None
+    for fault, ratio, limit in (("pump", 0.8, 0.41), ("pump", 1.2, None), ("leakage", 1.2, 1.5), ("leakage", 0.9, 1.5)):
+        examination = replace(asset.state.examination, faults=[{"name": fault, "ratio": ratio}], onset=7.0)
+        due = find_due_prognosis(replace(asset.state, examination=examination), asset.policy.limits, 3600.0)
+        assert due == (None if limit is None else DuePrognosis(fault, limit, 7.0))
+    halls.hall(tmp_path, "hall", more='limits = { leakage = "stability" }')
+    with pytest.raises(ConfigError, match=r"limits of lift: .* no size of leakage takes that from this loop"):
+        build_visit(ServiceFile.load(path))
+    halls.hall(tmp_path, "hall", more='limits = { leakage = "stabilty" }')
+    with pytest.raises(ConfigError, match="'stabilty': give a number, tracking or stability"):
+        ServiceFile.load(path)
+
+    halls.hall(tmp_path, "hall", more=named)
+    store, batch = Store.open("hall.sqlite", tmp_path, write=True), Batch()
+    batch.checkpoints["lift"] = {"asset": "lift", "sequence": 0, "state": b"", "status": {}, "at": 0.0}
+    sizes = [0.95 - 0.003 * day + 0.002 * (-1) ** day for day in range(60)]
+    ends = {"kind": "live", "name": "pump", "healthy": 1.0}
+    batch.rows["sizes"] = [
+        {"asset": "lift", "t": 86400.0 * day, "value": x, "low": x - 0.006, "high": x + 0.006, **ends}
+        for day, x in enumerate(sizes)
+    ]
+    store.write(batch, "hall", 1)
+    store.close()
+    shown = CliRunner().invoke(app, ["trend", str(path), "--asset", "lift", "--limit", "tracking"])
+    assert shown.exit_code == 0 and "pump reaches 0.41 in" in " ".join(shown.output.split())
 
 
 def test_a_forecast_goes_to_the_limit_of_the_loop(tmp_path: Path) -> None:

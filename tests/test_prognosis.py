@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from servoscope.cli import app
 from servoscope.core.errors import PrognosisError
-from servoscope.prognosis.forecast import DAY_S, Prognosis, draw_passages, prognose
+from servoscope.prognosis.forecast import DAY_S, Prognosis, draw_passages, prognose, shortest_interval
 from servoscope.prognosis.series import SizeSeries, read_sizes
 from servoscope.prognosis.wear import Courses, WearPosterior, filter_series, fit_wear, scale_series
 
@@ -40,7 +40,7 @@ class TestForecast:
         low, middle, high = (each / DAY_S for each in found.remaining_s if each is not None)
         assert low <= 150.0 <= high and middle == pytest.approx(150.0, rel=0.1)
         assert found.rate_per_day[0] <= 0.002 <= found.rate_per_day[2]
-        assert found.summary.startswith("leakage reaches 1.5 in ") and "months" in found.summary
+        assert found.summary.startswith("leakage reaches 1.5 in ") and "weeks" in found.summary
 
     def test_a_falling_size_reaches_a_limit_below(self) -> None:
         rising = wear()
@@ -83,6 +83,15 @@ class TestForecast:
         assert found.outlook == "none"
         low, _, high = found.effects["temperature"]
         assert low <= 0.01 <= high
+
+    def test_the_interval_is_the_shortest_that_holds_its_share(self) -> None:
+        draws = np.random.default_rng(0).gamma(2.0, size=400)
+        spans = [(b - a, a, b) for a in draws for b in draws if b > a and np.mean((draws >= a) & (draws <= b)) >= 0.9]
+        low, middle, high = shortest_interval(draws, 0.9)
+        assert (low, high) == min(spans)[1:] and np.mean(draws <= middle) == 0.5
+        seldom = np.where(np.arange(400) % 5 == 0, math.inf, draws)  # a fifth never gets there
+        low, _, high = shortest_interval(seldom, 0.9)
+        assert math.isinf(high) and np.mean(seldom < low) == pytest.approx(0.1, abs=0.003)
 
     def test_same_values_same_sentence(self) -> None:
         assert prognose(wear(), LIMIT) == prognose(wear(), LIMIT)

@@ -1,4 +1,4 @@
-"""The pages in a real browser: files of one's own, from the drop to the verdict, and a session that ends meanwhile."""
+"""The pages in a real browser: files of one's own, from the drop to the verdict; a session or service that ends."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+import halls
 import screens
 from commands import run
 from logs import german_axis
-from opening import LONG_MS, THEMES, Open, accessible, shot
+from opening import LONG_MS, THEMES, Open, accessible, fits, shot
 from screens import asked, until
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
@@ -124,7 +125,7 @@ def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: P
     page.get_by_role("button", name="Learn").click()
     expect(page.get_by_role("heading", name="What was learned")).to_be_visible(timeout=LONG_MS)
     shot(page, "learn", full_page=True)
-    accessible(page)
+    fits(page, 1440, 800, 390)
     page.get_by_label("Save as").fill("emps")
     page.get_by_role("button", name="Save").click()
     page.get_by_role("link", name="diagnose a recording with it").click()
@@ -148,8 +149,31 @@ def test_a_study_says_what_can_be_told_apart(open_page: Open) -> None:
     page.get_by_role("button", name="Study").click()
     expect(page.get_by_role("heading", name="How alike they look")).to_be_visible(timeout=LONG_MS)
     expect(page.get_by_role("region", name="Radii of faults")).to_contain_text("Leakage up")
+    limits = page.get_by_role("region", name="Limits of faults").get_by_role("row")
+    mimics = page.get_by_role("region", name="Mimics").get_by_role("rowheader")
+    assert "a further delay" in mimics.all_inner_texts()
+    expect(limits.filter(has_text="Pump down")).to_contain_text("0.41")  # where tracking is lost
     shot(page, "design", full_page=True)
-    accessible(page)
+    fits(page, 1440, 800, 390)
+
+
+def test_a_service_that_stops_is_told_and_its_restart_too(open_page: Open, tmp_path: Path) -> None:
+    """The server goes on without the service; the page's own clock is put forward by the minute that it waits."""
+    halls.files(tmp_path)
+    path = halls.hall(tmp_path, "small", speed=1.0)
+    with screens.serving(path) as address:
+        with screens.process("run", path.name, cwd=tmp_path):
+            until(lambda: len(asked(address, "/assets")["assets"]) == 2)
+            page = open_page("/", address=address)
+            page.clock.install()
+            page.reload()
+            link = page.locator(".link")
+            expect(link).to_have_text("Live")
+        page.clock.fast_forward("01:05")
+        expect(link).to_have_text("Nothing new for a minute: does the service run?")
+        accessible(page)
+        with screens.process("run", path.name, cwd=tmp_path):
+            expect(link).to_have_text("Live", timeout=LONG_MS)
 
 
 def test_a_session_that_is_over_begins_again_on_the_page(

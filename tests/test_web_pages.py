@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import screens
-from opening import SIZE, THEMES, Open, accessible, diagnosis_of, painted, shot
+from opening import SIZE, THEMES, Open, accessible, diagnosis_of, drag, painted, shot, tab_to
 from screens import asked
 from servoscope.prognosis.series import read_sizes
 
@@ -176,6 +176,71 @@ def test_a_phone_shows_cards_and_is_accessible(open_page: Open) -> None:
         )
 
 
+def test_a_finger_zooms_and_pans_a_chart_and_scrolls_the_page(chromium: Any, base: str) -> None:
+    size = {"width": 390, "height": 844}
+    context = chromium.new_context(viewport=size, has_touch=True, is_mobile=True, locale="en-GB")
+    page = context.new_page()
+    page.goto(f"{base}/assets/press-1")
+    chart = page.get_by_role("img", name="Both tests over time, as multiples of their limits")
+    expect(chart).to_be_visible()
+    page.wait_for_timeout(2000)  # what stands above it has come
+    chart.scroll_into_view_if_needed()
+    before = page.evaluate("scrollY")
+    drag(page, chart.bounding_box(), 0.0, -120.0)
+    page.wait_for_function(f"scrollY > {before + 60}")  # a chart is as wide as the phone, and lets the page go on
+    box = chart.bounding_box()
+    middle = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    touch = context.new_cdp_session(page)
+    touch.send("Input.synthesizePinchGesture", {**middle, "scaleFactor": 2.0, "gestureSourceType": "touch"})
+    page.wait_for_url("**view-both-tests*")
+    assert page.evaluate("[visualViewport.scale, document.documentElement.scrollWidth]") == [1, 390]
+    zoomed = page.url
+    drag(page, chart.bounding_box(), -120.0, 0.0)
+    page.wait_for_url(lambda url: "view-both-tests" in url and url != zoomed)
+    page.get_by_label("View and save: Both tests over time").tap()
+    page.get_by_role("button", name="Show all: Both tests over time").tap()
+    page.wait_for_url(lambda url: "view-" not in url)
+    context.close()
+
+
+def test_the_keyboard_alone_is_enough(open_page: Open, base: str) -> None:
+    page = open_page("/")
+    tab_to(page, "^Alarms$")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/alarms")
+    standing = [one for one in asked(base, "/alarms")["alarms"] if one["asset"] == "press-3"]
+    alarm = next(one["alarm"] for one in standing if "shelve" in one["commands"])
+    row = page.get_by_role("row").filter(has=page.get_by_role("button", name=re.compile(f": {alarm} of press-3$")))
+    expect(row).to_have_count(1)
+    tab_to(page, f"^Shelve: {alarm} of press-3$")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("dialog")).to_be_visible()
+    tab_to(page, "^Why")
+    page.keyboard.type("sensor is on order")
+    page.keyboard.press("Enter")
+    expect(row).to_contain_text("shelved until")
+    tab_to(page, f"^Unshelve: {alarm} of press-3$")
+    page.keyboard.press("Enter")
+    expect(row).not_to_contain_text("shelved until")
+    tab_to(page, "^press-3$")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/assets/press-3")
+    label = "Both tests over time, as multiples of their limits"
+    tab_to(page, f"^View and save: {label}")
+    page.keyboard.press("Enter")
+    tab_to(page, f"^Zoom in: {label}")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**view-both-tests*=25%2C75")
+    tab_to(page, "^Note what was done")
+    page.keyboard.press("Enter")
+    tab_to(page, "^What was done")
+    page.keyboard.type("sensor looked at")
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("sensor looked at (local)")).to_be_visible()
+    steps = [one["after"] for one in asked(base, "/assets/press-3/alarms")["transitions"] if one["alarm"] == alarm]
+    assert "shelved" in steps and steps[-1] != "shelved"
+
+
 def test_an_asset_is_live(open_page: Open) -> None:
     page = open_page("/assets/lift-1")
     last = page.locator(".facts dd").last
@@ -210,8 +275,9 @@ def test_an_alarm_is_acknowledged_and_another_shelved(open_page: Open, base: str
 def test_a_diagnosis_prints_in_black_on_white(open_page: Open, base: str, tmp_path: Path) -> None:
     page = open_page(f"/diagnoses/{diagnosis_of(base, 'press-1')}", "dark")
     expect(page.get_by_role("region", name="Verdict")).to_contain_text("Internal leakage")
+    page.wait_for_timeout(1000)
     pdf = page.pdf(path=tmp_path / "diagnosis.pdf", format="A4", print_background=True)
-    assert pdf.startswith(b"%PDF-") and len(pdf) > 20_000
+    assert len(re.findall(rb"/Type\s*/Page\b", pdf)) == 2 and len(pdf) > 20_000
     page.emulate_media(media="print")
     assert page.evaluate("getComputedStyle(document.body).color") == "rgb(28, 37, 48)"
     expect(page.locator("header.top")).to_be_hidden()

@@ -4,7 +4,7 @@
 
 A leak that grows and the four coefficients of the reference rig, one value every ten minutes for a year, are written
 for one asset and thinned as the service does; the other assets get the same rows. Times are of `servoscope serve`, the
-median of five.
+medians of nine: as a reader waits, and of its processor, which tells more on a busy machine.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from servoscope.service.store import Batch, Store, tables  # noqa: E402
 from servoscope.service.store.rows import SIZE_EVERY_S, coefficient_rows, fault_rows  # noqa: E402
 from servoscope.service.store.series import thin_sizes  # noqa: E402
 from web import store  # noqa: E402
-from web.load import SOURCE  # noqa: E402
+from web.load import SOURCE, usage  # noqa: E402
 
+REPEATS = 9
 YEAR_S = 365 * 86400.0
 LEAK, STD = 0.35, 0.004  # how far it grows in a year, and how sure each value is
 PAGE = ("", "/sizes?of=faults&points=600", "/sizes?of=coefficients&points=600", "/alarms", "/history", "/signals")
@@ -95,15 +96,16 @@ def size_of_table(folder: Path) -> float:
     return only.stat().st_size / 1e6
 
 
-def measure(client: httpx.Client, paths: tuple[str, ...]) -> float:
-    """Return how long it takes to get all of these, one after the other: the median of five times [s]."""
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
+def measure(client: httpx.Client, pid: int, paths: tuple[str, ...]) -> str:
+    """Return how long it takes to get all of these, one after the other, and the server's processor time for it."""
+    times, used = [], []
+    for _ in range(REPEATS):
+        start, before = time.perf_counter(), usage(pid)[0]
         for path in paths:
             client.get(f"/api/v1/assets/axis-007{path}").raise_for_status()
         times.append(time.perf_counter() - start)
-    return statistics.median(times)
+        used.append(usage(pid)[0] - before)
+    return f"{statistics.median(times):.2f} s, {statistics.median(used):.2f} s"
 
 
 def main() -> None:
@@ -124,18 +126,22 @@ def main() -> None:
         assert server.stderr is not None
         address = next(found[1] for line in server.stderr if (found := re.match(r"servoscope: (https?://\S+)/ ", line)))
         client = stack.enter_context(httpx.Client(base_url=address, timeout=60.0))
-        page = measure(client, (*PAGE, "/trend?limit=2"))
-        series = measure(client, ("/sizes?of=faults&points=600",))
-        trend = measure(client, ("/trend?limit=1.5",))
+        page = measure(client, server.pid, (*PAGE, "/trend?limit=2"))
+        series = measure(client, server.pid, ("/sizes?of=faults&points=600",))
+        trend = measure(client, server.pid, ("/trend?limit=1.5",))
         rows = (
             ("rows of an asset, as written and thinned", f"{before}, {after}"),
             ("thinning an asset's year at once", f"{thinning:.2f} s"),
             ("store of the series", f"{size_of_table(folder):.0f} MB"),
-            ("all that an asset's page asks for, with the forecast", f"{page:.2f} s"),
-            ("a year of sizes", f"{series:.2f} s"),
-            ("a year of sizes with the forecast", f"{trend:.2f} s"),
+            ("all that an asset's page asks for, with the forecast", page),
+            ("a year of sizes", series),
+            ("a year of sizes with the forecast", trend),
         )
-    note = f"{given.assets} assets, a leak and four coefficients each, for a year."
+    load = os.getloadavg()[0]
+    note = (
+        f"{given.assets} assets, a leak and four coefficients each, for a year; a machine with a load of {load:.1f}. "
+        "Of answers: as a reader waits, and processor time of the server."
+    )
     show([Table("A year of sizes", note, ("what", "value"), rows)], given.json)
 
 

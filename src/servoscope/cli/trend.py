@@ -26,7 +26,7 @@ def trend(
     ],
     limit: Annotated[
         str,
-        typer.Option(metavar="X", help="Value at which to stop the machine; or tracking or stability, with --loop."),
+        typer.Option(metavar="X", help="Value at which to stop; or tracking or stability, where the loop loses that."),
     ],
     value: Annotated[
         str | None, typer.Option(metavar="NAME", help="Column with the size; in a store, name of the fault.")
@@ -45,7 +45,7 @@ def trend(
         str | None, typer.Option("--from", metavar="TIME", help="From this time on: after a repair, 2026-01-31T12:00.")
     ] = None,
     loop: Annotated[
-        Path | None, typer.Option(metavar="LOOP", help="Loop file: the limit is where the loop loses that.")
+        Path | None, typer.Option(metavar="LOOP", help="Loop file of --limit tracking or stability, for a file.")
     ] = None,
     coverage: Annotated[float, typer.Option(metavar="P", help="Probability of the intervals.")] = 0.9,
     as_json: JsonOption = False,
@@ -76,7 +76,7 @@ def trend(
         store = open_store(source)
         check_assets(store, [asset])
         series = query_sizes(store, asset, value, begin)
-    found = prognose(series, _limit(limit, loop, series), coverage)
+    found = prognose(series, _find_limit(limit, loop, series, source, asset), coverage)
     if as_json:
         print_json(found.model_dump(mode="json", exclude={"headline", "reasons"}), lines=False)
     else:
@@ -93,23 +93,34 @@ def trend(
         results.print_written_path(results.create_console(stderr=as_json), plot)
 
 
-def _limit(text: str, path: Path | None, series: SizeSeries) -> float:
+def _find_limit(text: str, path: Path | None, series: SizeSeries, source: str, asset: str | None) -> float:
     """Return the limit that was given, or at which the loop no longer tracks or loses its margin of stability."""
     if text not in ("tracking", "stability"):
         try:
             return float(text)
         except ValueError:
             raise typer.BadParameter(f"--limit {text}: give a number, tracking or stability") from None
-    if path is None:
-        raise typer.BadParameter(f"--limit {text}: give the loop file, --loop loop.toml")
 
     from servoscope.design.operating_limits import operating_limits
+    from servoscope.detection.baseline import Baseline
     from servoscope.models.loop import Loop
 
-    rows = [one for one in operating_limits(Loop.load(path)) if one.fault == series.name and one.kind == text]
+    if path is not None:
+        loop = Loop.load(path)
+    elif asset is not None and source.endswith(".toml"):
+        from servoscope.service.config import ServiceFile
+
+        config = ServiceFile.load(source)
+        if asset not in config.assets:
+            raise typer.BadParameter(f"--asset {asset}: is not in {source}, give the loop file, --loop loop.toml")
+        path = config.folder / config.assets[asset].baseline
+        loop = Baseline.load(path).loop
+    else:
+        raise typer.BadParameter(f"--limit {text}: give the loop file, --loop loop.toml")
+    rows = [one for one in operating_limits(loop, [series.name]) if one.kind == text]
     if not rows:
         raise typer.BadParameter(f"--value {series.name}: is no fault of {path}")
-    found = rows[0].up if series.value[-1] >= 1.0 else rows[0].down
+    found = rows[0].side(series.value[-1])
     if found is None:
         raise typer.BadParameter(f"--limit {text}: {series.name} does not take it from this loop, give a number")
-    return float(f"{found:.3g}")  # no limit is known better
+    return found

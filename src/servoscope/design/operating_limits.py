@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from servoscope.models.plants import Fault, Plant
 from servoscope.simulation.stability import controller_gains, discrete_closed_loop_poles
 
 LimitKind = Literal["tracking", "stability"]
+LIMIT_KINDS: tuple[LimitKind, ...] = get_args(LimitKind)
 BANDWIDTH_LEFT = 0.7  # of the healthy bandwidth
 MARGIN_LEFT = 0.5  # of the healthy distance to the point -1
 GRID = 60  # ratios that are tried from healthy to the end of a fault's range
@@ -31,9 +32,13 @@ class OperatingLimit(NamedTuple):
     up: float | None
     down: float | None
 
+    def side(self, ratio: float) -> float | None:
+        """Return the limit on the side of healthy on which a size is."""
+        return self.up if ratio >= 1.0 else self.down
 
-def operating_limits(loop: Loop) -> list[OperatingLimit]:
-    """Return by fault the sizes at which tracking, or the margin of stability, is lost.
+
+def operating_limits(loop: Loop, faults: Sequence[str] | None = None) -> list[OperatingLimit]:
+    """Return by fault, or of some faults, the sizes at which tracking, or the margin of stability, is lost.
 
     Tracking is lost where the bandwidth is 0.7 of the healthy one: the frequency up to which the tracking error, by the
     sensitivity S = 1 / (1 + L), is below 0.707 of the reference (Skogestad and Postlethwaite 2005, section 2.4.5). The
@@ -49,7 +54,8 @@ def operating_limits(loop: Loop) -> list[OperatingLimit]:
     return [
         OperatingLimit(fault.name, kind, *(_first_loss(performance, fault, end, kind) for end in (1, 0)))
         for fault in loop.plant.all_faults
-        for kind in ("tracking", "stability")
+        if faults is None or fault.name in faults
+        for kind in LIMIT_KINDS
     ]
 
 
@@ -71,7 +77,7 @@ def _first_loss(
     for _ in range(BISECTIONS):
         middle = (sound + bad) / 2.0
         sound, bad = (sound, middle) if lost(middle) else (middle, bad)
-    return math.exp(bad)
+    return float(f"{math.exp(bad):.3g}")  # no limit is known better
 
 
 def _performance(loop: Loop, plant: Plant) -> tuple[float, float]:

@@ -46,6 +46,9 @@ class DirectionStudy(_StudyModel):
         Fault that it is taken for, if any.
     called
         Probability of each other name at the ratio `detectable`.
+    tracking, stability
+        Ratio from which on the loop no longer follows its reference, or has lost half of its margin of stability; None:
+        nowhere in its range, or a study of before this was asked.
     """
 
     detectable: float | None
@@ -55,6 +58,8 @@ class DirectionStudy(_StudyModel):
     bound: float | None
     nearest: str
     called: dict[str, float]
+    tracking: float | None = None
+    stability: float | None = None
 
     @property
     def isolable(self) -> float | None:

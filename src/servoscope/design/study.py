@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -20,6 +20,7 @@ from servoscope.design.fisher_information import (
     linear_isolability_radius,
 )
 from servoscope.design.isolability import Span, ambiguous_sizes, hypothesis_distances
+from servoscope.design.operating_limits import LIMIT_KINDS, LimitKind, OperatingLimit, operating_limits
 from servoscope.design.result import (
     SIZES,
     DesignStudy,
@@ -158,7 +159,8 @@ def study(
     progress("alarms")
     scene = Scenario.from_baseline(baseline, r, after_s)
     alarms = AlarmSimulator(scene)
-    faults = {f.name: _fault(scene, alarms, f, progress) for f in scene.loop.plant.faults}
+    lost = {(one.fault, one.kind): one for one in operating_limits(scene.loop)}
+    faults = {f.name: _fault(scene, alarms, f, lost, progress) for f in scene.loop.plant.faults}
     progress("mimics and frequencies")
     columns = scene.project_out_nuisances(scene.sensitivity)
     names = list(faults)
@@ -185,7 +187,13 @@ def study(
     )
 
 
-def _fault(scene: Scenario, alarms: AlarmSimulator, fault: Fault, progress: Progress) -> FaultStudy:
+def _fault(
+    scene: Scenario,
+    alarms: AlarmSimulator,
+    fault: Fault,
+    lost: Mapping[tuple[str, LimitKind], OperatingLimit],
+    progress: Progress,
+) -> FaultStudy:
     i = scene.names.index(fault.parameter)
     sizes = []
     for seconds in sorted({min(s, scene.after_s) for s in SECONDS}):
@@ -195,7 +203,10 @@ def _fault(scene: Scenario, alarms: AlarmSimulator, fault: Fault, progress: Prog
     sides = []
     for up in (True, False):
         progress(f"{fault.name}, {'up' if up else 'down'}")
-        sides.append(_side(scene, alarms, fault, up))
+        limits: dict[str, float | None] = {
+            kind: getattr(lost[fault.name, kind], "up" if up else "down") for kind in LIMIT_KINDS
+        }
+        sides.append(_side(scene, alarms, fault, up).model_copy(update=limits))
     return FaultStudy(
         name=fault.name,
         parameter=fault.parameter,

@@ -43,8 +43,8 @@ class Prognosis(BaseModel):
     value, rate_per_day
         Level at the last time and its rate, covariates at their means: lower end, median, upper end.
     remaining_s
-        From the last value until the limit is reached [s]: lower end, median, upper end; None for an end that lies
-        beyond ten times the history.
+        From the last value until the limit is reached [s]: the shortest interval of that probability, around the
+        median; None for an end that lies beyond ten times the history.
     odds
         How many times better wear explains the values than no wear.
     effects
@@ -145,7 +145,7 @@ def prognose(series: SizeSeries, limit: float, coverage: float = 0.9) -> Prognos
     if odds < LEAST_ODDS or towards < SURE_OF_DIRECTION:
         key = "receding" if odds >= LEAST_ODDS and towards < 1.0 - SURE_OF_DIRECTION else "steady"
         return Prognosis(**asked, outlook="none", headline=message(f"prognosis.{key}", **about, history=history))
-    passage = _quantiles(drawn.passage * posterior.length_s, ends)
+    passage = shortest_interval(drawn.passage * posterior.length_s, coverage)
     remaining = tuple(each if math.isfinite(each) else None for each in passage)
     asked["remaining_s"] = remaining
     if remaining[0] is None:
@@ -194,6 +194,19 @@ def draw_passages(posterior: WearPosterior, limit: float, rng: np.random.Generat
 def _quantiles(draws: FloatArray, ends: tuple[float, float, float]) -> tuple[float, float, float]:
     low, middle, high = np.quantile(draws, ends, method="inverted_cdf").tolist()
     return low, middle, high
+
+
+def shortest_interval(draws: FloatArray, coverage: float) -> tuple[float, float, float]:
+    """Return the ends of the shortest interval that holds a share of the draws, around their median.
+
+    Times to a limit have a long tail: equal shares on both sides would tell more of it, and less of what may come soon.
+    Where too many draws have no end, there is only an earliest.
+    """
+    ordered, held = np.sort(draws), math.ceil(coverage * draws.size)
+    low, high = ordered[: draws.size - held + 1], ordered[held - 1 :]
+    finite = int(np.isfinite(high).sum())
+    first = int(np.argmin(high[:finite] - low[:finite])) if finite else low.size - 1
+    return float(low[first]), float(ordered[(draws.size - 1) // 2]), float(high[first])
 
 
 def _estimate(interval: tuple[float, float, float]) -> Message:

@@ -52,6 +52,7 @@ def render_design_page(study: DesignStudy) -> str:
         delays=render_svg(drawn[1], "f1"),
         precision=render_svg(drawn[2], "f2"),
         faults=faults_table(study),
+        limits=limits_table(study),
         cosines=cosines_table(study),
         mimics=mimics_table(study, described=True),
         frequencies=frequencies_table(study),
@@ -73,6 +74,16 @@ def faults_table(study: DesignStudy) -> ResultTable:
             rows.append((*name, *map(format_change, sizes), side.nearest, again or DASH))
     head = ("Change", "Parameter", "Detected from", "Named from", "Linear bound", "Else taken for", "Unclear again")
     return ResultTable(head, rows, words=2)
+
+
+def limits_table(study: DesignStudy) -> ResultTable:
+    """Return from which size on the loop no longer does its work, in both directions of each fault."""
+    rows = [
+        (f"{fault.name} {direction}", *("never" if x is None else f"{x:g}" for x in (side.tracking, side.stability)))
+        for fault in study.faults.values()
+        for direction, side in (("up", fault.up), ("down", fault.down))
+    ]
+    return ResultTable(("Change, as a ratio to healthy", "Tracking lost at", "Stability lost at"), rows)
 
 
 def cosines_table(study: DesignStudy) -> ResultTable:

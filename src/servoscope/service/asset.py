@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -42,7 +42,7 @@ from servoscope.service.examination_schedule import (
     schedule_full_diagnosis,
     update_examination,
 )
-from servoscope.service.outlook import Outlook, PrognosisSettings, outlook_word, single_fault
+from servoscope.service.outlook import AssetLimits, Outlook, PrognosisSettings, outlook_word, single_fault
 from servoscope.service.recent_blocks import RecentBlocks
 from servoscope.service.reception import FOLLOWED
 from servoscope.service.records import BlockRefusal, StepResult, TableRow, transition_row
@@ -61,7 +61,7 @@ class AssetPolicy:
     alarms: AlarmSettings
     residual_every_s: float
     prognosis: PrognosisSettings = field(default_factory=PrognosisSettings)
-    limits: Mapping[str, float] = field(default_factory=dict)  # by fault, ratio to healthy at which the machine stops
+    limits: AssetLimits = field(default_factory=dict)
 
 
 class Asset:

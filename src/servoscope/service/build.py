@@ -11,10 +11,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from servoscope.core.errors import BaselineError, ConfigError
+from servoscope.core.errors import BaselineError, ConfigError, LoopError
 from servoscope.core.settings_errors import suggest_name
+from servoscope.design.operating_limits import LimitKind, OperatingLimit, operating_limits
 from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.models.loop import Loop
 from servoscope.service.actions import CommandSettings, WebhookSettings, load_secret
 from servoscope.service.actions.settings import Sink
 from servoscope.service.asset import Asset, AssetPolicy
@@ -22,6 +24,7 @@ from servoscope.service.asset_groups import AssetGroups, BlockOffer
 from servoscope.service.checkpoint import StreamPosition, unpack_state
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
+from servoscope.service.outlook import AssetLimits
 from servoscope.service.publishers.base import StatusPublisher
 from servoscope.service.reception import UNHEARD
 from servoscope.service.sources.base import BlockSource, SourceAsset
@@ -138,6 +141,7 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
     )
     files: dict[Path, Baseline] = {}
     shared: dict[tuple[Path, str | None], tuple[Baseline, Monitor]] = {}
+    resolved: dict[object, AssetLimits] = {}
     assets = {}
     for name, settings in config.assets.items():
         path, point = config.folder / settings.baseline, settings.point
@@ -163,18 +167,40 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
                 points = ", ".join(baseline.points)
                 raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
         faults = [fault.name for fault in shared[path, point][0].loop.plant.all_faults]
-        common = {fault: limit for fault, limit in config.prognosis.limits.items() if fault in faults}
-        if settings.limits is not None:
-            _check_names(f"[assets] {name}.limits", f"fault of {name}", settings.limits, faults)
-        limits = common if settings.limits is None else settings.limits
-        assets[name] = Asset(
-            name, *shared[path, point], replace(policy, limits=limits), settings.group, settings.source
-        )
+        if settings.limits is None:
+            limits = {fault: limit for fault, limit in config.prognosis.limits.items() if fault in faults}
+        else:
+            limits = settings.limits
+            _check_names(f"[assets] {name}.limits", f"fault of {name}", limits, faults)
+        asked = path, point, frozenset(limits.items())
+        if asked not in resolved:  # many assets are of one loop
+            resolved[asked] = _resolve_limits(shared[path, point][0].loop, limits, name)
+        policy = replace(policy, limits=resolved[asked])
+        assets[name] = Asset(name, *shared[path, point], policy, settings.group, settings.source)
     known = [fault.name for one in assets.values() for fault in one.baseline.loop.plant.all_faults]
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
     for asset in {id(one.baseline): one for one in assets.values()}.values():
         asset.compile_kernels()
     return assets
+
+
+def _resolve_limits(loop: Loop, limits: Mapping[str, float | LimitKind], asset: str) -> AssetLimits:
+    """Return limits with what a loop loses in place of its name; raises ConfigError where no size takes that."""
+    resolved: dict[str, float | OperatingLimit] = {}
+    for fault, limit in limits.items():
+        if not isinstance(limit, str):
+            resolved[fault] = limit
+            continue
+        try:
+            found = next(one for one in operating_limits(loop, [fault]) if one.kind == limit)
+        except LoopError as error:
+            raise ConfigError(f'limits of {asset}: {fault} = "{limit}": {error}') from None
+        if found.up is None and found.down is None:
+            raise ConfigError(
+                f'limits of {asset}: {fault} = "{limit}": no size of {fault} takes that from this loop, give a number'
+            )
+        resolved[fault] = found
+    return resolved
 
 
 def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str) -> dict[str, SourceAsset]:

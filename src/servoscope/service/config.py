@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from servoscope.core.settings import NonEmptyStr, NonNegative, Positive, Settings
+from servoscope.core.settings import NonEmptyStr, NonNegative, Settings
 from servoscope.service.access import WebSettings
 from servoscope.service.actions import ActionSettings
 from servoscope.service.alarms import AlarmSettings
@@ -15,7 +15,7 @@ from servoscope.service.config_types import Address, FileSettings, Name, Seconds
 from servoscope.service.kinds import PUBLISHERS, SOURCES, parse_tables
 from servoscope.service.network import ConnectionSettings, NetworkSettings, apply_network
 from servoscope.service.opcua.settings import OpcuaNodes
-from servoscope.service.outlook import PrognosisSettings
+from servoscope.service.outlook import PrognosisSettings, SizeLimit
 from servoscope.service.publishers.base import PublisherSettings
 from servoscope.service.sources.base import SourceSettings
 from servoscope.signals.quality import QualitySettings
@@ -66,7 +66,7 @@ class AssetSettings(Settings):
     files: Paths | None = None  # what a source of kind ``replay`` replays for it, one recording after the other
     nodes: OpcuaNodes | None = None  # where a source of kind ``opcua`` finds it
     group: Annotated[str, Field(strict=True, max_length=100)] = ""  # what it belongs to: a line, a hall
-    limits: dict[NonEmptyStr, Positive] | None = None  # instead of those of ``[prognosis]``
+    limits: dict[NonEmptyStr, SizeLimit] | None = None  # instead of those of ``[prognosis]``
 
 
 class ServiceFile(FileSettings):

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import Any
 
 from servoscope.core.workers import Worker, WorkerError
+from servoscope.design.operating_limits import OperatingLimit
 from servoscope.detection.baseline import Baseline
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.checkpoint import AssetState
 from servoscope.service.examination import StoredDiagnosis, diagnose_blocks, undetermined
 from servoscope.service.log import log
-from servoscope.service.outlook import DuePrognosis, current_outlook, single_fault
+from servoscope.service.outlook import AssetLimits, DuePrognosis, current_outlook, single_fault
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
 from servoscope.service.store.series import last_renewal, query_sizes
@@ -66,13 +67,16 @@ class DiagnosisWorker:
         return undetermined("crashed")
 
 
-def find_due_prognosis(state: AssetState, limits: Mapping[str, float], every_s: float) -> DuePrognosis | None:
+def find_due_prognosis(state: AssetState, limits: AssetLimits, every_s: float) -> DuePrognosis | None:
     """Return the prognosis that is due of an asset with these limits by fault; None: none is."""
     examination, t = state.examination, state.position.t
     fault, last = single_fault(examination.faults), current_outlook(state.outlook, examination.faults)
-    if fault is None or fault not in limits or (last is not None and last.asked <= t < last.asked + every_s):
+    if fault is None or (last is not None and last.asked <= t < last.asked + every_s):
         return None
-    return DuePrognosis(fault, limits[fault], examination.onset or 0.0)
+    limit = limits.get(fault)
+    if isinstance(limit, OperatingLimit):
+        limit = limit.side(float(examination.faults[0]["ratio"]))
+    return None if limit is None else DuePrognosis(fault, limit, examination.onset or 0.0)
 
 
 def diagnose_packed_blocks(

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from servoscope.core.settings import NonEmptyStr, Positive, Settings
+from servoscope.design.operating_limits import LIMIT_KINDS, LimitKind, OperatingLimit
 from servoscope.prognosis.forecast import Prognosis, prognose
 from servoscope.prognosis.series import SizeSeries
 
@@ -15,11 +16,22 @@ OutlookWord = Literal["far", "near", "reached"]
 DAY_S = 86400.0
 
 
+def _check_limit(limit: object) -> object:
+    if isinstance(limit, str) and limit not in LIMIT_KINDS:
+        raise ValueError(f"{limit!r}: give a number, tracking or stability")
+    return limit
+
+
+SizeLimit = Annotated[Positive | LimitKind, BeforeValidator(_check_limit)]
+AssetLimits = Mapping[str, float | OperatingLimit]  # by fault, ratio to healthy at which the machine stops
+
+
 class PrognosisSettings(Settings):
     """The section `[prognosis]`: until which sizes machines may run, and how far is looked ahead."""
 
-    # by the name of a fault, the ratio to healthy at which the machine is to be stopped: ``{ leakage = 1.5 }``
-    limits: dict[NonEmptyStr, Positive] = Field(default_factory=dict)
+    # by the name of a fault, the ratio to healthy at which the machine is to be stopped: ``{ leakage = 1.5 }``; or what
+    # the loop loses there: ``{ pump = "tracking" }``
+    limits: dict[NonEmptyStr, SizeLimit] = Field(default_factory=dict)
     every_s: Annotated[Positive, Field(ge=60.0)] = 6 * 3600.0  # between two prognoses of an asset with such a fault [s]
     ahead_s: Positive = 90 * DAY_S  # the alarm ``limit`` says so when the limit may be reached within this time [s]
 

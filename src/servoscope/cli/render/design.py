@@ -27,6 +27,8 @@ def print_study(out: Console, s: DesignStudy) -> None:
     print_facts(out, [("noise", noise), ("false alarms", f"{s.false_alarms_per_year:g} per year")])
     _print_faults(out, s)
     _print_sizes(out, s)
+    print_result_table(out, design_page.limits_table(s))
+    out.print()
     if len(s.faults) > 1:
         print_result_table(out, design_page.cosines_table(s))
         shares = [f"{name} {share:+.2g}" for name, share in s.joint.confused.items() if abs(share) > 1e-3]

@@ -55,9 +55,13 @@ def thin_sizes(store: Store, asset: str, now: float, since: float | None = None)
 
 
 def read_series(
-    store: Store, asset: str, span: tuple[float | None, float | None] = (None, None), kinds: Iterable[str] = ()
+    store: Store,
+    asset: str,
+    span: tuple[float | None, float | None] = (None, None),
+    kinds: Iterable[str] = (),
+    name: str | None = None,
 ) -> dict[tuple[str, str], Series]:
-    """Return an asset's series by kind and name: t, value, low, high, healthy in the order of time, shape (5, N).
+    """Return an asset's series, or those of a name, by kind and name: t, value, low, high, healthy, shape (5, N).
 
     Raises StoreError if the store was made by an older version, and has none yet.
     """
@@ -65,14 +69,18 @@ def read_series(
         raise StoreError(f"{store.name}: has no sizes over time yet, servoscope run makes them of its diagnoses")
     table, (since, until) = tables.sizes, span
     columns = ("kind", "name", "t", "value", "low", "high", "healthy")
-    query = sa.select(*(table.c[name] for name in columns)).where(table.c.asset == asset)
-    for bound in (since is not None and table.c.t >= since, until is not None and table.c.t < until):
-        query = query if bound is False else query.where(bound)
+    query = sa.select(*(table.c[column] for column in columns)).where(table.c.asset == asset)
+    if since is not None:
+        query = query.where(table.c.t >= since)
+    if until is not None:
+        query = query.where(table.c.t < until)
+    if name is not None:
+        query = query.where(table.c.name == name)
     if chosen := tuple(kinds):
         query = query.where(table.c.kind.in_(chosen))
     found: dict[tuple[str, str], list[tuple[float, ...]]] = {}
-    for kind, name, *numbers in store.fetch_tuples(query.order_by(table.c.t)):
-        found.setdefault((kind, name), []).append(tuple(numbers))
+    for kind, each, *numbers in store.fetch_tuples(query.order_by(table.c.t)):
+        found.setdefault((kind, each), []).append(tuple(numbers))
     return {key: np.array(rows, dtype=np.float64).T for key, rows in found.items()}
 
 
@@ -110,7 +118,9 @@ def query_sizes(store: Store, asset: str, name: str | None = None, since: float 
     StoreError
         If no fault was named, another one, or several and `name` does not say which.
     """
-    series = read_series(store, asset, (last_renewal(store, asset) if since is None else since, None))
+    span = last_renewal(store, asset) if since is None else since, None
+    # a year has five times as many rows; without one of that name, all names are needed for the error
+    series = (name and read_series(store, asset, span, name=name)) or read_series(store, asset, span)
     faults = sorted({each for kind, each in series if kind in FAULT_KINDS})
     coefficients = sorted({each for kind, each in series if kind not in FAULT_KINDS})
     if name is None and len(faults) > 1:

@@ -3,9 +3,10 @@ import { h, save, translate } from "./dom.js";
 
 const STEP = 0.5; // of what is seen, by one press
 
-// Zoom by Ctrl and the wheel or two fingers, pan by dragging; what is left out of view still shapes the lines.
+// Zoom by Ctrl and the wheel or two fingers, pan by dragging; what is left out of view still shapes the lines. A finger
+// that moves up or down scrolls the page (touch-action in the style sheet): charts are as wide as a phone.
 export function zoomed({ xAxis, yAxis, tooltip }) {
-  const inside = { type: "inside", zoomOnMouseWheel: "ctrl", filterMode: "none" };
+  const inside = { type: "inside", zoomOnMouseWheel: "ctrl", preventDefaultMouseMove: false, filterMode: "none" };
   const every = (axes) => [axes].flat().map((_, i) => i);
   const plane = tooltip.trigger === "item"; // without a time: both axes move
   return [{ ...inside, xAxisIndex: every(xAxis) }, ...(plane ? [{ ...inside, yAxisIndex: every(yAxis) }] : [])];

@@ -59,7 +59,7 @@ export function table(caption, head, rows, attributes = {}) {
       "table",
       attributes,
       h("caption", { class: "hidden" }, caption),
-      h("thead", {}, h("tr", {}, head.map((name, i) => h("th", { scope: "col", class: numeric[i] && "n", ...data }, data.translate ? name : name.replace("*", ""))))),
+      h("thead", {}, h("tr", {}, head.map((name, i) => (name ? h("th", { scope: "col", class: numeric[i] && "n", ...data }, data.translate ? name : name.replace("*", "")) : h("td", {}))))),
       h("tbody", {}, rows.map((row) => h("tr", {}, row.map(cell)))),
     ),
   );
