@@ -82,23 +82,21 @@ class Baseline(ShortRepr, BaselineModel):
         Smallest changes that are detected with 90 % probability within the baseline's own excitation.
     exact
         What the exact predictor says of the healthy recordings; None where there is none.
-    notes
-        Warnings of `learn`.
-    learned
-        Faults known from labelled recordings.
+    notes, learned
+        Warnings of `learn`; faults known from labelled recordings.
     sensors
         How the sensors of the output disagree; None where it has one.
     instrument
-        The model behind the instrument of a loop without a controller; None where there is none.
+        The model behind the instrument of a loop without a controller, if any.
     features, left_out
         What healthy recordings show besides coefficients; the largest T^2 of each over its limit when learned without
         it. None and empty where there are fewer than four recordings.
     motion
         The motion that the recordings hold; None in baselines of earlier versions, and where they are very short.
     axis
-        The healthy motor axis that the refit starts from; None for other kinds of plants.
+        The healthy motor axis that the refit starts from, for that kind of plant.
     covariates
-        How the coefficients move with covariates; theta is theirs in the middle of the learned range. None without any.
+        How coefficients move with covariates, if any; theta is theirs in the middle of the learned range.
     scatter
         Variance of the coefficients between the recordings beyond their noise, (n,); empty where there was only one.
     point, others
