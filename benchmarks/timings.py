@@ -15,6 +15,7 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
+from accuracy.unknown import changed
 from tables import Table, parser, show
 
 import servoscope as ss
@@ -32,6 +33,8 @@ def timings() -> Table:
         _servoscope("simulate", str(RIG), "-o", healthy, "--seed", "1")
         _servoscope("simulate", str(RIG), "-o", suspect, "--seed", "2", "--fault", "C_ie=1.2@30")
         _servoscope("learn", str(RIG), healthy, "-o", learned)
+        late = str(Path(folder) / "late.csv")  # u acts a sample later from half-way on: no fault of the list
+        changed("delay", "profile", 0, 3).to_frame().to_csv(late, index=False)
         bare = _median(lambda: _python("-c", "pass"))
         rows.append(("a bare interpreter", bare))
         rows.append(("import servoscope, beyond that", _median(lambda: _python("-c", "import servoscope")) - bare))
@@ -41,6 +44,7 @@ def timings() -> Table:
             ("servoscope learn, 60 s at 100 Hz", ["learn", str(RIG), healthy, "-o", str(Path(folder) / "again.json")]),
             ("servoscope diagnose, 60 s at 100 Hz, healthy", ["diagnose", learned, healthy]),
             ("servoscope diagnose, 60 s at 100 Hz, fault", ["diagnose", learned, suspect]),
+            ("servoscope diagnose, 60 s at 100 Hz, unknown change", ["diagnose", learned, late]),
         )
         rows += [(words, _median(partial(_servoscope, *arguments))) for words, arguments in jobs]
         monitor = ss.Monitor(ss.Baseline.load(learned))

@@ -18,7 +18,7 @@ from servoscope.isolation.ml.hypothesis import SizePrior, fit_hypothesis
 from servoscope.isolation.ml.onset import STEP, ChangeCosts
 from servoscope.isolation.ml.validity import fit_exact_predictor
 from servoscope.isolation.ml.window import SENSOR_GAIN, ChangeProfile, RefitWindow, plant_input
-from servoscope.models.discretise import discretise
+from servoscope.models.discretise import discretise, discretise_uncached
 from servoscope.simulation import FaultEvent, reference, simulate
 from servoscope.simulation.measurement import make_recording
 
@@ -85,6 +85,22 @@ class TestPredictor:
         # the gains of the changed plant are its own from the first sample on: exact again once they have settled
         settled = np.r_[1100:1200, 1600 : window.samples]
         assert got[settled] == pytest.approx(factor * e[settled], abs=5e-3)
+
+    @pytest.mark.parametrize("late", [0.0, 0.3, 1.4])
+    def test_plants_are_sampled_as_the_exact_transition_says(self, window: RefitWindow, late: float) -> None:
+        """Against the balanced exponential; imaginary parts are derivatives and as exact."""
+        bench = window.factory
+        step = {"C_ie": 3.0 + 1e-30j}
+        for ratios in ({}, {"beta": 0.005}, {"b_p": 40.0}, step):
+            plant = window.plant.scaled(ratios)
+            got = bench.predictor(plant, later_s=late / 100.0)
+            d = discretise_uncached(plant.state_space(), 100.0, "zoh", late / 100.0)
+            expected = d.A * bench.scale / bench.scale[:, None], d.b_now / bench.scale, d.b_late / bench.scale
+            parts = (got.A, got.b, got.b_late) if late < 1.0 else (got.A, got.b_late, got.b)
+            for mine, exact in zip(parts, expected, strict=True):
+                assert mine[0] == pytest.approx(exact, rel=0, abs=1e-13 * max(np.abs(exact).max(), 1e-300))
+                if ratios is step:
+                    assert mine[0].imag == pytest.approx(exact.imag, rel=0, abs=1e-13 * np.abs(exact.imag).max())
 
     def test_derivatives_by_complex_steps_are_those_of_differences(self, window: RefitWindow) -> None:
         z, growth = np.array([0.01, -0.01, 0.02, 0.0, 0.1, -0.3]), ChangeProfile(900, 300)

@@ -104,6 +104,10 @@ def learn(
         list[str] | None,
         typer.Option(metavar="NAME=FILE", help="Recording of a known fault to learn too, NAME@POINT=FILE; repeatable."),
     ] = None,
+    population: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="BASELINE", help="Baseline of a like machine, folder or pattern of them; repeatable."),
+    ] = None,
     *,
     reading: ReadingOptions,
     as_json: JsonOption = False,
@@ -116,11 +120,16 @@ def learn(
         raise typer.BadParameter("--accept-change goes with --compare, and that with recordings")
     if nominal and accept_delay:
         raise typer.BadParameter("--accept-delay goes with healthy recordings, not with --nominal")
+    if nominal and population:
+        raise typer.BadParameter("--population goes with healthy recordings, not with --nominal")
     if nominal and fault:
         raise typer.BadParameter("--fault goes with healthy recordings, not with --nominal")
     faults = arguments.parse_labelled(fault or [], list(dict.fromkeys(point for point, _ in named)))
     files = [path for _, path in named] + [path for *_, path in faults]
-    check_output(output, "-o", (), [loop, *files, *filter(None, [compare])])
+    from servoscope.signals.readers.archives import expand_paths
+
+    alike = expand_paths(population or [], (".json",))
+    check_output(output, "-o", (), [loop, *files, *alike, *filter(None, [compare])])
 
     from servoscope.cli.progress import show_steps
     from servoscope.cli.render import results
@@ -163,6 +172,7 @@ def learn(
                 faults=known,
                 accept_delay=accept_delay,
                 force=force,
+                population=alike,
             )
         baseline.save(output)
     if as_json:

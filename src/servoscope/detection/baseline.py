@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 FORMAT = "servoscope-baseline"
 VERSION = 2
-LATER = "motion", "axis", "covariates"  # what earlier versions did not know
+LATER = "motion", "axis", "covariates", "scatter"  # what earlier versions did not know
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
@@ -66,9 +66,8 @@ class Baseline(ShortRepr, BaselineModel):
     scale, P_d, R, noise_a, noise_b, noise_gamma, noise_variance, stage_one
         The recursion's tuning (see `servoscope.estimation.pipeline.Tuning`), and that of stage 1 of two stages.
     noise, ratios, ratios_std, ratios_covariance, model_theta
-        n_u and n_y; the healthy parameters relative to the loop file's nominal values, the standard deviations and the
-        covariance (m, m) of their logarithms; the coefficients that they lead to under the references of the baseline.
-        Without a controller or physics None or empty.
+        n_u and n_y; healthy parameters relative to the loop file's nominal values, standard deviations and covariance
+        (m, m) of their logarithms; the coefficients that they lead to. Without a controller or physics None or empty.
     dof, limit, explained
         Effective number of independent residuals; threshold of T^2; share of eta's variance that the model explains.
     still_speed
@@ -83,24 +82,23 @@ class Baseline(ShortRepr, BaselineModel):
         Smallest changes that are detected with 90 % probability within the baseline's own excitation.
     exact
         What the exact predictor says of the healthy recordings; None where there is none.
-    notes
-        Warnings of `learn`.
-    learned
-        Faults known from labelled recordings.
+    notes, learned
+        Warnings of `learn`; faults known from labelled recordings.
     sensors
         How the sensors of the output disagree; None where it has one.
     instrument
-        The model behind the instrument of a loop without a controller; None where none was needed or learned.
+        The model behind the instrument of a loop without a controller, if any.
     features, left_out
-        What the healthy recordings show besides their coefficients, and the largest T^2 of each of them as a multiple
-        of its limit when learned without it. None and empty where there are fewer than four recordings.
+        What healthy recordings show besides coefficients; the largest T^2 of each over its limit when learned without
+        it. None and empty where there are fewer than four recordings.
     motion
         The motion that the recordings hold; None in baselines of earlier versions, and where they are very short.
     axis
-        The healthy motor axis that the refit starts from; None for other kinds of plants.
+        The healthy motor axis that the refit starts from, for that kind of plant.
     covariates
-        How the coefficients move with what was logged beside the signals, as temperature or load; theta is theirs in
-        the middle of the learned range. None where the loop file names no covariates.
+        How coefficients move with covariates, if any; theta is theirs in the middle of the learned range.
+    scatter
+        Variance of the coefficients between the recordings beyond their noise, (n,); empty where there was only one.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -146,6 +144,7 @@ class Baseline(ShortRepr, BaselineModel):
     motion: MotionRange | None = None
     axis: AxisModel | None = None
     covariates: CovariateModel | None = None
+    scatter: Vector = ()
     point: str = ""
     others: tuple[Baseline, ...] = ()
 
@@ -183,7 +182,7 @@ class Baseline(ShortRepr, BaselineModel):
     def _without_nothing(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out what is `LATER`, where there is none: files of earlier versions are written as they were."""
         fields: dict[str, Any] = write(self)
-        return {name: value for name, value in fields.items() if value is not None or name not in LATER}
+        return {name: value for name, value in fields.items() if value or name not in LATER}
 
     @cached_property
     def loop(self) -> Loop:

@@ -116,8 +116,12 @@ def scatter(apart: FloatArray, covariances: FloatArray) -> FloatArray:
         return np.zeros((n, n))
     own = np.mean([np.diag(c) for c in covariances], axis=0)
     beyond = np.maximum(apart.var(axis=0, ddof=1) - own, 0.0)
-    students = (m - 1.0) / (m - 3.0) if m >= ENOUGH else 3.0
-    return np.diag(beyond * students * (1.0 + 1.0 / m))
+    return np.diag(beyond * prediction_factor(m))
+
+
+def prediction_factor(m: int) -> float:
+    """Return by how much the deviation of a further recording from the mean of m exceeds their own variance."""
+    return ((m - 1.0) / (m - 3.0) if m >= ENOUGH else 3.0) * (1.0 + 1.0 / m)
 
 
 def leave_one_out(
@@ -126,6 +130,7 @@ def leave_one_out(
     covariances: FloatArray,
     common: FloatArray,
     limit: float,
+    between: FloatArray | None = None,
 ) -> tuple[float, FloatArray]:
     """Judge each of m >= 4 healthy recordings by what the others teach; return the scatter's factor, and the ratios.
 
@@ -134,14 +139,15 @@ def leave_one_out(
     can so only raise the covariance that their own scatter has contradicted.
 
     `paths`: theta_hat less what is expected of a healthy loop, shape (K, n), and its covariance (K, n, n), of each
-    recording; `apart`, `covariances`: as in `find_outliers`; `common`: what theta is known to without scatter, (n, n).
+    recording; `apart`, `covariances`: as in `find_outliers`; `common`: what theta is known to without scatter, (n, n);
+    `between`: covariance of the scatter (n, n) where others than these recordings tell it.
     """
     m = len(apart)
     if m < ENOUGH:
         return 1.0, np.zeros(0)
     others = [np.delete(np.arange(m), i) for i in range(m)]
     shifts = [apart[j].mean(axis=0) - apart.mean(axis=0) for j in others]
-    spreads = [scatter(apart[j], covariances[j]) for j in others]
+    spreads = [scatter(apart[j], covariances[j]) if between is None else between for j in others]
     ratios = np.zeros(m)
     factors = np.ones(m)
     for i, (d, S) in enumerate(paths):

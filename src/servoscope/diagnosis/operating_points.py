@@ -14,6 +14,7 @@ from servoscope.diagnosis.learn_faults import LabelledRecordings
 from servoscope.learning import learn as learning
 from servoscope.learning.learn import Progress
 from servoscope.learning.plausibility import check_plausibility, check_wraps
+from servoscope.learning.population import Population
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
@@ -32,6 +33,7 @@ def learn(
     faults: LabelledRecordings | Mapping[str, LabelledRecordings] | None = None,
     accept_delay: bool = False,
     force: bool = False,
+    population: Mapping[str, Baseline] | Sequence[Baseline | str | Path] = (),
 ) -> Baseline:
     """Learn a baseline from healthy recordings, at one operating point or at several.
 
@@ -60,6 +62,10 @@ def learn(
     force
         Learn although the coefficients are none that a machine has, or explain less than half of u; the notes then
         say so.
+    population
+        Baselines of at least five like machines, or their paths, by name or in a list: how they differ is a prior, so
+        that a new machine needs less healthy data of its own. A machine that is none of them is learned without; the
+        notes say which it was.
 
     Returns
     -------
@@ -102,9 +108,11 @@ def learn(
     labels = _group_by_point(faults or {}, recordings)
     notes = {name: _compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
     learned: list[Baseline] = []
+    alikes = _named_machines(population)
     for name, some in named.items():
         check_wraps(some)
-        one = learning.learn_baseline(loop, some, progress, accept_delay)
+        like = Population.from_baselines(_machines_at(alikes, name)) if alikes else None
+        one = learning.learn_baseline(loop, some, progress, accept_delay, like)
         odd = check_plausibility(one, force or loop.implausible == "note")
         longest = max(some, key=lambda rec: rec.samples)
         progress("operating points")
@@ -112,6 +120,24 @@ def learn(
         one = one.model_copy(update={"point": name, "notes": (*odd, *one.notes, *notes[name], *alike)})
         learned.append(learn_faults.add_learned_faults(one, labels[name], progress) if name in labels else one)
     return learned[0].model_copy(update={"others": tuple(learned[1:])})
+
+
+def _named_machines(population: Mapping[str, Baseline] | Sequence[Baseline | str | Path]) -> dict[str, Baseline]:
+    if isinstance(population, str | Path):
+        raise TypeError("a population is a list of baselines, as in [path, path, ...]")
+    if isinstance(population, Mapping):
+        return dict(population)
+    return {
+        one.loop.name if isinstance(one, Baseline) else str(one): one
+        if isinstance(one, Baseline)
+        else Baseline.load(one)
+        for one in population
+    }
+
+
+def _machines_at(machines: Mapping[str, Baseline], point: str) -> dict[str, Baseline]:
+    """Return the machines' baselines of one operating point; those without points are of any."""
+    return {name: one.at(point) if point in one.points else one for name, one in machines.items()}
 
 
 def _group_by_point(

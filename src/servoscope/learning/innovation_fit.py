@@ -29,6 +29,7 @@ LEAST = 1e-3  # of the noise on y relative to that on u, in their usual units: w
 FILE_ERROR = 0.2  # standard deviation of the logarithm of a parameter in a loop file that is not right
 STARTS = (-2.0, 2.0)  # standard deviations of the prior, at which a search begins again for each parameter
 UNLIKELY = 1e-3  # probability below which other parameters are not believed
+DOUBTFUL = 0.05  # and below which a file's own are not: four that stand in for twelve wrong ones lead to wrong names
 LAGS = 20
 SILENT = 1e-6  # of the noise's variance: what is quieter was simulated without any
 BELIEVED = 0.1  # autocorrelation of innovations up to which a plant is believed to be of the kind of the loop file
@@ -46,11 +47,11 @@ class InnovationFit:
     largest_autocorrelation: float  # of the innovations, up to `LAGS`
     whiteness: float  # the same in standard deviations
 
-    def is_likely(self, spread: FloatArray) -> bool:
+    def is_likely(self, spread: FloatArray, unlikely: float = UNLIKELY) -> bool:
         """Whether the prior of a standard deviation per parameter (m,) allows the parameters."""
         from scipy import special
 
-        return float(((self.x / spread) ** 2).sum()) <= float(special.chdtri(len(self.x), UNLIKELY))
+        return float(((self.x / spread) ** 2).sum()) <= float(special.chdtri(len(self.x), unlikely))
 
     def contradicts(self, x: FloatArray) -> bool:
         """Whether other logarithms (m,) are further off than chance puts them in one of a thousand cases."""
@@ -74,7 +75,7 @@ def fit_innovations(loop: Loop, recordings: Sequence[Recording], noise: WhiteNoi
     windows = [RefitWindow.of_healthy(loop, plant, begin, rec).cut(0, min(rec.samples, MOST)) for rec in recordings]
     near = np.full(len(plant.parameters), PRIOR)
     found = _InnovationSearch(windows, begin, plant.parameters, near).run()
-    if found is None or found.is_likely(near):
+    if found is None or found.is_likely(near, DOUBTFUL):
         return found
     names = plant.physical_parameters
     spread = FILE_ERROR * np.array([plant.error_factors.get(name, 1.0) for name in names])

@@ -17,7 +17,7 @@ from servoscope.detection.baseline_parts import BaselineSource
 from servoscope.detection.covariates import CovariateModel, CovariatePath
 from servoscope.detection.cusum_design import CusumHypothesis
 from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system
-from servoscope.detection.homogeneity import describe_outliers, find_outliers, leave_one_out, scatter
+from servoscope.detection.homogeneity import describe_outliers, find_outliers, leave_one_out, prediction_factor, scatter
 from servoscope.detection.motion import learn_motion
 from servoscope.detection.plant_fit import (
     MOST_SATURATED,
@@ -50,6 +50,7 @@ from servoscope.learning.detectability import (
 from servoscope.learning.features import learn_features
 from servoscope.learning.innovation_fit import FILE_ERROR, fit_innovations
 from servoscope.learning.instrument import learn_instrument, learns_instrument
+from servoscope.learning.population import Population
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
@@ -70,12 +71,16 @@ Progress = Callable[[str], None]
 
 @with_one_blas_thread
 def learn_baseline(
-    loop: Loop, recordings: Sequence[Recording], progress: Progress = lambda _: None, accept_delay: bool = False
+    loop: Loop,
+    recordings: Sequence[Recording],
+    progress: Progress = lambda _: None,
+    accept_delay: bool = False,
+    population: Population | None = None,
 ) -> Baseline:
     """Learn what healthy looks like.
 
-    With several recordings their scatter counts. NotEnoughError: too short or too little excitation; RecordingError: u
-    and y are out of step, unless that is accepted.
+    With several recordings their scatter counts; a population of like machines is a prior. NotEnoughError: too short or
+    too little excitation; RecordingError: u and y are out of step, unless that is accepted.
     """
     if not recordings:
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
@@ -101,7 +106,16 @@ def learn_baseline(
     ]
     notes += warnings
     return _assemble_baseline(
-        pipeline.loop, recordings, pipeline, regressions, fit, delay_s, notes, progress, covariates=covariates
+        pipeline.loop,
+        recordings,
+        pipeline,
+        regressions,
+        fit,
+        delay_s,
+        notes,
+        progress,
+        covariates=covariates,
+        population=population,
     )
 
 
@@ -196,6 +210,7 @@ def _assemble_baseline(
     progress: Progress,
     exact: bool = False,
     covariates: CovariateModel | None = None,
+    population: Population | None = None,
 ) -> Baseline:
     calibration = CalibrationFactors()
     theta_covariance, deviations_between = fit.covariance, fit.each
@@ -207,6 +222,10 @@ def _assemble_baseline(
     hypotheses: tuple[CusumHypothesis, ...] = ()
     expectations: list[Expectation] = []
     known: tuple[tuple[str, ...], FloatArray, FloatArray] | None = None
+    if population is not None:
+        member, note = population.describe(theta, theta_covariance + np.diag(population.scatter) / len(recordings))
+        notes.append(note)
+        population = population if member else None
     if can_simulate(loop):
         from scipy import special
 
@@ -242,6 +261,11 @@ def _assemble_baseline(
                 healthy = describe_healthy_plant(expectations, regressions, fit, *known)
             else:
                 healthy = fit_healthy_plant(expectations, regressions, fit, healthy.true_theta, model)
+            if population is not None:
+                x = np.log(list(healthy.ratios.values()))
+                shared = population.combine_ratios(tuple(healthy.ratios), x, healthy.covariance)
+                if shared is not None:
+                    healthy = describe_healthy_plant(expectations, regressions, fit, *shared)
             ratios, ratios_std, model_theta = healthy.ratios, healthy.std(), healthy.theta
             plant = loop.plant.scaled(ratios)
             deviations_between = fit.each - np.array(
@@ -251,7 +275,8 @@ def _assemble_baseline(
             if healthy.misfit <= special.chdtri(pipeline.bank.n, UNLIKELY):
                 # the physics hold: what they say is known better than the coefficients one by one
                 theta, theta_covariance = model_theta, healthy.theta_covariance
-                if loudest and not loop.monitor.model_error and covariates is None:
+                sequential = population is None or population.sequential
+                if loudest and not loop.monitor.model_error and covariates is None and sequential:
                     progress("rehearsal")
                     calibration, hypotheses, warnings = design_sequential_test(
                         recordings, expectations, plant, healthy.theta, healthy.covariance, loudest
@@ -265,7 +290,15 @@ def _assemble_baseline(
         notes += warnings
         if axis is not None:  # scatter between recordings; a change within one is told from its own past
             error += np.diag(axis.scatter(pipeline.bank.names) ** 2)
+    m = len(recordings)
     between = scatter(deviations_between, fit.each_covariance)
+    own_scatter = np.diag(between) / prediction_factor(m)
+    if population is not None:
+        pooled = population.pooled_scatter(own_scatter, m)
+        between = np.diag(pooled) * (1.0 + 1.0 / m)
+        if not ratios:
+            theta, theta_covariance = population.theta.combine(theta, theta_covariance + np.diag(pooled) / m)
+            between = np.diag(pooled)  # what the mean of m recordings is off by is in the covariance of theta now
     outliers = find_outliers(deviations_between, fit.each_covariance + error)
     notes += describe_outliers(outliers, [rec.name for rec in recordings], pipeline.bank.names)
     tuning = replace(fit.tuning, theta=theta)
@@ -294,7 +327,9 @@ def _assemble_baseline(
     ]
     deviations = [e.theta - mean for e, mean in zip(estimates, expected, strict=True)]
     paths = [(d[e.updates > 0], e.S[e.updates > 0]) for d, e in zip(deviations, estimates, strict=True)]
-    factor, left_out = leave_one_out(paths, deviations_between, fit.each_covariance, theta_covariance + error, limit)
+    told = None if population is None else between
+    common = theta_covariance + error
+    factor, left_out = leave_one_out(paths, deviations_between, fit.each_covariance, common, limit, told)
     covariance = theta_covariance + factor * between + error
     notes += noise_notes(pipeline, fit, estimates, can_simulate(loop))
     excess, suggestion = baseline_misfit(estimates, deviations, covariance, fit)
@@ -350,6 +385,7 @@ def _assemble_baseline(
         motion=learn_motion(pipeline, recordings),
         axis=axis,
         covariates=covariates,
+        scatter=tuple(own_scatter) if m > 1 else (),
     )
     progress("predictor")
     predictor = None if covariates is not None else fit_exact_predictor(baseline, recordings)

@@ -1,4 +1,4 @@
-"""The compiled loops of the exact predictor: Kalman gains after a restart, and innovations through changing plants."""
+"""The compiled loops of the exact predictor: innovations through changing plants, and their sums."""
 
 from __future__ import annotations
 
@@ -12,56 +12,6 @@ from servoscope.core.arrays import BoolArray, IntArray
 from servoscope.core.jit import kernel, subroutine
 
 Array = npt.NDArray[Any]  # float64, or complex128 for complex-step derivatives
-
-SETTLED = 1e-6  # relative change of the gain from which it stays as it is
-
-
-@kernel
-def gains(A: Array, Q: Array, c: Array, r: float, P: Array, K: Array, S: Array) -> None:
-    """Fill Kalman gains K (L, n) and innovation variances S (L,) for the samples after a restart.
-
-    ``S = c P c' + r,  K = A P c'/S,  P <- A P A' + Q - K S K'`` from the covariance P (n, n) of the first state, which
-    is overwritten (Anderson and Moore, 1979, chapter 4). The last gain stands for all later samples.
-    """
-    n, L = len(c), len(S)
-    zero = 0.0 * A[0, 0]
-    Pc, AP = np.zeros_like(c), np.zeros_like(A)
-    for j in range(L):
-        s = zero + r
-        for i in range(n):
-            total = zero
-            for k in range(n):
-                total += P[i, k] * c[k]
-            Pc[i] = total
-            s += c[i] * total
-        S[j] = s
-        by, settled = 1.0 / s, True
-        for i in range(n):
-            total = zero
-            for k in range(n):
-                total += A[i, k] * Pc[k]
-            K[j, i] = total * by
-            if j > 0:
-                ratio = abs(K[j, i].real - K[j - 1, i].real)
-                settled = settled and ratio <= SETTLED * abs(K[j, i].real)
-        if j > n and settled:
-            for later in range(j + 1, L):
-                S[later] = s
-                for i in range(n):
-                    K[later, i] = K[j, i]
-            return
-        for i in range(n):
-            for k in range(n):
-                total = zero
-                for q in range(n):
-                    total += A[i, q] * P[q, k]
-                AP[i, k] = total
-        for i in range(n):
-            for k in range(n):
-                total = Q[i, k] - K[j, i] * s * K[j, k]
-                for q in range(n):
-                    total += AP[i, q] * A[k, q]
-                P[i, k] = total
 
 
 @kernel
@@ -223,17 +173,17 @@ def sum_over_onsets(
             run_constant_plant(A, b, b_late, c, K, by, v, 0, k, k + 1, age, u, y, restart, x, x_next, e, 0)
             for i in range(n):
                 states[k + 1, v, i] = x[v, i]
-    accumulate_products(before, e, 0, 0, N, 0.0, Q)
+    accumulate_products(before, e, 0.0, Q)
     for v in range(V):  # and the changed one
         for i in range(n):
             x[v, i] = 0.0
         run_constant_plant(A, b, b_late, c, K, by, v, last, 0, N, age, u, y, restart, x, x_next, e, 0)
-    accumulate_products(after, e, 0, 0, N, 1.0 / step, Q)
+    accumulate_products(after, e, 1.0 / step, Q)
     volume_after = np.zeros(N + 1)
     for k in range(N - 1, -1, -1):
         volume_after[k] = volume_after[k + 1] + log_ratios[last, age[k]]
     sums, volume = np.zeros((M, V, V + m)), np.zeros(M)
-    total = np.zeros((N + 1, V, V + m))
+    row = np.zeros(V)
     for i in range(M):
         onset, duration = onsets[i], durations[i]
         end, stop = min(onset + duration, N), min(onset + duration + settle, N)
@@ -249,28 +199,33 @@ def sum_over_onsets(
             run_constant_plant(A, b, b_late, c, K, by, v, last, end, stop, age, u, y, restart, x, x_next, e, onset)
         for v in range(V):
             for o in range(V + m):
-                total[0, v, o] = before[onset, v, o] + after[N, v, o] - after[stop, v, o]
-        accumulate_products(total, e, onset, onset, stop, 1.0 / step, Q)
-        for v in range(V):
-            for o in range(V + m):
-                sums[i, v, o] = total[stop - onset, v, o]
+                sums[i, v, o] = before[onset, v, o] + after[N, v, o] - after[stop, v, o]
+        for k in range(onset, stop):
+            fill_row(row, e, k - onset, 1.0 / step)
+            for v in range(V):
+                for o in range(V):
+                    sums[i, v, o] += row[v] * row[o]
+                for o in range(m):
+                    sums[i, v, V + o] += row[v] * Q[k, o]
     return sums, volume
 
 
 @functools.partial(subroutine, heap=True)
-def accumulate_products(sums: Array, e: Array, first: int, begin: int, end: int, by: float, Q: Array) -> None:
-    """Sum up products of innovations, their derivatives and Q: sums[k - begin + 1] is what they are up to sample k.
-
-    e[v, k - first] are the innovations of the variants; derivatives are their differences times `by`.
-    """
-    V, m = e.shape[0], Q.shape[1]
-    row = np.zeros(V)
-    for k in range(begin, end):
-        row[0] = e[0, k - first]
-        for v in range(1, V):
-            row[v] = (e[v, k - first] - row[0]) * by
+def accumulate_products(sums: Array, e: Array, by: float, Q: Array) -> None:
+    """Sum up products of innovations, their derivatives and Q: sums[k + 1] is what they are up to sample k."""
+    V, N, m, row = e.shape[0], e.shape[1], Q.shape[1], np.zeros(e.shape[0])
+    for k in range(N):
+        fill_row(row, e, k, by)
         for v in range(V):
             for o in range(V):
-                sums[k - begin + 1, v, o] = sums[k - begin, v, o] + row[v] * row[o]
+                sums[k + 1, v, o] = sums[k, v, o] + row[v] * row[o]
             for o in range(m):
-                sums[k - begin + 1, v, V + o] = sums[k - begin, v, V + o] + row[v] * Q[k, o]
+                sums[k + 1, v, V + o] = sums[k, v, V + o] + row[v] * Q[k, o]
+
+
+@subroutine
+def fill_row(row: Array, e: Array, k: int, by: float) -> None:
+    """Put the innovations of a sample and their derivatives, the differences of the variants e[v, k] times `by`."""
+    row[0] = e[0, k]
+    for v in range(1, len(row)):
+        row[v] = (e[v, k] - row[0]) * by

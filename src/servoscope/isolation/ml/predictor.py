@@ -12,7 +12,7 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.kernels import Array
-from servoscope.models.discretise import discretise, discretise_uncached, split_delay
+from servoscope.models.discretise import discretise, split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 
@@ -66,28 +66,41 @@ class PredictorFactory:
     def predictor(
         self, plant: Plant, output_gain: float = 1.0, later_s: float = 0.0, noise: WhiteNoise | None = None
     ) -> Predictor:
-        """Return the predictor of a plant.
+        """Return the predictor of a plant, as `predictors` does of several."""
+        return self.predictors([plant], [output_gain], later_s, noise)
+
+    def predictors(
+        self,
+        plants: Sequence[Plant],
+        output_gains: Sequence[float],
+        later_s: float = 0.0,
+        noise: WhiteNoise | None = None,
+    ) -> Predictor:
+        """Return the predictors of plants in a row.
 
         ``x(k+1) = A x + b (u + n_u),  y = c x + n_y`` with the input held between samples. u as logged is known, so
         the loop being closed changes nothing, and no controller is needed (Ljung, 1999, section 13.4).
 
-        The parameters of the plant may be complex. `later_s` [s] is delay beyond the loop file's; `noise` takes the
-        place of the factory's, but for the state after a restart.
+        The parameters of the plants may be complex, and `output_gains` multiply their y. `later_s` [s] is delay beyond
+        the loop file's; `noise` takes the place of the factory's, but for the state after a restart.
         """
-        from servoscope.isolation.ml.kernels import gains
+        from servoscope.isolation.ml.sampling import sample_plants
 
-        d = discretise_uncached(plant.state_space(), self.loop.sample_rate, "zoh", self.fractional_delay_s + later_s)
-        A, b, late = d.A * self.scale / self.scale[:, None], d.b_now / self.scale, d.b_late / self.scale
-        c = d.c * self.scale * output_gain
-        kind = np.result_type(A, b, c)  # one for all: each further mixture would be compiled anew
-        A, b, late, c = (np.ascontiguousarray(part, dtype=kind) for part in (A, b, late, c))
-        if d.delay_samples:  # one sample later than the loop file says
-            b, late = late, b
+        F, g, c = (np.stack(each) for each in zip(*(plant.state_space() for plant in plants), strict=True))
+        F, g = F * self.scale / self.scale[:, None], g[..., 0] / self.scale
+        c = c[:, 0] * self.scale * np.array(output_gains)[:, None]
+        kind = np.result_type(F, g, c)  # one for all: each further mixture would be compiled anew
+        F, g, c = (np.ascontiguousarray(part, dtype=kind) for part in (F, g, c))
+        samples, late = split_delay(self.fractional_delay_s + later_s, self.loop.sample_rate)
+        A, b, b_late = np.empty_like(F), np.empty_like(g), np.empty_like(g)
+        K, S = np.empty((len(g), LONGEST, g.shape[1]), kind), np.empty((len(g), LONGEST), kind)
         noise = noise or self.noise
-        Q = noise.u_std**2 * (b[:, None] * b + late[:, None] * late)
-        K, S = np.zeros((LONGEST, len(b)), A.dtype), np.zeros(LONGEST, A.dtype)
-        gains(A, Q, c, noise.y_std**2, self.initial_covariance.astype(kind), K, S)
-        return Predictor(A[None], b[None], late[None], c[None], K[None], S[None])
+        variances = noise.u_std**2, noise.y_std**2
+        P = self.initial_covariance.astype(kind)
+        sample_plants(F, g, 1.0 / self.loop.sample_rate, late, c, *variances, P, A, b, b_late, K, S)
+        if samples:  # one sample later than the loop file says
+            b, b_late = b_late, b
+        return Predictor(A, b, b_late, c, K, S)
 
     @property
     def fractional_delay_s(self) -> float:

@@ -35,6 +35,7 @@ PAIRS = 0.02  # probability that two faults come at once, before anything is kno
 OUTSIDE = 0.01  # and that it is a parameter outside the list of faults
 LOOKS = 4  # for the onset, each with the sizes that fit the one before
 WORTH_A_LOOK = 1.0  # of the sum of squares that a look gained, for another one
+HOPELESS = 10.0  # of what noise leaves unexplained at most, from which a pair is not followed to its onset
 SHARP = 20  # samples of an onset's interval, up to which the step is loud
 
 
@@ -138,7 +139,7 @@ class _HypothesisSearch:
             for one, other in combinations([f for f in singles if f.faults[0] not in self.rays], 2)
         ]
         found, everything = self._iterate_onset(found, [*singles, *pairs])
-        if not self._explains(self._update_noise_variance(everything)):
+        if self._misfit(self._update_noise_variance(everything)) > 1.0:
             # no fault alone is near the truth, nor are the sizes that the pairs started from
             pairs = [
                 self._fit(p.faults, nothing, [p.x, *pair_start_values(self.window, p.faults, self.profile)])
@@ -183,16 +184,18 @@ class _HypothesisSearch:
             found = self._onset(best)
             after = self._refit_at(best, found.profile)
             gained, best = best.cost - after.cost, after
-            if gained < WORTH_A_LOOK * self.noise_variance:
+            # a pair that is far off at its own onset is not the truth, whatever further looks gain
+            if gained < WORTH_A_LOOK * self.noise_variance or self._misfit(best) > HOPELESS:
                 break
         self.profile = found.profile
         everything = self._refit_contenders([self._refit_at(f, found.profile) for f in fitted])
         self._update_noise_variance(everything)
         return found, everything
 
-    def _explains(self, fitted: HypothesisFit) -> bool:
+    def _misfit(self, fitted: HypothesisFit) -> float:
+        """Return what a hypothesis leaves unexplained, in units of what noise leaves at most."""
         good = self._goodness(fitted)
-        return good.statistic <= good.limit
+        return good.statistic / good.limit
 
     def _fit_singles(self, d: FloatArray) -> tuple[OnsetEstimate, list[HypothesisFit]]:
         """Find the onset and the sizes of single faults in turns; drifts are tried once the steps have settled.

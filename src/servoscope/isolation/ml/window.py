@@ -202,14 +202,14 @@ class RefitWindow(ChangeWindow):
     def predictor(self, d: Array, names: Sequence[str], x: Array, profile: ChangeProfile) -> Predictor:
         """Return the predictors of the healthy plant and of all that follow; d are errors of logarithms."""
         healthy = dict(zip(self.names, np.exp(d), strict=True)) if np.any(d) else {}
-        each = [self.factory.predictor(self.plant.scaled(healthy)) if healthy else self.healthy]
+        plants, output_gains = [self.plant.scaled(healthy) if healthy else self.plant], [1.0]
         for share in profile.shares:
             faulty = dict(healthy)
             for name, value in zip(names, np.exp(share * x), strict=True):
                 faulty[name] = faulty.get(name, 1.0) * value
-            output_gain = faulty.pop(SENSOR_GAIN, 1.0)
-            each.append(self.factory.predictor(self.plant.scaled(self.plant.expand_rays(faulty)), output_gain))
-        return Predictor.concatenate([_cast_predictor(one, np.result_type(*(e.A for e in each))) for one in each])
+            output_gains.append(faulty.pop(SENSOR_GAIN, 1.0))
+            plants.append(self.plant.scaled(self.plant.expand_rays(faulty)))
+        return self.factory.predictors(plants, output_gains)
 
     def innovations(self, predictor: Predictor, profile: ChangeProfile) -> Array:
         """Return the innovations in standard deviations, shape (N,)."""
@@ -266,7 +266,3 @@ def delay_input(u: FloatArray, restart: BoolArray, samples: int) -> FloatArray:
     k = np.arange(len(u))
     begin = np.maximum.accumulate(np.where(restart, k, 0))
     return np.asarray(u[np.maximum(k - samples, begin)])
-
-
-def _cast_predictor(predictor: Predictor, dtype: np.dtype[np.generic]) -> Predictor:
-    return Predictor(*(part.astype(dtype) for part in predictor))

@@ -1,0 +1,179 @@
+"""Like machines as a prior: how healthy ones differ from each other, and how the recordings of each scatter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import BaselineError
+from servoscope.core.messages import Message, message
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.homogeneity import prediction_factor
+from servoscope.detection.plant_fit import PRIOR
+
+FEWEST = 5  # machines: of fewer, the scatter between them is mostly chance
+LEAST_DEGREES = 3.0  # of freedom, below which a variance says nothing of a further recording
+UNLIKELY = 1e-3  # probability below which a machine is none of the population
+
+
+@dataclass(frozen=True, eq=False)
+class NormalPrior:
+    """Where values of a further machine are expected: mean (n,) and covariance (n, n), as k machines tell."""
+
+    names: tuple[str, ...]
+    mean: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def from_machines(cls, names: tuple[str, ...], values: FloatArray, covariances: FloatArray) -> Self:
+        """Estimate it from the values of k machines (k, n), each with the covariance (n, n) of its own estimate.
+
+        The covariance between machines is that of the values less the mean of their own (DerSimonian and Laird, 1986,
+        for vectors), and as wide as that of a further draw (Student's t), with no negative variance in any direction.
+        """
+        k = len(values)
+        size = np.maximum(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0)), values.std(axis=0, ddof=1))
+        between = (np.cov(values.T, ddof=1).reshape(len(names), -1) - covariances.mean(axis=0)) / np.outer(size, size)
+        variances, directions = np.linalg.eigh(between)
+        widened = np.maximum(variances, 0.0) * (k - 1.0) / (k - 3.0) * (1.0 + 1.0 / k)
+        own = covariances.mean(axis=0) / np.outer(size, size) / k  # of the mean, where machines do not differ
+        covariance = (directions * widened) @ directions.T + own
+        return cls(names, values.mean(axis=0), covariance * np.outer(size, size))
+
+    def combine(
+        self, values: FloatArray, covariance: FloatArray, earlier_std: float | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of values (n,) that a machine's own recordings know with a covariance (n, n).
+
+        `earlier_std`: standard deviation of a prior around zero that they were found with, whose place this one takes.
+        """
+        own, prior = np.linalg.inv(covariance), np.linalg.inv(self.covariance)
+        fresh = own - (np.eye(len(values)) / earlier_std**2 if earlier_std is not None else 0.0)
+        C = np.linalg.inv(fresh + prior)
+        return C @ (own @ values + prior @ self.mean), C
+
+    def distance(self, values: FloatArray, covariance: FloatArray) -> float:
+        """Return the squared Mahalanobis distance of values from the population."""
+        off = values - self.mean
+        return float(off @ np.linalg.solve(self.covariance + covariance, off))
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """Healthy machines of one kind."""
+
+    machines: int
+    theta: NormalPrior  # coefficients
+    ratios: NormalPrior | None  # logarithms of the plant's parameters relative to the loop file's
+    scatter: FloatArray  # variance of the coefficients between recordings of one machine, shape (n,)
+    degrees: float  # what it is worth for a further machine, in degrees of freedom
+    sequential: bool  # whether most machines have a sequential test: recordings that scatter leave none
+
+    @classmethod
+    def from_baselines(cls, baselines: Mapping[str, Baseline]) -> Self:
+        """Describe a population by the baselines of its machines, by name.
+
+        Raises
+        ------
+        BaselineError
+            If there are fewer than five, or one has other coefficients or another plant than the first.
+        """
+        if len(baselines) < FEWEST:
+            raise BaselineError(
+                f"a population needs the baselines of at least {FEWEST} like machines, {len(baselines)} given"
+            )
+        first_name, first = next(iter(baselines.items()))
+        for name, other in baselines.items():
+            if (other.names, other.loop.plant.kind) != (first.names, first.loop.plant.kind):
+                raise BaselineError(
+                    f"{name}: its coefficients ({', '.join(other.names)}; plant {other.loop.plant.kind}) are not those "
+                    f"of {first_name} ({', '.join(first.names)}; plant {first.loop.plant.kind}): no like machine"
+                )
+        each = list(baselines.values())
+        scatter, degrees = _common_scatter([one for one in each if one.scatter], len(first.names))
+        theta = np.array([one.theta for one in each])
+        errors = np.array([_estimation_error(one, scatter) for one in each])
+        return cls(
+            len(each),
+            NormalPrior.from_machines(first.names, theta, errors),
+            _ratios(each),
+            scatter,
+            degrees,
+            2 * sum(bool(one.members) for one in each) > len(each),
+        )
+
+    def pooled_scatter(self, own: FloatArray, recordings: int) -> FloatArray:
+        """Return the variance between recordings (n,) of a machine whose own m of them say `own` (n,).
+
+        Both weigh by their degrees of freedom (Smyth, 2004, eq. 3); it is as wide as Student's t with their sum.
+        """
+        weight = max(recordings - 1, 0)
+        total = weight + self.degrees
+        if total <= LEAST_DEGREES:
+            return own
+        return np.asarray((weight * own + self.degrees * self.scatter) / (total - 2.0))
+
+    def describe(self, theta: FloatArray, covariance: FloatArray) -> tuple[bool, Message]:
+        """Return whether a machine is one of the population, and a note that says so."""
+        from scipy import special
+
+        n = len(theta)
+        distance, limit = self.theta.distance(theta, covariance), float(special.chdtri(n, UNLIKELY))
+        if distance <= limit:
+            return True, message("learning.population", machines=self.machines)
+        off = (theta - self.theta.mean) / np.sqrt(np.diag(self.theta.covariance + covariance))
+        most = int(np.argmax(np.abs(off)))
+        return False, message(
+            "learning.no_population",
+            machines=self.machines,
+            coefficient=self.theta.names[most],
+            deviations=abs(float(off[most])),
+        )
+
+    def combine_ratios(
+        self, names: Sequence[str], x: FloatArray, C: FloatArray
+    ) -> tuple[tuple[str, ...], FloatArray, FloatArray] | None:
+        """Return names, logarithms and covariance of parameters with the population's; None where it has others."""
+        if self.ratios is None or self.ratios.names != tuple(names):
+            return None
+        return self.ratios.names, *self.ratios.combine(x, C, PRIOR)
+
+
+def _common_scatter(known: Sequence[Baseline], n: int) -> tuple[FloatArray, float]:
+    """Return the variance between recordings that machines have in common, (n,), and its degrees of freedom.
+
+    These are what is left of all of theirs where machines scatter by different amounts: variances that scatter among
+    machines with a coefficient of variation c come from an inverse gamma law of 4 + 2/c^2 degrees (by moments).
+    """
+    if len(known) < FEWEST:
+        return np.zeros(n), 0.0
+    degrees = np.array([len(one.sources) - 1.0 for one in known])
+    variances = np.array([one.scatter for one in known])
+    mean = degrees @ variances / degrees.sum()
+    seen = mean > 0.0
+    chance = 2.0 / degrees.mean()
+    variation = variances[:, seen].var(axis=0, ddof=1) / mean[seen] ** 2
+    between = max(float(np.median((variation - chance) / (1.0 + chance))) if seen.any() else 0.0, 1e-9)
+    return mean, float(min(4.0 + 2.0 / between, degrees.sum()))
+
+
+def _estimation_error(baseline: Baseline, scatter: FloatArray) -> FloatArray:
+    """Return the covariance of a baseline's own coefficients: noise, and its recordings' share of the scatter."""
+    m = len(baseline.sources)
+    own = np.array(baseline.scatter) if baseline.scatter else np.zeros(len(scatter))
+    noise = baseline.covariance_array() - np.diag(own * prediction_factor(m))
+    lowest = 1e-3 * np.diag(baseline.covariance_array())  # a scatter that was widened is more than what it adds
+    noise[np.diag_indices_from(noise)] = np.maximum(np.diag(noise), lowest)
+    return np.asarray(noise + np.diag(scatter) / m)
+
+
+def _ratios(each: Sequence[Baseline]) -> NormalPrior | None:
+    names = tuple(each[0].ratios)
+    if not names or any(tuple(one.ratios) != names or len(one.ratios_covariance) != len(names) for one in each):
+        return None
+    values = np.log([[one.ratios[name] for name in names] for one in each])
+    return NormalPrior.from_machines(names, values, np.array([one.ratios_covariance for one in each]))
