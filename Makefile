@@ -4,6 +4,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# what the demonstration needs, which is what users install; the rest, if it is there, will do as well
+PRODUCT := $(or $(wildcard $(STAMP)),$(VENV)/.product)
 CODE := src tests benchmarks scripts
 
 .DEFAULT_GOAL := help
@@ -15,7 +17,7 @@ help:           ## list the targets
 
 install: $(STAMP)  ## make .venv with servoscope, editable, and what its tests need
 
-demo: $(STAMP)  ## simulate a rig, break it, diagnose it; the report goes to demo-output/
+demo: $(PRODUCT)  ## simulate a rig, break it, diagnose it; the report goes to demo-output/
 	$(BIN)/servoscope demo -o demo-output
 
 test: lint      ## what must pass before a commit: format, lint, types, all tests but the slow ones
@@ -46,15 +48,16 @@ sbom: $(STAMP)     ## the software bill of materials of a release, as CycloneDX:
 	$(BIN)/python scripts/sbom.py -o servoscope.cdx.json
 
 clean:          ## remove what the other targets made
-	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist src/servoscope/site
+	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist src/servoscope/site src/servoscope/core/jit/kernels
 	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Done again only when one of the two files has changed; .venv itself is kept then, unless its Python is gone.
-$(STAMP): pyproject.toml requirements-dev.lock
+$(STAMP): EXTRAS := [dev]
+$(STAMP) $(VENV)/.product: pyproject.toml requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "servoscope needs Python 3.11 or newer, and '$(PYTHON)' is $$($(PYTHON) --version 2>&1):" \
 	       "install one and name it, as in 'make PYTHON=python3.12'" >&2; exit 1; }
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV) || { \
 	  echo "no virtual environment could be made: on Debian and its kin, install python3-venv" >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements-dev.lock -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements-dev.lock -e '.$(EXTRAS)'
 	@touch $@

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from servoscope.core.errors import ServoscopeError
-from servoscope.core.jit import backend, compile, fma, plain, symbolic
+from servoscope.core.jit import backend, cache, compile, fma, plain, symbolic
 from servoscope.core.jit.cache import kernel_key
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -174,7 +174,7 @@ class TestCache:
     @pytest.mark.slow
     def test_it_depends_on_code_and_not_on_comments(self, tmp_path: Path) -> None:
         """A comment or a docstring in an estimator compiles nothing anew; a line of it, what contains it."""
-        shutil.copytree(PROJECT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(PROJECT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__", "kernels"))
         package = tmp_path / "src" / "servoscope"
 
         def keys(*arguments: str) -> dict[str, Any]:
@@ -231,11 +231,10 @@ class TestCache:
         assert done[0].stdout == done[1].stdout
 
     def test_without_a_folder_it_compiles_for_this_process(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        class NoFolder:
-            def __init__(self, kernel: Any) -> None:
-                raise RuntimeError("cannot cache function: no locator available")
+        def fail(cache: Any, function: Any) -> None:
+            raise RuntimeError("cannot cache function: no locator available")
 
-        monkeypatch.setattr(compile, "KernelCache", NoFolder)
+        monkeypatch.setattr(cache.FunctionCache, "__init__", fail)
 
         def twice(x: float) -> float:
             return 2.0 * x

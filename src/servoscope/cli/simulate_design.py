@@ -170,7 +170,7 @@ def bench(
     from servoscope.cli.render import results
     from servoscope.research import bench as benchmark
 
-    with show_steps(9, 1) as steps:
+    with show_steps(10, 1) as steps:
         result = benchmark.run_benchmarks(repeats, steps.begin, share=share)
     if as_json:
         print_json(result.to_dict(), lines=False)

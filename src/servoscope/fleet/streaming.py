@@ -1,5 +1,8 @@
 """The fleet as a stream of Spark: rows wait in the state for the watermark, then are sorted and followed.
 
+Before they are shuffled by asset, each Arrow batch becomes one block of bytes per asset: what Spark does to a row costs
+more than all that follows.
+
 Rows of an asset may come in several Arrow batches, in any order, from any partition. They are only stored until the
 watermark has passed them, and then followed in the order of time: where all rows are on time, results depend on them
 alone. A row from before what has been followed already is late, and counted.
@@ -20,14 +23,14 @@ from servoscope.core.errors import LoopError, RecordingError, ServoscopeError
 from servoscope.detection.baseline import Baseline
 from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.day_monitor import WINDOW, DayState, EvaluationBlock
-from servoscope.fleet.partition import DAY_US, day_name
-from servoscope.fleet.rows import Rows, required_columns, signals_from_table
+from servoscope.fleet.partition import BLOCKS, DAY_US, day_name, join_blocks, pack_blocks
+from servoscope.fleet.rows import Rows, required_columns
 from servoscope.fleet.tasks import day_result, error_text, failed_result
 from servoscope.models.loop import Columns
-from servoscope.signals.readers.table import TIME_UNITS, Table
+from servoscope.signals.readers.table import TIME_UNITS
 
 if TYPE_CHECKING:
-    from pyspark.sql import DataFrame
+    from pyspark.sql import DataFrame, SparkSession
     from pyspark.sql.streaming import StatefulProcessorHandle
 
 
@@ -36,8 +39,10 @@ SCHEMA = (
     "level double, late long, result string"
 )
 ROCKSDB = "org.apache.spark.sql.execution.streaming.state.RocksDBStateStoreProvider"
+PARTITIONS = "spark.sql.shuffle.partitions"
+DEFAULT_PARTITIONS = "200"  # Spark's own: of a small stream, most would be empty, and each costs a task per batch
+PARTITIONS_PER_CORE = 3
 FAR_PAST = -(2**62)
-CHUNK = 65_536  # rows of one entry of the state, about
 
 
 def follow(
@@ -87,6 +92,7 @@ def follow(
     if session.conf.get("spark.sql.session.timeZone") not in ("UTC", "Etc/UTC", "GMT", "Z"):
         raise LoopError("a stream's days are those of UTC: set spark.sql.session.timeZone to UTC")
     session.conf.set("spark.sql.streaming.stateStore.providerClass", ROCKSDB)
+    _set_partitions(session, assets)
     known = Baselines.from_source(baselines, assets, window_s)
     mapping = columns if columns is not None else known.first().loop.columns
     time, *signals = required_columns(mapping, frame.columns, "the stream")
@@ -98,13 +104,14 @@ def follow(
         micros = F.rint(frame[time] * TIME_UNITS[mapping.time_unit] * 1e6).cast("long")
         stamp = F.timestamp_micros(micros)
     named = [frame[name] for name in signals]
-    keyed = frame.select(
-        frame["asset"].cast("string"), frame[by].cast("string").alias("baseline_of"), stamp.alias("_at"), *named
-    )
-    marked = keyed.where("_at is not null").withWatermark("_at", f"{round(delay_s * 1e3)} milliseconds")
+    asset, baseline = frame["asset"].cast("string"), frame[by].cast("string").alias("baseline_of")
+    keyed = frame.select(asset, baseline, F.unix_micros(stamp).alias("at_us"), *named).where("at_us is not null")
+    blocks = keyed.mapInArrow(lambda batches: pack_blocks(batches, mapping), BLOCKS)
+    last = F.timestamp_micros("last_us").alias("_at")
+    marked = blocks.select("*", last).withWatermark("_at", f"{round(delay_s * 1e3)} milliseconds")
     # without the column that bears the watermark Spark drops no late row unseen: they are counted here, by asset
-    rows = marked.select("asset", "baseline_of", F.unix_micros("_at").alias("at_us"), *signals)
-    processor = _create_processor(known, mapping)
+    rows = marked.select("asset", "baseline_of", "rows")
+    processor = _create_processor(known)
     return rows.groupBy("asset").transformWithStateInPandas(processor, SCHEMA, "append", "eventtime")
 
 
@@ -150,7 +157,14 @@ class StreamState:
         return min((max(low, done + 1) for low, high in self.blocks.values() if high > done), default=None)
 
 
-def _create_processor(baselines: Baselines, columns: Columns) -> Any:
+def _set_partitions(session: SparkSession, assets: int) -> None:
+    """Take as many partitions as assets and cores have use for, unless somebody has chosen a number."""
+    context = session.sparkContext
+    if session.conf.get(PARTITIONS) == DEFAULT_PARTITIONS and not context.getConf().contains(PARTITIONS):
+        session.conf.set(PARTITIONS, str(min(max(assets, 1), PARTITIONS_PER_CORE * context.defaultParallelism)))
+
+
+def _create_processor(baselines: Baselines) -> Any:
     """Return the stateful processor; its class needs PySpark, which is imported late."""
     from pyspark.sql.streaming import StatefulProcessor
 
@@ -161,16 +175,16 @@ def _create_processor(baselines: Baselines, columns: Columns) -> Any:
             self.blocks = handle.getMapState("blocks", "number long", "content binary")
 
         def handleInputRows(self, key: Any, rows: Iterator[Any], timerValues: Any) -> Iterator[Any]:
-            asset = _StreamAsset(key[0], self, baselines, columns)
+            asset = _StreamAsset(key[0], self, baselines)
             late: Counter[int] = Counter()
-            for frame in _chunks(rows):
-                late += asset.store_rows(frame)
+            for baseline, chunk in join_blocks(rows):
+                late += asset.store_rows(baseline, chunk)
             asset.save()
             for day, count in sorted(late.items()):
                 yield _output(asset.name, kind=["late"], day=[day_name(day)], late=[count])
 
         def handleExpiredTimer(self, key: Any, timerValues: Any, expiredTimerInfo: Any) -> Iterator[Any]:
-            asset = _StreamAsset(key[0], self, baselines, columns)
+            asset = _StreamAsset(key[0], self, baselines)
             yield from asset.process_until(timerValues.getCurrentWatermarkInMs() * 1000)
             asset.save()
 
@@ -183,21 +197,16 @@ def _create_processor(baselines: Baselines, columns: Columns) -> Any:
 class _StreamAsset:
     """One asset of a stream, for as long as a worker processes it."""
 
-    def __init__(self, name: str, store: Any, baselines: Baselines, columns: Columns) -> None:
-        self.name, self.store, self.baselines, self.columns = name, store, baselines, columns
+    def __init__(self, name: str, store: Any, baselines: Baselines) -> None:
+        self.name, self.store, self.baselines = name, store, baselines
         packed = store.head.get()
         self.head = StreamState.unpack(bytes(packed[0])) if packed is not None else StreamState()
         self._cache: dict[int, Rows] = {}
 
-    def store_rows(self, frame: Any) -> Counter[int]:
+    def store_rows(self, baseline: str, rows: Rows) -> Counter[int]:
         """Store the rows that are on time; return how many are late, by day."""
-        import pyarrow as pa
-
-        head, t_us = self.head, frame["at_us"].to_numpy().astype(np.int64)
-        head.baseline = str(frame["baseline_of"].iloc[-1])
-        names = [name for name in frame.columns if name not in ("asset", "baseline_of", "at_us")]
-        table = Table(self.name, {name: pa.chunked_array([pa.Array.from_pandas(frame[name])]) for name in names})
-        rows = Rows(t_us, *signals_from_table(table, self.columns))
+        head, t_us = self.head, rows.t_us
+        head.baseline = baseline
         late = t_us <= head.processed_until_us
         rows = rows[~late]
         if len(rows):
@@ -274,22 +283,6 @@ class _StreamAsset:
                     self._cache[number] = Rows.unpack(bytes(self.store.blocks.getValue((number,))[0]))
                 parts.append(self._cache[number].between(after_us, to_us))
         return Rows.concatenate(parts).sort_by_time()
-
-
-def _chunks(frames: Iterator[Any]) -> Iterator[Any]:
-    """Yield the rows in larger pieces: Arrow batches may be tiny, and each piece is one entry of the state."""
-    import pandas as pd
-
-    parts: list[Any] = []
-    rows = 0
-    for frame in frames:
-        parts.append(frame)
-        rows += len(frame)
-        if rows >= CHUNK:
-            yield pd.concat(parts, ignore_index=True)
-            parts, rows = [], 0
-    if parts:
-        yield pd.concat(parts, ignore_index=True)
 
 
 def _trace_frame(asset: str, day: str, block: EvaluationBlock) -> Any:

@@ -3,6 +3,10 @@
 Numba's own key is the date of the file in which a kernel stands: a comment there compiles anew, and a change of what
 the kernel calls in other files does not. Here the key is a hash of the byte code of the kernel and of all functions
 that it calls, with the constants that they use. Comments, docstrings and other functions of these files do not count.
+
+What is not cached yet may have come with the installation: `SHIPPED` has the kernels of the examples, made for every
+processor of the last ten years when the wheel was built (``hatch_build.py``). Arithmetic here is exact about its order
+and its multiply-adds, so that their bits are those of kernels made for this processor.
 """
 
 from __future__ import annotations
@@ -10,21 +14,27 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
-import platform
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from importlib.util import MAGIC_NUMBER
+from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
 
 import llvmlite
 import numba
 import numpy as np
+from llvmlite.binding import get_host_cpu_features
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.compiler import CompileResult
 from numba.core.runtime import rtsys
 
 from servoscope.core.cache_folders import warn_of_missing_cache
 
 PACKAGE = __name__.partition(".")[0]
+SHIPPED = Path(__file__).with_name("kernels")
+SHIPPED_PROCESSOR = "x86-64-v3", ""  # its name for LLVM, and what it has beyond that
+SHIPPED_NEEDS = "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"  # of those, what a processor may lack
 COMPILER = ("compile", "link", "symbolic", "vector")  # modules whose code decides what a traced function becomes
 
 
@@ -32,22 +42,41 @@ class KernelCache(FunctionCache):  # type: ignore[misc]  # numba has no complete
     """Numba's cache under `kernel_key`; without what only compiling needs, whose import takes a third of a second."""
 
     def __init__(self, kernel: Any) -> None:
-        super().__init__(kernel.py_func)
-        self._kernel = kernel
-        del self._cache_file  # made when it is first used: a kernel may call functions that stand below it
+        self._kernel, self._py_func = kernel, kernel.py_func
+        try:
+            super().__init__(kernel.py_func)
+            del self._cache_file  # made when it is first used: a kernel may call functions that stand below it
+        except RuntimeError:  # Numba found no folder that it can write
+            self.disable()
+            warn_of_missing_cache()
 
     @functools.cached_property
     def _cache_file(self) -> Any:
+        return self._file(self._cache_path)
+
+    def _file(self, folder: object) -> Any:
         function, key = self._py_func, kernel_key(self._kernel)
         name = f"{function.__module__}.{function.__qualname__}".replace("<", "").replace(">", "")
         base = f"{name}-{key}.py{sys.version_info[0]}{sys.version_info[1]}"
-        return IndexDataCacheFile(cache_path=self._cache_path, filename_base=base, source_stamp=key)
+        return IndexDataCacheFile(cache_path=str(folder), filename_base=base, source_stamp=key)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what is cached for a signature, None if nothing is."""
+        """Return what is cached, or came with the installation, for a signature; None if nothing is."""
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
+            return self._load_overload(sig, target_context) or self._load_shipped(sig, target_context)
+
+    def _load_shipped(self, sig: Any, target_context: Any) -> Any:
+        if not _runs_shipped():
+            return None
+        triple = target_context.codegen().magic_tuple()[0]
+        processor = SimpleNamespace(magic_tuple=lambda: (triple, *SHIPPED_PROCESSOR))
+        payload = self._file(SHIPPED).load(self._index_key(sig, processor))
+        return None if payload is None else CompileResult._rebuild(target_context, *payload)
+
+    def _save_overload(self, sig: Any, data: Any) -> None:
+        # the annotation is a listing for people, with the paths of whoever compiles: a third of the file
+        super()._save_overload(sig, data._replace(type_annotation=""))
 
     @contextlib.contextmanager
     def _guard_against_spurious_io_errors(self) -> Iterator[None]:
@@ -56,6 +85,15 @@ class KernelCache(FunctionCache):  # type: ignore[misc]  # numba has no complete
             yield
         except OSError:
             warn_of_missing_cache()
+
+
+@functools.cache
+def _runs_shipped() -> bool:
+    """Return whether kernels came with the installation, and this processor can run them."""
+    if not SHIPPED.is_dir():
+        return False
+    features = get_host_cpu_features()
+    return all(features.get(name) for name in SHIPPED_NEEDS)
 
 
 def kernel_key(kernel: Any) -> str:
@@ -68,7 +106,7 @@ def kernel_key(kernel: Any) -> str:
 @functools.cache
 def compiler_key() -> str:
     """Return the hash of this package's code and of the versions of what compiles it."""
-    versions = numba.__version__, llvmlite.__version__, platform.python_version()
+    versions = numba.__version__, llvmlite.__version__, MAGIC_NUMBER
     digest = hashlib.sha256(repr(versions).encode())
     walk = _Walk(digest.update)
     for name in COMPILER:
@@ -91,6 +129,8 @@ class _Walk:
         """Add a value, and what it refers to, to the hash."""
         if value is None or isinstance(value, bool | int | float | complex | str | bytes):
             return self._add(repr(value))
+        if getattr(value, "__module__", None) == __name__:
+            return None  # where code is looked for is no part of it
         if id(value) in self._visited:
             return self._add("again", self._visited[id(value)][0])
         self._visited[id(value)] = len(self._visited), value

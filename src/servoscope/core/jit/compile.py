@@ -13,7 +13,6 @@ from numba.core.event import Event, Listener, install_listener
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-from servoscope.core.cache_folders import warn_of_missing_cache
 from servoscope.core.jit.cache import KernelCache
 from servoscope.core.jit.link import LinkOnlyCompiler
 from servoscope.core.jit.symbolic import Bool, Float, Int
@@ -34,10 +33,7 @@ def kernel(function: F, heap: bool = True) -> F:
     `heap` says whether it, or what it calls, allocates arrays; without, there is no counting of references either.
     """
     compiled = numba.njit(error_model="numpy", nogil=True, _nrt=heap, no_cfunc_wrapper=True)(function)
-    try:
-        compiled._cache = KernelCache(compiled)
-    except RuntimeError:  # Numba found no folder that it can write
-        warn_of_missing_cache()
+    compiled._cache = KernelCache(compiled)
     return compiled  # type: ignore[no-any-return]
 
 

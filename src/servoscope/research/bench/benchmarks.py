@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from servoscope.core.errors import ServoscopeError
 from servoscope.research.bench import limits, oracle, peers
+from servoscope.research.bench.layers import measure_layers, vector_bits
 from servoscope.research.bench.timing import BenchmarkRow, JobTiming, time_interleaved
 
 if TYPE_CHECKING:
@@ -27,13 +29,14 @@ FLEET_SAMPLES = 100  # samples of each asset of the fleet
 
 @dataclass(frozen=True)
 class BenchmarkSize:
-    """How much is measured: assets of the fleet, samples of the log, samples for what is slow, steps, simulations."""
+    """How much is measured: assets of fleet and service, samples of a log and of slow ones, steps, simulations."""
 
     fleet: int = 10_000
     log: int = 60_000
     slow_log: int = 2_000
     steps: int = 20_000
     simulations: int = 1_000
+    assets: int = 200  # of the service
 
     @classmethod
     def scaled(cls, share: float) -> BenchmarkSize:
@@ -86,6 +89,8 @@ def run_benchmarks(
     more, scaling = _measure_fleet(baseline, recording, repeats, amount)
     figures += more
     facts |= scaling
+    tell("the service, by layer")
+    figures += _measure_layers(baseline, recording, amount)
     tell("peers")
     figures += _measure_peers(baseline, recording, max(3, repeats // 3), amount)
     tell("a thousand simulations")
@@ -110,7 +115,20 @@ def _measure_machine(repeats: int) -> dict[str, float]:
     return {
         "peak multiply-adds per ns, one core, double": count / timings["fma"].processor / 1e9,
         "memory, GB/s read and written, one core": moved / timings["copy"].processor / 1e9,
+        "bits of a vector (256: AVX2, 512: AVX-512)": vector_bits(),
     }
+
+
+def _measure_layers(baseline: Baseline, recording: Recording, amount: BenchmarkSize) -> list[BenchmarkRow]:
+    try:
+        spent = measure_layers(baseline, recording, amount.assets)
+    except (ImportError, ServoscopeError):  # the service is an extra, and its decoder another
+        return []
+    rows = []
+    for layer, seconds in spent.items():
+        ratio, to = (None, "") if layer == "kernel" else (seconds / spent["kernel"], "service, kernel")
+        rows.append(BenchmarkRow(f"service, {layer}", (1e9 * seconds,) * 3, 1e9 * seconds, ratio, to))
+    return rows
 
 
 def _repeat_signals(recording: Recording, samples: int) -> list[np.ndarray[Any, Any]]:
