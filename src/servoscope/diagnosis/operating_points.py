@@ -128,10 +128,8 @@ def _named_machines(population: Mapping[str, Baseline] | Sequence[Baseline | str
     if isinstance(population, Mapping):
         return dict(population)
     return {
-        one.loop.name if isinstance(one, Baseline) else str(one): one
-        if isinstance(one, Baseline)
-        else Baseline.load(one)
-        for one in population
+        f"machine {i}" if isinstance(one, Baseline) else str(one): Baseline.of(one)
+        for i, one in enumerate(population, 1)
     }
 
 
