@@ -36,7 +36,9 @@ def compile_kernels(sources: Path, folder: Path, examples: tuple[str, ...] = EXA
     with tempfile.TemporaryDirectory() as work:
         cache = Path(work) / "cache"
         copy_sources(sources, Path(work) / "src")
-        variables = {"PYTHONPATH": str(Path(work) / "src"), "NUMBA_CACHE_DIR": str(cache), "MPLCONFIGDIR": work, **PROCESSOR}
+        # pip tells by PYTHONPATH where the packages of its build environment are
+        paths = [str(Path(work) / "src"), *filter(None, [os.environ.get("PYTHONPATH")])]
+        variables = {"PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(cache), "MPLCONFIGDIR": work, **PROCESSOR}
         for example in examples:
             argv = [sys.executable, "-m", "servoscope", *example.split()]
             subprocess.run(argv, cwd=work, env=os.environ | variables, check=True, stdout=subprocess.DEVNULL)
