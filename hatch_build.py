@@ -38,7 +38,8 @@ def compile_kernels(sources: Path, folder: Path, examples: tuple[str, ...] = EXA
         copy_sources(sources, Path(work) / "src")
         # pip tells by PYTHONPATH where the packages of its build environment are
         paths = [str(Path(work) / "src"), *filter(None, [os.environ.get("PYTHONPATH")])]
-        variables = {"PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(cache), "MPLCONFIGDIR": work, **PROCESSOR}
+        folders = {"NUMBA_CACHE_DIR": str(cache), "MPLCONFIGDIR": work}
+        variables = {"PYTHONPATH": os.pathsep.join(paths), **folders, **PROCESSOR}
         for example in examples:
             argv = [sys.executable, "-m", "servoscope", *example.split()]
             subprocess.run(argv, cwd=work, env=os.environ | variables, check=True, stdout=subprocess.DEVNULL)
