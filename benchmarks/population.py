@@ -79,8 +79,8 @@ def machine(kind: Kind, seed: int, count: int, fault: str = "") -> list[ss.Recor
 
 
 @with_one_blas_thread
-def rows(machines: int) -> Iterator[tuple[str, ...]]:
-    """Judge the recordings of new machines by what each was learned from."""
+def rows(machines: int, advance: Callable[[], None]) -> Iterator[tuple[str, ...]]:
+    """Judge the recordings of new machines by what each was learned from; `advance` after each machine."""
     for kind in kinds():
         known = [machine(kind, seed, EACH) for seed in range(1, KNOWN + 1)]
         population = {f"machine {i}": ss.learn(kind.loop, some) for i, some in enumerate(known, 1)}
@@ -93,7 +93,7 @@ def rows(machines: int) -> Iterator[tuple[str, ...]]:
             for (size, how), count in counts.items():
                 like = population if how == "with the population" else {}
                 count += alarms(common if not size else ss.learn(kind.loop, own[:size], population=like), judged)
-            progress()
+            advance()
         total = machines * JUDGED
         for (size, how), (false, found) in counts.items():
             yield kind.name, f"{size}", how, f"{false} of {total}", f"{found} of {total}"
@@ -106,20 +106,15 @@ def alarms(baseline: ss.Baseline, recordings: Sequence[ss.Recording]) -> tuple[i
     return sum(raised[:JUDGED]), sum(raised[JUDGED:])
 
 
-progress: Callable[[], None] = lambda: None  # noqa: E731
-
-
 def main() -> None:
     """Run the command line of this process."""
-    global progress
     command = parser(__doc__)
     command.add_argument("--machines", type=int, default=20, help="new machines of each kind")
     given = command.parse_args()
     heads = ("machines", "recordings of its own", "learned", "alarms, healthy", "alarms, fault")
     with Progress(transient=True) as bar:
         task = bar.add_task("new machines", total=2 * given.machines)
-        progress = lambda: bar.advance(task)  # noqa: E731
-        found = tuple(rows(given.machines))
+        found = tuple(rows(given.machines, lambda: bar.advance(task)))
     note = f"{given.machines} new machines of each kind beside {KNOWN} known ones."
     show([Table("Population", note, heads, found)], given.json)
 

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+from reliability.servers import Mosquitto, mosquitto
 
 from servoscope.service.checkpoint import StreamPosition
 from servoscope.service.mqtt import payload
@@ -32,6 +34,16 @@ def until(holds: Callable[[], Any], seconds: float = 300.0) -> Any:
         assert time.monotonic() < deadline, "it never came to that"
         time.sleep(0.02)
     return found
+
+
+def started_broker(folder: Path) -> Mosquitto:
+    """Return a broker that runs; whoever asks for it stops it."""
+    program = mosquitto()
+    if program is None:
+        pytest.skip("Mosquitto is not on this machine: scripts/install-test-servers installs it")
+    server = Mosquitto(folder, program)
+    server.start()
+    return server
 
 
 def block(sequence: int, *, stream: int = 0, samples: int = 50, value: float = 0.0) -> Block:

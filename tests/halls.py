@@ -10,7 +10,9 @@ from typing import Any
 from servoscope.detection.baseline import Baseline
 from servoscope.learning.learn import nominal_baseline
 from servoscope.models.loop import Loop
+from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
+from servoscope.service.service import Service
 from servoscope.signals import Recording, writers
 from servoscope.simulation import FaultEvent, reference, simulate
 
@@ -25,6 +27,12 @@ RESULTS = {
     "recent": "SELECT * FROM recent ORDER BY asset, sequence",
     "states": "SELECT asset, sequence, state, status FROM checkpoints WHERE asset <> 'hall' ORDER BY asset",
 }
+
+
+def service_of(config: Path) -> Service:
+    """Return the service of a service file, not yet running."""
+    settings = ServiceFile.load(config)
+    return Service(settings, build_components(settings))
 
 
 @functools.cache

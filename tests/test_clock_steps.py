@@ -11,15 +11,12 @@ from typing import Any
 import pytest
 
 import halls
-from halls import RESULTS, asked, hall
+from halls import RESULTS, asked, hall, service_of
 from servoscope.service.actions import ActionSettings
 from servoscope.service.alarms import AlarmSettings
-from servoscope.service.build import build_components
 from servoscope.service.clock import SteadyClock
-from servoscope.service.config import ServiceFile
 from servoscope.service.housekeeping import Housekeeping
 from servoscope.service.notifications import Notifier
-from servoscope.service.service import Service
 
 TIME = time.time
 HOOK = '[actions.command.tool]\nargv = ["false"]\n[actions.retry]\nfirst_s = 0.1\ngive_up_s = 600.0'
@@ -36,11 +33,6 @@ class MachineClock:
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> MachineClock:
     return MachineClock(monkeypatch)
-
-
-def service_of(config: Path) -> Service:
-    settings = ServiceFile.load(config)
-    return Service(settings, build_components(settings))
 
 
 def test_a_service_s_own_alarm_keeps_its_dates(machine: MachineClock) -> None:

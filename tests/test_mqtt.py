@@ -14,7 +14,7 @@ import pytest
 from reliability.servers import Mosquitto, mosquitto
 
 import halls
-from brokers import BEGAN, Running, Sender, Taker, block, publisher, until
+from brokers import BEGAN, Running, Sender, Taker, block, publisher, started_broker, until
 from halls import RESULTS, asked
 from servoscope.core.errors import ConfigError, SourceError
 from servoscope.service.build import build_components
@@ -30,11 +30,7 @@ STREAM = round(BEGAN * 1e6)
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Mosquitto]:
-    program = mosquitto()
-    if program is None:
-        pytest.skip(MISSING)
-    server = Mosquitto(tmp_path, program)
-    server.start()
+    server = started_broker(tmp_path)
     yield server
     server.stop()
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reliability.servers import Mosquitto, mosquitto
+from reliability.servers import Mosquitto
 
 import halls
 import plant_writers as plants
-from brokers import Running, Sender, kafka_brokers, kafka_cluster, until
+from brokers import Running, Sender, kafka_brokers, kafka_cluster, started_broker, until
 from halls import asked
 from servoscope.service.build import build_components
 from servoscope.service.commissioning import listen
@@ -30,11 +30,7 @@ SECONDS = 4.0
 
 @pytest.fixture(scope="module")
 def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mosquitto]:
-    program = mosquitto()
-    if program is None:
-        pytest.skip("Mosquitto is not on this machine: scripts/install-test-servers installs it")
-    server = Mosquitto(tmp_path_factory.mktemp("broker"), program)
-    server.start()
+    server = started_broker(tmp_path_factory.mktemp("broker"))
     yield server
     server.stop(signal.SIGKILL)
 

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reliability.servers import Mosquitto, mosquitto
+from reliability.servers import Mosquitto
 from typer.testing import CliRunner
 
 import halls
-from brokers import Running, Sender, until
+from brokers import Running, Sender, started_broker, until
 from halls import asked
 from servoscope.cli.app import app
 from servoscope.core.errors import ConfigError
@@ -44,11 +44,7 @@ DAY = 86400.0
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Mosquitto]:
-    program = mosquitto()
-    if program is None:
-        pytest.skip("Mosquitto is not on this machine: scripts/install-test-servers installs it")
-    server = Mosquitto(tmp_path, program)
-    server.start()
+    server = started_broker(tmp_path)
     yield server
     server.stop(signal.SIGKILL)
 

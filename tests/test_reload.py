@@ -14,15 +14,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from reliability.servers import Mosquitto, Postgres, mosquitto
+from reliability.servers import Postgres
 
 import halls
-from brokers import Running, publisher
+from brokers import Running, publisher, started_broker
 from brokers import until as wait_until
-from halls import RESULTS, asked, hall
+from halls import RESULTS, asked, hall, service_of
 from servoscope.core.errors import StoreError
-from servoscope.service.build import build_components
-from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
 from servoscope.service.store import Store
 from servoscope.signals import writers
@@ -46,11 +44,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("hall")
     halls.files(made)
     return made
-
-
-def service_of(config: Path) -> Service:
-    settings = ServiceFile.load(config)
-    return Service(settings, build_components(settings))
 
 
 def told(config: Path, what: str) -> list[dict[str, object]]:
@@ -117,6 +110,19 @@ def test_an_asset_with_another_baseline_begins_anew_and_loses_no_block(folder: P
         assert (found["counted"]["blocks"], found["counted"]["samples"]) == (blocks, 50 * blocks)
 
 
+def test_a_source_is_opened_anew_where_what_it_is_told_has_changed(folder: Path) -> None:
+    """How far time stamps may be ahead stands outside of its table, and is part of what it is told."""
+    config = hall(folder, "ahead", speed=1.0)
+    running = Running(service := service_of(config))
+    before, text = service.sources["line"], config.read_text()
+    reload(service, config, text)
+    assert service.sources["line"] is before and told(config, "reloaded")[-1]["opened"] == []
+    reload(service, config, text.replace("[service]", "[service]\n        ahead_s = 5.0"))
+    assert service.sources["line"] is not before and told(config, "reloaded")[-1]["opened"] == ["line"]
+    service.stop()
+    running.end()
+
+
 def test_a_file_that_cannot_be_used_changes_nothing(folder: Path) -> None:
     config = hall(folder, "refused", speed=60.0)
     first = config.read_text()
@@ -150,10 +156,7 @@ def told_of(store: Path) -> list[str]:
 @pytest.mark.slow
 def test_an_asset_more_at_a_broker_while_blocks_come(tmp_path: Path) -> None:
     """Its source connects anew; the broker keeps what comes meanwhile."""
-    program = mosquitto()
-    if program is None:
-        pytest.skip("Mosquitto is not on this machine: scripts/install-test-servers installs it")
-    (broker := Mosquitto(tmp_path, program)).start()
+    broker = started_broker(tmp_path)
     halls.baseline().save(tmp_path / "baseline.json")
     writers.write_recording(tmp_path / "press.csv", halls.recorded(2, halls.LEAK))
     config = tmp_path / "hall.toml"

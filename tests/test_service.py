@@ -24,12 +24,11 @@ from reliability.carrying import Carrier
 from reliability.servers import Postgres
 
 import halls
-from halls import RESULTS, asked, hall
+from halls import RESULTS, asked, hall, service_of
 from servoscope.core.errors import StoreError
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
 from servoscope.service.health import serve_health
-from servoscope.service.service import Service
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +36,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("hall")
     halls.files(made)
     return made
-
-
-def service_of(config: Path) -> Service:
-    settings = ServiceFile.load(config)
-    return Service(settings, build_components(settings))
 
 
 @pytest.fixture(scope="module")

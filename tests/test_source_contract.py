@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from reliability.servers import Mosquitto, mosquitto
 
 import halls
-from brokers import Sender, kafka_brokers, kafka_cluster, until
+from brokers import Sender, kafka_brokers, kafka_cluster, started_broker, until
 from brokers import block as mqtt_block
 from commands import one_line, run
 from servoscope.models.loop import Loop
@@ -82,11 +81,7 @@ def replay(tmp_path: Path) -> Iterator[Harness]:
 
 @pytest.fixture
 def mqtt(tmp_path: Path) -> Iterator[Harness]:
-    program = mosquitto()
-    if program is None:
-        pytest.skip("Mosquitto is not on this machine: scripts/install-test-servers installs it")
-    server = Mosquitto(tmp_path, program)
-    server.start()
+    server = started_broker(tmp_path)
     harness = Harness(
         "mqtt", {"host": "127.0.0.1", "port": server.port}, SourceAsset(SimpleNamespace(), None), tmp_path
     )  # type: ignore[arg-type]
@@ -114,11 +109,7 @@ def rows() -> list[bytes]:
 @pytest.fixture
 def plant(tmp_path: Path) -> Iterator[Harness]:
     """A source of kind mqtt that reads a plant's own messages."""
-    program = mosquitto()
-    if program is None:
-        pytest.skip("Mosquitto is not on this machine: scripts/install-test-servers installs it")
-    server = Mosquitto(tmp_path, program)
-    server.start()
+    server = started_broker(tmp_path)
     harness = Harness("mqtt", {"host": "127.0.0.1", "port": server.port, "payload": PAYLOAD}, AXIS, tmp_path)
     first = harness.open()
     until(lambda: first.connected)

@@ -213,6 +213,13 @@ def expand_files(paths: Sequence[Path]) -> list[Path]:
     return expand_paths(paths, readers.readable_suffixes())
 
 
+def expand_baselines(paths: Sequence[Path]) -> list[Path]:
+    """Return the baselines that are meant by files, folders and patterns."""
+    from servoscope.signals.readers.archives import expand_paths
+
+    return expand_paths(paths, (".json",), "baselines")
+
+
 def parse_fault_events(texts: Sequence[str]) -> list[FaultEvent]:
     """Read ``--fault``."""
     from servoscope.simulation import FaultEvent

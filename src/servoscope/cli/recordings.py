@@ -126,9 +126,7 @@ def learn(
         raise typer.BadParameter("--fault goes with healthy recordings, not with --nominal")
     faults = arguments.parse_labelled(fault or [], list(dict.fromkeys(point for point, _ in named)))
     files = [path for _, path in named] + [path for *_, path in faults]
-    from servoscope.signals.readers.archives import expand_paths
-
-    alike = expand_paths(population or [], (".json",))
+    alike = arguments.expand_baselines(population or [])
     check_output(output, "-o", (), [loop, *files, *alike, *filter(None, [compare])])
 
     from servoscope.cli.progress import show_steps

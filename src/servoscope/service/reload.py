@@ -133,5 +133,5 @@ def _is_same(name: str, running: tuple[ServiceFile, Asset], new: tuple[ServiceFi
 
 def _source_identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tuple[Any, ...]:
     """Return all on which a source depends."""
-    own = {each: (one.loop.hash(), one.address) for each, one in source_assets(config, assets, name).items()}
+    own = {each: (one.loop.hash(), *one[1:]) for each, one in source_assets(config, assets, name).items()}
     return config.sources[name], own

@@ -84,7 +84,7 @@ class PredictorFactory:
         The parameters of the plants may be complex, and `output_gains` multiply their y. `later_s` [s] is delay beyond
         the loop file's; `noise` takes the place of the factory's, but for the state after a restart.
         """
-        from servoscope.isolation.ml.sampling import sample_plants
+        from servoscope.isolation.ml.plant_kernels import sample_plants
 
         F, g, c = (np.stack(each) for each in zip(*(plant.state_space() for plant in plants), strict=True))
         F, g = F * self.scale / self.scale[:, None], g[..., 0] / self.scale

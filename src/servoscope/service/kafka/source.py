@@ -6,23 +6,21 @@ import threading
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, PrivateAttr
+from pydantic import AfterValidator, Field
 
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
 from servoscope.service.config_types import read_password
 from servoscope.service.log import log
-from servoscope.service.mapping.collector import MessageCollector
+from servoscope.service.mapping.collector import MessageCollector, MessageSource
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.network import TlsSettings
-from servoscope.service.reception import AssetTrouble
-from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
-from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.base import SourceAsset, SourceSettings
+from servoscope.service.sources.block import ResumePosition
 
-POLL_S = 0.02
 FETCH_S = 0.2  # how long one call of the client waits for messages
 SESSION_MS = 6000  # after a kill so long, the brokers give our partitions away, to our next process as well
 AT_ONCE = 500  # messages that one call returns
@@ -54,22 +52,11 @@ class KafkaSourceSettings(TlsSettings, SourceSettings):
     in_flight: Annotated[int, Field(strict=True, ge=1, le=10**7)] = 100_000  # most messages that wait to be stored
     largest: Annotated[int, Field(strict=True, ge=1024, le=2**28)] = 2**20  # longest message that is accepted [bytes]
 
-    _is_visit: bool = PrivateAttr(default=False)
+    visit_changes: ClassVar[Mapping[str, Any]] = {"client": None, "start": "now"}
 
     def identity(self, name: str) -> str:
         """Return what no other source may share: the group at these brokers."""
         return f"group {self.client or name} at {', '.join(sorted(self.brokers))}"
-
-    def for_visit(self) -> Self:
-        """Return the settings of a client with a group of its own."""
-        visit = self.model_copy(update={"client": None, "start": "now"})
-        visit._is_visit = True
-        return visit
-
-    @property
-    def is_visit(self) -> bool:
-        """Whether the client only listens, and tells what is not for its assets, too."""
-        return self._is_visit
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> KafkaSource:
         """Return the source."""
@@ -112,7 +99,7 @@ class _PartitionOffsets:
         return next(iter(self.open), self.next)
 
 
-class KafkaSource(BlockSource):
+class KafkaSource(MessageSource):
     """Follows the messages of some assets; `client` names its group, unless the settings do."""
 
     def __init__(
@@ -150,16 +137,6 @@ class KafkaSource(BlockSource):
     def trouble(self) -> str:
         """What is wrong with the connection, in words; empty: nothing."""
         return self._trouble
-
-    @property
-    def asset_troubles(self) -> Mapping[str, AssetTrouble]:
-        """Assets that come too slowly."""
-        return self._collector.troubles
-
-    @property
-    def update_intervals_s(self) -> Mapping[tuple[str, str], float]:
-        """Time between two updates, as measured, by asset and signal [s]."""
-        return self._collector.update_intervals_s
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as a broker is there."""
@@ -237,19 +214,6 @@ class KafkaSource(BlockSource):
                 self._note_error(error.args[0])
             else:
                 committed.update(changed)
-
-    def poll(self, limit: int) -> list[Block]:
-        """Return blocks that are complete."""
-        return self._collector.poll(limit)
-
-    def acknowledge(self, asset: str, blocks: int) -> None:
-        """Let the offsets be committed of the messages of which every sample is stored."""
-        self._collector.acknowledge(asset, blocks)
-
-    @property
-    def next_block_s(self) -> float:
-        """How long until the next block may be due [s]."""
-        return 0.0 if self._collector.waiting else POLL_S
 
     def close(self) -> None:
         """Disconnect."""

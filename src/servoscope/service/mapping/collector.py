@@ -19,9 +19,10 @@ from servoscope.service.mapping.rows import MessageMapping, SignalValue
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
+from servoscope.service.sources.base import BlockSource, RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 
+POLL_S = 0.02
 QUIET_S = 2.0  # without a message of an asset for so long, what has come of it is made a block, however short
 REMEMBERED = 1000  # messages of an asset by which one that comes again is known
 MAX_VALUES = 100_000  # of a signal, between two looks at what is complete
@@ -247,3 +248,32 @@ class MessageCollector:
             for name, one in self._streams.items()
             for signal, value in one.assembler.intervals_s.items()
         }
+
+
+class MessageSource(BlockSource):
+    """A source of a plant's messages: its collector has the blocks, and knows what each asset lacks."""
+
+    _collector: MessageCollector
+
+    @property
+    def asset_troubles(self) -> Mapping[str, AssetTrouble]:
+        """Assets that come too slowly, or whose sender has said that it is gone."""
+        return self._collector.troubles
+
+    @property
+    def update_intervals_s(self) -> Mapping[tuple[str, str], float]:
+        """Time between two updates, as measured, by asset and signal [s]."""
+        return self._collector.update_intervals_s
+
+    def poll(self, limit: int) -> list[Block]:
+        """Return blocks that are complete."""
+        return self._collector.poll(limit)
+
+    def acknowledge(self, asset: str, blocks: int) -> None:
+        """Acknowledge the messages of which every sample is stored."""
+        self._collector.acknowledge(asset, blocks)
+
+    @property
+    def next_block_s(self) -> float:
+        """How long until the next block may be due [s]."""
+        return 0.0 if self._collector.waiting else POLL_S

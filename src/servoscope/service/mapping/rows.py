@@ -96,15 +96,19 @@ class MessageMapping:
 
     def find_asset(self, topic: str) -> str:
         """Return the asset that a topic tells, or the only one; empty: it tells none."""
-        names = next((found for one in self._topics if (found := one.match(topic)) is not None), {})
+        names = self._match_topic(topic) or {}
         return self._assets.get(names.get(ASSET, ""), "") or self._only
+
+    def _match_topic(self, topic: str) -> dict[str, str] | None:
+        """Return what the names of the first pattern that fits stand for."""
+        return next((found for one in self._topics if (found := one.match(topic)) is not None), None)
 
     def read(self, topic: str, message: bytes, received_at: float) -> MessageContent:
         """Return what a message holds that came at `received_at` [UTC s].
 
         A row that cannot be used is counted and left out; raises MessageError if nothing of the message can be read.
         """
-        names = next((found for one in self._topics if (found := one.match(topic)) is not None), None)
+        names = self._match_topic(topic)
         if names is None:
             raise MessageError("unknown topic", f"{topic[:100]!r} fits none of the topics of this source")
         tree, gone = self._decode(names, message)

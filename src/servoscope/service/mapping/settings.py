@@ -108,7 +108,7 @@ class PayloadSettings(Settings):
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:
-        inside = RowPath(self.rows).names.union(*(TextPattern(one).names for one in self.match.values()))
+        inside = self._row_names
         signal = [SIGNAL in inside or SIGNAL in TextPattern(topic).names for topic in self.topics]
         if any(signal) and not all(signal):
             raise ValueError("topics: {signal} must stand in all of them, or in none")
@@ -119,13 +119,20 @@ class PayloadSettings(Settings):
         return self
 
     @property
+    def _row_names(self) -> frozenset[str]:
+        """Names in the path to the rows, and in the patterns of their texts."""
+        return RowPath(self.rows).names.union(*(TextPattern(one).names for one in self.match.values()))
+
+    @property
+    def _names(self) -> frozenset[str]:
+        return self._row_names.union(*(TextPattern(one).names for one in self.topics))
+
+    @property
     def has_signal_names(self) -> bool:
         """Whether a row is one value of one signal, which topic, rows or match name."""
-        patterns = (TextPattern(one).names for one in (*self.topics, *self.match.values()))
-        return SIGNAL in RowPath(self.rows).names.union(*patterns)
+        return SIGNAL in self._names
 
     @property
     def names_assets(self) -> bool:
         """Whether messages tell of which asset they are."""
-        patterns = (TextPattern(one).names for one in (*self.topics, *self.match.values()))
-        return ASSET in RowPath(self.rows).names.union(*patterns)
+        return ASSET in self._names

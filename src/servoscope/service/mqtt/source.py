@@ -10,19 +10,18 @@ from collections.abc import Mapping
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from servoscope.core.errors import MessageError
 from servoscope.service.config_types import Seconds
-from servoscope.service.mapping.collector import MessageCollector
+from servoscope.service.mapping.collector import MessageCollector, MessageSource
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import encode_rebirth
 from servoscope.service.mqtt import topics
 from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_mqtt_client
 from servoscope.service.mqtt.payload import DecodedBlock, decode_block
-from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
 
@@ -48,18 +47,8 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
     # how long the broker keeps the session, and what comes for it, while we are disconnected [s]
     session_s: Annotated[Seconds, Field(lt=2**32 - 1)] = 7 * 86400.0
     payload: PayloadSettings | None = None  # where the samples are in a plant's own messages; None: blocks are sent
-    _is_visit: bool = PrivateAttr(default=False)
 
-    def for_visit(self) -> Self:
-        """Return the settings of a client with a session of its own, which the broker does not keep."""
-        visit = self.model_copy(update={"client": None, "session_s": 1.0})
-        visit._is_visit = True
-        return visit
-
-    @property
-    def is_visit(self) -> bool:
-        """Whether the client only listens, and may hear what is not for its assets, too."""
-        return self._is_visit
+    visit_changes: ClassVar[Mapping[str, Any]] = {"client": None, "session_s": 1.0}  # which the broker does not keep
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
         """Return the source."""
@@ -224,7 +213,7 @@ class MqttSource(BlockSource):
         self._client.loop_stop()
 
 
-class PlantSource(MqttSource):
+class PlantSource(MessageSource, MqttSource):
     """Receives a plant's own messages, as `settings.payload` describes them."""
 
     def __init__(
@@ -269,26 +258,3 @@ class PlantSource(MqttSource):
             if now - self._asked.get((group, node), -math.inf) >= REBIRTH_EVERY_S:
                 self._asked[group, node] = now
                 self._client.publish(f"spBv1.0/{group}/NCMD/{node}", encode_rebirth(time.time()))
-
-    def poll(self, limit: int) -> list[Block]:
-        """Return blocks that are complete."""
-        return self._collector.poll(limit)
-
-    def acknowledge(self, asset: str, blocks: int) -> None:
-        """Acknowledge to the broker the messages of which every sample is stored."""
-        self._collector.acknowledge(asset, blocks)
-
-    @property
-    def asset_troubles(self) -> Mapping[str, AssetTrouble]:
-        """Assets that come too slowly, or whose sender has said that it is gone."""
-        return self._collector.troubles
-
-    @property
-    def update_intervals_s(self) -> Mapping[tuple[str, str], float]:
-        """Time between two updates, as measured, by asset and signal [s]."""
-        return self._collector.update_intervals_s
-
-    @property
-    def next_block_s(self) -> float:
-        """How long until the next block may be due [s]."""
-        return 0.0 if self._collector.waiting else POLL_S

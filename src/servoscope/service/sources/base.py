@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
+from pydantic import PrivateAttr
+
 from servoscope.core.settings import Settings
 from servoscope.models.loop import Loop
 from servoscope.service.reception import AssetTrouble
@@ -127,6 +129,8 @@ class SourceSettings(Settings):
 
     asset_key: ClassVar[str] = ""  # the key of ``[assets.NAME]`` under which such a source finds an asset; empty: none
     asset_example: ClassVar[str] = ""  # what to write there
+    visit_changes: ClassVar[Mapping[str, Any]] = {}  # values of keys for a client that only listens for a while
+    _is_visit: bool = PrivateAttr(default=False)
 
     kind: str
 
@@ -136,7 +140,14 @@ class SourceSettings(Settings):
 
     def for_visit(self) -> Self:
         """Return the settings of a client that only listens for a while, beside a service that runs."""
-        return self
+        visit = self.model_copy(update=self.visit_changes)
+        visit._is_visit = True
+        return visit
+
+    @property
+    def is_visit(self) -> bool:
+        """Whether the client only listens, and may hear what is not for its assets, too."""
+        return self._is_visit
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> BlockSource:
         """Return the source, not yet open; `name` is unique among services, paths are relative to `folder`.

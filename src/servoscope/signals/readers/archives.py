@@ -27,7 +27,7 @@ MOST_RATIO = 200  # times its size in the archive; measured values shrink to a t
 LEAST_BYTES = 100_000_000  # that any file may have when it is unpacked
 
 
-def expand_paths(paths: Sequence[Path], suffixes: Collection[str]) -> list[Path]:
+def expand_paths(paths: Sequence[Path], suffixes: Collection[str], what: str = "recordings") -> list[Path]:
     """Return the files that are meant by files, folders, globs and archives of several files, in order of their names.
 
     Raises RecordingError if a folder or an archive holds none, or a pattern meets none.
@@ -39,14 +39,14 @@ def expand_paths(paths: Sequence[Path], suffixes: Collection[str]) -> list[Path]
         elif path.is_dir():
             files = sorted(each for each in path.iterdir() if each.is_file() and each.suffix.lower() in suffixes)
             if not files:
-                raise RecordingError(f"{path}: holds no recordings; readable are {', '.join(suffixes)}")
-            found += expand_paths(files, suffixes)
+                raise RecordingError(f"{path}: holds no {what}; readable are {', '.join(suffixes)}")
+            found += expand_paths(files, suffixes, what)
         elif any(sign in str(path) for sign in "*?[") and not path.exists():
             root = Path(path.anchor) if path.is_absolute() else Path()
             files = sorted(root.glob(str(path.relative_to(root))))
             if not files:
                 raise RecordingError(f"{path}: no file has such a name, check the pattern")
-            found += expand_paths(files, suffixes)
+            found += expand_paths(files, suffixes, what)
         elif path.suffix.lower() == ZIP and path.is_file():
             members = list_members(path)
             found += [path / member for member in members] if len(members) > 1 else [path]
