@@ -72,6 +72,7 @@ def run(
     listen_s: Annotated[
         float, typer.Option("--for", metavar="S", min=0.1, help="With --online: listen for so long at most, in s.")
     ] = 10.0,
+    worker: Annotated[int | None, typer.Option("--worker", hidden=True)] = None,
 ) -> None:
     """Follow assets until stopped: what their sources say goes to the store, alarms go out; logs on stderr.
 
@@ -96,17 +97,27 @@ def run(
         return
     log.set_up_logging(settings.service.log)
     from servoscope.service.health import serve_health
+    from servoscope.service.process_supervisor import call_at_end_of_stdin
     from servoscope.service.service import Service
-    from servoscope.web.supervisor import WebSupervisor
+    from servoscope.service.workers import WorkerPool
+    from servoscope.web.supervisor import supervise_pages
 
+    service: Service | WorkerPool
+    settings = settings.shard(worker)
     with prefix_file_name(config):
-        service = Service(settings, build_components(settings, anew or ()))
+        if settings.service.workers > 1 and worker is None:
+            service = WorkerPool(settings, config, anew or ())
+        else:
+            service = Service(settings, build_components(settings, anew or ()))
         server = serve_health(service, settings.service.listen) if settings.service.listen else None
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
-    if not sys.stderr.isatty():  # a terminal that is closed ends what runs in it
+    if worker is not None:
+        call_at_end_of_stdin(service.stop)
+        typer.echo(f"127.0.0.1:{server.server_address[1]}" if server is not None else "")
+    if worker is not None or not sys.stderr.isatty():  # a terminal that is closed ends what runs in it
         signal.signal(signal.SIGHUP, lambda *_: service.reload(config))
-    pages = WebSupervisor(config) if settings.web is not None else None
+    pages = supervise_pages(config) if settings.web is not None else None
     try:
         if pages is not None:
             pages.start()

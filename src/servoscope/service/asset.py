@@ -39,6 +39,7 @@ from servoscope.service.examination_schedule import (
     accept_diagnosis,
     examination_phase,
     fault_names,
+    is_at_rest,
     schedule_full_diagnosis,
     update_examination,
 )
@@ -215,8 +216,7 @@ class Asset:
         """Count a block that is left out for its time stamps; its place in its stream has passed."""
         refusal = BlockRefusal(kind, render(message(f"service.reception.{kind}", **seconds)))
         if self.state is not None:
-            position = self.state.position
-            position = replace(position, **{kind: getattr(position, kind) + 1})
+            position = replace(self.state.position, **{kind: getattr(self.state.position, kind) + 1})
             if kind == "future" and self.heard and block.stream == position.stream:
                 lost = max(0, block.sequence - position.sequence - 1)
                 sequence = max(block.sequence, position.sequence)
@@ -266,10 +266,8 @@ class Asset:
 
     def is_news(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> bool:
         """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
-        names = fault_names(diagnosis.document.get("faults", []))
-        return self._is_first_diagnosis(window) or bool(
-            names and names != fault_names(self._current.examination.faults)
-        )
+        names, known = fault_names(diagnosis.document.get("faults", [])), fault_names(self._current.examination.faults)
+        return self._is_first_diagnosis(window) or bool(names and names != known)
 
     def _is_first_diagnosis(self, window: PendingDiagnosis) -> bool:
         return window.until <= self._schedule.end(self._current.examination.since)
@@ -349,6 +347,8 @@ class Asset:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self._current, self.policy.diagnosis
         t = state.position.t
+        if is_at_rest(state.examination, t, state.evaluation.exceeded):
+            return
         recent = partial(self._window.after, t - settings.window_s)
         examination, result = update_examination(
             state.examination,

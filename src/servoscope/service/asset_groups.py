@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import ServoscopeError
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.asset import Asset
@@ -81,24 +82,25 @@ class AssetGroups:
                 together[self._places[block.asset][0], block.t.size].append(_LaneEntry(block, asset, accepted))
             else:
                 alone.append(_LaneEntry(block, asset, accepted))
-        for (key, _), accepted_blocks in together.items():
-            regular = accepted_blocks[0].asset.lanes.are_regular([one.accepted for one in accepted_blocks])
-            phases = self._fleets[key].phase(np.array([one.accepted.state.monitor for one in accepted_blocks]))
-            lanes: dict[int, list[_LaneEntry]] = defaultdict(list)
-            for one, orderly, phase in zip(accepted_blocks, regular, phases.tolist(), strict=True):
-                (lanes[phase] if orderly else alone).append(one)
-            for group in lanes.values():
-                if len(group) == 1:
+        for (key, _), entries in together.items():
+            signals = np.array([one.accepted.signals for one in entries])
+            regular = entries[0].asset.lanes.are_regular([one.accepted for one in entries], signals)
+            phases = self._fleets[key].phase(np.array([one.accepted.state.monitor for one in entries]))
+            for phase in [-1, *np.unique(phases[regular]).tolist()]:
+                rows = np.flatnonzero(regular & (phases == phase) if phase >= 0 else ~regular)
+                group = [entries[i] for i in rows.tolist()]
+                if phase < 0 or len(group) == 1:
                     alone += group
                 else:
-                    yield from self._conclude(group, self._follow(self._fleets[key], group))
+                    chosen = signals if len(group) == len(entries) else signals[rows]
+                    yield from self._conclude(group, self._follow(self._fleets[key], group, chosen))
         self.layers.enter("kernel")
         yield from self._conclude(alone, [one.asset.lanes.follow(one.asset.monitor, one.accepted) for one in alone])
 
-    def _follow(self, fleet: Monitor, group: Sequence[_LaneEntry]) -> list[LaneOutput]:
+    def _follow(self, fleet: Monitor, group: Sequence[_LaneEntry], signals: FloatArray) -> list[LaneOutput]:
         places = np.array([self._places[one.block.asset][1] for one in group])
         blocks = [one.accepted for one in group]
-        return group[0].asset.lanes.follow_lanes(fleet.select(places), blocks, self.layers)
+        return group[0].asset.lanes.follow_lanes(fleet.select(places), blocks, signals, self.layers)
 
     def _conclude(
         self, group: Iterable[_LaneEntry], followed: Iterable[LaneOutput]

@@ -174,7 +174,7 @@ def asset_status(
     examination, findings = state.examination, quality.active_findings(state.quality)
     verdict = quality.limit_verdict(examination.verdict, findings)
     ne107 = evaluate_ne107(verdict, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
-    named = examination.named
+    named, evaluation = examination.named, state.evaluation.status
     if verdict == "healthy" and reception != FOLLOWED:
         verdict = "undetermined"  # nobody knows what it does now
     summary = named if verdict == "fault" and named else asset_summary(examination, findings, reception)
@@ -182,13 +182,13 @@ def asset_status(
         verdict = "fault"  # it was seen on sound data, and nothing has shown since that it has gone
         fault = named or render(message("service.examination.seen"))
         summary = render(message("service.examination.stands", fault=fault, t=examination.fault_at, since=summary))
-    return AssetStatus.model_validate(
-        {
+    return AssetStatus.model_construct(  # its values are checked where it is read
+        **{
             "verdict": verdict,
             "summary": summary,
             "since": examination.since,
             "onset": examination.onset,
-            "faults": examination.faults,
+            "faults": tuple(map(FaultEstimate.model_validate, examination.faults)),
             "examined": examination.examined,
             "ne107": ne107.ne107,
             "reasons": ne107.reasons,
@@ -205,14 +205,18 @@ def asset_status(
                 for name, alarm in state.alarms.items()
                 if alarm.state is not LifecycleState.NORMAL
             },
-            "awaited": [window.number for window in state.pending_diagnoses],
-            "counted": state.position,
-            "about": metadata,
+            "pending_diagnoses": tuple(window.number for window in state.pending_diagnoses),
+            "position": state.position,
+            "metadata": metadata,
             **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
             **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
-            **({"size": examination.size, "sized": examination.sized} if examination.size else {}),
+            **(
+                {"size": FaultEstimate.model_validate(examination.size), "sized": examination.sized}
+                if examination.size
+                else {}
+            ),
             **({} if (outlook := current_outlook(state.outlook, examination.faults)) is None else {"outlook": outlook}),
             **({} if reception == FOLLOWED else {"reception": reception.state}),
-            **state.evaluation.status.model_dump(exclude_unset=True),
+            **{key: getattr(evaluation, key) for key in evaluation.model_fields_set},
         }
     )

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.checkpoint import AssetState
@@ -70,17 +70,24 @@ class BlockLanes:
             evaluation = LatestEvaluation(exceeded, (excess, level), features, float(times[-1]), _writer(trace, times))
         return LaneOutput(new, checked, state.samples + len(t), last_t, history, rows, evaluation)
 
-    def are_regular(self, blocks: Sequence[LaneInput]) -> list[bool]:
-        """Tell which of some blocks of one length need no sorting, and no second look at what came before them."""
-        last = np.array([np.nan if one.state.last_t is None else one.state.last_t for one in blocks])
-        regular = self._timebase.is_regular(np.array([one.signals[0] for one in blocks]), last)
-        return [bool(one) and not block.restart for one, block in zip(regular, blocks, strict=True)]
+    def are_regular(self, blocks: Sequence[LaneInput], signals: FloatArray) -> BoolArray:
+        """Tell which of some blocks of one length need no sorting, and no second look at what came before them.
 
-    def follow_lanes(self, fleet: Monitor, blocks: Sequence[LaneInput], layers: LayerTimes) -> list[LaneOutput]:
-        """Follow regular blocks of the assets of a fleet, of one length and one phase, side by side."""
+        `signals`: theirs, shape (blocks, 4, N).
+        """
+        last = np.array([np.nan if one.state.last_t is None else one.state.last_t for one in blocks])
+        follows = ~np.array([one.restart for one in blocks], dtype=np.bool_)
+        return np.logical_and(self._timebase.is_regular(signals[:, 0], last), follows)
+
+    def follow_lanes(
+        self, fleet: Monitor, blocks: Sequence[LaneInput], signals: FloatArray, layers: LayerTimes
+    ) -> list[LaneOutput]:
+        """Follow regular blocks of the assets of a fleet, of one length and one phase, side by side.
+
+        `signals`: theirs, shape (blocks, 4, N).
+        """
         layers.enter("assemble")
         states = [one.state for one in blocks]
-        signals = np.array([one.signals for one in blocks])
         t, given = signals[:, 0], signals[:, 1:]
         used = np.where(np.isfinite(given), given, np.nan)
         before = np.array([one.monitor for one in states])
@@ -99,21 +106,21 @@ class BlockLanes:
         columns = zip(
             states,
             last_t,
+            times[:, -1].tolist(),
             trace.exceeded[:, -1].tolist(),
             _peaks(trace).T.tolist(),
             np.floor(times[:, [0, -1]] / self._residual_every_s).tolist(),
             strict=True,
         )
         found = []
-        for i, (state, at, exceeded, (excess, level, known), (first, last)) in enumerate(columns):
+        for i, (state, at, evaluated, exceeded, (excess, level, known), (first, last)) in enumerate(columns):
             history, rows = state.history, list[dict[str, Any]]()
             if first == history.period == last:
-                history = HistoryState(history.period, max(history.excess, known), max(history.level, level))
+                if known > history.excess or level > history.level:
+                    history = HistoryState(history.period, max(history.excess, known), max(history.level, level))
             else:
                 history, rows = update_history(history, trace.lane(i), times[i], self._residual_every_s)
-            evaluation = LatestEvaluation(
-                exceeded, (excess, level), None, float(times[i, -1]), _writer(trace, times, i)
-            )
+            evaluation = LatestEvaluation(exceeded, (excess, level), None, evaluated, _writer(trace, times, i))
             # copies: an asset that falls silent must not hold the arrays of all others
             new, seen = monitors[i].copy(), checked[i].copy()
             found.append(LaneOutput(new, seen, state.samples + size, at, history, rows, evaluation))

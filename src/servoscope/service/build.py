@@ -53,12 +53,13 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
     nothing is left open.
     """
     known = [*config.assets, config.name]
-    if strange := set(restarted) - set(known):
-        raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(known)}")
+    check_restarted(restarted, known)
     assets = build_assets(config)
-    check_actions(config, assets)
+    if not config.is_shard:  # the whole file was checked
+        check_actions(config, assets)
     sources, publishers = _build_sources(config, assets), _build_publishers(config)
-    store = Store.open(config.store.url, config.folder, write=True, network=config.store.rules)
+    url, rules = config.store.url, config.store.rules
+    store = Store.open(url, config.folder, write=True, network=rules, has_lock=config.is_shard)
     try:
         store.acquire_lock([config.name, *assets])
         rows = store.checkpoints([config.name, *assets])
@@ -78,6 +79,12 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
         raise
     order = tuple(name for name in known if name in restarted)
     return ServiceComponents(assets, groups, notifier, sources, publishers, store, order)
+
+
+def check_restarted(names: Collection[str], known: Collection[str]) -> None:
+    """Raise ConfigError unless all that is to begin with a new state is known."""
+    if strange := set(names) - set(known):
+        raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(known)}")
 
 
 def resume_assets(

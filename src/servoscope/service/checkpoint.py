@@ -96,6 +96,8 @@ class AssetState(FollowerState):
 
 def pack_state(state: AssetState) -> bytes:
     """Return a state as bytes, with version and digest."""
+    import msgspec
+
     document = {
         "asset": state.asset,
         "baseline": state.baseline,
@@ -105,11 +107,11 @@ def pack_state(state: AssetState) -> bytes:
         "fed": state.samples,
         "thinned": vars(state.history),
         "windows": [vars(window) for window in state.pending_diagnoses],
-        "alarms": {name: alarm.to_dict() for name, alarm in state.alarms_now.items()},
+        "alarms": {name: {"version": alarm.VERSION, **vars(alarm)} for name, alarm in state.alarms_now.items()},
         "shown": state.evaluation.status.to_json(),
         **({} if state.outlook is None else {"outlook": state.outlook.model_dump(mode="json")}),
     }
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text = msgspec.json.encode(document)
     numbers = state.monitor.astype("<f8").tobytes() + state.quality.astype("<f8").tobytes()
     body = HEADER.pack(MAGIC, VERSION, len(text), state.monitor.size, state.quality.size) + text + numbers
     return body + hashlib.blake2b(body, digest_size=DIGEST_BYTES).digest()

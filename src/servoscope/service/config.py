@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
+from servoscope.core.errors import ConfigError
 from servoscope.core.settings import NonEmptyStr, NonNegative, Settings
 from servoscope.service.access import WebSettings
 from servoscope.service.actions import ActionSettings
@@ -29,6 +32,8 @@ class ServiceSettings(Settings):
     listen: Address = "127.0.0.1:9464"  # address of health and metrics, ``host:port``; empty: none
     # how long results are gathered before they are stored together [s]; 0: each block for itself
     commit_every_s: Annotated[NonNegative, Field(le=3600.0)] = 0.5
+    # among how many processes the assets are shared out; which has an asset depends on its name and this number alone
+    workers: Annotated[int, Field(strict=True, ge=1, le=256)] = 1
     # how many blocks may wait for a store that is full, locked or down; then the sources are stopped
     buffer: Annotated[int, Field(strict=True, ge=1)] = 10_000
     stop_within_s: NonNegative = 10.0  # how long a stop waits for such a store [s]
@@ -69,6 +74,11 @@ class AssetSettings(Settings):
     limits: dict[NonEmptyStr, SizeLimit] | None = None  # instead of those of ``[prognosis]``
 
 
+def shard_number(asset: str, workers: int) -> int:
+    """Return which of so many workers follows an asset: the same on every machine, and at every start."""
+    return zlib.crc32(asset.encode()) % workers
+
+
 class ServiceFile(FileSettings):
     """A service file."""
 
@@ -86,6 +96,7 @@ class ServiceFile(FileSettings):
     alarms: AlarmSettings = Field(default_factory=lambda: AlarmSettings.model_validate({}))
     actions: ActionSettings = ActionSettings()
     web: WebSettings | None = None
+    _shard: int | None = PrivateAttr(default=None)
     # sources, outlets, assets: tables by name: ``[sources.NAME]``, ``[outlets.NAME]``, ``[assets.NAME]``
     sources: Annotated[dict[Name, SourceSettings], Field(min_length=1)]
     outlets: dict[Name, PublisherSettings] = Field(default_factory=dict)
@@ -116,6 +127,59 @@ class ServiceFile(FileSettings):
             object.__setattr__(self, name, value)  # frozen for everybody else
         return self
 
+    @property
+    def is_shard(self) -> bool:
+        """Whether it is one of the parts that `shard` returns."""
+        return self._shard is not None
+
+    def shard_name(self, number: int) -> str:
+        """Return what the service of a shard is called."""
+        return f"{self.name}.{number}"
+
+    def shard_numbers(self) -> set[int]:
+        """Return which shards have assets."""
+        return {shard_number(name, self.service.workers) for name in self.assets}
+
+    def shard(self, number: int | None) -> Self:
+        """Return the service file of one of the workers: its assets, their sources, no pages; None: all of it."""
+        if number is None:
+            return self
+        workers, name = self.service.workers, self.shard_name(number)
+        assets = {key: one for key, one in self.assets.items() if shard_number(key, workers) == number}
+        used = {one.source for one in assets.values()}
+        listen = "127.0.0.1:0" if self.service.listen else ""  # whom it tells the port asks it there
+        update = {
+            "name": name,
+            "assets": assets,
+            "sources": {key: one for key, one in self.sources.items() if key in used},
+            "service": self.service.model_copy(update={"listen": listen}),
+            "actions": self.actions.with_service_name(self.name, name),
+            "web": None,
+        }
+        found = self.model_copy(update=update)
+        found._shard = number
+        return found
+
+    def load_again(self, path: Path) -> Self:
+        """Read the service file once more, and return the same part of it."""
+        return type(self).load(path).shard(self._shard)
+
+    def check_fixed(self, new: ServiceFile) -> None:
+        """Refuse a change of what a service cannot change while it runs."""
+
+        def fixed(one: ServiceFile) -> dict[str, Any]:
+            return {
+                "name": one.name,
+                "[service] listen": one.service.listen,
+                "[service] workers": one.service.workers,
+                "[store] url": one.store.url,
+                "[web]": one.web,
+            }
+
+        for place, value in fixed(self).items():
+            if fixed(new)[place] != value:
+                raise ConfigError(f"{place}: cannot be changed while the service runs, start it again")
+
     def client_names(self) -> dict[tuple[str, str], str]:
         """Return by what names sources and outlets are known outside, by section and name."""
         sources = {("sources", name): f"{self.name}.{name}" for name in self.sources}
@@ -131,6 +195,15 @@ class ServiceFile(FileSettings):
             if identity and identity in found:
                 raise ValueError(f"{place}: {identity} is that of {found[identity]} too, give each one of its own")
             found[identity] = place
+
+    def _check_sharing(self) -> None:
+        """Refuse what several processes cannot have at the same time."""
+        for section, name in self.client_names():
+            settings: SourceSettings | PublisherSettings = getattr(self, section)[name]
+            if getattr(settings, "client", None) is not None:
+                raise ValueError(f"[{section}] {name}.client: leave it out, each of several workers needs its own")
+            if isinstance(settings, PublisherSettings) and settings.listens:
+                raise ValueError(f"[outlets] {name}: one process has its address, so that [service] workers must be 1")
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:
@@ -148,6 +221,8 @@ class ServiceFile(FileSettings):
                 if given and key != source.asset_key:
                     raise ValueError(f"[assets] {name}.{key}: leave it out, its source is of kind {source.kind}")
         self._check_identities()
+        if self.service.workers > 1:
+            self._check_sharing()
         if self.name in self.assets:
             raise ValueError(f"name: {self.name!r} is an asset's name too, call the service something else")
         return self

@@ -63,6 +63,12 @@ def examination_phase(asset: str) -> float:
     return zlib.crc32(asset.encode()) / 2.0**32
 
 
+def is_at_rest(state: ExaminationState, t: float, exceeded: bool) -> bool:
+    """Return whether `update_examination` changes nothing at time `t` [UTC s]: nearly always."""
+    agrees = exceeded == (state.verdict == "fault") and not state.doubts
+    return agrees and t < state.due and (state.examined is None or t >= state.examined)
+
+
 def update_examination(
     state: ExaminationState,
     settings: DiagnosisSettings,

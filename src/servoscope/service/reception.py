@@ -52,6 +52,10 @@ class ReceptionLog:
         """Note something that could not be used."""
         self._refusal = now, why
 
+    def is_fresh(self, now: float, within_s: float) -> bool:
+        """Return whether something could be used less than so long ago [s]."""
+        return self._heard and now - self._heard_at < within_s
+
     def silence_s(self, now: float) -> float:
         """Return how long nothing could be used [s]."""
         return now - self._heard_at

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from servoscope.core.errors import ConfigError, ServoscopeError
+from servoscope.core.errors import ServoscopeError
 from servoscope.service.asset import Asset
 from servoscope.service.asset_groups import AssetGroups
 from servoscope.service.build import (
@@ -41,9 +41,10 @@ def reload_components(
     ServoscopeError what runs can go on. An asset whose baseline has changed begins with a new state, behind the samples
     that were counted.
     """
-    _check_fixed(config, before)
+    before.check_fixed(config)
     assets = build_assets(config)
-    check_actions(config, assets)
+    if not config.is_shard:  # the whole file was checked
+        check_actions(config, assets)
     for name, one in running.assets.items():
         if name in assets and _is_same(name, (before, one), (config, assets[name])):
             assets[name] = one
@@ -103,22 +104,6 @@ def reload_components(
     }
     components = ServiceComponents(assets, groups, notifier, sources, publishers, store, anew)
     return Reload(config, components, changes)
-
-
-def _check_fixed(config: ServiceFile, before: ServiceFile) -> None:
-    """Refuse a change of what a service cannot change while it runs."""
-
-    def fixed(one: ServiceFile) -> dict[str, Any]:
-        return {
-            "name": one.name,
-            "[service] listen": one.service.listen,
-            "[store] url": one.store.url,
-            "[web]": one.web,
-        }
-
-    for place, value in fixed(before).items():
-        if fixed(config)[place] != value:
-            raise ConfigError(f"{place}: cannot be changed while the service runs, start it again")
 
 
 def _is_same(name: str, running: tuple[ServiceFile, Asset], new: tuple[ServiceFile, Asset]) -> bool:

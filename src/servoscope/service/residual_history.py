@@ -45,11 +45,12 @@ def evaluation_status(trace: Trace, t: float) -> EvaluationStatus:
     values = zip(trace.names, trace.theta[-1].tolist(), std.tolist(), trace.expected[-1].tolist(), strict=True)
     ready = bool(trace.ready[-1])
     responses = response_rows(trace.ifrf, trace.ifrf_expected, -1).tolist() if ready else []
-    return EvaluationStatus(
+    learned: dict[str, Any] = {} if trace.features is None else {"features": float(trace.features[-1])}
+    return EvaluationStatus.model_construct(  # its values are checked where it is read
+        **learned,
         t=t,
         statistic=float(excess[-1]),
         level=float(trace.level[-1]),
-        **({} if trace.features is None else {"features": float(trace.features[-1])}),
         peaks=(float(excess.max()), float(trace.level.max())),
         residual=ifrf_residual(trace, -1),
         exceeded=bool(trace.exceeded[-1]),

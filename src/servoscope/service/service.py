@@ -68,6 +68,8 @@ class Service:
         self.sources, self.store = components.sources, components.store
         self.assets, self.notifier = components.assets, components.notifier
         self._groups, self._publishers = components.groups, components.publishers
+        # those of which a full diagnosis may be pending, in order
+        self._awaiting = {name: None for name, one in self.assets.items() if one.state and one.state.pending_diagnoses}
 
     def reload(self, path: Path) -> None:
         """Change to what the service file says now, soon; for a signal's handler or another thread."""
@@ -132,7 +134,7 @@ class Service:
         """Change to what the service file says now; where that cannot be used, go on as before."""
         notify_systemd("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
-            found = reload_components(ServiceFile.load(path), self.config, self._components, self._commit_all)
+            found = reload_components(self.config.load_again(path), self.config, self._components, self._commit_all)
         except ServoscopeError as error:
             log("error", "reload refused", why=str(error))
             self.writer.add(self.config.name, [audit_row("reload refused", {"why": str(error)})])
@@ -187,6 +189,8 @@ class Service:
         latest = self.clock.latest() + self.config.service.ahead_s if source.clock_rate == 1.0 else math.inf
         for block, result in self._groups.process([BlockOffer(block, latest) for block in blocks]):
             asset = self.assets[block.asset]
+            if asset.state is not None and asset.state.pending_diagnoses:
+                self._awaiting[asset.name] = None
             if isinstance(result, ServoscopeError):
                 log("error", "block refused", asset=block.asset, sequence=block.sequence, why=str(result))
                 self.note_refusal(block.asset, str(result))
@@ -216,11 +220,13 @@ class Service:
 
     def _run_diagnoses(self, *, ended: bool) -> None:
         """Start the full diagnoses that are due, and take the results of those that are done."""
-        for asset in self.assets.values():
+        for name in list(self._awaiting):
+            asset = self.assets[name]
+            if asset.state is None or not asset.state.pending_diagnoses:
+                del self._awaiting[name]
             for window, blocks in asset.due_diagnoses(ended=ended):
-                if (asset.name, window) not in self._diagnosis_jobs:
-                    job = self._diagnosis_worker.submit(asset.baseline, asset.name, blocks)
-                    self._diagnosis_jobs[asset.name, window] = job
+                if (name, window) not in self._diagnosis_jobs:
+                    self._diagnosis_jobs[name, window] = self._diagnosis_worker.submit(asset.baseline, name, blocks)
         for name, window in [key for key, job in self._diagnosis_jobs.items() if job.done()]:
             asset, diagnosis = self.assets[name], self._diagnosis_jobs.pop((name, window)).result()
             log("info", "diagnosis", asset=name, verdict=diagnosis.verdict, summary=diagnosis.summary)
@@ -263,9 +269,12 @@ class Service:
         if self._exhausted:
             return
         troubles = {name: (source.trouble, source.asset_troubles) for name, source in self.sources.items()}
+        fresh_s = min(HOUSEKEEPING_EVERY_S, self.config.quality.silent_s)
         for name, asset in self.assets.items():
-            source = self.config.assets[name].source
+            source = asset.source
             reception, before, (trouble, of_assets) = self._receptions[name], asset.reception, troubles[source]
+            if before is FOLLOWED and name not in of_assets and reception.is_fresh(self._listening_s, fresh_s):
+                continue  # nearly all of them, nearly always
             patience_s, own = self.config.quality.silent_s, of_assets.get(name)
             if not math.isinf(self.sources[source].next_block_s):
                 asset.reception = reception.evaluate(self._listening_s, patience_s, trouble, own)
@@ -318,7 +327,7 @@ class Service:
         self.dispatcher.wake()
         now = time.monotonic()
         for name, blocks in stored.blocks.items():
-            self.sources[self.config.assets[name].source].acknowledge(name, blocks)
+            self.sources[self.assets[name].source].acknowledge(name, blocks)
         self.layers.enter("other")
         latencies = [now - completed for completed in stored.completion_times]
         self.metrics.record_commit(latencies, now - start)

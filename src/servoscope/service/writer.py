@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 from servoscope.core.errors import StoreUnavailableError
 from servoscope.service.asset import Asset
-from servoscope.service.checkpoint import pack_state
+from servoscope.service.checkpoint import AssetState, pack_state
 from servoscope.service.records import TableRow
 from servoscope.service.store import Batch, Store
 
@@ -29,6 +29,14 @@ class PendingCommit:
     completion_times: list[float] = field(default_factory=list)  # of these blocks, by the monotonic clock [s]
 
 
+class _Checkpoint(NamedTuple):
+    """A state that is to be written, and the number of the first block that is needed with it."""
+
+    asset: Asset
+    state: AssetState
+    first_needed: int
+
+
 class StoreWriter:
     """Gathers what is to be written about up to `capacity` blocks, and writes each batch exactly once.
 
@@ -44,7 +52,7 @@ class StoreWriter:
         self._number = store.last_commit(owner)
         self._gathered = PendingCommit()
         self._sealed: PendingCommit | None = None  # on its way: nothing is added to it any more
-        self._checkpoints: dict[str, Callable[[], tuple[Mapping[str, Any], int]]] = {}
+        self._checkpoints: dict[str, _Checkpoint] = {}
         self._urgent: set[str] = set()  # assets whose checkpoint cannot wait
         self._in_doubt = False
         self._retry_s = self._retry_at = 0.0
@@ -93,15 +101,10 @@ class StoreWriter:
             self._gathered.completion_times.append(completed_at)
         if asset.state is None:
             return
-        state, first_needed, status = asset.state, asset.first_needed_sequence, asset.status
-
-        def checkpoint() -> tuple[Mapping[str, Any], int]:
-            row = {"asset": state.asset, "sequence": state.position.sequence, "state": pack_state(state)}
-            return {**row, "status": status(state).to_json(), "at": time.time()}, first_needed
-
-        self._checkpoints[state.asset] = checkpoint  # called when it is written: of many blocks, only the last counts
+        # packed when it is written: of many blocks, only the last counts
+        self._checkpoints[asset.name] = _Checkpoint(asset, asset.state, asset.first_needed_sequence)
         if not can_wait:
-            self._urgent.add(state.asset)
+            self._urgent.add(asset.name)
 
     def finish(self) -> None:
         """Let no checkpoint wait any longer: nothing follows."""
@@ -140,6 +143,8 @@ class StoreWriter:
         batch, count = self._gathered.batch, max(MIN_CHECKPOINTS, len(self._checkpoints) // CHECKPOINT_SHARE)
         waiting = (name for name in self._checkpoints if name not in self._urgent)  # the oldest first
         for name in [*self._urgent, *islice(waiting, count)]:
-            batch.checkpoints[name], batch.first_needed[name] = self._checkpoints.pop(name)()
+            asset, state, batch.first_needed[name] = self._checkpoints.pop(name)
+            row = {"asset": name, "sequence": state.position.sequence, "state": pack_state(state)}
+            batch.checkpoints[name] = {**row, "status": asset.status(state).to_json(), "at": time.time()}
         self._urgent = set()
         return self._gathered

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import socket
 import sys
-import threading
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ from servoscope.core.workers import ProcessLimits
 from servoscope.service.access import Sessions, Users, WebSettings
 from servoscope.service.access.allowed_hosts import split_address
 from servoscope.service.config import ServiceFile
+from servoscope.service.process_supervisor import call_at_end_of_stdin
 from servoscope.service.store import Store
 from servoscope.web.app import create_app
 from servoscope.web.connections import ConnectionTable, LimitedProtocol, TlsListener
@@ -97,7 +96,7 @@ def run_server(
     try:
         server = WebServer(_uvicorn_config(context, tls), hub)
         if with_parent:
-            threading.Thread(target=_stop_with_parent, args=(server,), daemon=True).start()
+            call_at_end_of_stdin(lambda: setattr(server, "should_exit", True))
         _print_address(settings, listening)
         server.run([listening])
     finally:
@@ -176,9 +175,3 @@ def _print_address(settings: WebSettings, listening: socket.socket) -> None:
     if settings.login and not settings.secure:
         lines.append(message("web.no_tls"))
     print(*map(render, lines), sep="\n", file=sys.stderr, flush=True)
-
-
-def _stop_with_parent(server: uvicorn.Server) -> None:
-    while os.read(sys.stdin.fileno(), 4096):
-        pass
-    server.should_exit = True

@@ -6,7 +6,7 @@ import math
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -204,6 +204,19 @@ class ActionSettings(Settings):
         brokers = apply_network({name: one.broker for name, one in self.mqtt.items()}, network)
         mqtt = {name: one.model_copy(update={"broker": brokers[name]}) for name, one in self.mqtt.items()}
         return self.model_copy(update={"webhook": apply_network(self.webhook, network), "mqtt": mqtt})
+
+    def with_service_name(self, before: str, name: str) -> Self:
+        """Return them with another name of the service, where sinks are limited to its own alarms."""
+
+        def renamed(sinks: dict[str, Any]) -> dict[str, Any]:
+            return {
+                key: one.model_copy(update={"assets": tuple(name if each == before else each for each in one.assets)})
+                if one.assets
+                else one
+                for key, one in sinks.items()
+            }
+
+        return self.model_copy(update={key: renamed(getattr(self, key)) for key in ("webhook", "command", "mqtt")})
 
     @property
     def sinks(self) -> dict[str, Sink]:

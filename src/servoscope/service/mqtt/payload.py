@@ -23,6 +23,7 @@ import json
 import math
 import struct
 import zlib
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,10 +104,38 @@ def _decode_binary(asset: str, message: bytes, received_at: float) -> DecodedBlo
     at = BODY_HEADER.size + stamps
     t = np.frombuffer(body[BODY_HEADER.size : at], "<f8").astype(np.float64) if stamps else _uniform_times(t0, dt, n)
     numbers = np.frombuffer(body[at:], f"<f{width}").astype(np.float64).reshape(3, -1)
-    return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, t, numbers, received_at)
+    signals = _join_columns(t, numbers)
+    return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, signals, received_at)
+
+
+@cache
+def _json_decoder() -> Any:
+    """Return what reads a JSON message of the usual keys in a third of the time that `parse_json` and checks take."""
+    import msgspec
+
+    numbers, number = list[float | None], float | None
+    given: list[tuple[str, Any]] = [("version", int), ("sequence", int), *((name, numbers) for name in "ruy")]
+    others: list[tuple[str, Any]] = [("t", numbers | None), ("t0", number), ("dt", number), ("oldest", int | None)]
+    fields: list[Any] = [*given, *((name, kind, None) for name, kind in others), ("stream", int, 0)]
+    return msgspec.json.Decoder(msgspec.defstruct("JsonBlock", fields, forbid_unknown_fields=True))
 
 
 def _decode_json(asset: str, message: bytes, received_at: float) -> DecodedBlock:
+    import msgspec
+
+    try:
+        found = _json_decoder().decode(message)
+        columns = [found.t, found.r, found.u, found.y]
+        lengths = {len(column) for column in columns if column is not None}
+    except (msgspec.MsgspecError, RecursionError):
+        return _decode_loose_json(asset, message, received_at)  # which takes more, or says what is wrong
+    if found.version != VERSION or found.t is None or len(lengths) > 1:
+        return _decode_loose_json(asset, message, received_at)
+    signals = np.array(columns, dtype=np.float64)  # None becomes NaN
+    return _build_block(asset, found.stream, found.sequence, found.oldest, signals, received_at)
+
+
+def _decode_loose_json(asset: str, message: bytes, received_at: float) -> DecodedBlock:
     try:
         plain = parse_json(message)
     except (ValueError, RecursionError) as error:
@@ -124,7 +153,7 @@ def _decode_json(asset: str, message: bytes, received_at: float) -> DecodedBlock
         (t,) = _parse_columns(plain, ("t",))
     else:
         t = _uniform_times(_parse_number(plain, "t0"), _parse_number(plain, "dt"), numbers.shape[1])
-    return _build_block(asset, stream, sequence, oldest, t, numbers, received_at)
+    return _build_block(asset, stream, sequence, oldest, _join_columns(t, numbers), received_at)
 
 
 def parse_json(message: bytes) -> Any:
@@ -175,17 +204,24 @@ def _uniform_times(t0: float, dt: float, n: int) -> FloatArray:
     return t0 + dt * np.arange(n, dtype=np.float64)
 
 
+def _join_columns(t: FloatArray, numbers: FloatArray) -> FloatArray:
+    """Return t, r, u and y as rows, shape (4, N)."""
+    if t.size != numbers.shape[1]:
+        kind = "lengths" if t.size else "empty"
+        raise MessageError(kind, f"{t.size} time stamps, {numbers.shape[1]} samples" if t.size else "no samples")
+    return np.concatenate([t[None, :], numbers])
+
+
 def _build_block(
-    asset: str, stream: int, sequence: int, oldest: int | None, t: FloatArray, numbers: FloatArray, received_at: float
+    asset: str, stream: int, sequence: int, oldest: int | None, signals: FloatArray, received_at: float
 ) -> DecodedBlock:
+    t = signals[0]
     if not t.size:
         raise MessageError("empty", "no samples")
-    if t.size != numbers.shape[1]:
-        raise MessageError("lengths", f"{t.size} time stamps, {numbers.shape[1]} samples")
     for name, value in (("stream", stream), ("sequence", sequence), ("oldest", oldest or 0)):
         if not 0 <= value <= MAX_COUNT:
             raise MessageError("out of range", f"{name}: must lie between 0 and 2^63 - 1")
-    if not ((t >= 0.0) & (t < MAX_TIME_S)).all():
+    if not (t.min() >= 0.0 and t.max() < MAX_TIME_S):  # NaN is neither
         raise MessageError("times", "a time stamp is missing, or outside of the years 1970 to 9999")
-    r, u, y = numbers
-    return DecodedBlock(Block(asset, sequence, t, r, u, y, received_at, stream, oldest is not None), oldest)
+    block = Block.from_signals(asset, sequence, signals, received_at, stream, oldest is not None)
+    return DecodedBlock(block, oldest)

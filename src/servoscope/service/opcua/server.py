@@ -8,7 +8,7 @@ import threading
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -29,6 +29,7 @@ VARIABLES: Mapping[str, Any] = {  # of each asset, with their values before anyt
 class OpcuaServerSettings(CertificateSettings, PublisherSettings):
     """An outlet of kind ``opcua``; with a certificate only signed and encrypted connections are accepted."""
 
+    listens: ClassVar[bool] = True
     kind: Literal["opcua"]
     listen: Annotated[str, Field(strict=True, pattern=r"^.+:\d{1,5}$")] = "127.0.0.1:4841"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from servoscope.core.settings import Settings
 
@@ -31,6 +31,8 @@ def publisher_trouble(publisher: StatusPublisher) -> str:
 
 class PublisherSettings(Settings):
     """A table ``[outlets.NAME]``; a subclass adds the keys of its kind and says which publisher it creates."""
+
+    listens: ClassVar[bool] = False  # whether it answers at an address, which one process has alone
 
     kind: str
 

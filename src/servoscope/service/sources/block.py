@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -42,19 +43,36 @@ class Block:
 
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
-        known = np.flatnonzero(np.isfinite(self.t)) if self.t.ndim == 1 else np.zeros(0, dtype=np.intp)
-        if not known.size or any(signal.shape != self.t.shape for signal in (self.r, self.u, self.y)):
+        shape = self.t.shape
+        known = np.flatnonzero(np.isfinite(self.t)) if len(shape) == 1 else np.zeros(0, dtype=np.intp)
+        if not known.size or not shape == self.r.shape == self.u.shape == self.y.shape:
             raise RecordingError(f"{self.asset}: block {self.sequence}: t, r, u, y must have one length, t a number")
         return float(self.t[known[0]])
 
     def until(self, latest: float) -> Block | None:
         """Return it without the stamps of samples that claim to be later [UTC s]; None: all of them claim that."""
-        future = self.t > latest
-        if not future.any():
+        if not np.fmax.reduce(self.t) > latest:
             return self
+        future = self.t > latest
         return None if (future | ~np.isfinite(self.t)).all() else replace(self, t=np.where(future, np.nan, self.t))
 
-    @property
+    @classmethod
+    def from_signals(
+        cls,
+        asset: str,
+        sequence: int,
+        signals: FloatArray,
+        completed_at: float = 0.0,
+        stream: int = 0,
+        retained: bool = False,
+    ) -> Block:
+        """Return the block of t, r, u and y as rows, shape (4, N), which it keeps."""
+        t, r, u, y = signals
+        block = cls(asset, sequence, t, r, u, y, completed_at, stream, retained)
+        vars(block)["signals"] = signals
+        return block
+
+    @cached_property
     def signals(self) -> FloatArray:
         """t, r, u and y as rows, shape (4, N)."""
         return np.stack([self.t, self.r, self.u, self.y])
@@ -65,11 +83,11 @@ class Block:
 
     def pack(self) -> bytes:
         """Return its samples as bytes, from which `unpack` restores them bit by bit."""
-        return self.signals.astype("<f8").tobytes()
+        return self.signals.astype("<f8", copy=False).tobytes()
 
     @classmethod
     def unpack(cls, asset: str, sequence: int, packed: bytes) -> Block:
         """Return the block of packed samples; raises RecordingError if they are not whole."""
         if len(packed) % 32:
             raise RecordingError(f"{asset}: block {sequence} in the store is torn: restart with --anew {asset}")
-        return cls(asset, sequence, *np.frombuffer(packed, dtype="<f8").astype(np.float64).reshape(4, -1))
+        return cls.from_signals(asset, sequence, np.frombuffer(packed, dtype="<f8").astype(np.float64).reshape(4, -1))

@@ -80,7 +80,8 @@ def create_store_engine(
     if url.get_backend_name() == "sqlite":
         lies_still = not write and _lies_still(Path(str(url.database)))
         read = url.set(database=f"file:{quote(str(url.database))}", query=UNCHANGED) if lies_still else url
-        engine = sa.create_engine(read, connect_args={"timeout": lock_timeout_s}, hide_parameters=True)
+        arguments: dict[str, Any] = {"connect_args": {"timeout": lock_timeout_s}, "json_serializer": encode_document}
+        engine = sa.create_engine(read, hide_parameters=True, **arguments)
         if not lies_still:
             sa.event.listen(engine, "connect", _set_up_sqlite)
         # the driver itself begins late, and ends a transaction before it changes a table
@@ -89,13 +90,22 @@ def create_store_engine(
     options = "-c statement_timeout=60s -c lock_timeout=5s"
     arguments = {"connect_timeout": 5, "application_name": "servoscope", "options": options, "tcp_user_timeout": 10000}
     try:
-        engine = sa.create_engine(url, connect_args=arguments, pool_pre_ping=True, hide_parameters=True)
+        engine = sa.create_engine(
+            url, connect_args=arguments, pool_pre_ping=True, hide_parameters=True, json_serializer=encode_document
+        )
     except ModuleNotFoundError:
         where = display_url(url)
         raise StoreError(f"{where}: the driver psycopg is missing, pip install 'servoscope[service]'") from None
     if network is not None:
         sa.event.listen(engine, "do_connect", lambda *given: _resolve_host(network, given[-1]))
     return engine
+
+
+def encode_document(document: Any) -> str:
+    """Return a document as JSON text, in a fifth of the time that `json.dumps` takes; what is not finite is null."""
+    import msgspec
+
+    return msgspec.json.encode(document).decode()
 
 
 def _lies_still(path: Path) -> bool:
@@ -151,7 +161,7 @@ class WriterLock:
 
     def __init__(self, url: URL, engine: sa.Engine, assets: Sequence[str]) -> None:
         self._url, self._engine, self._assets = url, engine, tuple(assets)
-        self._file: int | None = None
+        self.file: int | None = None
         self._connection: sa.Connection | None = None
 
     def acquire(self) -> None:
@@ -200,12 +210,12 @@ class WriterLock:
                 self._connection.execute(sa.select(sa.func.pg_advisory_unlock(_advisory_lock_key(asset))))
 
     def _acquire_file(self) -> None:
-        if self._file is not None:
+        if self.file is not None:
             return
         path = Path(f"{self._url.database}.lock")
         try:
-            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            _lock_file(self._file)
+            self.file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            _lock_file(self.file)
         except BlockingIOError:
             self.release()
             hint = "stop it first, or give a store of its own"
@@ -226,12 +236,12 @@ class WriterLock:
 
     def release(self) -> None:
         """Release it."""
-        if self._file is not None:
-            os.close(self._file)
+        if self.file is not None:
+            os.close(self.file)
         if self._connection is not None:
             self._connection.invalidate()
             self._connection.close()
-        self._file = self._connection = None
+        self.file = self._connection = None
 
 
 def _lock_file(file: int) -> None:

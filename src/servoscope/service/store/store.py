@@ -27,6 +27,7 @@ from servoscope.service.store.rows import (
     Row,
 )
 
+RECENT_COLUMNS = tuple(column.name for column in tables.recent.c)
 OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
 
 
@@ -53,6 +54,10 @@ class Batch:
                 rows = [row for row in rows if row["sequence"] >= self.first_needed.get(row["asset"], row["sequence"])]
             if name == tables.sizes.name and rows:  # a clock that was set back may come to the same time again
                 _upsert(connection, tables.sizes, rows)
+            elif name == tables.recent.name and rows:  # nearly all rows, which need no conversion
+                marks = ", ".join(["?" if connection.dialect.name == "sqlite" else "%s"] * len(RECENT_COLUMNS))
+                insert = f"INSERT INTO {name} ({', '.join(RECENT_COLUMNS)}) VALUES ({marks})"
+                connection.exec_driver_sql(insert, [tuple(row[key] for key in RECENT_COLUMNS) for row in rows])
             elif rows:
                 connection.execute(tables.METADATA.tables[name].insert(), rows)
         if self.checkpoints:
@@ -87,6 +92,7 @@ class Store:
     def __init__(self, url: URL, connections: sa.Engine) -> None:
         self._url, self._engine = url, connections
         self._lock: engine.WriterLock | None = None
+        self._has_lock = False
         self.version = 0  # of its tables
 
     @classmethod
@@ -98,11 +104,13 @@ class Store:
         write: bool = False,
         lock_timeout_s: float = engine.LOCK_TIMEOUT_S,
         network: NetworkSettings | None = None,
+        has_lock: bool = False,
     ) -> Store:
         """Open a store by its URL, or a path for SQLite, relative to `folder` or else the working directory.
 
         With `write` tables may be created and migrated; otherwise the store must exist. A locked SQLite file is
-        waited for `lock_timeout_s`; `network` says which addresses a server may have. Raises StoreError if it cannot be
+        waited for `lock_timeout_s`; `network` says which addresses a server may have; `has_lock`: whether the process
+        has inherited the lock of a file. Raises StoreError if it cannot be
         used.
         """
         try:
@@ -110,6 +118,7 @@ class Store:
             store = cls(found, engine.create_store_engine(found, network, lock_timeout_s=lock_timeout_s, write=write))
         except ModuleNotFoundError as error:
             raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
+        store._has_lock = has_lock and found.get_backend_name() == "sqlite"
         if found.get_backend_name() == "sqlite":
             if not write and not Path(found.database or "").exists():
                 raise StoreError(f"{store.name}: no such store, servoscope run makes it")
@@ -154,11 +163,18 @@ class Store:
 
         Raises StoreError if another process has it; then nothing has changed.
         """
+        if self._has_lock:
+            return
         if self._lock is not None:
             self._lock.change(assets)
             return
         self._lock = engine.WriterLock(self._url, self._engine, assets)
         self._lock.acquire()
+
+    @property
+    def lock_file(self) -> int | None:
+        """The open file that is locked; None: there is none."""
+        return None if self._lock is None else self._lock.file
 
     def close(self) -> None:
         """Close it."""

@@ -1,0 +1,239 @@
+"""The processes among which a service shares out its assets: started, asked, and stopped as one service."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from json import loads
+from pathlib import Path
+
+from servoscope.core.errors import ServoscopeError
+from servoscope.service.build import check_restarted, check_service_file
+from servoscope.service.config import ServiceFile
+from servoscope.service.health import STALL_S
+from servoscope.service.log import log
+from servoscope.service.process_supervisor import ProcessSupervisor
+from servoscope.service.store import Store
+from servoscope.service.systemd import notify_systemd
+
+LOOK_EVERY_S = 1.0
+ANSWER_S = 5.0  # in which a worker answers
+# of metrics that several workers have under one name: how they are put together, where that is not their sum
+COMBINATIONS: dict[str, Callable[[float, float], float]] = {
+    "servoscope_store_up": min,
+    "servoscope_source_up": min,
+    "servoscope_connection_trouble": max,
+    "servoscope_last_turn_age_seconds": max,
+}
+
+
+def merge_metrics(texts: Iterable[str]) -> str:
+    """Return metrics of several processes, each in the format of Prometheus, as those of one."""
+    heads: dict[str, list[str]] = {}  # by family, in order
+    values: dict[str, dict[str, float]] = {}  # by family, then by name and labels
+    for text in texts:
+        family, own = "", set[str]()
+        for line in text.splitlines():
+            if line.startswith("#"):
+                family = line.split(" ", 3)[2]
+                if family not in heads or family in own:
+                    heads.setdefault(family, []).append(line)
+                    own.add(family)
+                continue
+            key, _, value = line.rpartition(" ")
+            name, of = key.partition("{")[0], values.setdefault(family, {})
+            combine = min if name.endswith("_created") else COMBINATIONS.get(name, float.__add__)
+            of[key] = combine(of[key], float(value)) if key in of else float(value)
+    lines = []
+    for family, head in heads.items():
+        lines += [*head, *(f"{key} {value!r}" for key, value in values.get(family, {}).items())]
+    return "\n".join(lines) + "\n"
+
+
+class _Worker:
+    """One of the processes, and where it answers; empty: it has not said so yet.
+
+    `anew`: assets that begin with a new state when it first starts; `files`: as in `ProcessSupervisor`.
+    """
+
+    def __init__(
+        self, config: ServiceFile, path: Path, number: int, anew: Iterable[str], files: Collection[int]
+    ) -> None:
+        self.number, self._path, self._anew, self._address = number, path, list(anew), ""
+        self.supervisor = ProcessSupervisor(
+            f"worker {number}",
+            self._command,
+            may_end=True,
+            says=self._take_address,
+            files=files,
+            stops_within_s=config.service.stop_within_s + 10.0,
+        )
+
+    def _command(self) -> list[str]:
+        anew, self._anew = self._anew, []  # once: started again, it goes on
+        return [
+            "run",
+            str(self._path),
+            "--worker",
+            str(self.number),
+            *(part for one in anew for part in ("--anew", one)),
+        ]
+
+    def _take_address(self, line: str) -> None:
+        self._address = line
+
+    def ask(self, path: str) -> bytes:
+        """Return its answer; raises OSError where it has none."""
+        try:
+            with urllib.request.urlopen(f"http://{self._address}{path}", timeout=ANSWER_S) as answer:
+                return bytes(answer.read())
+        except urllib.error.HTTPError as error:  # it is not ready, and says why
+            return error.read()
+        except ValueError:
+            raise OSError("it has not started yet") from None
+
+
+@dataclass
+class WorkerMetrics:
+    """Metrics of all workers."""
+
+    ask_all: Callable[[str], list[bytes]]
+
+    def render(self) -> bytes:
+        """Return all of them in the format of Prometheus."""
+        return merge_metrics(answer.decode() for answer in self.ask_all("/metrics")).encode()
+
+
+@dataclass
+class WorkerPool:
+    """A service whose assets are shared out among processes; each follows those of its shard as a service of its own.
+
+    `config`: the whole service file, from `path`; `restarted`: assets that begin with a new state.
+    """
+
+    config: ServiceFile
+    path: Path
+    restarted: Collection[str] = ()
+    _workers: list[_Worker] = field(default_factory=list)
+    _stopping: threading.Event = field(default_factory=threading.Event)
+    _reload: threading.Event = field(default_factory=threading.Event)
+    last_turn: float = field(default_factory=time.monotonic)
+
+    @property
+    def metrics(self) -> WorkerMetrics:
+        """Its metrics."""
+        return WorkerMetrics(self._ask_all)
+
+    def _ask_all(self, path: str) -> list[bytes]:
+        found = []
+        for worker in self._workers:
+            try:
+                found.append(worker.ask(path))
+            except OSError:
+                continue  # its supervisor starts it again; readiness says so
+        return found
+
+    def _why(self, key: str) -> str:
+        whys = []
+        for worker in self._workers:
+            try:
+                why = str(loads(worker.ask("/health/ready"))[key])
+            except (OSError, ValueError):
+                why = "does not answer" if key == "why" and not worker.supervisor.done else ""
+            whys += [f"worker {worker.number}: {why}"] if why else []
+        return "; ".join(whys)
+
+    @property
+    def unready_reason(self) -> str:
+        """Why it is not ready; empty: it is."""
+        return "stopping" if self._stopping.is_set() else self._why("why")
+
+    @property
+    def degraded_reason(self) -> str:
+        """Which assets are not followed although the service itself is ready; empty: none."""
+        return self._why("degraded")
+
+    def stop(self) -> None:
+        """Stop soon; for a signal's handler."""
+        self._stopping.set()
+
+    def reload(self, path: Path) -> None:
+        """Let all workers change to what the service file says now, soon; for a signal's handler."""
+        self.path = path
+        self._reload.set()
+
+    def __post_init__(self) -> None:
+        names = [self.config.shard_name(number) for number in sorted(self.config.shard_numbers())]
+        check_restarted(self.restarted, [*self.config.assets, *names])
+        check_service_file(self.config)
+
+    def run(self) -> None:
+        """Run until it is stopped, or all workers have nothing left to do."""
+        settings = self.config.store
+        store = Store.open(settings.url, self.config.folder, write=True, network=settings.rules)
+        try:
+            # of a file the workers inherit the lock: it ends with the last of them. A server locks each asset.
+            store.acquire_lock(())
+            files = () if store.lock_file is None else (store.lock_file,)
+            self._start(files)
+            next_look = time.monotonic() + STALL_S
+            notify_systemd("READY=1", f"STATUS={len(self.config.assets)} assets, {len(self._workers)} workers")
+            while not self._stopping.wait(LOOK_EVERY_S) and not all(one.supervisor.done for one in self._workers):
+                self.last_turn = time.monotonic()
+                notify_systemd("WATCHDOG=1")
+                if self.last_turn >= next_look:
+                    next_look = self.last_turn + STALL_S / 3.0
+                    self._end_hung()
+                if self._reload.is_set():
+                    self._reload.clear()
+                    self._change(files)
+            notify_systemd("STOPPING=1")
+            for one in self._workers:
+                one.supervisor.ask_to_stop()  # all at once
+            for one in self._workers:
+                one.supervisor.stop()
+        finally:
+            store.close()
+
+    def _start(self, files: Sequence[int]) -> None:
+        """Start a worker for each shard that has assets and none yet."""
+        running = {one.number for one in self._workers if not one.supervisor.done}
+        self._workers = [one for one in self._workers if one.number in running]
+        restarted, self.restarted = self.restarted, ()  # once
+        for number in sorted(self.config.shard_numbers() - running):
+            own = {*self.config.shard(number).assets, self.config.shard_name(number)}
+            worker = _Worker(self.config, self.path, number, [one for one in restarted if one in own], files)
+            self._workers.append(worker)
+            worker.supervisor.start()
+
+    def _end_hung(self) -> None:
+        """Kill workers that answer, and do nothing else: they are started again."""
+        for worker in self._workers:
+            try:
+                if not loads(worker.ask("/health/live"))["ok"]:
+                    log("error", "worker hangs", worker=worker.number)
+                    worker.supervisor.send_signal(signal.SIGKILL)
+            except (OSError, ValueError):
+                continue
+
+    def _change(self, files: Sequence[int]) -> None:
+        """Change to what the service file says now; where that cannot be used, go on as before."""
+        notify_systemd("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        try:
+            config = ServiceFile.load(self.path)
+            self.config.check_fixed(config)
+            check_service_file(config)
+        except ServoscopeError as error:
+            log("error", "reload refused", why=str(error))
+            notify_systemd("READY=1", f"STATUS=reload refused: {error}")
+            return
+        self.config = config
+        for one in self._workers:
+            one.supervisor.send_signal(signal.SIGHUP)
+        self._start(files)
+        notify_systemd("READY=1", f"STATUS={len(config.assets)} assets, {len(self._workers)} workers")
