@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +36,8 @@ class Block:
     completed_at: float = 0.0  # when its last sample was taken, by `time.monotonic` [s]: latency counts from there
     stream: int = 0  # name of the asset's stream, greater for a later one; 0: it has none, and there is only one
     retained: bool = False  # whether its sender retains it, and sends it again, until it is acknowledged
+    # columns of what the healthy coefficients depend on, as the loop file names them, shape (k, N)
+    covariates: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def start_time(self) -> float:
         """Return the time of its first sample that has one.
@@ -43,7 +45,7 @@ class Block:
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
         known = np.flatnonzero(np.isfinite(self.t)) if self.t.ndim == 1 else np.zeros(0, dtype=np.intp)
-        if not known.size or any(signal.shape != self.t.shape for signal in (self.r, self.u, self.y)):
+        if not known.size or any(x.shape != self.t.shape for x in (self.r, self.u, self.y, *self.covariates)):
             raise RecordingError(f"{self.asset}: block {self.sequence}: t, r, u, y must have one length, t a number")
         return float(self.t[known[0]])
 
@@ -56,20 +58,26 @@ class Block:
 
     @property
     def signals(self) -> FloatArray:
-        """t, r, u and y as rows, shape (4, N)."""
-        return np.stack([self.t, self.r, self.u, self.y])
+        """t, r, u, y and the covariates as rows, shape (4 + k, N)."""
+        return np.stack([self.t, self.r, self.u, self.y, *self.covariates])
 
     def digest(self, before: int = 0) -> int:
         """Return the CRC-32 of its samples, continued from that of the blocks before it."""
         return zlib.crc32(self.signals.tobytes(), before)
 
     def pack(self) -> bytes:
-        """Return its samples as bytes, from which `unpack` restores them bit by bit."""
-        return self.signals.astype("<f8").tobytes()
+        """Return its samples as bytes, from which `unpack` restores them bit by bit.
+
+        Where there are covariates, a last byte tells their number: without it the length is a multiple of eight.
+        """
+        return self.signals.astype("<f8").tobytes() + bytes([len(self.covariates)] if len(self.covariates) else ())
 
     @classmethod
     def unpack(cls, asset: str, sequence: int, packed: bytes) -> Block:
         """Return the block of packed samples; raises RecordingError if they are not whole."""
-        if len(packed) % 32:
+        k = packed[-1] if len(packed) % 8 == 1 else 0
+        numbers = packed[:-1] if k else packed
+        if len(numbers) % (8 * (4 + k)):
             raise RecordingError(f"{asset}: block {sequence} in the store is torn: restart with --anew {asset}")
-        return cls(asset, sequence, *np.frombuffer(packed, dtype="<f8").astype(np.float64).reshape(4, -1))
+        t, r, u, y, *covariates = np.frombuffer(numbers, dtype="<f8").astype(np.float64).reshape(4 + k, -1)
+        return cls(asset, sequence, t, r, u, y, covariates=np.reshape(covariates, (k, -1 if k else 0)))
