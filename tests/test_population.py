@@ -102,10 +102,28 @@ class TestPopulation:
             }
 
         alike, unlike = (Population.from_baselines(machines(spread)) for spread in (0.0, 1.5))
-        assert alike.scatter == pytest.approx(np.ones(4), rel=0.3)
+        assert np.diag(alike.scatter) == pytest.approx(np.ones(4), rel=0.3)
         assert alike.degrees > 50.0 > 10.0 > unlike.degrees
-        one = alike.pooled_scatter(np.zeros(4), 1)
-        assert one == pytest.approx(alike.scatter * alike.degrees / (alike.degrees - 2.0))
+        one = alike.pooled_scatter(np.zeros((4, 4)), 1)
+        assert one == pytest.approx(alike.scatter * alike.degrees / (alike.degrees - 5.0))
+
+    def test_coefficients_that_scatter_together_do_so_in_the_population(self, known: dict[str, ss.Baseline]) -> None:
+        """T^2 of further recordings is n on average in every direction; from the diagonal alone it is not."""
+        rng = np.random.default_rng(5)
+        half = np.array([[1.0, 0.0, 0.0, 0.0], [0.95, 0.3, 0.0, 0.0], [0.9, 0.1, 0.4, 0.0], [0.0, 0.0, 0.0, 1.0]])
+        one = next(iter(known.values()))
+        blank = {"covariance": tuple(map(tuple, 1e-6 * np.eye(4))), "sources": one.sources[:1] * 4}
+        machines = {}
+        for k in range(20):
+            S = np.cov(rng.standard_normal((4, 4)) @ half.T, rowvar=False)
+            machines[str(k)] = one.model_copy(update={**blank, "scatter": tuple(map(tuple, S.tolist()))})
+        pooled = Population.from_baselines(machines).pooled_scatter(np.zeros((4, 4)), 1)
+        further = rng.standard_normal((4000, 4)) @ half.T
+        T2 = np.einsum("ki,ij,kj->k", further, np.linalg.inv(pooled), further)
+        diagonal = (further**2 / np.diag(pooled)).sum(axis=1)
+        assert T2.mean() == pytest.approx(4.0, rel=0.2)
+        assert (T2 > 18.5).mean() < 0.006  # 0.1 % of chi-square with 4 degrees
+        assert (diagonal > 18.5).mean() > 0.02
 
     def test_few_or_other_machines_are_refused(self, known: dict[str, ss.Baseline]) -> None:
         with pytest.raises(BaselineError, match="at least 5 like machines, 2 given"):

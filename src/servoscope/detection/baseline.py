@@ -98,7 +98,8 @@ class Baseline(ShortRepr, BaselineModel):
     covariates
         How coefficients move with covariates, if any; theta is theirs in the middle of the learned range.
     scatter
-        Variance of the coefficients between the recordings beyond their noise, (n,); empty where there was only one.
+        Covariance (n, n) of the coefficients between the recordings beyond their noise; earlier versions wrote its
+        diagonal (n,). Empty where there was only one recording.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -144,7 +145,7 @@ class Baseline(ShortRepr, BaselineModel):
     motion: MotionRange | None = None
     axis: AxisModel | None = None
     covariates: CovariateModel | None = None
-    scatter: Vector = ()
+    scatter: Matrix | Vector = ()
     point: str = ""
     others: tuple[Baseline, ...] = ()
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import RecordingError
+from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.core.messages import message
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import t2_statistic
@@ -22,6 +22,11 @@ class CovariateMonitor:
     """Follows covariates block by block beside a recursion that starts at the coefficients of their first values."""
 
     def __init__(self, baseline: Baseline, model: CovariateModel) -> None:
+        if model.warm_up is not None:
+            raise BaselineError(
+                "a warm-up without a thermometer is known at the end of a recording only: diagnose recordings, or "
+                "log the temperature and name its column under [columns.covariates]"
+            )
         pipeline = baseline.pipeline()
         self.model, self._theta, self._bank = model, np.array(baseline.theta), pipeline.bank
         self._covariance = baseline.covariance_array()

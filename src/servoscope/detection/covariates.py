@@ -7,12 +7,22 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.messages import Message, message
 
 EDGE = 0.05  # share of the learned range, by which a covariate may be outside of it
+
+
+class WarmUp(BaseModel):
+    """What healthy recordings say of a warm-up that is not measured; see `servoscope.detection.warm_up`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    time_constant_s: float
+    power: float  # mean of u y'; 0 where there is none
+    variance: float  # of what is left of eta, as sums over blocks of time show it
 
 
 class CovariateModel(BaseModel):
@@ -34,6 +44,8 @@ class CovariateModel(BaseModel):
     proportional: tuple[bool, ...]
     slopes: tuple[tuple[float, ...], ...]  # B (p, n)
     covariance: tuple[tuple[float, ...], ...]  # of B by rows, (p n, p n)
+    # where the one covariate is no column but a warm-up that the coefficients tell
+    warm_up: WarmUp | None = Field(default=None, exclude_if=lambda value: value is None)
 
     @cached_property
     def origin(self) -> FloatArray:
@@ -68,7 +80,7 @@ class CovariateModel(BaseModel):
 
     def describe_missing(self, channels: Mapping[str, FloatArray]) -> Message | None:
         """Return that a covariate was not logged; None where all were."""
-        for name in self.names:
+        for name in self.names if self.warm_up is None else ():
             if name not in channels or np.isnan(channels[name]).all():
                 return message("covariate.missing", covariate=name)
         return None
@@ -148,6 +160,10 @@ class CovariatePath:
     theta: FloatArray  # of the model's origin, shape (n,)
     values: FloatArray  # shape (N, k)
     averages: FloatArray  # with the estimator's memory, shape (N, k)
+    # of the one covariate that is not measured but fitted: its standard deviation, shape (N,), and from which size on a
+    # jump is not taken for its course
+    std: FloatArray | None = None
+    jump: float = 0.0
 
     @classmethod
     def of(
@@ -176,7 +192,11 @@ class CovariatePath:
     @property
     def outside(self) -> Message | None:
         """That the covariates leave the learned range; None where they do not."""
-        return self.model.describe_outside(self.values)
+        outside = self.model.describe_outside(self.values)
+        if outside is None or self.std is None:
+            return outside
+        values = dict(outside.values)
+        return message("covariate.warm_up_outside", seen=values["seen"], known=values["known"])
 
     def expected(self, samples: IntArray) -> FloatArray:
         """Return the coefficients that theta_hat is compared with at some samples, shape (K, n)."""
@@ -184,4 +204,9 @@ class CovariatePath:
 
     def covariance(self, samples: IntArray) -> FloatArray:
         """Return what is not known of them, shape (K, n, n)."""
-        return self.model.theta_covariance(self.theta, self.averages[samples])
+        c = self.averages[samples]
+        slopes = self.model.theta_covariance(self.theta, c)
+        if self.std is None:
+            return slopes
+        off = self.model.theta(self.theta, c + self.std[samples, None]) - self.model.theta(self.theta, c)
+        return slopes + off[:, :, None] * off[:, None, :]

@@ -178,7 +178,7 @@ class GroupStatistic(NamedTuple):
         centre = M.mean(axis=0)
         scale = np.sqrt(np.diag(W) + M.var(axis=0, ddof=1))
         scale = np.where(scale > 0.0, scale, np.maximum(np.abs(centre), 1.0))
-        Z, within = (M - centre) / scale, _shrink(W / np.outer(scale, scale), group.degrees)
+        Z, within = (M - centre) / scale, shrink(W / np.outer(scale, scale), group.degrees)
         t = np.arange(n) - (n - 1.0) / 2.0
         tt = float(t @ t)
         slope = t @ Z / tt if drift else np.zeros(len(centre))
@@ -207,7 +207,7 @@ class GroupStatistic(NamedTuple):
         return float(z[seen] @ np.linalg.solve(C[np.ix_(seen, seen)], z[seen])) / int(seen.sum())
 
 
-def _shrink(S: FloatArray, degrees: int) -> FloatArray:
+def shrink(S: FloatArray, degrees: int) -> FloatArray:
     """Shrink a covariance matrix towards a multiple of the identity (oracle approximating shrinkage)."""
     p, n = len(S), max(degrees, 1)
     mean, square = float(np.trace(S)) / p, float((S**2).mean())

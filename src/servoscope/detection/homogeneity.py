@@ -119,6 +119,28 @@ def scatter(apart: FloatArray, covariances: FloatArray) -> FloatArray:
     return np.diag(beyond * prediction_factor(m))
 
 
+def between_covariance(apart: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return the covariance (n, n) between m recordings less that of their noise; 0 of one recording.
+
+    It has no bias, and so it may be negative in some directions: it is there to be averaged over machines. The
+    arguments are those of `find_outliers`.
+    """
+    if len(apart) < 2:
+        return np.zeros_like(covariances[0])
+    return np.asarray(np.cov(apart.T, ddof=1).reshape(covariances[0].shape) - covariances.mean(axis=0))
+
+
+def cover_transients(between: FloatArray, shares: Sequence[FloatArray]) -> FloatArray:
+    """Return a scatter (n, n) that also covers what it does while the recursion has not yet forgotten its start.
+
+    With Psi of the start left, an actuator that is off by d moves the estimate by (I - Psi) d, and what is known badly
+    then moves by far more than d. `shares`: Psi of each recording, shape (K, n, n).
+    """
+    left = np.eye(len(between)) - np.concatenate(shares)
+    most = np.einsum("kij,jl,kil->ki", left, between, left).max(axis=0, initial=0.0)
+    return between + np.diag(np.maximum(most - np.diag(between), 0.0))
+
+
 def prediction_factor(m: int) -> float:
     """Return by how much the deviation of a further recording from the mean of m exceeds their own variance."""
     return ((m - 1.0) / (m - 3.0) if m >= ENOUGH else 3.0) * (1.0 + 1.0 / m)

@@ -43,6 +43,7 @@ from servoscope.diagnosis.warnings import (
     detectable_sizes,
     estimate_warnings,
     power_warnings,
+    warm_up_warnings,
     warning_throughout,
 )
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
@@ -147,9 +148,8 @@ def _judge_signals(
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     points = baseline.per_point if point is None else (baseline.at(point),)
     recording, sensors = check_sensors(points[0], recording)
-    if (model := points[0].covariates) is not None and (
-        missing := model.describe_missing(recording.channels)
-    ) is not None:
+    model = points[0].covariates
+    if model is not None and (missing := model.describe_missing(recording.channels)) is not None:
         raise RecordingError(f"{recording.name}: {missing}")
     exams = [Examination.from_recording(one, recording) for one in points]
     if exams[0].along is not None and (outside := exams[0].along.outside) is not None:
@@ -238,7 +238,7 @@ def diagnose_examination(
         doubts = power_warnings(exam, detectable)
         verdict = "undetermined" if doubts or exam.apparent_alarm.any() else "healthy"
         unwatched = unwatched_changes(baseline.plant, detectable)
-    warnings += motion_warnings(exam) + doubts
+    warnings += motion_warnings(exam) + warm_up_warnings(exam) + doubts
     interval = next((one for one in intervals if _covers(one, float(exam.t(at)))), intervals[-1] if intervals else None)
     correction = estimate_bias_correction(exam, interval.candidates if interval else (), onset, at)
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))

@@ -26,6 +26,7 @@ from servoscope.detection.covariates import CovariatePath
 from servoscope.detection.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.detection.motion import RecordedMotion
 from servoscope.detection.trace import UNSEEN, Statistic, any_exceeded, detection_statistics
+from servoscope.detection.warm_up import follow_warm_up
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, RegressionRunner, Tuning
@@ -77,7 +78,11 @@ class Examination:
         along = None
         if (model := baseline.covariates) is not None:
             memory = baseline.pipeline().memory_samples
-            along = CovariatePath.of(model, np.array(baseline.theta), recording.channels, memory)
+            theta = np.array(baseline.theta)
+            if model.warm_up is None:
+                along = CovariatePath.of(model, theta, recording.channels, memory)
+            else:
+                along = follow_warm_up(baseline.pipeline(), model, theta, recording, memory)
             place = ", ".join(filter(None, [baseline.point, along.place]))
             baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
             baseline = baseline.model_copy(update={"point": place})

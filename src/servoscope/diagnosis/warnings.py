@@ -13,6 +13,7 @@ from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
 
 AT_ONCE = 4096  # evaluations
 VALUES_TRIED = 201  # of a covariate
+ALIKE = 0.95  # squared cosine from which on a change counts as looking like another temperature
 MIN_SKIPPED_SHARE = 0.01  # share of updates without an instrument from which a warning is given
 NO_PROMISE = 10.0  # relative change; a baseline that detects nothing smaller promises nothing
 WEAKER = 3.0  # a recording that shows only changes this much larger than promised is called undetermined
@@ -30,8 +31,37 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
         if ok.any():
             best = np.maximum(best, noncentrality(exam.covariance(at)[ok], e.Psi[at][ok], rows).max(axis=0))
     needed = required_noncentrality(exam.pipeline.bank.n, baseline.limit)
-    smallest = (float(np.sqrt(needed / one)) if one > 0.0 else np.inf for one in best)
-    return dict(zip(promised, zip(smallest, promised.values(), strict=True), strict=True))
+    smallest = {
+        name: float(np.sqrt(needed / one)) if one > 0.0 else np.inf for name, one in zip(promised, best, strict=True)
+    }
+    if exam.along is not None and exam.along.std is not None:
+        for name, per_warmth in changes_like_warmth(exam).items():
+            smallest[name] = max(smallest.get(name, 0.0), exam.along.jump * per_warmth)
+    return {name: (smallest[name], change) for name, change in promised.items()}
+
+
+def changes_like_warmth(exam: Examination) -> dict[str, float]:
+    """Return, by parameter, the relative change that does nearly what the whole learned warm-up does, if one does."""
+    along, last = exam.along, exam.evaluations - 1
+    if along is None or along.std is None or last < 0:
+        return {}
+    c = along.averages[exam.estimates.index[last]]
+    step = 0.5 * (np.array(along.model.high) - np.array(along.model.low))
+    warmth = (along.model.theta(along.theta, c + 1e-3 * step) - along.model.theta(along.theta, c - 1e-3 * step)) / 2e-3
+    found = {}
+    for name, d in fault_directions(exam.baseline.loop, exam.baseline.plant, exam.tuning.theta).items():
+        known_d, known_w = np.linalg.solve(exam.covariance(last), np.stack([d, warmth], axis=1)).T
+        if float(d @ known_w) ** 2 >= ALIKE * float(d @ known_d) * float(warmth @ known_w):
+            found[name] = 2.0 * abs(float(d @ known_w)) / float(d @ known_d)
+    return found
+
+
+def warm_up_warnings(exam: Examination) -> list[DiagnosisWarning]:
+    """Return the warning that some changes cannot be told from a temperature that nobody has logged."""
+    if exam.along is None or exam.along.std is None:
+        return []
+    alike = list(changes_like_warmth(exam)) or list(exam.baseline.names)
+    return [warning_throughout(exam, "warm_up", message("warning.warm_up", parameters=alike))]
 
 
 def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]) -> list[DiagnosisWarning]:
@@ -72,7 +102,11 @@ def covariate_warnings(exam: Examination, at: int) -> list[DiagnosisWarning]:
         best = int(np.argmin(T2))
         if T2[best] <= exam.baseline.limit:
             other, said = float(values[best]), float(logged[j])
-            found.append(message("warning.covariate", covariate=name, other=f"{other:.3g}", logged=f"{said:.3g}"))
+            if along.std is None:
+                text = message("warning.covariate", covariate=name, other=f"{other:.3g}", logged=f"{said:.3g}")
+            else:
+                text = message("warning.warm_up_jump", before=f"{said:.3g}", after=f"{other:.3g}")
+            found.append(text)
     return [warning_throughout(exam, "point", text) for text in found]
 
 

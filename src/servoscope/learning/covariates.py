@@ -24,6 +24,18 @@ FEWEST_PER_COEFFICIENT = 20  # usable samples of a stretch
 
 def fit_covariates(
     pipeline: Pipeline, recordings: Sequence[Recording], regressions: Sequence[Regression], fit: TuningFit
+) -> tuple[CovariateModel, Sequence[Regression], TuningFit, Sequence[Recording]]:
+    """Return what `refer_to_covariates` does for those that the loop file names, and the recordings."""
+    names = tuple(pipeline.loop.columns.covariates)
+    return *refer_to_covariates(pipeline, recordings, regressions, fit, names), recordings
+
+
+def refer_to_covariates(
+    pipeline: Pipeline,
+    recordings: Sequence[Recording],
+    regressions: Sequence[Regression],
+    fit: TuningFit,
+    names: Sequence[str],
 ) -> tuple[CovariateModel, Sequence[Regression], TuningFit]:
     """Return the model of the covariates, and regressions and tuning as if these had stayed at its origin.
 
@@ -31,14 +43,18 @@ def fit_covariates(
     """
     referred = regressions
     for _ in range(ROUNDS):
-        model = learn_covariates(pipeline, recordings, regressions, fit)
+        model = learn_covariates(pipeline, recordings, regressions, fit, names)
         referred = at_origin(model, fit.tuning.theta, recordings, regressions)
         fit = fit_tuning(pipeline, referred)
     return model, referred, fit
 
 
 def learn_covariates(
-    pipeline: Pipeline, recordings: Sequence[Recording], regressions: Sequence[Regression], fit: TuningFit
+    pipeline: Pipeline,
+    recordings: Sequence[Recording],
+    regressions: Sequence[Regression],
+    fit: TuningFit,
+    names: Sequence[str],
 ) -> CovariateModel:
     """Fit the coefficients of short stretches as polynomials of the covariates (generalised least squares).
 
@@ -46,7 +62,6 @@ def learn_covariates(
 
     Raises NotEnoughError if a covariate is missing or hardly varies, or if the stretches are too few.
     """
-    names = tuple(pipeline.loop.columns.covariates)
     for name in names:
         for rec in recordings:
             if name not in rec.channels or np.isnan(rec.channels[name]).all():
@@ -70,7 +85,7 @@ def learn_covariates(
     if len(theta) <= 1 + p:
         raise NotEnoughError(f"{len(theta)} stretches are too few to tell what {', '.join(names)} do: record longer")
     blank = CovariateModel(
-        names=names,
+        names=tuple(names),
         low=tuple(low.tolist()),
         high=tuple(high.tolist()),
         degrees=tuple(degrees),

@@ -11,13 +11,13 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
+from servoscope.detection import homogeneity
 from servoscope.detection.axis_model import AxisModel
 from servoscope.detection.baseline import Baseline, digest
 from servoscope.detection.baseline_parts import BaselineSource
 from servoscope.detection.covariates import CovariateModel, CovariatePath
 from servoscope.detection.cusum_design import CusumHypothesis
 from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system
-from servoscope.detection.homogeneity import describe_outliers, find_outliers, leave_one_out, prediction_factor, scatter
 from servoscope.detection.motion import learn_motion
 from servoscope.detection.plant_fit import (
     MOST_SATURATED,
@@ -51,6 +51,7 @@ from servoscope.learning.features import learn_features
 from servoscope.learning.innovation_fit import FILE_ERROR, fit_innovations
 from servoscope.learning.instrument import learn_instrument, learns_instrument
 from servoscope.learning.population import Population
+from servoscope.learning.warm_up import fit_warm_up
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
@@ -93,9 +94,10 @@ def learn_baseline(
             )
     pipeline, regressions, fit, notes = _tune(loop, recordings)
     covariates = None
-    if loop.columns.covariates:
+    if loop.columns.covariates or loop.monitor.hidden_warm_up:
         progress("covariates")
-        covariates, regressions, fit = fit_covariates(pipeline, recordings, regressions, fit)
+        fit_them = fit_warm_up if loop.monitor.hidden_warm_up else fit_covariates
+        covariates, regressions, fit, recordings = fit_them(pipeline, recordings, regressions, fit)
     progress("delay")
     delay_s, warnings = check_delay(pipeline.loop, recordings, accept_delay)
     name = pipeline.loop.monitor.estimator
@@ -223,7 +225,7 @@ def _assemble_baseline(
     expectations: list[Expectation] = []
     known: tuple[tuple[str, ...], FloatArray, FloatArray] | None = None
     if population is not None:
-        member, note = population.describe(theta, theta_covariance + np.diag(population.scatter) / len(recordings))
+        member, note = population.describe(theta, theta_covariance + population.scatter / len(recordings))
         notes.append(note)
         population = population if member else None
     if can_simulate(loop):
@@ -291,16 +293,16 @@ def _assemble_baseline(
         if axis is not None:  # scatter between recordings; a change within one is told from its own past
             error += np.diag(axis.scatter(pipeline.bank.names) ** 2)
     m = len(recordings)
-    between = scatter(deviations_between, fit.each_covariance)
-    own_scatter = np.diag(between) / prediction_factor(m)
+    between = homogeneity.scatter(deviations_between, fit.each_covariance)
+    own_scatter = homogeneity.between_covariance(deviations_between, fit.each_covariance)
     if population is not None:
         pooled = population.pooled_scatter(own_scatter, m)
-        between = np.diag(pooled) * (1.0 + 1.0 / m)
+        between = pooled * (1.0 + 1.0 / m)
         if not ratios:
-            theta, theta_covariance = population.theta.combine(theta, theta_covariance + np.diag(pooled) / m)
-            between = np.diag(pooled)  # what the mean of m recordings is off by is in the covariance of theta now
-    outliers = find_outliers(deviations_between, fit.each_covariance + error)
-    notes += describe_outliers(outliers, [rec.name for rec in recordings], pipeline.bank.names)
+            theta, theta_covariance = population.theta.combine(theta, theta_covariance + pooled / m)
+            between = pooled  # what the mean of m recordings is off by is in the covariance of theta now
+    outliers = homogeneity.find_outliers(deviations_between, fit.each_covariance + error)
+    notes += homogeneity.describe_outliers(outliers, [rec.name for rec in recordings], pipeline.bank.names)
     tuning = replace(fit.tuning, theta=theta)
     plant = loop.plant.scaled(ratios) if ratios else loop.plant
     progress("features")
@@ -327,9 +329,10 @@ def _assemble_baseline(
     ]
     deviations = [e.theta - mean for e, mean in zip(estimates, expected, strict=True)]
     paths = [(d[e.updates > 0], e.S[e.updates > 0]) for d, e in zip(deviations, estimates, strict=True)]
-    told = None if population is None else between
+    told = None if population is None else homogeneity.cover_transients(between, [e.Psi for e in estimates])
+    between = between if told is None else told
     common = theta_covariance + error
-    factor, left_out = leave_one_out(paths, deviations_between, fit.each_covariance, common, limit, told)
+    factor, left_out = homogeneity.leave_one_out(paths, deviations_between, fit.each_covariance, common, limit, told)
     covariance = theta_covariance + factor * between + error
     notes += noise_notes(pipeline, fit, estimates, can_simulate(loop))
     excess, suggestion = baseline_misfit(estimates, deviations, covariance, fit)
@@ -342,8 +345,7 @@ def _assemble_baseline(
     if duration < least:
         notes.append(message("learning.short", duration_s=duration, memory_s=memory, least_s=least))
     supported = supported_budget(pipeline.bank.n, loop, fit.dof, excess)
-    budget = loop.monitor.false_alarms_per_year
-    if supported > budget:
+    if supported > (budget := loop.monitor.false_alarms_per_year):
         notes.append(message("learning.budget", supported=supported, budget=budget))
     directions = fault_directions(loop, plant, theta)
     baseline = Baseline(
@@ -385,7 +387,7 @@ def _assemble_baseline(
         motion=learn_motion(pipeline, recordings),
         axis=axis,
         covariates=covariates,
-        scatter=tuple(own_scatter) if m > 1 else (),
+        scatter=_rows(own_scatter) if m > 1 else (),
     )
     progress("predictor")
     predictor = None if covariates is not None else fit_exact_predictor(baseline, recordings)

@@ -12,11 +12,12 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.core.messages import Message, message
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.feature_model import shrink
 from servoscope.detection.homogeneity import prediction_factor
 from servoscope.detection.plant_fit import PRIOR
 
 FEWEST = 5  # machines: of fewer, the scatter between them is mostly chance
-LEAST_DEGREES = 3.0  # of freedom, below which a variance says nothing of a further recording
+FLOOR = 0.01  # of the uncertainty of a coefficient: less scatter than that is none
 UNLIKELY = 1e-3  # probability below which a machine is none of the population
 
 
@@ -69,7 +70,7 @@ class Population:
     machines: int
     theta: NormalPrior  # coefficients
     ratios: NormalPrior | None  # logarithms of the plant's parameters relative to the loop file's
-    scatter: FloatArray  # variance of the coefficients between recordings of one machine, shape (n,)
+    scatter: FloatArray  # covariance of the coefficients between recordings of one machine, shape (n, n)
     degrees: float  # what it is worth for a further machine, in degrees of freedom
     sequential: bool  # whether most machines have a sequential test: recordings that scatter leave none
 
@@ -94,7 +95,7 @@ class Population:
                     f"of {first_name} ({', '.join(first.names)}; plant {first.loop.plant.kind}): no like machine"
                 )
         each = list(baselines.values())
-        scatter, degrees = _common_scatter([one for one in each if one.scatter], len(first.names))
+        scatter, degrees = _common_scatter(each, len(first.names))
         theta = np.array([one.theta for one in each])
         errors = np.array([_estimation_error(one, scatter) for one in each])
         return cls(
@@ -107,15 +108,17 @@ class Population:
         )
 
     def pooled_scatter(self, own: FloatArray, recordings: int) -> FloatArray:
-        """Return the variance between recordings (n,) of a machine whose own m of them say `own` (n,).
+        """Return the covariance between recordings (n, n) of a machine whose own m of them say `own` (n, n).
 
-        Both weigh by their degrees of freedom (Smyth, 2004, eq. 3); it is as wide as Student's t with their sum.
+        Both weigh by their degrees of freedom (Smyth, 2004, eq. 3, for a covariance). With v of them in all, a further
+        recording has the covariance v S/(v - n - 1): a multivariate Student's t (Gelman et al., 2013, section 3.6).
         """
-        weight = max(recordings - 1, 0)
+        weight, n = max(recordings - 1, 0), len(own)
         total = weight + self.degrees
-        if total <= LEAST_DEGREES:
-            return own
-        return np.asarray((weight * own + self.degrees * self.scatter) / (total - 2.0))
+        if not self.degrees or total <= n + 2.0:
+            return np.diag(np.maximum(np.diag(own), 0.0))
+        S = (weight * own + self.degrees * self.scatter) / (total - n - 1.0)
+        return _without_negative(S, np.sqrt(np.diag(self.scatter)))
 
     def describe(self, theta: FloatArray, covariance: FloatArray) -> tuple[bool, Message]:
         """Return whether a machine is one of the population, and a note that says so."""
@@ -143,32 +146,50 @@ class Population:
         return self.ratios.names, *self.ratios.combine(x, C, PRIOR)
 
 
-def _common_scatter(known: Sequence[Baseline], n: int) -> tuple[FloatArray, float]:
-    """Return the variance between recordings that machines have in common, (n,), and its degrees of freedom.
+def _common_scatter(each: Sequence[Baseline], n: int) -> tuple[FloatArray, float]:
+    """Return the covariance between recordings that machines have in common, (n, n), and its degrees of freedom.
 
     These are what is left of all of theirs where machines scatter by different amounts: variances that scatter among
-    machines with a coefficient of variation c come from an inverse gamma law of 4 + 2/c^2 degrees (by moments).
+    machines with a coefficient of variation c come from an inverse gamma law of 4 + 2/c^2 degrees (by moments). The
+    correlations between coefficients are shrunk towards none (oracle approximating shrinkage).
     """
+    known = [one for one in each if len(one.scatter)]
     if len(known) < FEWEST:
-        return np.zeros(n), 0.0
+        return np.zeros((n, n)), 0.0
     degrees = np.array([len(one.sources) - 1.0 for one in known])
-    variances = np.array([one.scatter for one in known])
-    mean = degrees @ variances / degrees.sum()
-    seen = mean > 0.0
+    covariances = np.array([_scatter_array(one) for one in known])
+    S = np.einsum("k,kij->ij", degrees, covariances) / degrees.sum()
+    least = FLOOR * np.mean([np.diag(one.covariance_array()) for one in known], axis=0)
+    variances = np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)
+    seen = np.diag(S) > least
     chance = 2.0 / degrees.mean()
-    variation = variances[:, seen].var(axis=0, ddof=1) / mean[seen] ** 2
+    variation = variances[:, seen].var(axis=0, ddof=1) / variances[:, seen].mean(axis=0) ** 2
     between = max(float(np.median((variation - chance) / (1.0 + chance))) if seen.any() else 0.0, 1e-9)
-    return mean, float(min(4.0 + 2.0 / between, degrees.sum()))
+    size = np.sqrt(np.maximum(np.diag(S), least))
+    correlations = shrink(_without_negative(S, size) / np.outer(size, size), int(degrees.sum()))
+    return correlations * np.outer(size, size), float(min(4.0 + 2.0 / between, degrees.sum()))
+
+
+def _scatter_array(baseline: Baseline) -> FloatArray:
+    S = np.array(baseline.scatter)
+    return S if S.ndim == 2 else np.diag(S)
+
+
+def _without_negative(S: FloatArray, size: FloatArray) -> FloatArray:
+    """Return a symmetric matrix without its negative directions, as seen in units of `size` (n,)."""
+    units = np.outer(*(np.where(size > 0.0, size, 1.0),) * 2)
+    values, directions = np.linalg.eigh(S / units)
+    return np.asarray((directions * np.maximum(values, 0.0)) @ directions.T * units)
 
 
 def _estimation_error(baseline: Baseline, scatter: FloatArray) -> FloatArray:
     """Return the covariance of a baseline's own coefficients: noise, and its recordings' share of the scatter."""
     m = len(baseline.sources)
-    own = np.array(baseline.scatter) if baseline.scatter else np.zeros(len(scatter))
+    own = np.maximum(np.diag(_scatter_array(baseline)), 0.0) if len(baseline.scatter) else np.zeros(len(scatter))
     noise = baseline.covariance_array() - np.diag(own * prediction_factor(m))
     lowest = 1e-3 * np.diag(baseline.covariance_array())  # a scatter that was widened is more than what it adds
     noise[np.diag_indices_from(noise)] = np.maximum(np.diag(noise), lowest)
-    return np.asarray(noise + np.diag(scatter) / m)
+    return np.asarray(noise + scatter / m)
 
 
 def _ratios(each: Sequence[Baseline]) -> NormalPrior | None:

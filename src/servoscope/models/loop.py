@@ -120,6 +120,8 @@ class MonitorSettings(Settings):
     false_alarms_per_year: Positive = 1.0  # budget that the alarm is set for, after its delays
     # share of healthy recordings that the features beside the coefficients may call changed; 0: no features
     feature_false_alarms: Annotated[float, Field(ge=0.0, le=0.5)] = FEATURE_FALSE_ALARMS
+    # whether coefficients follow a warm-up that no column tells
+    hidden_warm_up: bool = False
     on_delay: NonNegative = 0.0  # how long a limit must be exceeded before the alarm is raised [s]
     # how long the alarm stays after the limit was exceeded last [s]; None: for the memory
     off_delay: NonNegative | None = None
@@ -223,6 +225,11 @@ class Loop(ShortRepr, Settings):
                 )
         if len(set(self.monitor.frequencies)) < len(self.monitor.frequencies):
             raise ValueError("[monitor] frequencies: a frequency stands twice, remove one")
+        if self.monitor.hidden_warm_up and self.columns.covariates:
+            raise ValueError(
+                "[monitor] hidden_warm_up: stands for a temperature that is not logged, leave it out beside "
+                "[columns.covariates]"
+            )
         if self.monitor.evaluation_rate > self.sample_rate:
             raise ValueError(
                 f"[monitor] evaluation_rate: {self.monitor.evaluation_rate:g} Hz is above"
@@ -334,6 +341,8 @@ class Loop(ShortRepr, Settings):
             del plain["implausible"]
         if self.monitor.feature_false_alarms == FEATURE_FALSE_ALARMS:
             del plain["monitor"]["feature_false_alarms"]  # came later: files and hashes of loops without it stay
+        if not self.monitor.hidden_warm_up:
+            del plain["monitor"]["hidden_warm_up"]
         return {key: value for key, value in plain.items() if value is not None}
 
     def hash(self) -> str:

@@ -25,7 +25,7 @@ class LaneInput(NamedTuple):
     """A block that is to be followed, with the state before it."""
 
     state: AssetState
-    signals: FloatArray  # t, r, u and y, shape (4, N)
+    signals: FloatArray  # t, r, u, y and covariates, shape (4 + k, N)
     restart: bool  # whether samples before it are missing
 
 
@@ -55,9 +55,10 @@ class BlockLanes:
         order = self._timebase.order_block(block[0], last)
         order.restart[:1] |= accepted.restart
         t, signals = block[0, order.rows], block[1:, order.rows]
-        r, u, y = np.where(np.isfinite(signals), signals, np.nan)
-        new, trace = monitor.run(state.monitor, r, u, y, order.restart)
-        checked, _ = quality.check_block(self._limits, state.quality, *block[:, order.order])
+        r, u, y, *covariates = np.where(np.isfinite(signals), signals, np.nan)
+        channels = dict(zip(monitor.loop.columns.covariates, covariates, strict=False))
+        new, trace = monitor.run(state.monitor, r, u, y, order.restart, channels=channels)
+        checked, _ = quality.check_block(self._limits, state.quality, *block[:4, order.order])
         last_t = order.t if np.isfinite(order.t) else None
         checked, _ = quality.tick(self._limits, checked, state.position.t if last_t is None else last_t)
         times = t[self._evaluated_samples(trace, state)]

@@ -162,11 +162,11 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
                 baseline = files[path] if point is None else files[path].at(point)
             except BaselineError as error:
                 raise ConfigError(f"[assets] {name}.point: {path.name}: {error}") from None
-            if baseline.covariates is not None:
+            if baseline.covariates is not None and not config.sources[settings.source].carries_covariates:
                 names = ", ".join(baseline.covariates.names)
                 raise ConfigError(
-                    f"[assets] {name}.baseline: {path.name} depends on {names}, which sources do not carry: learn "
-                    "operating points for the service"
+                    f"[assets] {name}.baseline: {path.name} depends on {names}, which source {settings.source} "
+                    "does not carry: learn operating points for it"
                 )
             try:
                 shared[path, point] = baseline, Monitor(baseline)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.covariates import hold_last
 from servoscope.detection.result import FaultEstimate, Verdict
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
@@ -156,6 +157,12 @@ def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) 
 
     Raises RecordingError if they cannot be used as one.
     """
-    t, r, u, y = np.concatenate([block.signals for block in blocks], axis=1)
+    t, r, u, y, *covariates = np.concatenate([block.signals for block in blocks], axis=1)
+    # a thermometer may tell less often than the motion is sampled
+    rows = [np.where(np.isfinite(c), c, np.nan) for c in covariates]
+    held = [hold_last(c[:, None], c[~np.isnan(c)][:1])[:, 0] for c in rows if not np.isnan(c).all()]
+    channels = dict(zip(baseline.loop.columns.covariates, held, strict=False))
     loop, start = baseline.loop, float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0
-    return clean(t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=loop.input_limits), start
+    limits = loop.input_limits
+    found = clean(t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=limits, channels=channels or None)
+    return found, start

@@ -6,7 +6,7 @@ Binary, little-endian:
          0      4  "SVSB"
          4      1  version, 1
          5      1  flags: 1 sender keeps blocks, 2 a time stamp per sample, 4 samples as binary32 instead of binary64
-         6      2  0
+         6      2  k, number of further columns: the covariates that the loop file names, in its order
          8      4  N, number of samples
         12      4  CRC-32 of all that follows
         16      8  stream
@@ -14,7 +14,7 @@ Binary, little-endian:
         32      8  oldest: of the blocks that the sender keeps; 0 where it keeps none
         40      8  time of the first sample, binary64 [UTC s]
         48      8  sample time, binary64 [s]; 0 where there is a time stamp per sample
-        56         time stamps, N binary64, if flag 2 is set; then r, u and y, N numbers each
+        56         time stamps, N binary64, if flag 2 is set; then r, u, y and k further columns, N numbers each
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import json
 import math
 import struct
 import zlib
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -38,7 +39,7 @@ BODY_HEADER = struct.Struct("<QQQdd")
 FLAG_RETAINED, FLAG_TIMES, FLAG_BINARY32 = 1, 2, 4
 MAX_COUNT = 2**63 - 1  # what a database can count
 MAX_TIME_S = 253402300800.0  # s: the year 10000, from which on calendars end
-JSON_KEYS = {"version", "stream", "sequence", "oldest", "t", "t0", "dt", "r", "u", "y"}
+JSON_KEYS = {"version", "stream", "sequence", "oldest", "t", "t0", "dt", "r", "u", "y", "covariates"}
 
 
 class DecodedBlock(NamedTuple):
@@ -55,45 +56,52 @@ def encode_binary(block: Block, oldest: int | None = None) -> bytes:
     uniform = dt > 0.0 and bool((stamps == stamps[0] + dt * np.arange(n)).all())
     flags = (0 if oldest is None else FLAG_RETAINED) | (0 if uniform else FLAG_TIMES)
     body = BODY_HEADER.pack(block.stream, block.sequence, oldest or 0, float(stamps[0]), dt if uniform else 0.0)
-    columns = [block.r, block.u, block.y] if uniform else [stamps, block.r, block.u, block.y]
+    columns = [*([] if uniform else [stamps]), block.r, block.u, block.y, *block.covariates]
     body += np.stack(columns).astype("<f8").tobytes()
-    return HEADER.pack(MAGIC, VERSION, flags, 0, n, zlib.crc32(body)) + body
+    return HEADER.pack(MAGIC, VERSION, flags, len(block.covariates), n, zlib.crc32(body)) + body
 
 
-def encode_json(block: Block, oldest: int | None = None) -> bytes:
-    """Return a block as a JSON message."""
+def encode_json(block: Block, oldest: int | None = None, covariates: Sequence[str] = ()) -> bytes:
+    """Return a block as a JSON message; `covariates`: their names."""
     plain: dict[str, Any] = {"version": VERSION, "stream": block.stream, "sequence": block.sequence}
     if oldest is not None:
         plain["oldest"] = oldest
     for name in "truy":
-        plain[name] = [x if math.isfinite(x) else None for x in getattr(block, name).tolist()]
+        plain[name] = _plain_column(getattr(block, name))
+    if covariates:
+        plain["covariates"] = dict(zip(covariates, map(_plain_column, block.covariates), strict=True))
     return json.dumps(plain, separators=(",", ":"), allow_nan=False).encode()
 
 
-def decode_block(asset: str, message: bytes, received_at: float = 0.0) -> DecodedBlock:
+def _plain_column(values: FloatArray) -> list[float | None]:
+    return [x if math.isfinite(x) else None for x in values.tolist()]
+
+
+def decode_block(asset: str, message: bytes, received_at: float = 0.0, covariates: Sequence[str] = ()) -> DecodedBlock:
     """Return the block of a message, binary or JSON, that came at `received_at` by the monotonic clock [s].
 
-    Memory is allocated for what is there, not for what a header announces. Raises MessageError if it is no block.
+    `covariates`: names of the further columns that it must have; without them, further columns are left out. Memory is
+    allocated for what is there, not for what a header announces. Raises MessageError if it is no block.
     """
     if message[:4] == MAGIC:
-        return _decode_binary(asset, message, received_at)
+        return _decode_binary(asset, message, received_at, covariates)
     if message[:1] in (b"{", b" ", b"\n", b"\r", b"\t"):
-        return _decode_json(asset, message, received_at)
+        return _decode_json(asset, message, received_at, covariates)
     raise MessageError("not a block", f"begins with {message[:8]!r}: neither a binary block nor a JSON object")
 
 
-def _decode_binary(asset: str, message: bytes, received_at: float) -> DecodedBlock:
+def _decode_binary(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> DecodedBlock:
     if len(message) < HEADER.size + BODY_HEADER.size:
         shortest = HEADER.size + BODY_HEADER.size
         raise MessageError("truncated", f"{len(message)} bytes, a binary block has at least {shortest}")
-    _, version, flags, zero, n, checksum = HEADER.unpack_from(message)
+    _, version, flags, further, n, checksum = HEADER.unpack_from(message)
     if version != VERSION:
         raise MessageError("version", f"binary block of version {version}, only {VERSION} is known")
-    if flags & ~(FLAG_RETAINED | FLAG_TIMES | FLAG_BINARY32) or zero:
-        raise MessageError("not a block", f"flags {flags} and {zero}: some of them have no meaning")
+    if flags & ~(FLAG_RETAINED | FLAG_TIMES | FLAG_BINARY32):
+        raise MessageError("not a block", f"flags {flags}: some of them have no meaning")
     width = 4 if flags & FLAG_BINARY32 else 8
     stamps = 8 * n if flags & FLAG_TIMES else 0
-    expected = HEADER.size + BODY_HEADER.size + stamps + 3 * width * n
+    expected = HEADER.size + BODY_HEADER.size + stamps + (3 + further) * width * n
     if len(message) != expected:
         kind = "truncated" if len(message) < expected else "oversized"
         raise MessageError(kind, f"{len(message)} bytes, {n} samples need {expected}")
@@ -103,8 +111,10 @@ def _decode_binary(asset: str, message: bytes, received_at: float) -> DecodedBlo
     stream, sequence, oldest, t0, dt = BODY_HEADER.unpack_from(body)
     at = BODY_HEADER.size + stamps
     t = np.frombuffer(body[BODY_HEADER.size : at], "<f8").astype(np.float64) if stamps else _uniform_times(t0, dt, n)
-    numbers = np.frombuffer(body[at:], f"<f{width}").astype(np.float64).reshape(3, -1)
-    signals = _join_columns(t, numbers)
+    numbers = np.frombuffer(body[at:], f"<f{width}").astype(np.float64).reshape(3 + further, -1)
+    if covariates and further != len(covariates):
+        raise MessageError("covariates", f"{further} further columns, expected {', '.join(covariates)}")
+    signals = _join_columns(t, numbers[: 3 + len(covariates)])
     return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, signals, received_at)
 
 
@@ -120,22 +130,26 @@ def _json_decoder() -> Any:
     return msgspec.json.Decoder(msgspec.defstruct("JsonBlock", fields, forbid_unknown_fields=True))
 
 
-def _decode_json(asset: str, message: bytes, received_at: float) -> DecodedBlock:
+def _decode_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> DecodedBlock:
     import msgspec
 
+    if covariates:
+        return _decode_loose_json(asset, message, received_at, covariates)
     try:
         found = _json_decoder().decode(message)
         columns = [found.t, found.r, found.u, found.y]
         lengths = {len(column) for column in columns if column is not None}
     except (msgspec.MsgspecError, RecursionError):
-        return _decode_loose_json(asset, message, received_at)  # which takes more, or says what is wrong
+        return _decode_loose_json(asset, message, received_at, ())  # which takes more, or says what is wrong
     if found.version != VERSION or found.t is None or len(lengths) > 1:
-        return _decode_loose_json(asset, message, received_at)
+        return _decode_loose_json(asset, message, received_at, ())
     signals = np.array(columns, dtype=np.float64)  # None becomes NaN
     return _build_block(asset, found.stream, found.sequence, found.oldest, signals, received_at)
 
 
-def _decode_loose_json(asset: str, message: bytes, received_at: float) -> DecodedBlock:
+def _decode_loose_json(
+    asset: str, message: bytes, received_at: float, covariates: Sequence[str]
+) -> DecodedBlock:
     try:
         plain = parse_json(message)
     except (ValueError, RecursionError) as error:
@@ -148,7 +162,13 @@ def _decode_loose_json(asset: str, message: bytes, received_at: float) -> Decode
         raise MessageError("version", f"version {str(plain.get('version'))[:20]!r}, only {VERSION} is known")
     stream, sequence = _parse_int(plain, "stream", 0), _parse_int(plain, "sequence", None)
     oldest = None if plain.get("oldest") is None else _parse_int(plain, "oldest", None)
-    numbers = np.stack(_parse_columns(plain, ("r", "u", "y")))
+    columns = dict(plain)
+    if covariates:
+        named = plain.get("covariates")
+        if not isinstance(named, dict) or not set(covariates) <= set(named):
+            raise MessageError("covariates", f"missing, expected {', '.join(covariates)}")
+        columns |= {f"covariates.{name}": named[name] for name in covariates}
+    numbers = np.stack(_parse_columns(columns, ("r", "u", "y", *(f"covariates.{name}" for name in covariates))))
     if "t" in plain:
         (t,) = _parse_columns(plain, ("t",))
     else:
@@ -205,7 +225,7 @@ def _uniform_times(t0: float, dt: float, n: int) -> FloatArray:
 
 
 def _join_columns(t: FloatArray, numbers: FloatArray) -> FloatArray:
-    """Return t, r, u and y as rows, shape (4, N)."""
+    """Return t, r, u, y and the covariates as rows, shape (4 + k, N)."""
     if t.size != numbers.shape[1]:
         kind = "lengths" if t.size else "empty"
         raise MessageError(kind, f"{t.size} time stamps, {numbers.shape[1]} samples" if t.size else "no samples")

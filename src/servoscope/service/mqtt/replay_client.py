@@ -192,9 +192,12 @@ class ReplayClient:
 
     def _enqueue(self, block: Block) -> None:
         blocks = self._queues[block.asset].blocks
-        encode = payload.encode_binary if self.settings.format == "binary" else payload.encode_json
         oldest = blocks[0].sequence if blocks else block.sequence
-        blocks.append(_UnacknowledgedBlock(block.sequence, encode(block, oldest)))
+        if self.settings.format == "binary":
+            message = payload.encode_binary(block, oldest)
+        else:
+            message = payload.encode_json(block, oldest, self._replay.covariates(block.asset))
+        blocks.append(_UnacknowledgedBlock(block.sequence, message))
 
     def _send(self, asset: str, one: _UnacknowledgedBlock) -> None:
         """Send a block, unless the client is still sending it to the broker itself."""

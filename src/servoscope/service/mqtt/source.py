@@ -50,10 +50,16 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
 
     visit_changes: ClassVar[Mapping[str, Any]] = {"client": None, "session_s": 1.0}  # which the broker does not keep
 
+    @property
+    def carries_covariates(self) -> bool:  # type: ignore[override]  # a plant's own messages do not
+        """Whether its blocks carry the columns under ``[columns.covariates]``."""
+        return self.payload is None
+
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
         """Return the source."""
         if self.payload is None:
-            return MqttSource(self, frozenset(assets), folder, name)
+            covariates = {asset: tuple(one.loop.columns.covariates) for asset, one in assets.items()}
+            return MqttSource(self, frozenset(assets), folder, name, covariates)
         return PlantSource(self, assets, folder, name)
 
 
@@ -69,8 +75,17 @@ class _AckHandle(NamedTuple):
 class MqttSource(BlockSource):
     """Receives blocks of several assets from a broker; `client` names its session, unless the settings do."""
 
-    def __init__(self, settings: MqttSourceSettings, assets: frozenset[str], folder: Path, client: str) -> None:
+    def __init__(
+        self,
+        settings: MqttSourceSettings,
+        assets: frozenset[str],
+        folder: Path,
+        client: str,
+        covariates: Mapping[str, tuple[str, ...]] | None = None,
+    ) -> None:
+        """`covariates`: names of the further columns that blocks of an asset carry."""
         super().__init__()
+        self._covariates = covariates or {}
         self.settings, self._assets = settings, assets
         self._client = create_mqtt_client(settings, folder, settings.client or client, manual_ack=True)
         self._broker = BrokerConnection(settings, settings.client or client)
@@ -147,7 +162,7 @@ class MqttSource(BlockSource):
             if len(message.payload) > self.settings.largest:
                 raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
             start = time.thread_time()
-            decoded = decode_block(asset, bytes(message.payload), time.monotonic())
+            decoded = decode_block(asset, bytes(message.payload), time.monotonic(), self._covariates.get(asset, ()))
             self._thread_s = time.thread_time()
             self._decode_s += self._thread_s - start
             self._check_order(decoded)

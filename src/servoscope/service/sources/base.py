@@ -130,6 +130,7 @@ class SourceSettings(Settings):
     asset_key: ClassVar[str] = ""  # the key of ``[assets.NAME]`` under which such a source finds an asset; empty: none
     asset_example: ClassVar[str] = ""  # what to write there
     visit_changes: ClassVar[Mapping[str, Any]] = {}  # values of keys for a client that only listens for a while
+    carries_covariates: ClassVar[bool] = False  # whether its blocks carry the columns under ``[columns.covariates]``
     _is_visit: bool = PrivateAttr(default=False)
 
     kind: str

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -37,6 +37,8 @@ class Block:
     completed_at: float = 0.0  # when its last sample was taken, by `time.monotonic` [s]: latency counts from there
     stream: int = 0  # name of the asset's stream, greater for a later one; 0: it has none, and there is only one
     retained: bool = False  # whether its sender retains it, and sends it again, until it is acknowledged
+    # columns of what the healthy coefficients depend on, as the loop file names them, shape (k, N)
+    covariates: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def start_time(self) -> float:
         """Return the time of its first sample that has one.
@@ -45,7 +47,8 @@ class Block:
         """
         shape = self.t.shape
         known = np.flatnonzero(np.isfinite(self.t)) if len(shape) == 1 else np.zeros(0, dtype=np.intp)
-        if not known.size or not shape == self.r.shape == self.u.shape == self.y.shape:
+        same = shape == self.r.shape == self.u.shape == self.y.shape
+        if not known.size or not same or any(x.shape != shape for x in self.covariates):
             raise RecordingError(f"{self.asset}: block {self.sequence}: t, r, u, y must have one length, t a number")
         return float(self.t[known[0]])
 
@@ -66,28 +69,37 @@ class Block:
         stream: int = 0,
         retained: bool = False,
     ) -> Block:
-        """Return the block of t, r, u and y as rows, shape (4, N), which it keeps."""
-        t, r, u, y = signals
+        """Return the block of t, r, u, y and the covariates as rows, shape (4 + k, N), which it keeps."""
+        (t, r, u, y), covariates = signals[:4], signals[4:]
         block = cls(asset, sequence, t, r, u, y, completed_at, stream, retained)
+        if len(covariates):
+            block = replace(block, covariates=covariates)
         vars(block)["signals"] = signals
         return block
 
     @cached_property
     def signals(self) -> FloatArray:
-        """t, r, u and y as rows, shape (4, N)."""
-        return np.stack([self.t, self.r, self.u, self.y])
+        """t, r, u, y and the covariates as rows, shape (4 + k, N)."""
+        return np.stack([self.t, self.r, self.u, self.y, *self.covariates])
 
     def digest(self, before: int = 0) -> int:
         """Return the CRC-32 of its samples, continued from that of the blocks before it."""
         return zlib.crc32(self.signals.tobytes(), before)
 
     def pack(self) -> bytes:
-        """Return its samples as bytes, from which `unpack` restores them bit by bit."""
-        return self.signals.astype("<f8", copy=False).tobytes()
+        """Return its samples as bytes, from which `unpack` restores them bit by bit.
+
+        Where there are covariates, a last byte tells their number: without it the length is a multiple of eight.
+        """
+        packed = self.signals.astype("<f8", copy=False).tobytes()
+        return packed + bytes([len(self.covariates)]) if len(self.covariates) else packed
 
     @classmethod
     def unpack(cls, asset: str, sequence: int, packed: bytes) -> Block:
         """Return the block of packed samples; raises RecordingError if they are not whole."""
-        if len(packed) % 32:
+        k = packed[-1] if len(packed) % 8 == 1 else 0
+        numbers = packed[:-1] if k else packed
+        if len(numbers) % (8 * (4 + k)):
             raise RecordingError(f"{asset}: block {sequence} in the store is torn: restart with --anew {asset}")
-        return cls.from_signals(asset, sequence, np.frombuffer(packed, dtype="<f8").astype(np.float64).reshape(4, -1))
+        signals = np.frombuffer(numbers, dtype="<f8").astype(np.float64).reshape(4 + k, -1)
+        return cls.from_signals(asset, sequence, signals)

@@ -31,6 +31,8 @@ class ReplaySettings(SourceSettings):
     asset_example: ClassVar[str] = "recordings: files = [...]"
 
     kind: Literal["replay"] = "replay"
+    carries_covariates: ClassVar[bool] = True
+
     speed: NonNegative = 1.0  # how many times as fast as they were recorded; 0: as fast as they are polled
     block: Seconds = 1.0  # length of a block [s]
     repeat: bool = False  # whether the recordings begin again when they have ended
@@ -52,6 +54,7 @@ class ReplayStream:
     recordings: tuple[Recording, ...]  # what is replayed, in this order
     block_samples: int  # per block, at most: blocks end where a recording does
     repeat: bool  # whether it begins again
+    covariates: tuple[str, ...] = ()  # channels that blocks carry beside r, u and y
 
     def locate(self, sequence: int) -> tuple[Recording, slice, float] | None:
         """Return a block's recording, its rows there, and when that recording begins in the stream [s].
@@ -78,7 +81,10 @@ class ReplayStream:
             return None
         recording, rows, start = found
         t = stream_start + start + (recording.t[rows] - recording.t[0])
-        return Block(asset, sequence, np.asarray(t), recording.r[rows], recording.u[rows], recording.y[rows])
+        block = Block(asset, sequence, np.asarray(t), recording.r[rows], recording.u[rows], recording.y[rows])
+        if not self.covariates:
+            return block
+        return replace(block, covariates=np.stack([recording.channels[name][rows] for name in self.covariates]))
 
 
 class ReplaySource(BlockSource):
@@ -95,7 +101,10 @@ class ReplaySource(BlockSource):
                     shared[path, loop.hash()] = read(path, loop)
             samples = max(1, round(settings.block * loop.sample_rate))
             recordings = tuple(shared[path, loop.hash()] for path in files)
-            self._streams[asset] = ReplayStream(recordings, samples, settings.repeat), math.nan
+            self._streams[asset] = (
+                ReplayStream(recordings, samples, settings.repeat, tuple(loop.columns.covariates)),
+                math.nan,
+            )
         self._queue: list[tuple[float, int, Block]] = []  # a heap of the next block of each asset: end, order, block
         self._clock_origin = (0.0, 0.0)  # the same moment by the monotonic clock and by that of the samples
 
@@ -107,6 +116,10 @@ class ReplaySource(BlockSource):
             self._streams[asset] = stream, at.stream_start
             self._schedule(order, asset, at.sequence + 1)
         self._clock_origin = time.monotonic(), float(self._queue[0][2].t[0]) if self._queue else 0.0
+
+    def covariates(self, asset: str) -> tuple[str, ...]:
+        """Return the names of the covariates that an asset's blocks carry."""
+        return self._streams[asset][0].covariates
 
     def _schedule(self, order: int, asset: str, sequence: int) -> None:
         stream, start = self._streams[asset]

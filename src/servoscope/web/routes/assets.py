@@ -183,7 +183,7 @@ def get_signals(context: ContextDep, asset: str, query: Annotated[SignalQuery, Q
     """Return its last seconds, or those before a time, as measured."""
     units = schemas.signal_units(find_asset(context, asset)[1].metadata.units)
     sequence, blocks = _read_blocks(context.store, asset, query.seconds, query.until)
-    t, *signals = np.concatenate([block.signals for block in blocks], axis=1) if blocks else np.zeros((4, 0))
+    t, *signals = np.concatenate([block.signals[:4] for block in blocks], axis=1) if blocks else np.zeros((4, 0))
     end = query.until if query.until is not None else t[-1] if t.size else 0.0
     within = (t > end - query.seconds) & (t <= end)
     t, signals = t[within], [signal[within] for signal in signals]

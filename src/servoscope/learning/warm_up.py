@@ -1,0 +1,122 @@
+"""Healthy recordings without a thermometer -> how a warm-up that nobody measures moves the coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.errors import NotEnoughError
+from servoscope.detection.covariates import CovariateModel, WarmUp
+from servoscope.detection.warm_up import BLOCK, NAME, BlockSums, WarmUpFit, fit_course
+from servoscope.estimation.pipeline import Pipeline, Regression
+from servoscope.estimation.tuning import TuningFit
+from servoscope.learning.covariates import CLEAR, STRETCH, refer_to_covariates
+from servoscope.models.lti import solve_scaled
+from servoscope.signals import Recording
+
+CONSTANTS_TRIED = 16  # time constants before the best is refined
+LONGEST = 20.0  # durations of a recording
+ROUNDS = 2  # courses make a model of the coefficients, which makes better courses
+LEAST = 5.0  # standard deviations by which the warmest recording has to warm
+
+
+def fit_warm_up(
+    pipeline: Pipeline, recordings: Sequence[Recording], regressions: Sequence[Regression], fit: TuningFit
+) -> tuple[CovariateModel, Sequence[Regression], TuningFit, Sequence[Recording]]:
+    """Return what `fit_covariates` does for a warm-up that nobody measured, and recordings that carry it as a channel.
+
+    The coefficients of short
+    stretches move along one direction (the first principal component in the metric of their noise); the time constant
+    is that with which courses along it explain the recordings best.
+
+    Raises NotEnoughError if no recording warms up, or what `fit_covariates` raises.
+    """
+    sums = [BlockSums.of(pipeline, rec) for rec in recordings]
+    power = max(float(np.mean([each.losses.mean() for each in sums])), 0.0)
+    blank = WarmUp(time_constant_s=1.0, power=power, variance=fit.tuning.R)
+    theta, model = _principal_direction(sums, fit)
+    warm_up = _with_time_constant(blank, sums, theta, model, max(rec.duration_s for rec in recordings))
+    for _ in range(ROUNDS):
+        courses = [fit_course(each, warm_up, theta, model) for each in sums]
+        warm_up = warm_up.model_copy(update={"variance": _variance(sums, courses)})
+        courses = [fit_course(each, warm_up, theta, model) for each in sums]
+        carried = [
+            replace(rec, channels={**rec.channels, NAME: each.at_samples(course.course, rec.samples)})
+            for rec, each, course in zip(recordings, sums, courses, strict=True)
+        ]
+        model, referred, fit_there = refer_to_covariates(pipeline, carried, regressions, fit, (NAME,))
+        theta = fit_there.tuning.theta
+    if max(np.ptp(one.course) / one.std.max() for one in courses) < LEAST:
+        raise NotEnoughError("no recording warms up enough to tell what warmth does: record a start from cold")
+    return model.model_copy(update={"warm_up": warm_up}), referred, fit_there, carried
+
+
+def _principal_direction(sums: Sequence[BlockSums], fit: TuningFit) -> tuple[FloatArray, CovariateModel]:
+    """Return the coefficients in the middle of what the stretches show, and a straight line through them."""
+    found, whose = [], []
+    for i, each in enumerate(sums):
+        blocks = max(round(STRETCH / BLOCK), 1)
+        for first in range(0, len(each.first) - blocks + 1, blocks):
+            A, b = each.normal[first : first + blocks].sum(axis=0), each.moment[first : first + blocks].sum(axis=0)
+            if np.linalg.matrix_rank(A / np.sqrt(np.outer(np.diag(A), np.diag(A)))) == len(A):
+                found.append((solve_scaled(A, b), A))
+                whose.append(i)
+    if len(found) < 3:
+        raise NotEnoughError("too short to tell what a warm-up does: record longer, from a cold start on")
+    theta, A = (np.array(column) for column in zip(*found, strict=True))
+    std = np.sqrt(fit.tuning.R * np.array([np.diag(np.linalg.inv(one)) for one in A]))
+    proportional = (np.sign(theta) == np.sign(theta[0])).all(axis=0) & (np.abs(theta) > CLEAR * std).all(axis=0)
+    size = np.where(proportional, theta.mean(axis=0), 1.0)
+    y = np.where(proportional, np.log(np.abs(np.where(proportional, theta, 1.0))), theta)
+    root = np.linalg.cholesky((A * np.outer(size, size)).mean(axis=0)).T
+    off = y - y.mean(axis=0)
+    direction = np.linalg.svd(off @ root.T, full_matrices=False)[2][0]
+    w, v = off @ root.T @ direction, np.linalg.solve(root, direction)
+    if sum(float(np.diff(w[np.array(whose) == i]).sum()) for i in set(whose)) < 0.0:
+        w, v = -w, -v  # warmer is later
+    half, middle = 0.5 * float(np.ptp(w)), 0.5 * float(w.max() + w.min())
+    origin = y.mean(axis=0) + middle * v
+    return np.where(proportional, np.sign(theta[0]) * np.exp(origin), origin), _line(half * v, proportional)
+
+
+def _line(slope: FloatArray, proportional: BoolArray) -> CovariateModel:
+    n = len(slope)
+    return CovariateModel(
+        names=(NAME,),
+        low=(0.0,),
+        high=(1.0,),
+        degrees=(1,),
+        proportional=tuple(proportional.tolist()),
+        slopes=(tuple(slope.tolist()),),
+        covariance=((0.0,) * n,) * n,
+    )
+
+
+def _with_time_constant(
+    blank: WarmUp, sums: Sequence[BlockSums], theta: FloatArray, model: CovariateModel, duration_s: float
+) -> WarmUp:
+    """Return the warm-up with the time constant that leaves least of the recordings unexplained."""
+    from scipy.optimize import minimize_scalar
+
+    def made(log_s: float) -> WarmUp:
+        return blank.model_copy(update={"time_constant_s": float(np.exp(log_s))})
+
+    def cost(log_s: float) -> float:
+        return sum(fit_course(each, made(log_s), theta, model).cost for each in sums)
+
+    tried = np.linspace(np.log(sums[0].seconds), np.log(LONGEST * duration_s), CONSTANTS_TRIED)
+    best = int(np.argmin([cost(one) for one in tried]))
+    bounds = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
+    return made(float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.01}).x))
+
+
+def _variance(sums: Sequence[BlockSums], courses: Sequence[WarmUpFit]) -> float:
+    """Return the variance of eta's residual that sums over blocks show, whatever its colour within them."""
+    each = [
+        np.trace(np.linalg.solve(one.normal.sum(axis=0), fit.residual.T @ fit.residual)) / one.moment.shape[1]
+        for one, fit in zip(sums, courses, strict=True)
+    ]
+    return float(np.mean(each))
