@@ -17,6 +17,7 @@ import pytest
 import sqlalchemy as sa
 from reliability.servers import Postgres, programs
 
+from servoscope.cli import progress
 from servoscope.service.store import Store, tables
 
 pytest_plugins = ("opening",)  # the browser, and what stands before it
@@ -26,6 +27,7 @@ hypothesis.settings.register_profile("servoscope", derandomize=True, deadline=No
 hypothesis.settings.load_profile("servoscope")
 
 
+progress.LINE_INTERVAL_S = 3600.0  # what a command says on stderr must not depend on how fast the machine is
 # one cache of compiled kernels for all workers and subprocesses
 os.environ.setdefault("NUMBA_CACHE_DIR", str(PROJECT / ".cache" / "numba"))
 

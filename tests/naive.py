@@ -309,15 +309,17 @@ def inside(points: Array, polygon: Array) -> npt.NDArray[np.bool_]:
 
 
 def cusums(
-    e: Array, psi: Array, counts: npt.NDArray[np.bool_], changes: Array, limits: Array, every: int, steps: int
-) -> tuple[Array, Array]:
+    e: Array, psi: Array, counts: npt.NDArray[np.bool_], changes: Array, limits: Array, every: int, steps: int,
+    by_evaluation: bool = False,
+) -> tuple[Array, Array]:  # fmt: skip
     """Add up log-likelihood ratios of "shifted by psi' change" against "white"; return level and crossed row by row.
 
     `e` (steps,) and `psi` (steps, m) are whitened, `counts` says where a sample speaks. `level` is the largest CUSUM
     relative to its limit since the evaluation before, `crossed` the sample (from 1) at which one rose to its limit.
+    With `by_evaluation` the CUSUMs step at the last sample of an evaluation, by all that came since the one before.
     """
     g = np.zeros(len(limits))
-    now, peak, since = 0.0, 0.0, 0
+    now, peak, since, gain = 0.0, 0.0, 0, np.zeros(len(limits))
     rows = []
     for k in range(steps):
         if k % every == 0:
@@ -325,7 +327,9 @@ def cusums(
             since = since if now >= 1.0 else 0
         if counts[k]:
             m = changes @ psi[k]
-            g = np.clip(g + m * (np.clip(e[k], -4.0, 4.0) - m / 2.0), 0.0, 2.0 * limits)
+            gain = gain + m * (np.clip(e[k], -4.0, 4.0) - m / 2.0)
+        if (k + 1) % every == 0 if by_evaluation else counts[k]:
+            g, gain = np.clip(g + gain, 0.0, 2.0 * limits), np.zeros(len(limits))
             now = float((g / limits).max())
             peak = max(peak, now)
             if now >= 1.0 and not since:

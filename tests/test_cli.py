@@ -6,6 +6,8 @@ import json
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from commands import loop_with, one_line, prepared, rows_of, run, write_rows
+from servoscope.cli import progress
 
 PROJECT = Path(__file__).resolve().parent.parent
 
@@ -250,6 +253,27 @@ def test_help_and_version_start_fast_and_without_colour() -> None:
     environment = {**os.environ, "PYTHONPATH": str(PROJECT / "src")}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_stderr_that_is_no_terminal_says_now_and_then_what_goes_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "LINE_INTERVAL_S", 0.001)
+    out = err = ""
+    with progress.show_steps(1, 2) as steps:
+        steps.begin("press.csv")
+        steps.advance("recursion")
+        while "press.csv: recursion, " not in err:
+            time.sleep(0.001)
+            said = capsys.readouterr()
+            out, err = out + said.out, err + said.err
+    with progress.show_count() as show:
+        show("items", 3, 40)
+        while "items: 3 of 40, " not in err:
+            time.sleep(0.001)
+            err += capsys.readouterr().err
+    capsys.readouterr()
+    assert not out and not any("progress" in thread.name for thread in threading.enumerate())
 
 
 def test_a_reader_that_leaves_is_no_error(made: Path) -> None:

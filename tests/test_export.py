@@ -100,6 +100,11 @@ def test_without_the_sequential_test(tmp_path: Path) -> None:
     same(Drive.built(baseline, tmp_path), baseline, 20_000)
 
 
+def test_with_a_step_of_the_sequential_test_per_evaluation(tmp_path: Path) -> None:
+    baseline = fresh(altered(demo(), sequential_step="evaluation"))
+    same(Drive.built(baseline, tmp_path), baseline, 20_000)
+
+
 def test_delays_of_the_alarm(tmp_path: Path) -> None:
     baseline = fresh(altered(demo(), on_delay=0.3, off_delay=1.5))
     same(Drive.built(baseline, tmp_path), baseline, 20_000)

@@ -43,9 +43,9 @@ def recorded(loop: Loop, seed: int, seconds: float = 60.0, kind: str = "multisin
 
 
 @functools.cache
-def learned(kind: str = "multisine", seed: int = 1) -> Baseline:
+def learned(kind: str = "multisine", seed: int = 1, step: str = "update") -> Baseline:
     """Return a baseline of one healthy minute with a budget of one false alarm a year."""
-    loop = loop_of(false_alarms_per_year=1.0)
+    loop = loop_of(false_alarms_per_year=1.0, sequential_step=step)
     return learn_baseline(loop, [recorded(loop, seed, kind=kind)])
 
 
@@ -66,10 +66,10 @@ class TestKernel:
         g = pipeline.regression(r, u, y, recording.restart)
         return g.eta, g.phi
 
-    @pytest.mark.parametrize("case", ["every sample", "every fourth sample"])
-    def test_equals_its_slow_double(self, rig: dict[str, Any], case: str) -> None:
-        rate, cutoff = (100.0, 10.0) if case == "every sample" else (400.0, 10.0)
-        loop = Loop.from_dict(rig | {"sample_rate": rate, "monitor": {"cutoff": cutoff}})
+    @pytest.mark.parametrize("decides", ["update", "evaluation"])
+    @pytest.mark.parametrize("rate", [100.0, 400.0], ids=["every sample", "every fourth sample"])
+    def test_equals_its_slow_double(self, rig: dict[str, Any], rate: float, decides: str) -> None:
+        loop = Loop.from_dict(rig | {"sample_rate": rate, "monitor": {"cutoff": 10.0, "sequential_step": decides}})
         pipeline, n = Pipeline.of(loop), 4
         g = pipeline.regression(*(getattr(recorded(loop, 1, 20.0), x) for x in ("r", "u", "y", "restart")))
         tuning = fit_tuning(pipeline, [g]).tuning
@@ -106,7 +106,9 @@ class TestKernel:
             for lag in range(1, LAGS + 1):
                 psi[at[lag:], n - 1 + lag] = psi[at[:-lag], n - 1]
             counts[at[warm:]] = True
-        level, crossed = naive.cusums(e, psi, counts, changes, limits, pipeline.every, len(r))
+        level, crossed = naive.cusums(
+            e, psi, counts, changes, limits, pipeline.every, len(r), by_evaluation=decides == "evaluation"
+        )
         turn = (np.arange(len(r)) + 1) % pipeline.stride == 0
         assert np.array_equal(g.ok, ok & turn)
         assert whitening_filter(model)[3] == warm
@@ -114,9 +116,12 @@ class TestKernel:
         assert ours.level == pytest.approx(level, rel=1e-6, abs=1e-6)
         assert np.array_equal(ours.crossed, crossed)
 
-    @pytest.mark.parametrize("cuts", [[1], [99, 100, 3333], [3101, 3105, 3107]])
-    def test_blocks_leave_the_same_bits(self, cuts: list[int]) -> None:
-        baseline = learned()
+    @pytest.mark.parametrize(
+        "cuts, step",
+        [([1], "update"), ([99, 100, 3333], "update"), ([3101, 3105, 3107], "update"), ([99, 100, 3105], "evaluation")],
+    )
+    def test_blocks_leave_the_same_bits(self, cuts: list[int], step: str) -> None:
+        baseline = learned(step=step)
         monitor, fault = Monitor(baseline), FaultEvent("C_ie", 1.2, 31.0)
         recording = recorded(baseline.loop, 5, 40.0, "multisine", fault)
         recording.y[1500], recording.restart[2000] = np.nan, True
@@ -131,6 +136,35 @@ class TestKernel:
             joined = np.concatenate([getattr(part, name) for part in parts])
             assert np.array_equal(joined, getattr(whole, name), equal_nan=True), name
         assert whole.exceeded[-1] and whole.crossed[-1] == pytest.approx(31.5, abs=0.5)
+
+    @pytest.mark.slow
+    def test_all_ways_to_run_leave_the_same_bits_by_evaluation(self) -> None:
+        """Sample by sample, alone, and in a fleet beside an asset whose changes lie in more directions."""
+        baseline = learned(step="evaluation")
+        fields = learned().model_dump(by_alias=True) | {"loop": baseline.loop_settings}
+        other = Baseline.model_validate(fields)  # its changes were not made of few
+        counts = [
+            len(test.directions)
+            for each in (baseline, other)
+            if (test := each.cusum_constants(each.pipeline())) is not None
+        ]
+        assert counts[0] < counts[1] == 4 + LAGS
+        recording = recorded(baseline.loop, 5, 40.0, "multisine", FaultEvent("C_ie", 1.2, 31.0))
+        recording.y[[1500, 1507]] = np.nan
+        signals = recording.r, recording.u, recording.y
+        monitor = Monitor(baseline)
+        state, trace = monitor.run(monitor.init(), *signals)
+        stepped = monitor.init()
+        for sample in zip(*(each.tolist() for each in signals), strict=True):
+            monitor.step(stepped, *sample)
+        assert np.array_equal(stepped, state)
+        alike = Monitor([baseline] * 11)
+        together, many = alike.run(alike.init(), *(np.tile(each, (11, 1)) for each in signals))
+        assert np.array_equal(together[10], state) and np.array_equal(many.level[10], trace.level)
+        mixed = Monitor([other, baseline])
+        _, both = mixed.run(mixed.init(), *(np.tile(each, (2, 1)) for each in signals))
+        assert np.array_equal(both.crossed[1], trace.crossed, equal_nan=True)
+        assert np.allclose(both.level[1], trace.level, rtol=1e-9, atol=1e-12) and trace.level.max() == 2.0
 
     def test_a_gap_is_silent_until_the_whitening_has_forgotten_it(self) -> None:
         baseline = learned()
@@ -165,11 +199,12 @@ class TestAlarms:
         getattr(recording, name)[[2000, 3500]] += size * std
         assert estimates(baseline, recording).level.max() < 1.0
 
-    def test_a_leak_is_told_within_two_thirds_of_a_second(self) -> None:
+    @pytest.mark.parametrize("step", ["update", "evaluation"])
+    def test_a_leak_is_told_within_two_thirds_of_a_second(self, step: str) -> None:
         """At a budget of one false alarm a year; the median over ten recordings and baselines of their own."""
         delays = []
         for seed in range(10):
-            baseline = learned(seed=1 + seed % 2)
+            baseline = learned(seed=1 + seed % 2, step=step)
             recording = recorded(baseline.loop, 100 + seed, 40.0, "multisine", FaultEvent("C_ie", 1.2, 30.0))
             crossed = estimates(baseline, recording).crossed
             assert not crossed[:300].any() and crossed[-1] > 0
@@ -187,10 +222,10 @@ class TestAlarms:
         )
         assert trace.t[np.argmax(trace.statistic > trace.threshold)] >= trace.t[first]
 
-    @pytest.mark.parametrize("kind", ["multisine", "profile"])
-    def test_keeps_its_budget(self, kind: str) -> None:
+    @pytest.mark.parametrize("kind, step", [("multisine", "update"), ("profile", "update"), ("profile", "evaluation")])
+    def test_keeps_its_budget(self, kind: str, step: str) -> None:
         """Sixty alarms an hour are asked for; noise and plant are known, so that nothing but the limits is tested."""
-        loop, per_hour, hours = loop_of(), 60.0, 4
+        loop, per_hour, hours = loop_of(sequential_step=step), 60.0, 4
         pipeline, plant = Pipeline.of(loop), loop.plant
         healthy = recorded(loop, 1, kind=kind)
         tuning = fit_tuning(pipeline, [pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)]).tuning

@@ -1,9 +1,12 @@
-"""Progress bars on stderr, if that is a terminal, and what is compiled meanwhile."""
+"""Progress on stderr: bars on a terminal, with what is compiled meanwhile; elsewhere a line now and then."""
 
 from __future__ import annotations
 
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -12,9 +15,11 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, ProgressColumn
 
+LINE_INTERVAL_S = 10.0  # from one line to the next, where stderr is no terminal: what takes less says nothing
+
 
 class StepProgress:
-    """A progress bar over some parts, each in so many steps, or none; made by `show_steps`."""
+    """A progress bar over some parts, each in so many steps, or lines instead of it; made by `show_steps`."""
 
     def __init__(self, bar: Progress | None, parts: int, each: int) -> None:
         self._bar, self._each = bar, each
@@ -47,21 +52,26 @@ class StepProgress:
         finally:
             self._bar.start()
 
+    def describe(self) -> str:
+        """Return what goes on."""
+        return ": ".join(filter(None, (self._part_name, self._step)))
+
     def _show(self, more: str = "") -> None:
         if self._bar is not None and self._task is not None:
-            text = ": ".join(filter(None, (self._part_name, self._step))) + more
-            self._bar.update(self._task, completed=self._part * self._each + self._steps_done, description=text)
+            done = self._part * self._each + self._steps_done
+            self._bar.update(self._task, completed=done, description=self.describe() + more)
 
 
 @contextmanager
 def show_steps(parts: int, each: int) -> Iterator[StepProgress]:
-    """Show a progress bar on stderr, if that is a terminal, and take it away again at the end."""
+    """Show a progress bar on stderr, if that is a terminal, and take it away again at the end; else lines."""
     from rich.progress import SpinnerColumn
 
     with _bar(SpinnerColumn()) as bar:
         steps = StepProgress(bar, parts, each)
         if bar is None:
-            yield steps
+            with _lines(steps.describe):
+                yield steps
             return
         from servoscope.core.jit import on_compilation  # loads Numba: only where a bar is shown
 
@@ -71,25 +81,48 @@ def show_steps(parts: int, each: int) -> Iterator[StepProgress]:
 
 @contextmanager
 def show_count() -> Iterator[Callable[[str, int, int], None]]:
-    """Show how many of many are done, and how long the rest will take, on stderr if that is a terminal."""
+    """Show how many of many are done on stderr, and on a terminal how long the rest will take."""
     from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
     with _bar(after=(MofNCompleteColumn(), TimeRemainingColumn())) as bar:
         task = bar.add_task("") if bar is not None else None
+        now = ""
 
         def show(what: str, done: int, total: int) -> None:
+            nonlocal now
+            now = f"{what}: {done} of {total}"
             if bar is not None and task is not None:
                 bar.update(task, description=what, completed=done, total=total)
 
-        yield show
+        with nullcontext() if bar is not None else _lines(lambda: now):
+            yield show
 
 
 @contextmanager
 def show_spinner(what: str) -> Iterator[None]:
-    """Show that something goes on, on stderr if that is a terminal."""
+    """Show on stderr that something goes on."""
     console = _terminal()
-    with console.status(what) if console is not None else nullcontext():
+    with console.status(what) if console is not None else _lines(lambda: what):
         yield
+
+
+@contextmanager
+def _lines(describe: Callable[[], str]) -> Iterator[None]:
+    """Write what goes on to stderr as a line every `LINE_INTERVAL_S`, from a thread: a step may take long."""
+    ended, begin = threading.Event(), time.monotonic()
+
+    def write() -> None:
+        with suppress(OSError, ValueError):  # nobody reads it any more
+            while not ended.wait(LINE_INTERVAL_S):
+                print(f"{describe() or 'working'}, {time.monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
+
+    writer = threading.Thread(target=write, name="servoscope-progress", daemon=True)
+    writer.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        writer.join()
 
 
 def _terminal() -> Console | None:

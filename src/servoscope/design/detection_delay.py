@@ -27,25 +27,31 @@ from servoscope.simulation import simulate
 
 @kernel
 def cusum_crossings(
-    shift: FloatArray, noise: FloatArray, heard: FloatArray, limits: FloatArray, since: int
+    shift: FloatArray, noise: FloatArray, heard: FloatArray, limits: FloatArray, since: int, together: int
 ) -> FloatArray:
     """Return how many updates after `since` the first CUSUM reaches its limit, shape (M,); infinity if none does.
 
     `shift`: what the change adds to the whitened residual, shape (K,); `noise`: realisations of the residual of a
-    healthy loop, shape (M, K); `heard`: shifts that the members listen for, shape (q, K); `limits`: shape (q,).
+    healthy loop, shape (M, K); `heard`: shifts that the members listen for, shape (q, K); `limits`: shape (q,);
+    `together`: updates that a step of the CUSUMs takes together.
     """
     M, K = noise.shape
     q = len(limits)
     found = np.full(M, np.inf)
-    g = np.zeros(q)
+    g, gain = np.zeros(q), np.zeros(q)
     for i in range(M):
         g[:] = 0.0
+        gain[:] = 0.0
         for k in range(K):
             e = min(max(noise[i, k] + shift[k], -CLIP), CLIP)
             over = False
             for j in range(q):
                 s = heard[j, k]
-                g[j] = max(g[j] + s * (e - 0.5 * s), 0.0)
+                gain[j] += s * (e - 0.5 * s)
+                if (k + 1) % together != 0:
+                    continue
+                g[j] = max(g[j] + gain[j], 0.0)
+                gain[j] = 0.0
                 if g[j] >= limits[j]:
                     over = True
                     g[j] = limits[j]
@@ -115,9 +121,9 @@ class AlarmSimulator:
             return AlarmDelays(late)
         shift = self._shift(self.expectation.regression(self.plant, faulty, self.onset))
         chosen = self._reachable_cusums(shift)
-        updates = cusum_crossings(
-            shift, self.residuals, self.cusum_shifts[chosen], self.limits[chosen], self.onset_update
-        )
+        heard, limits = self.cusum_shifts[chosen], self.limits[chosen]
+        together = self.pipeline.cusum_updates
+        updates = cusum_crossings(shift, self.residuals, heard, limits, self.onset_update, together)
         evaluations = np.ceil(updates * self.pipeline.stride / every) + on
         return AlarmDelays(np.minimum(late, evaluations * every / rate))
 

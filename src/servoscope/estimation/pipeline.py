@@ -131,6 +131,11 @@ class Pipeline:
         return self.memory_samples / self.stride
 
     @property
+    def cusum_updates(self) -> int:
+        """Updates that a step of the sequential test takes together."""
+        return max(self.every // self.stride, 1) if self.loop.monitor.sequential_step == "evaluation" else 1
+
+    @property
     def memory_samples(self) -> float:
         """Memory of the estimator in samples."""
         return self.loop.monitor.memory * self.loop.sample_rate

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.kernel.buffers import BufferPool
 from servoscope.estimation.kernel.build import build_kernels
-from servoscope.estimation.kernel.cusum import LAGS, CusumConstants
+from servoscope.estimation.kernel.cusum import LAGS, CusumConstants, evaluation_weights
 from servoscope.estimation.kernel.sample_steps import CUSUM_BATCH, HEADER_SIZE, SAMPLE, KernelSizes, KernelSpec
 from servoscope.estimation.kernel.sparse_lti import pack_coefficients, sparsity_pattern
 from servoscope.models.lti import LinearSystem
@@ -274,7 +274,7 @@ def structure_key(c: RecursionConstants) -> Hashable:
     """Return the sizes and settings that assets of one fleet must have in common."""
     spec = _kernel_spec([c])
     sizes = spec.sizes._replace(lags=0, memory=0, watched=0, floats=0)
-    return spec.estimator, sizes, spec.bank, c.stride, c.every, c.memory
+    return spec.estimator, sizes, spec.directions > 0, spec.bank, c.stride, c.every, c.memory
 
 
 def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
@@ -285,6 +285,8 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
     nxs = len(shadows[0].A) if shadows else 0
     memory = max((_whitening_order(c.watch) for c in watched if c.watch), default=0)
     count = max((len(c.watch.limits) for c in watched if c.watch), default=0)
+    q = max((len(c.watch.directions) for c in watched if c.watch), default=0)
+    sums = {"psi": q, "late": LAGS, "sums": q * (q + 3) // 2} if q else {"psi": (n + LAGS) * bool(nxs)}
     lags = max(len(c.a) for c in constants)
     speed = 0
     if first.codes or first.only_moving or first.still_speed > 0.0:
@@ -295,7 +297,7 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
         {
             **{"power": 1, "drift": 1, "level": 1, "peak": 1, "x": len(first.bank.A), "velocity": 2 * bool(speed)},
             **{"theta": n, "P": 0 if first.steady else n * n, "S": n * (n + 1) // 2, "M": n * lags},
-            **{"Psi": n * n * start, "shadow": nxs, "white": (n + 1) * memory, "psi": (n + LAGS) * bool(nxs)},
+            **{"Psi": n * n * start, "shadow": nxs, "white": ((q or n) + 1) * memory, **sums},
         }
     )
     bank, shadow = sparsity_pattern([c.bank for c in constants]), sparsity_pattern(shadows) if shadows else ((), ())
@@ -312,6 +314,7 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
                 "rate": 0 if start else 1,
                 "response": frequencies * 2 * (n + 1),
                 "shapes": len(first.shapes),
+                **({"directions": q * (n + LAGS)} if q else {}),
             },
         }
     )
@@ -348,7 +351,8 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
         return np.pad(x, (0, size - len(x)))
 
     shadow = pad(np.zeros(0), dict(spec.at)["white"] - dict(spec.at)["shadow"] + 1 + 2 * memory)
-    members = np.zeros((n + LAGS + 1, watched))
+    directions = np.zeros((spec.directions, n + LAGS))
+    members = np.zeros((spec.sums or n + LAGS + 1, watched))
     if test is not None:
         system = _shadow_system(c)
         apart = np.linalg.solve(c.basis, test.theta / c.scale) - c.theta
@@ -358,7 +362,11 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
                 *(pad(test.numerator[1 : 1 + memory], memory), pad(test.denominator[1 : 1 + memory], memory)),
             ]
         )
-        members[:, : len(test.limits)] = np.vstack([test.changes.T / test.limits, -0.5 * test.limits])
+        if spec.directions:
+            directions[: len(test.directions)] = test.directions
+            members[:, : len(test.limits)] = evaluation_weights(test.changes, directions, test.limits)
+        else:
+            members[:, : len(test.limits)] = np.vstack([test.changes.T / test.limits, -0.5 * test.limits])
     evaluation: list[Any] = []
     if view is not None:
         E = view.response.reshape(-1, 2, n)
@@ -372,6 +380,15 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
             *([float(x) for x in (*counts, *gates, c.memory, 1.0 / c.memory, c.R, test.warm if test else 0)],),
             *(v.A.ravel(), v.B[:, 0], v.C[0], v.D[0], v.steady[:, 0]),
             *(pack_coefficients(spec.bank, c.bank), c.bank.steady.ravel(), np.zeros(0) if c.steady else c.P_d.ravel()),
-            *([c.variance], pad(c.a, lags), pad(c.heads, lags), shadow, *evaluation, c.shapes, members.ravel()),
+            *(
+                [c.variance],
+                pad(c.a, lags),
+                pad(c.heads, lags),
+                shadow,
+                *evaluation,
+                c.shapes,
+                directions.ravel(),
+                members.ravel(),
+            ),
         ]
     )

@@ -164,7 +164,7 @@ def _code(made: ExportConstants, name: str, single: bool) -> dict[str, str]:
         "locals": _locals(size, single),
         "before": _before(made.recursion.constants[0].every, bool(size.shadow)),
         "update": f"update_estimate(s, h, v, shadow, e{'' if size.steady else ', &state->numbers[PRIVATE]'});",
-        "after": _after() if size.watched else "",
+        "after": _after(made) if size.watched else "",
         "initial": "\n".join(
             f"    state->numbers[{i - HEADER_SIZE}] = {c_literal(start[i], single)};" for i in np.flatnonzero(start)
         ),
@@ -225,10 +225,12 @@ def _before(every: int, shadow: bool) -> str:
     return f"    if ((number % {every}u) == 0u) {{\n        begin_evaluation(s, h);\n    }}" if shadow else ""
 
 
-def _after() -> str:
-    lines = (
-        "store_residual(s, h, status, e, w, when);",
-        "top[0] = update_cusums(g, w);",
-        "update_alarm(s, h, top, when);",
-    )
+def _after(made: ExportConstants) -> str:
+    lines = ["store_residual(s, h, status, e, w, when);"]
+    if made.spec.sums:
+        every, sums = made.recursion.constants[0].every, dict(made.spec.to)["sums"]
+        lines += [f"if (((number + 1u) % {every}u) == 0u) {{", f"    top[0] = update_cusums(g, &s[{sums}]);"]
+        lines += ["    end_evaluation(s, h, top);", "}"]
+    else:
+        lines += ["top[0] = update_cusums(g, w);", "update_alarm(s, h, top, when);"]
     return "\n".join(f"    {line}" for line in lines)

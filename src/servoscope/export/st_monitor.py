@@ -64,7 +64,7 @@ def _words(made: ExportConstants) -> dict[str, Any]:
         "constant": len(made.table),
     }
     return (
-        _blocks(texts)
+        _blocks(texts, made.recursion.constants[0].every if made.spec.sums else 0)
         | {f"last_{each}": count - 1 for each, count in last.items()}
         | {
             "rate": f"{baseline.loop.sample_rate:g}",
@@ -101,11 +101,17 @@ def save_st(baseline: Baseline, folder: str | Path, name: str = NAME, *, only_co
     return path
 
 
-def _blocks(texts: StepTexts) -> dict[str, str]:
-    """Return the statements of each step, indented as its place in the template asks."""
+def _blocks(texts: StepTexts, by_evaluation: int) -> dict[str, str]:
+    """Return the statements of each step, indented as its place in the template asks.
+
+    `by_evaluation`: samples of an evaluation, if CUSUMs step once in each, else 0.
+    """
     depths = {"begin_filters": 2, "advance_filters": 1, "update_estimate": 1, "reset_noise": 1, "evaluate": 1}
     blocks = {name: _indented(texts[name], depth) for name, depth in depths.items()}
-    test = [*texts["store_residual"], *texts["update_cusums"], *texts["update_alarm"]]
+    test = [*texts["update_cusums"], *texts["update_alarm"]]
+    if test and by_evaluation:
+        test = [f"IF evaluation_phase + 1 >= {by_evaluation} THEN", *(f"    {line}" for line in test), "END_IF;"]
+    test = [*texts["store_residual"], *test]
     begin = texts["begin_evaluation"]
     if begin:
         begin = ["IF evaluation_phase = 0 THEN", *(f"    {line}" for line in begin), "END_IF;"]

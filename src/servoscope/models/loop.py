@@ -115,6 +115,9 @@ class MonitorSettings(Settings):
     update_when: Literal["auto", "always", "moving"] = "auto"
     rest_speed: NonNegative = 0.0  # speed [output per s] below which the output counts as resting
     evaluation_rate: Positive = 10.0  # how often iFRF, residual and statistic are evaluated [Hz]
+    # when the sequential test decides: at every ``update`` of the estimator, or once per ``evaluation``, by what the
+    # updates since the one before sum up to; that takes less time, and alarms come up to an evaluation later
+    sequential_step: Literal["update", "evaluation"] = "update"
     # monitored frequencies [Hz]
     frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
     false_alarms_per_year: Positive = 1.0  # budget that the alarm is set for, after its delays

@@ -11,7 +11,6 @@ from typing import Any
 from servoscope.core.jit import inline, kernel, make_transpose, specialise, trace_function
 from servoscope.estimation import estimators
 from servoscope.estimation.kernel import run, tile, transpose
-from servoscope.estimation.kernel.cusum import LAGS
 from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
 from servoscope.estimation.kernel.sample_steps import CUSUM_BATCH, HEADER_SIZE, TILE, KernelSpec, SampleSteps
 
@@ -19,10 +18,13 @@ from servoscope.estimation.kernel.sample_steps import CUSUM_BATCH, HEADER_SIZE, 
 EVALUATION_STEPS = "write_evaluation", "write_response", "write_internal"
 SAMPLE_STEPS = (
     *("begin_evaluation", "is_undisturbed", "count_sample", "advance_filters", "is_update", "update_estimate"),
-    "store_residual",
+    *("store_residual", "end_evaluation"),
 )
 # loops over the samples of a tile, and the arrays that stay in registers meanwhile
-TILE_LOOPS = {"accumulate_size": ("e",), "update_undisturbed": ("s", "h"), "update_alarm": ("s", "h")}
+TILE_LOOPS = {
+    **{"accumulate_size": ("e",), "advance_shadow": ("s",), "update_undisturbed": ("s", "h")},
+    **{"whiten_undisturbed": ("s", "h"), "accumulate_sums": ("s",), "update_alarm": ("s", "h")},
+}
 # as `_step_one`, for one lane whose neighbours may do something else
 SINGLE_LANE_STEPS = "begin_filters", "advance_filters", "update_estimate", "record_update", "reset_noise"
 
@@ -41,7 +43,14 @@ def build_kernels(spec: KernelSpec, lanes: int, width: int, own: int) -> SimpleN
     names: dict[str, object] = {
         **{f"_{x}": getattr(sizes, x) for x in ("n", "rows", "row", "floats", "frequencies", "extra", "watched")},
         **{"_columns": sizes.n + 1, "_gain_rows": sizes.n + 2, "_tile": 4 * TILE},
-        **{"_residual_rows": (sizes.n + LAGS + 1) * TILE, "_lanes": lanes, "_width": width, "_own": own},
+        **{"_sums": spec.sums, "_sums_at": dict(spec.to).get("sums", 0)},
+        **{
+            "_shadow": sizes.shadow,
+            "_residual_rows": (steps.columns + 1) * TILE,
+            "_lanes": lanes,
+            "_width": width,
+            "_own": own,
+        },
         "_size": HEADER_SIZE + sizes.floats + sizes.watched + sizes.extra,
         "_cusum_lanes": CUSUM_BATCH if single else lanes,  # CUSUMs of one asset side by side, or those of several
         "_to": namedtuple("To", dict(spec.to))(**dict(spec.to)),
@@ -51,10 +60,12 @@ def build_kernels(spec: KernelSpec, lanes: int, width: int, own: int) -> SimpleN
         "_transpose": make_transpose(width),
         "_transpose_header": make_transpose(HEADER_SIZE),
     }
+    update_cusums = steps.update_cusums_by_sums if spec.sums else steps.update_cusums
     if single:
-        names["_update_cusums"] = trace_function(steps.update_cusums, CUSUM_BATCH, "w", ("g",))
+        observed = "sums" if spec.sums else "w"
+        names["_update_cusums"] = trace_function(update_cusums, CUSUM_BATCH, observed, ("g",))
     else:
-        names["_update_cusums"] = trace_function(steps.update_cusums, width, shared, ("g",))
+        names["_update_cusums"] = trace_function(update_cusums, width, shared, ("g",))
     for step in SAMPLE_STEPS:
         names[f"_{step}"] = trace_function(getattr(steps, step), width, shared)
     for step, kept in TILE_LOOPS.items():

@@ -30,7 +30,9 @@ class CusumConstants(NamedTuple):
     ``A, B, C, D, X0`` are the shadow, r -> [eta, phi]; `theta` the coefficients that the residual is formed with;
     `numerator` and `denominator` the whitening filter, both of one length, first element 1, and `gain` its factor;
     `warm` the updates that it needs; `changes` (members, n + `LAGS`) the weights of the columns and `limits`
-    (members,) where a CUSUM alarms. Scaled as `estimation.recursion.RecursionConstants`.
+    (members,) where a CUSUM alarms. With `directions` (q, n + `LAGS`), whose combinations the changes are, CUSUMs step
+    once per evaluation, with what its updates sum up to; without, at each update. Scaled as
+    `estimation.recursion.RecursionConstants`.
     """
 
     A: FloatArray
@@ -45,6 +47,7 @@ class CusumConstants(NamedTuple):
     warm: int
     changes: FloatArray
     limits: FloatArray
+    directions: FloatArray = np.zeros((0, 0))
 
 
 def whitening_filter(noise: ArmaNoise) -> tuple[FloatArray, FloatArray, float, int]:
@@ -76,6 +79,24 @@ def whiten_sample(c: Any, model: int, s: Any, at: int, memory: int, x: Any) -> A
     return y * c[model]
 
 
+def evaluation_weights(changes: FloatArray, directions: FloatArray, limits: FloatArray) -> FloatArray:
+    """Return by how much each sum of `accumulate_sums` moves each CUSUM in units of its limit, (sums, members)."""
+    shares = np.linalg.lstsq(directions.T, changes.T, rcond=None)[0]
+    rows, columns = np.tril_indices(len(directions))
+    squares = np.where(rows == columns, -0.5, -1.0)[:, None] * shares[rows] * shares[columns]
+    return np.vstack([shares, squares]) / limits
+
+
+def accumulate_sums(s: Any, at: int, psi: Sequence[Any], e: Any) -> None:
+    """Add psi e, and the products of psi among themselves, to the sums s[at:]: they make up any likelihood ratio.
+
+    Over several updates the logarithm is the sum of m e - m^2/2 with m = weights' psi, linear in psi e and psi psi'.
+    """
+    factors = [(one, e) for one in psi] + [(one, other) for i, one in enumerate(psi) for other in psi[: i + 1]]
+    for k, (one, other) in enumerate(factors):
+        s[at + k] = fma(one, other, s[at + k])
+
+
 def update_cusum(weights: Sequence[Any], psi: Sequence[Any], e: Any, g: Any, half: Any) -> Any:
     """Return a CUSUM g, in units of its limit h, after one more whitened residual e.
 
@@ -83,3 +104,10 @@ def update_cusum(weights: Sequence[Any], psi: Sequence[Any], e: Any, g: Any, hal
     """
     shift = dot(weights, psi)
     return minimum(maximum(fma(shift, fma(shift, half, e), g), 0.0), CAP)
+
+
+def update_cusum_by_sums(weights: Sequence[Any], sums: Sequence[Any], g: Any) -> Any:
+    """Return a CUSUM g, in units of its limit, after the updates that the sums were taken over."""
+    for weight, one in zip(weights, sums, strict=True):
+        g = fma(weight, one, g)
+    return minimum(maximum(g, 0.0), CAP)

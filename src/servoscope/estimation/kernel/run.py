@@ -58,7 +58,8 @@ def run_blocks(
                         for j in range(min(TILE, samples)):
                             tile[3 * TILE + j, a] = restart[min(b * _lanes + a, assets - 1), window + j]
             i = k - window
-            _process_samples(c, s, h, g, tile, i, i + count, phase, stride, since == 0, v, shadow, e, status, extra)
+            first, last = since == 0, since + count == every
+            _process_samples(c, s, h, g, tile, i, i + count, phase, stride, first, last, v, shadow, e, status, extra)
             k, since, phase = k + count, since + count, (phase + count) % stride
             if since == every:
                 since = 0
@@ -86,9 +87,10 @@ def run_sample(constants: Rows, state: Rows, r: float, u: float, y: float) -> bo
     tile[0, 0], tile[TILE, 0], tile[2 * TILE, 0], tile[3 * TILE, 0] = r, u, y, 0.0
     number = int(state[SAMPLE])
     extra = state[private : private + _extra]
-    _process_samples(c, s, h, g, tile, 0, 1, number % stride, stride, number % every == 0, v, shadow, e, status, extra)
+    first, last = number % every == 0, (number + 1) % every == 0
+    _process_samples(c, s, h, g, tile, 0, 1, number % stride, stride, first, last, v, shadow, e, status, extra)
     _pack_states(s, h, g, row, 0)
-    return (number + 1) % every == 0
+    return last
 
 
 def evaluate_states(constants: Rows, state: Rows, out: Rows) -> None:

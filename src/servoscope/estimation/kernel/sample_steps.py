@@ -12,7 +12,14 @@ from typing import Any, NamedTuple
 
 from servoscope.core.jit import Bool, dot, fma, maximum, minimum, sine, where
 from servoscope.estimation.kernel import sparse_lti
-from servoscope.estimation.kernel.cusum import CLIP, LAGS, update_cusum, whiten_sample
+from servoscope.estimation.kernel.cusum import (
+    CLIP,
+    LAGS,
+    accumulate_sums,
+    update_cusum,
+    update_cusum_by_sums,
+    whiten_sample,
+)
 from servoscope.estimation.kernel.sparse_lti import SparsityPattern
 from servoscope.estimation.moments import propagate_covariance, propagate_initial_share
 
@@ -62,6 +69,17 @@ class KernelSpec(NamedTuple):
     bank: SparsityPattern
     shadow: SparsityPattern
 
+    @property
+    def directions(self) -> int:
+        """Number of directions of changes whose sums move the CUSUMs once per evaluation; 0: each update moves them."""
+        to = dict(self.to)
+        return to["late"] - to["psi"] if "late" in to else 0
+
+    @property
+    def sums(self) -> int:
+        """Number of sums that are taken over an evaluation's updates."""
+        return self.directions * (self.directions + 3) // 2
+
 
 class SampleSteps:
     """The steps of one sample for the sizes of a specification.
@@ -74,6 +92,8 @@ class SampleSteps:
     def __init__(self, spec: KernelSpec, steady: Any, single_lane: bool = False) -> None:
         self.size, self.to, self.at = spec.sizes, SimpleNamespace(**dict(spec.to)), SimpleNamespace(**dict(spec.at))
         self._bank, self._shadow, self._steady, self.single_lane = spec.bank, spec.shadow, steady, single_lane
+        self.directions, self.sums = spec.directions, spec.sums
+        self.columns = self.directions or self.size.n + LAGS  # that the test takes of each update
 
     def begin_evaluation(self, s: Any, h: Any) -> None:
         """Forget the largest CUSUM of the evaluation before."""
@@ -95,17 +115,30 @@ class SampleSteps:
         )  # NaN is below nothing
         return undisturbed
 
+    def advance_shadow(self, c: Any, s: Any, w: Any, tile: Any, i: Any) -> None:
+        """Pass an undisturbed r through the healthy loop: columns and residual of the test go to w, not yet white."""
+        shadow = sparse_lti.advance_system(self._shadow, c, self.at.shadow, s, self.to.shadow, [tile[i]])
+        columns = self._combine_columns(c, s, shadow[1:])
+        for k, column in enumerate(columns):
+            w[i * (self.columns + 1) + k] = column
+        w[i * (self.columns + 1) + self.columns] = shadow[0]
+
     def update_undisturbed(self, c: Any, s: Any, h: Any, w: Any, when: Any, tile: Any, i: Any) -> None:
         """Process an undisturbed sample: `advance_filters` and `update_estimate` without their special cases."""
         h[SAMPLE] = h[SAMPLE] + 1.0
         x = self._inputs(c, tile[i], tile[i + TILE], tile[i + 2 * TILE], None)
         v = sparse_lti.advance_system(self._bank, c, self.at.bank, s, self.to.x, x)
-        shadow = sparse_lti.advance_system(self._shadow, c, self.at.shadow, s, self.to.shadow, x)
-        e: dict[int, Any] = {}
-        self.update_estimate(c, s, h, v, shadow, e)
+        phi = self._update_theta(c, s, h, v)
         if self.size.shadow:
-            self._store_whitened(s, e, h[WHITENED] > c[self.at.warm], w, i)
+            row = i * (self.columns + 1) + self.columns
+            w[row] = self._residual(c, v, w[row], phi)
             when[i] = h[SAMPLE]
+
+    def whiten_undisturbed(self, c: Any, s: Any, h: Any, w: Any, i: Any) -> None:
+        """Whiten what `advance_shadow` and `update_undisturbed` left in w."""
+        row = i * (self.columns + 1)
+        e = self._whiten(c, s, h, w[row + self.columns], [w[row + k] for k in range(self.directions or self.size.n)])
+        self._store_whitened(s, e, h[WHITENED] > c[self.at.warm], w, i)
 
     def count_sample(self, h: Any, tile: Any, i: Any) -> Bool:
         """Count a sample; return whether it is complete and continues the one before."""
@@ -189,15 +222,9 @@ class SampleSteps:
 
     def update_estimate(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any) -> None:
         """Update theta with an estimator whose P stays at P_d, then all that follows from the update."""
-        phi = [v[1 + i] for i in range(self.size.n)]
-        theta = [s[self.to.theta + i] for i in range(self.size.n)]
-        residual = v[0] - dot(phi, theta)
-        K = self._steady(c[self.at.R], phi)
-        for i, gain in enumerate(K):
-            s[self.to.theta + i] = fma(gain, residual, theta[i])
-        h[UPDATES] = h[UPDATES] + 1.0
-        s[self.to.power] = self._mean_square(c, s, residual)
-        self._propagate(c, s, h, v, shadow, e, phi, K)
+        phi = self._update_theta(c, s, h, v)
+        if self.size.shadow:
+            self._test_update(c, s, h, v, shadow, e, phi)
 
     def record_update(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, k: Any) -> None:
         """Do what follows from an update of theta and P by any estimator; k holds its gain, residual and status."""
@@ -206,7 +233,10 @@ class SampleSteps:
         h[UPDATES] = h[UPDATES] + (1.0 - refused)
         h[SKIPPED] = h[SKIPPED] + refused
         s[self.to.power] = where(refused > 0.0, s[self.to.power], self._mean_square(c, s, k[n]))
-        self._propagate(c, s, h, v, shadow, e, [v[1 + i] for i in range(n)], [k[i] for i in range(n)])
+        phi = [v[1 + i] for i in range(n)]
+        self._propagate(c, s, phi, [k[i] for i in range(n)])
+        if self.size.shadow:
+            self._test_update(c, s, h, v, shadow, e, phi)
 
     def reset_noise(self, s: Any, h: Any) -> None:
         """Forget the noise before a gap or a rest."""
@@ -214,7 +244,9 @@ class SampleSteps:
         spans = [(to.M, size.lags * size.n)]
         if size.shadow:
             h[WHITENED] = 0.0
-            spans += [(to.white, (size.n + 1) * size.memory), (to.psi, size.n + LAGS)]
+            spans += [(to.white, ((self.directions or size.n) + 1) * size.memory), (to.psi, self.columns)]
+            if self.directions:
+                spans.append((to.late, LAGS))
         for begin, count in spans:
             for i in range(count):
                 s[begin + i] = 0.0
@@ -222,18 +254,39 @@ class SampleSteps:
     def store_residual(self, c: Any, s: Any, h: Any, status: Any, e: Any, w: Any, when: Any, i: Any) -> None:
         """Store a sample for the sequential test; it counts once the whitening filter has forgotten its start."""
         used = self.is_update(status)
-        self._store_whitened(s, e, used & (h[WHITENED] > c[self.at.warm]), w, i)
+        self._store_whitened(s, e[0], used & (h[WHITENED] > c[self.at.warm]), w, i)
         when[i] = where(used, h[SAMPLE], 0.0)
 
     def update_cusums(self, c: Any, g: Any, w: Any, top: Any, i: Any) -> None:
         """Update the CUSUMs g with the whitened residual of sample i; c begins with their weights."""
-        columns, each = self.size.n + LAGS, self.size.watched // CUSUM_BATCH if self.single_lane else CUSUM_BATCH
+        columns, each = self.columns, self.size.watched // CUSUM_BATCH if self.single_lane else CUSUM_BATCH
         count = each if self.single_lane else self.size.watched
         psi, white, best = [w[i * (columns + 1) + k] for k in range(columns)], w[i * (columns + 1) + columns], top[i]
         for j in range(each):
             g[j] = update_cusum([c[j + count * k] for k in range(columns)], psi, white, g[j], c[j + count * columns])
             best = maximum(best, g[j])
         top[i] = best
+
+    def accumulate_sums(self, s: Any, w: Any, i: Any) -> None:
+        """Add sample i to the sums that move the CUSUMs at the end of the evaluation."""
+        row = i * (self.columns + 1)
+        accumulate_sums(s, self.to.sums, [w[row + k] for k in range(self.columns)], w[row + self.columns])
+
+    def update_cusums_by_sums(self, c: Any, g: Any, sums: Any, top: Any, i: Any) -> None:
+        """Update the CUSUMs g with the sums of an evaluation; c begins with their weights, `top` is row i."""
+        each = self.size.watched // CUSUM_BATCH if self.single_lane else CUSUM_BATCH
+        count, best = each if self.single_lane else self.size.watched, top[i]
+        for j in range(each):
+            weights = [c[j + count * k] for k in range(self.sums)]
+            g[j] = update_cusum_by_sums(weights, [sums[k] for k in range(self.sums)], g[j])
+            best = maximum(best, g[j])
+        top[i] = best
+
+    def end_evaluation(self, s: Any, h: Any, top: Any) -> None:
+        """Store the level of the largest CUSUM as `update_alarm` does, and begin the sums anew."""
+        self.update_alarm(s, h, top, [h[SAMPLE]], 0)
+        for k in range(self.sums):
+            s[self.to.sums + k] = 0.0
 
     def reduce_cusums(self, top: Any, i: Any) -> None:
         """Write the largest of neighbouring CUSUMs of one asset to the first of them."""
@@ -283,29 +336,57 @@ class SampleSteps:
     def _mean_square(self, c: Any, s: Any, residual: Any) -> Any:
         return fma(fma(residual, residual, -s[self.to.power]), c[self.at.share], s[self.to.power])
 
-    def _propagate(
-        self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, phi: Sequence[Any], K: Sequence[Any]
-    ) -> None:
+    def _update_theta(self, c: Any, s: Any, h: Any, v: Any) -> list[Any]:
+        """Update theta with an estimator whose P stays at P_d, and its covariance; return phi."""
+        phi = [v[1 + i] for i in range(self.size.n)]
+        theta = [s[self.to.theta + i] for i in range(self.size.n)]
+        residual = v[0] - dot(phi, theta)
+        K = self._steady(c[self.at.R], phi)
+        for i, gain in enumerate(K):
+            s[self.to.theta + i] = fma(gain, residual, theta[i])
+        h[UPDATES] = h[UPDATES] + 1.0
+        s[self.to.power] = self._mean_square(c, s, residual)
+        self._propagate(c, s, phi, K)
+        return phi
+
+    def _propagate(self, c: Any, s: Any, phi: Sequence[Any], K: Sequence[Any]) -> None:
         propagate_covariance(c, self.at.noise, s, self.to.S, self.size.lags, phi, K)
         if self.size.start:
             propagate_initial_share(s, self.to.Psi, phi, K)
-        if self.size.shadow:
-            self._whiten(c, s, h, v, shadow, e, phi)
 
-    def _whiten(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, phi: Sequence[Any]) -> None:
-        """Whiten the residual minus the shadow's, and the shadow's columns; delay copies of the last column."""
-        n, memory, to = self.size.n, self.size.memory, self.to
-        for lag in range(LAGS, 0, -1):
-            s[to.psi + n - 1 + lag] = s[to.psi + n - 2 + lag]
-        for i in range(n):
-            s[to.psi + i] = whiten_sample(c, self.at.white, s, to.white + (1 + i) * memory, memory, shadow[1 + i])
-        residual = v[0] - shadow[0] - dot([c[self.at.apart + i] for i in range(n)], phi)
-        e[0] = minimum(maximum(whiten_sample(c, self.at.white, s, to.white, memory, residual), -CLIP), CLIP)
+    def _test_update(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, phi: Sequence[Any]) -> None:
+        """Whiten what the sequential test takes of one update."""
+        columns = self._combine_columns(c, s, [shadow[1 + i] for i in range(self.size.n)])
+        e[0] = self._whiten(c, s, h, self._residual(c, v, shadow[0], phi), columns)
+
+    def _residual(self, c: Any, v: Any, expected: Any, phi: Sequence[Any]) -> Any:
+        """Return the residual minus the shadow's."""
+        return v[0] - expected - dot([c[self.at.apart + i] for i in range(self.size.n)], phi)
+
+    def _combine_columns(self, c: Any, s: Any, columns: list[Any]) -> list[Any]:
+        """Return the shadow's columns, or the sums of them and of delayed copies of the last in which changes lie."""
+        if not self.directions:
+            return columns
+        late = self.to.late
+        columns = [*columns, *(s[late + lag] for lag in range(LAGS))]
+        for lag in range(LAGS):
+            s[late + lag] = columns[self.size.n - 1 + lag]
+        rows = [self.at.directions + d * len(columns) for d in range(self.directions)]
+        return [dot([c[row + k] for k in range(len(columns))], columns) for row in rows]
+
+    def _whiten(self, c: Any, s: Any, h: Any, residual: Any, columns: Sequence[Any]) -> Any:
+        """Whiten the columns to psi, behind which delayed copies of the last may stand; return the white residual."""
+        memory, to = self.size.memory, self.to
+        if not self.directions:
+            for k in range(self.columns - 1, len(columns) - 1, -1):
+                s[to.psi + k] = s[to.psi + k - 1]
+        for i, column in enumerate(columns):
+            s[to.psi + i] = whiten_sample(c, self.at.white, s, to.white + (1 + i) * memory, memory, column)
         h[WHITENED] = h[WHITENED] + 1.0
+        return minimum(maximum(whiten_sample(c, self.at.white, s, to.white, memory, residual), -CLIP), CLIP)
 
     def _store_whitened(self, s: Any, e: Any, counts: Bool, w: Any, i: Any) -> None:
         """Write columns and residual of sample i to w; no CUSUM moves where all of them are zero."""
-        columns = self.size.n + LAGS
-        for k in range(columns):
-            w[i * (columns + 1) + k] = where(counts, s[self.to.psi + k], 0.0)
-        w[i * (columns + 1) + columns] = where(counts, e[0], 0.0)
+        for k in range(self.columns):
+            w[i * (self.columns + 1) + k] = where(counts, s[self.to.psi + k], 0.0)
+        w[i * (self.columns + 1) + self.columns] = where(counts, e, 0.0)

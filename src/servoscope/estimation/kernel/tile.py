@@ -21,7 +21,8 @@ _filter_sample = _write_evaluation = _record_update_one = _reset_noise_one = _fr
 _update_undisturbed = _try_undisturbed = _residual_rows = _reduce_cusums = _lanes = _update_estimate = _UNFILLED
 _update_estimate_one = _update_cusums = _n = _store_residual = _begin_evaluation = _write_response = _UNFILLED
 _gain_rows = _rows = _process_sample = _cusum_lanes = _learn_lane = _learn_lanes = _write_internal = _UNFILLED
-_count_sample = _to = _update = _is_update = _watched = _accumulate_size = _width = _UNFILLED
+_count_sample = _to = _update = _is_update = _watched = _accumulate_size = _width = _end_evaluation = _UNFILLED
+_sums = _sums_at = _accumulate_sums = _advance_shadow = _whiten_undisturbed = _shadow = _UNFILLED
 
 
 def filter_sample(
@@ -121,8 +122,12 @@ def process_undisturbed(
         _accumulate_size(a, e, tile, begin, end)
         undisturbed &= _is_undisturbed(a, h, e)
     if undisturbed:
-        for a in range(0, _lanes, _width):
+        for a in range(0, _lanes, _width):  # one loop after the other: the state of each has room in registers
+            if _shadow:
+                _advance_shadow(a, c, s, w, tile, begin, end)
             _update_undisturbed(a, c, s, h, w, when, tile, begin, end)
+            if _shadow:
+                _whiten_undisturbed(a, c, s, h, w, begin, end)
     return undisturbed
 
 
@@ -133,9 +138,9 @@ def decline(c: Rows, s: Rows, h: Rows, tile: Rows, begin: int, end: int, e: Rows
 
 def process_samples(
     c: Rows, s: Rows, h: Rows, g: Rows, tile: Rows, begin: int, end: int, phase: int, stride: int, first: bool,
-    v: Rows, shadow: Rows, e: Rows, status: Rows, extra: Rows,
+    last: bool, v: Rows, shadow: Rows, e: Rows, status: Rows, extra: Rows,
 ) -> None:  # fmt: skip
-    """Process samples `begin` to `end` of the tile in all lanes; with `first`, an evaluation begins with them."""
+    """Process samples `begin` to `end` of the tile in all lanes; `first` and `last` begin and end an evaluation."""
     w = stack_array(c, _residual_rows, _lanes)
     when = stack_array(h, TILE, _lanes)
     if first:
@@ -150,9 +155,14 @@ def process_samples(
             if _watched:
                 for a in range(0, _lanes, _width):
                     _store_residual(a, c, s, h, status, e, w, when, i)
-    if not _watched:
+    if _sums:
+        for a in range(0, _lanes, _width):
+            _accumulate_sums(a, s, w, begin, end)
+    if not _watched or (_sums and not last):
         return
     top = stack_array(c, TILE, _cusum_lanes)
+    if _sums:  # the CUSUMs step once, with what the evaluation's samples sum up to
+        w, begin, end = s[_sums_at:], 0, 1
     for i in range(begin, end):
         for a in range(_cusum_lanes):
             top[i, a] = 0.0
@@ -173,7 +183,10 @@ def process_samples(
         for i in range(begin, end):
             _reduce_cusums(0, lane_view(top, 1, 1), i)
     for a in range(0, _lanes, _width):
-        _update_alarm(a, s, h, top, when, begin, end)
+        if _sums:
+            _end_evaluation(a, s, h, top)
+        else:
+            _update_alarm(a, s, h, top, when, begin, end)
 
 
 def write_evaluations(c: Rows, s: Rows, h: Rows, q: Rows) -> None:
