@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from accuracy.axis import AXES, moves, record
+from accuracy.axis import loop as axis_loop
 
 import servoscope as ss
 from servoscope.core.arrays import FloatArray
@@ -180,6 +182,20 @@ def test_output_error_finds_the_coefficients_and_the_force_of_each_recording() -
     assert found.offset == pytest.approx([0.3, -0.2], abs=0.01)
     assert found.plant.coefficients == pytest.approx(coefficients, rel=0.01)
     assert max(found.rmse) < 1e-3 * float(np.abs(r).max())
+
+
+@pytest.mark.slow
+def test_a_worn_belt_gets_no_wrong_name_and_a_payload_on_it_its_own() -> None:
+    """Two masses, the encoder at the motor: a belt a quarter as stiff, or loose by half a millimetre, has no term."""
+    belt = AXES["belt"]
+    loop = ss.Loop.from_dict(axis_loop().to_dict() | {"plant": {"kind": "axis"}})
+    baseline = ss.learn(loop, [record(belt, moves(seed), seed) for seed in range(2)])
+    for worn in (replace(belt, belt_hz=0.5 * belt.belt_hz), replace(belt, slack=5e-4)):
+        assert ss.diagnose(baseline, record(belt, moves(10), 10, worn)).faults == ()
+    # 2 kg more behind the same belt
+    heavier = replace(belt, mass=22.0, load_share=12.0 / 22.0, belt_hz=belt.belt_hz * (22.0 / 24.0) ** 0.5)
+    (fault,) = ss.diagnose(baseline, record(belt, moves(10), 10, heavier)).faults
+    assert (fault.name, fault.ratio) == ("payload", pytest.approx(1.1, rel=0.01))
 
 
 @pytest.mark.slow
