@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from accuracy.axis import AXES, moves, record
+from accuracy.axis import loop as axis_loop
 
 import servoscope as ss
 from servoscope.core.arrays import FloatArray
@@ -18,10 +20,12 @@ from servoscope.detection.axis_model import AxisModel
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals
 from servoscope.isolation.ml.axis_scan import FALSE_ALARMS, TRIM, scan_limit
 from servoscope.isolation.ml.axis_window import AxisWindow
+from servoscope.isolation.ml.hypothesis import fit_hypothesis
 from servoscope.isolation.ml.window import ChangeProfile
+from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.output_error import fit_output_error
 from servoscope.models.plants.axis import AxisPlant
-from servoscope.simulation import simulate
+from servoscope.simulation import FaultEvent, simulate
 
 LOOP: dict[str, Any] = {
     "sample_rate": 1000.0,
@@ -118,6 +122,19 @@ class TestWindow:
         assert gain / healthy == pytest.approx([0.5, 1.0, 1.0, 1.0])  # more u for the same motion
         assert mass / healthy == pytest.approx([0.5, 0.5, 0.5, 0.5])
 
+    def test_a_search_that_begins_a_hair_beside_zero_moves(self, window: AxisWindow) -> None:
+        """The first step of the search is as long as its start is away from zero."""
+        fault = next(fault for fault in window.plant.faults if fault.parameter == "inertia")
+        m, profile = window.nuisance_count, ChangeProfile(100)
+        found = [
+            fit_hypothesis(window, [fault], profile, np.full(m, begin), [np.array([begin])], free=True)
+            for begin in (0.0, 1e-10, 0.1)
+        ]
+        assert abs(found[0].x[0]) > 0.01
+        for other in found[1:]:
+            assert other.x == pytest.approx(found[0].x, rel=1e-2)
+            assert other.cost == pytest.approx(found[0].cost, rel=1e-4)
+
     def test_the_limit_of_the_scan_is_that_of_a_brownian_bridge(self) -> None:
         """Counted at a probability at which simulation can count: the largest of all standardised partial sums."""
         rng, N, tries = np.random.default_rng(2), 1000, 4000
@@ -165,6 +182,50 @@ def test_output_error_finds_the_coefficients_and_the_force_of_each_recording() -
     assert found.offset == pytest.approx([0.3, -0.2], abs=0.01)
     assert found.plant.coefficients == pytest.approx(coefficients, rel=0.01)
     assert max(found.rmse) < 1e-3 * float(np.abs(r).max())
+
+
+@pytest.mark.slow
+def test_a_worn_belt_gets_no_wrong_name_and_a_payload_on_it_its_own() -> None:
+    """Two masses, the encoder at the motor: a belt a quarter as stiff, or loose by half a millimetre, has no term."""
+    belt = AXES["belt"]
+    loop = ss.Loop.from_dict(axis_loop().to_dict() | {"plant": {"kind": "axis"}})
+    baseline = ss.learn(loop, [record(belt, moves(seed), seed) for seed in range(2)])
+    for worn in (replace(belt, belt_hz=0.5 * belt.belt_hz), replace(belt, slack=5e-4)):
+        assert ss.diagnose(baseline, record(belt, moves(10), 10, worn)).faults == ()
+    # 2 kg more behind the same belt
+    heavier = replace(belt, mass=22.0, load_share=12.0 / 22.0, belt_hz=belt.belt_hz * (22.0 / 24.0) ** 0.5)
+    (fault,) = ss.diagnose(baseline, record(belt, moves(10), 10, heavier)).faults
+    assert (fault.name, fault.ratio) == ("payload", pytest.approx(1.1, rel=0.01))
+
+
+@pytest.mark.slow
+def test_a_friction_that_the_motion_does_not_show_costs_its_own_faults_only() -> None:
+    values = {"inertia": 2.0, "viscous_friction": 3.0, "coulomb_friction": 0.0}
+    plant: dict[str, Any] = {"kind": "axis", "terms": ["viscous", "coulomb"], "coefficients": values}
+    loop = ss.Loop.from_dict({
+        "sample_rate": 100.0, "plant": plant, "controller": {"kind": "pi", "k_p": 80.0, "k_i": 0.0},
+        "monitor": {"cutoff": 5.0, "memory": 2.0},
+    })  # fmt: skip
+    t = np.arange(3000) * 0.01
+    r = 0.5 * np.sin(3.0 * t) + 0.2 * np.sin(11.0 * t)
+
+    def recorded(seed: int, *faults: FaultEvent) -> ss.Recording:
+        return simulate(loop, r, faults=faults, noise_u_std=0.05, noise_y_std=1e-5, seed=seed)[0]
+
+    model, notes = fit_axis(loop, [recorded(seed) for seed in range(2)])
+    assert model is not None
+    assert [*model.unseen] == ["coulomb_friction"]
+    assert "do not show coulomb_friction" in str(notes[0])
+    assert model.coefficients["inertia"] == pytest.approx(2.0, rel=0.01)
+    assert model.plant(loop.plant).coefficients == model.coefficients  # type: ignore[arg-type]
+    assert [fault.name for fault in model.visible_faults(loop.plant.faults)] == [
+        "payload", "lubrication", "motor_constant"]  # fmt: skip
+    learned = ss.Loop.from_dict({k: v for k, v in loop.to_dict().items() if k != "controller"} | {
+        "plant": {name: plant[name] for name in ("kind", "terms")}})  # fmt: skip
+    baseline = ss.learn(learned, [recorded(seed) for seed in range(2)])
+    diagnosis = ss.diagnose(baseline, recorded(7, FaultEvent("inertia", 1.3, 15.0)))
+    assert [one.name for one in diagnosis.faults] == ["payload"]
+    assert diagnosis.faults[0].ratio == pytest.approx(1.3, rel=0.02)
 
 
 @pytest.mark.slow

@@ -36,6 +36,7 @@ class Axis:
     load_share: float = 0.5  # of the mass that is behind the belt
     load: float = 0.0  # N against the motor
     shift: float = 0.0  # of the sensor [m]
+    slack: float = 0.0  # between belt and load, from one end of the gap to the other [m]
 
 
 AXES = {
@@ -55,7 +56,7 @@ def _run(r, p, q, switch, n_y, n_u, gains, limit, dt, substeps):  # type: ignore
     speed = 0.0
     h = dt / substeps
     for k in range(N):
-        m, b, c, gain, static, v_s, cogging, pitch, w, share, load_force, shift = p if k < switch else q
+        m, b, c, gain, static, v_s, cogging, pitch, w, share, load_force, shift, slack = p if k < switch else q
         y[k] = x + shift + n_y[k]
         speed += 0.5 * ((y[k] - before) / dt - speed)
         before = y[k]
@@ -71,7 +72,8 @@ def _run(r, p, q, switch, n_y, n_u, gains, limit, dt, substeps):  # type: ignore
             friction = c + static * np.exp(-((v / v_s) ** 2))
             force = gain * (u[k] + n_u[k]) - b * v - cogging * np.sin(2.0 * np.pi * x / pitch) - load_force
             if w > 0.0:
-                spring = stiffness * (xl - x) + 0.02 * stiffness / w * (vl - v)
+                twist = xl - x - min(max(xl - x, -0.5 * slack), 0.5 * slack)
+                spring = stiffness * twist + (0.02 * stiffness / w * (vl - v) if twist != 0.0 or slack == 0.0 else 0.0)
                 vl -= h * spring / load
                 xl += h * vl
                 total, force = motor, force + spring
@@ -122,6 +124,7 @@ def record(axis: Axis, r: FloatArray, seed: int, faulty: Axis | None = None, at:
             a.load_share,
             a.load,
             a.shift,
+            a.slack,
         )
         for a in (axis, faulty or axis)
     )

@@ -9,7 +9,8 @@ the sizes even in their logarithms, between a quarter and three quarters of the 
   the learned coefficients; speed and acceleration are hardly smoothed (11 ms), or inertia comes out too small.
 - QUBE: fourteen runs, each judged with what the thirteen others taught.
 - XL330: simulated, for what it logs as u is its own P law of y, which an added force would not obey. The plant is that
-  learned from its eight files, the reference a measured one, five times over; eight simulated recordings are learned.
+  learned from its eight files, the reference a measured one, five times over; eight simulated recordings are learned,
+  a hundred healthy ones judged.
 - Cranfield: runs 1 to 5 at 20 kgf learned, u of the others multiplied: a stepper's current has no physical inertia to
   change, so its plant is the polynomial one of examples/cranfield.toml, without a refit.
 """
@@ -31,16 +32,21 @@ from public import cranfield, qube
 from public.servoscope_detector import OURS, ROOT, with_gain
 from public.simple_detectors import detectors, judge
 from servoscope.core.arrays import FloatArray
+from servoscope.isolation.ml.axis_scan import scan_limit
+from servoscope.isolation.ml.axis_window import AxisWindow
+from servoscope.isolation.ml.hypothesis import fit_hypothesis
+from servoscope.isolation.ml.window import ChangeProfile
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.simulation import FaultEvent, simulate
 
 KINDS = ("payload", "motor_constant", "dry_friction", "lubrication")
+SHOWN = (*KINDS, "gravity")
 POLYNOMIAL = {"input_gain": "motor_constant"}  # what a polynomial plant calls it
 TOGETHER = 0.95  # probability of the causes that are told together
 BANDS = ((0.05, 0.1), (0.1, 0.2), (0.2, 0.5))
 POINTS = 0.02  # added to both ends of an interval of a size, beside the interval as stated
 BETWEEN = 0.25, 0.75  # of a recording, where changes begin
-LEARNED, HEALTHY, REPEATS = 8, 8, 5  # simulated recordings that are learned, and judged as they are; of the reference
+LEARNED, HEALTHY, REPEATS = 8, 100, 5  # simulated recordings that are learned, and judged as they are; of the reference
 
 Change = Callable[[int, str, float, int], ss.Recording]
 """From a number, a kind, a size and an onset to the recording that holds the change."""
@@ -158,8 +164,7 @@ def xl330(data: Path) -> Iterator[Case]:
         return lambda i, kind, size, at: run(1000 + i, [FaultEvent(names[kind], 1.0 + size, at / loop.sample_rate)])
 
     seen = [run(seed) for seed in range(LEARNED + HEALTHY)]
-    kinds = (*KINDS, "gravity")
-    yield Case("XL330, simulated", loop, seen[:LEARNED], seen[LEARNED], kinds, of_baseline, 6.0, seen[LEARNED + 1 :])
+    yield Case("XL330, simulated", loop, seen[:LEARNED], seen[LEARNED], SHOWN, of_baseline, 6.0, seen[LEARNED + 1 :])
 
 
 def cranfield_runs(data: Path) -> Iterator[Case]:
@@ -216,6 +221,21 @@ def inject(case: Case, count: int, rng: np.random.Generator) -> tuple[list[Injec
     return made, false, len(healthy)
 
 
+def smallest_changes(case: Case) -> dict[str, float]:
+    """Return by kind the change half-way whose likelihood ratio comes to the limit of the scan."""
+    baseline = ss.learn(case.loop, case.learned)
+    if baseline.axis is None:
+        return {}
+    window = AxisWindow.from_recording(baseline, case.judged, 0, case.judged.samples)
+    faults, middle = baseline.plant.faults, ChangeProfile(window.samples // 2)
+    found = {}
+    for fault in faults:
+        fit = fit_hypothesis(window, [fault], middle, np.zeros(window.nuisance_count), [np.zeros(1)], free=True)
+        variance = window.inflation(fit.jacobian, fit.residual, 1) * fit.cost / window.used
+        found[fault.name] = float(np.expm1(np.sqrt(scan_limit(len(faults)) * variance * fit.covariance[0, 0])))
+    return found
+
+
 def found_cells(name: str, detector: str, made: Sequence[Injection], false: int, healthy: int) -> tuple[str, ...]:
     """Return the cells of one detector."""
     bands = [[one.found[detector] for one in made if low <= abs(one.size) < high] for low, high in BANDS]
@@ -236,12 +256,12 @@ def told_cells(name: str, made: Sequence[Injection]) -> tuple[str, ...]:
 def main() -> None:
     """Run the command line of this process."""
     command = parser(__doc__)
-    command.add_argument("--count", type=int, default=100, help="changes per case; a machine with many shares them")
+    command.add_argument("--count", type=int, default=40, help="changes per case; a machine with many shares them")
     command.add_argument("--seed", type=int, default=1)
     command.add_argument("--machine", choices=MACHINES, action="append", help="only this machine")
     given = parse_with_data(command, "real")
     rng = np.random.default_rng(given.seed)
-    found_rows, told_rows, values = [], [], {}
+    found_rows, told_rows, shown_rows, values = [], [], [], {}
     for machine in given.machine or MACHINES:
         groups: dict[str, list[Case]] = {}
         for case in MACHINES[machine](given.data):
@@ -258,6 +278,10 @@ def main() -> None:
             ]
             found_rows += rows
             told_rows.append(told_cells(name, made))
+            if shown := [one for one in map(smallest_changes, cases) if one]:
+                medians = {kind: float(np.median([one[kind] for one in shown])) for kind in shown[0]}
+                shown_rows.append((name, *(f"{100 * medians[k]:.0f} %" if k in medians else "" for k in SHOWN)))
+                values |= {f"{name}.smallest.{kind}": f"{100 * size:.0f} %" for kind, size in medians.items()}
             values |= {f"{name}.found.{i}": cell for i, cell in enumerate(rows[0][3:])}
             values |= {f"{name}.false": rows[0][2], f"{name}.named": told_rows[-1][1]}
     bands = [f"found of {100 * low:g} to {100 * high:g} %" for low, high in BANDS]
@@ -278,6 +302,13 @@ def main() -> None:
                 "onset in 95 %",
             ),
             tuple(told_rows),
+        ),
+        Table(
+            "Axes: what the motion can show",
+            "The change half-way through a recording from which the data tell it apart from noise: its likelihood "
+            "ratio comes to the limit of the scan. Medians over recordings.",
+            ("recording", *SHOWN),
+            tuple(shown_rows),
         ),
     ]
     show(tables, given.json, values)

@@ -31,6 +31,7 @@ FAULTS = (
     "spalling5",
     "spalling7",
 )
+RIGHT = {fault: ("friction", "lubrication") for fault in FAULTS if fault.startswith("lack")}
 FOLDS = {"runs 1 to 5": (1, 2, 3, 4, 5), "odd runs": (1, 3, 5, 7, 9)}
 CYCLE_S, CUTOFF_HZ = 12.96, 1.0
 
@@ -50,9 +51,11 @@ def main() -> None:
     loop, loads = ss.Loop.load(ROOT / "examples" / "cranfield.toml"), given.load or LOADS
     values: dict[str, str] = {}
     rows, faults = [], []
+    told: list[tuple[str, ...]] = []
     for fold, chosen in FOLDS.items():
         counts: dict[str, list[int]] = {}
         of_fault: dict[tuple[str, str], list[int]] = {}
+        named: dict[str, list[str]] = {fault: [] for fault in FAULTS}  # of the runs that were found
         for load in loads:
             normal = runs(given.data, loop, "normal", load)
             healthy = [normal[k - 1] for k in chosen]
@@ -61,7 +64,11 @@ def main() -> None:
             judged = [*held_out, *(run for _, run in faulty)]
             scores = {OURS: servoscope_scores(loop, healthy, judged)}
             scores |= {one.name: judge(one, healthy, judged) for one in detectors(CYCLE_S, CUTOFF_HZ)}
-            for name, (limit, largest, order) in scores.items():
+            ours = scores[OURS]
+            found_runs = zip(faulty, ours.largest[len(held_out) :], ours.names[len(held_out) :], strict=True)
+            for (fault, _), score, cause in found_runs:
+                named[fault] += [cause] if score > ours.limit else []
+            for name, (limit, largest, order, _) in scores.items():
                 normal_scores, fault_scores = largest[: len(held_out)], largest[len(held_out) :]
                 false = sum(score > limit for score in normal_scores)
                 found = sum(score > limit for score in fault_scores)
@@ -88,6 +95,10 @@ def main() -> None:
             )
         names = list(counts)
         for fault in FAULTS:
+            causes = [cause for cause in named[fault] if cause]
+            wrong = [cause for cause in causes if not any(one in cause for one in RIGHT.get(fault, ()))]
+            counts_of = (len(named[fault]), len(causes) - len(wrong), len(wrong), len(named[fault]) - len(causes))
+            told.append((fold, fault, *map(str, counts_of)))
             faults.append((fold, fault, *("{} of {}".format(*of_fault[fault, name]) for name in names)))
     heads = ("learned from", "detector", "false", "found", "above the worst healthy run")
     note = (
@@ -98,6 +109,14 @@ def main() -> None:
     tables = [
         Table("Cranfield: detectors", note, heads, tuple(rows)),
         Table("Cranfield: faults", "Faulty runs above the limit.", ("learned from", "fault", *names), tuple(faults)),
+        Table(
+            "Cranfield: names",
+            "What servoscope said of the runs that it found. Right: a friction, where lubricant lacks; no coefficient "
+            "is that of a loose or a damaged screw. u is a stepper's current, which is no force: its inertia is "
+            "negative.",
+            ("learned from", "fault", "found", "named right", "named wrong", "unknown"),
+            tuple(told),
+        ),
     ]
     show(tables, given.json, values)
 

@@ -5,7 +5,8 @@
 Official protocol (nonlinearbenchmark.org): identify on DATA_EMPS, simulate the position of DATA_EMPS_PULSES in open
 loop from `vir`, root mean square error in mm from sample 20 on. What it leaves open, and what is done here: the
 simulation starts at sample 20 from the measured position and the measured speed there (central difference over 2
-samples); `vir` is held from one sample to the next; the axis sticks where the force does not overcome Coulomb friction.
+samples); `vir` is held from one sample to the next; the axis sticks where the force does not overcome Coulomb friction
+(`simulate_free`, the simulator of servoscope).
 Other conventions stand beside it, with what 0.1 N of constant force does.
 
 As a detector: each half of DATA_EMPS learned, the other judged, as measured and with changes; DATA_EMPS learned and the
@@ -16,19 +17,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
-from numba import njit
 from tables import Table, parse_with_data, parser, show
 
 import servoscope as ss
 from public.servoscope_detector import COLUMNS, ROOT, Count, all_scores, with_coefficient, with_gain
 from public.simple_detectors import halves
-from servoscope.core.arrays import FloatArray
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.output_error import OutputErrorFit, fit_output_error, simulate_free
 from servoscope.models.plants.axis import AxisPlant
@@ -36,94 +35,68 @@ from servoscope.models.plants.axis import AxisPlant
 SKIPPED = 20  # samples before the score counts
 WINDOW_S = 2.0
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
-AUTHORS = np.array([95.1089, 203.5034, 20.3935, -3.1648])  # Janot, Gautier and Brunot, 2019
+AUTHORS = 95.1089, 203.5034, 20.3935, -3.1648  # Janot, Gautier and Brunot, 2019
 OFFSET_N = 0.1
 STARTS = 1.0, 0.95  # of all coefficients, for the output error is not convex
 PUBLISHED = (("dynoNet, neural", "2.64", "Forgione and Piga, 2021, open-loop simulation of the test file"),)
 
 
-@njit  # type: ignore[untyped-decorator]
-def simulate(theta: FloatArray, force: FloatArray, q: float, v: float, period: float) -> FloatArray:
-    """Return the positions of an axis with Coulomb friction that sticks, under forces that are held, from (q, v) on.
-
-    M q'' = force - F_v q' - F_c sign(q') - offset, solved exactly between samples; where the speed would change its
-    sign within a sample, it is 0 at the end of that sample.
-    """
-    inertia, viscous, coulomb, offset = theta
-    decay = np.exp(-viscous / inertia * period)
-    settle = (1.0 - decay) * inertia / viscous
-    out = np.empty(force.size)
-    for k in range(force.size):
-        out[k] = q
-        free = force[k] - offset
-        if v == 0.0 and abs(free) <= coulomb:
-            continue
-        sign = np.sign(v) if v != 0.0 else np.sign(free)
-        final = (free - coulomb * sign) / viscous  # speed that would be reached
-        after = final + (v - final) * decay
-        if v != 0.0 and after * v < 0.0:
-            q, v = q + 0.5 * v * period, 0.0
-        else:
-            q, v = q + final * period + (v - final) * settle, after
-    return out
-
-
 def rmse_mm(
-    theta: FloatArray, recording: ss.Recording, gain: float, start: str = "measured", hold: str = "held"
+    loop: ss.Loop, plant: AxisPlant, recording: ss.Recording, start: str = "measured", hold: str = "held"
 ) -> float:
     """Return the root mean square error in mm of an open-loop simulation, from sample 20 on."""
-    u, y, period = recording.u, recording.y, 1.0 / recording.sample_rate
-    force = gain * (u if hold == "held" else np.append(0.5 * (u[1:] + u[:-1]), u[-1]))
+    if hold != "held":
+        recording = replace(recording, u=np.append(0.5 * (recording.u[1:] + recording.u[:-1]), recording.u[-1]))
     if start == "rest":
-        error = simulate(theta, force, y[0], 0.0, period)[SKIPPED:] - y[SKIPPED:]
+        simulated = simulate_free(loop, recording, plant, speed=0.0)[SKIPPED:]
     else:
-        speed = 0.0 if start == "no speed" else (y[SKIPPED + 1] - y[SKIPPED - 1]) / (2.0 * period)
-        error = simulate(theta, force[SKIPPED:], y[SKIPPED], speed, period) - y[SKIPPED:]
-    return float(1e3 * np.sqrt(np.mean(error**2)))
+        simulated = simulate_free(loop, recording, plant, start=SKIPPED, speed=0.0 if start == "no speed" else None)
+    return 1e3 * float(np.sqrt(np.mean((simulated - recording.y[SKIPPED:]) ** 2)))
 
 
-def output_error(recording: ss.Recording, gain: float, start: FloatArray) -> FloatArray:
-    """Return the four parameters of least output error; the best of several starts, for the error is not convex."""
-    from scipy.optimize import minimize
+def axis_loop(loop: ss.Loop, viscous: str) -> ss.Loop:
+    """Return the loop with a plant of kind ``axis`` and one of the terms of viscous friction."""
+    plant = {"kind": "axis", "terms": [viscous, "coulomb", "offset"], "input_gain": loop.plant.input_gain}
+    return ss.Loop.from_dict(loop.to_dict() | {"plant": plant})
 
-    def loss(ratios: FloatArray) -> float:
-        theta = start * ratios
-        return rmse_mm(theta, recording, gain) if (theta[:3] > 0.0).all() else 1e6
 
-    found = []
-    for seed in range(4):
-        first = np.random.default_rng(seed).normal(1.0, 0.02 if seed else 0.0, 4)
-        found.append(
-            minimize(loss, first, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-4, "maxiter": 600})
-        )
-    return np.asarray(start * min(found, key=lambda one: float(one.fun)).x)
+def fitted_plant(loop: ss.Loop, recording: ss.Recording, plant: AxisPlant) -> AxisPlant:
+    """Return the axis of least output error; the best of several starts, for the error is not convex."""
+    starts = [plant.scaled({"inertia": x, "viscous_friction": x, "coulomb_friction": x}) for x in STARTS]
+    fits = [fit_output_error(loop, [recording], one, drifts=False, start=SKIPPED) for one in starts]
+    best = min(fits, key=lambda fit: fit.rmse)
+    found = best.plant.coefficients or {}
+    return best.plant.model_copy(update={"coefficients": found | {"offset": found["offset"] + best.offset[0]}})
 
 
 def scores(train: ss.Recording, test: ss.Recording, loop: ss.Loop) -> tuple[list[Table], dict[str, str]]:
     """Return the official score of three sets of parameters, conventions, and what a constant force does."""
-    gain = loop.plant.input_gain
+    axis = axis_loop(loop, "viscous")
+    assert isinstance(axis.plant, AxisPlant)
     baseline = ss.learn(loop, [train])
-    learned = np.array([baseline.theta[baseline.names.index(name)] for name in NAMES])
+    authors, learned = (
+        axis.plant.model_copy(update={"coefficients": dict(zip(NAMES, theta, strict=True))})
+        for theta in (AUTHORS, [baseline.theta[baseline.names.index(name)] for name in NAMES])
+    )
     sets = {
-        "the authors' parameters": AUTHORS,
+        "the authors' parameters": authors,
         "servoscope, coefficients of `learn`": learned,
-        "the same four parameters by output error": output_error(train, gain, AUTHORS),
+        "the same four parameters by output error": fitted_plant(axis, train, authors),
     }
     rows, shifts, conventions = [], [], []
     values = {}
-    step = np.array([0.0, 0.0, 0.0, OFFSET_N])
-    for name, theta in sets.items():
-        each = [rmse_mm(theta, one, gain) for one in (train, test)]
-        rows.append((name, *(f"{x:.2f}" for x in theta), *(f"{x:.2f}" for x in each), "measured here"))
-        moved = [rmse_mm(theta + sign * step, test, gain) for sign in (-1.0, 1.0)]
-        shifts.append((name, f"{moved[0]:.2f}", f"{each[1]:.2f}", f"{moved[1]:.2f}"))
-        others: list[Callable[..., float]] = [
-            partial(rmse_mm, theta, test, gain),
-            partial(rmse_mm, theta, test, gain, start="no speed"),
-            partial(rmse_mm, theta, test, gain, start="rest"),
-            partial(rmse_mm, theta, test, gain, hold="straight"),
+    for name, plant in sets.items():
+        theta = plant.coefficients or {}
+        each = [rmse_mm(axis, plant, one) for one in (train, test)]
+        rows.append((name, *(f"{theta[key]:.2f}" for key in NAMES), *(f"{x:.2f}" for x in each), "measured here"))
+        others = [
+            plant.model_copy(update={"coefficients": theta | {"offset": theta["offset"] + force}})
+            for force in (-OFFSET_N, OFFSET_N)
         ]
-        conventions.append((name, *(f"{other():.2f}" for other in others)))
+        moved = [rmse_mm(axis, other, test) for other in others]
+        shifts.append((name, f"{moved[0]:.2f}", f"{each[1]:.2f}", f"{moved[1]:.2f}"))
+        kept = [{}, {"start": "no speed"}, {"start": "rest"}, {"hold": "straight"}]
+        conventions.append((name, *(f"{rmse_mm(axis, plant, test, **how):.2f}" for how in kept)))
         values[f"{name}.test"] = f"{each[1]:.2f}"
     rows += [(name, *[""] * 5, score, source) for name, score, source in PUBLISHED]
     heads = ("parameters", "M [kg]", "F_v [N s/m]", "F_c [N]", "offset [N]", "DATA_EMPS [mm]", "test [mm]", "source")
@@ -158,10 +131,7 @@ def scores(train: ss.Recording, test: ss.Recording, loop: ss.Loop) -> tuple[list
 
 def by_direction(train: ss.Recording, test: ss.Recording, loop: ss.Loop) -> tuple[Table, dict[str, str]]:
     """Return what friction by direction scores by output error: as the protocol has it, and with own forces."""
-    names = ("viscous_by_direction", "coulomb", "offset")
-    axis = ss.Loop.from_dict(
-        loop.to_dict() | {"plant": {"kind": "axis", "terms": list(names), "input_gain": loop.plant.input_gain}}
-    )
+    axis = axis_loop(loop, "viscous_by_direction")
     model, _ = fit_axis(axis, [train])
     assert model is not None and isinstance(axis.plant, AxisPlant)
     learned = model.plant(axis.plant)

@@ -58,14 +58,15 @@ def servoscope_scores(loop: ss.Loop, healthy: Sequence[ss.Recording], judged: Se
     baseline = ss.learn(loop, healthy)
     features = baseline.features
     stds = {"features": score_std(features.left_out), "t2": score_std(baseline.left_out)} if features else {}
-    largest, order = [], []
+    largest, order, names = [], [], []
     for recording in judged:
-        _, trace = diagnose_with_trace(baseline, recording)
+        diagnosis, trace = diagnose_with_trace(baseline, recording)
+        names.append(" + ".join(fault.name for fault in diagnosis.faults))
         ready = trace.ready
         ratios = {one.name: float((one.value / one.limit)[ready].max(initial=0.0)) for one in trace.statistics}
         largest.append(max(ratios.values()))
         order.append(max(ratio ** (1.0 / stds.get(name, 1.0)) for name, ratio in ratios.items()))
-    return Scores(1.0, tuple(largest), tuple(order))
+    return Scores(1.0, tuple(largest), tuple(order), tuple(names))
 
 
 def all_scores(

@@ -30,6 +30,8 @@ class Scores(NamedTuple):
     largest: tuple[float, ...]
     # what recordings are ranked by, where a detector has several scores; otherwise the largest
     order: tuple[float, ...] | None = None
+    # the causes named with certainty, joined by plus signs, where a detector names any
+    names: tuple[str, ...] = ()
 
 
 class Detector(Protocol):

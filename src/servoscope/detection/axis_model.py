@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict
 
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.axis_filter import AxisNoise
-from servoscope.models.plants.axis import AxisPlant
+from servoscope.models.plants import Fault
+from servoscope.models.plants.axis import BY_DIRECTION, AxisPlant
 
 
 class AxisModel(BaseModel):
@@ -25,12 +26,19 @@ class AxisModel(BaseModel):
     rest_speed: float  # below, the axis counts as resting [output per s]
     offset_std: float  # how far the constant force of a recording may be from that of the others
     drift_std: float  # and how much it may change within one
+    # coefficients that the healthy recordings do not show, and how far one recording's estimate may be from them
+    unseen: dict[str, float] = {}
 
     def scatter(self, names: Sequence[str]) -> FloatArray:
         """Return the standard deviations of coefficients between recordings, shape (len(names),)."""
         std = dict(zip(self.parameters, np.sqrt(np.diag(np.array(self.covariance))), strict=True))
         known = {name: float(std[name]) * abs(self.coefficients[name]) for name in self.parameters}
-        return np.array([(known | {"offset": self.offset_std}).get(name, 0.0) for name in names])
+        return np.array([(known | self.unseen | {"offset": self.offset_std}).get(name, 0.0) for name in names])
+
+    def visible_faults(self, faults: Sequence[Fault]) -> tuple[Fault, ...]:
+        """Return those faults that multiply something that the healthy recordings show."""
+        both = {"viscous_friction": BY_DIRECTION} if "viscous_friction" not in self.coefficients else {}
+        return tuple(one for one in faults if not set(both.get(one.parameter, (one.parameter,))) <= set(self.unseen))
 
     def plant(self, declared: AxisPlant) -> AxisPlant:
         """Return the plant of the loop file with these coefficients."""

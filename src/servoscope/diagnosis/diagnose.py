@@ -42,6 +42,7 @@ from servoscope.diagnosis.warnings import (
     covariate_warnings,
     detectable_sizes,
     estimate_warnings,
+    implausible_warnings,
     power_warnings,
     warm_up_warnings,
     warning_throughout,
@@ -297,6 +298,7 @@ def _explain_alarm(
             onset = ml_refit.refit_onset(refined, exam, outside)
         doubts = ml_refit.disagreement_warnings(exam, candidates, refit, SURE)
     best, t = candidates[0], exam.recording.t
+    doubts += (implausible := implausible_warnings(exam, best))
     wait_s = exam.pipeline.bank.wait / exam.recording.sample_rate
     interval = FaultInterval(
         detected_at_s=float(t[alarm.sample]),
@@ -304,7 +306,7 @@ def _explain_alarm(
         end_s=None if exam.alarm[-1] else float(exam.t(int(np.flatnonzero(exam.alarm)[-1]) + 1)),
         from_start=onset.likely_s - float(t[0]) <= 3.0 * wait_s,
         probability=best.probability,
-        faults=best.faults if best.probability >= SURE and best.name != UNKNOWN else (),
+        faults=best.faults if best.probability >= SURE and best.name != UNKNOWN and not implausible else (),
         candidates=candidates,
         refit=refit,
     )

@@ -8,8 +8,9 @@ from servoscope.core import outofcore
 from servoscope.core.messages import Message, message
 from servoscope.detection.chi2_test import noncentrality, required_noncentrality, t2_statistic
 from servoscope.detection.plant_fit import MOST_SATURATED, fault_directions, saturated_share
-from servoscope.detection.result import DiagnosisWarning
+from servoscope.detection.result import Candidate, DiagnosisWarning
 from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
+from servoscope.learning.plausibility import negative_coefficients
 
 AT_ONCE = 4096  # evaluations
 VALUES_TRIED = 201  # of a covariate
@@ -133,6 +134,14 @@ def estimate_warnings(exam: Examination) -> list[DiagnosisWarning]:
             rest = message("warning.rest")
             warnings.append(DiagnosisWarning(kind="rest", from_s=from_s, to_s=to_s, count=count, description=rest))
     return warnings
+
+
+def implausible_warnings(exam: Examination, best: Candidate) -> list[DiagnosisWarning]:
+    """Return why a cause is not named: its coefficients are none that a machine can have, so u is no force there."""
+    names = tuple(name for name, _, _ in negative_coefficients(exam.baseline))
+    if not names or not best.faults or best.is_learned:
+        return []
+    return [warning_throughout(exam, "implausible", message("warning.implausible", names=names, cause=best.names))]
 
 
 def warning_throughout(exam: Examination, kind: str, description: Message) -> DiagnosisWarning:

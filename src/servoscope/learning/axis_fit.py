@@ -113,7 +113,10 @@ def fit_recording(problem: AxisRegression, noise: AxisNoise, slow: float) -> Axi
 
 
 def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | None, list[Message]]:
-    """Learn a healthy axis; with a note where it cannot be refitted, None."""
+    """Learn a healthy axis; None, with a note, where u does not show its inertia.
+
+    A friction that the recordings do not show stays as they have it, and has no faults in the refit.
+    """
     plant, stride = loop.plant, axis_stride(loop.sample_rate)
     assert isinstance(plant, AxisPlant)
     signals = [axis_signals(loop, one, stride) for one in recordings]
@@ -131,9 +134,14 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     ]
     # of all recordings together (Stouffer, 1949)
     seen = (values / stds).sum(axis=0) / np.sqrt(len(fits))
-    unseen = [names[i] for i in known if seen[i] < SEEN and names[i] != "gravity"]
-    if unseen:
-        return None, [message("learning.axis_unseen", names=tuple(unseen))]
+    unseen = [i for i in known if seen[i] < SEEN and names[i] != "gravity"]
+    of_unseen = tuple(names[i] for i in unseen)
+    if 0 in unseen:
+        return None, [message("learning.axis_unseen_none", names=of_unseen)]
+    notes = [message("learning.axis_unseen_partly", names=of_unseen)] if unseen else []
+    off = np.sqrt(np.mean((values - mean) ** 2 + stds**2, axis=0))
+    mean[unseen] = np.maximum(mean[unseen], 0.0)  # friction drives nothing
+    known = [i for i in known if i not in unseen]
     covariance = np.zeros((len(known), len(known)))
     for one in fits:
         C = _physical_covariance(one, plant, len(names))[np.ix_(known, known)]
@@ -155,8 +163,9 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
         rest_speed=slow,
         offset_std=ADDED_SHARE * force,
         drift_std=ADDED_SHARE * force,
+        unseen=dict(zip(of_unseen, off[unseen].tolist(), strict=True)),
     )
-    return model, []
+    return model, notes
 
 
 def _physical(fit: AxisFit, plant: AxisPlant, n: int) -> FloatArray:

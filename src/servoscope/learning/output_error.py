@@ -31,7 +31,7 @@ class OutputErrorFit:
 
 def simulate_free(
     loop: Loop, recording: Recording, plant: AxisPlant | None = None, *, start: int = 0, offset: float = 0.0,
-    drift: float = 0.0,
+    drift: float = 0.0, speed: float | None = None,
 ) -> FloatArray:  # fmt: skip
     """Return y (N - start,) of an axis that u drives in open loop, from the measured position and speed on.
 
@@ -44,10 +44,12 @@ def simulate_free(
     plant
         Plant to simulate; that of the loop if None.
     start
-        First sample, at least 1: the speed there is a central difference.
+        First sample; at least 1 where the speed is measured.
     offset, drift
         Force that acts against the motion's positive direction in addition: in the middle, and its change from end to
         end of the recording [unit of ``input_gain u``].
+    speed
+        Speed at the first sample [output per s]; a central difference of the measured y if None.
     """
     from servoscope.simulation.linear_kernels import axis_constants, run_free_axis
 
@@ -56,8 +58,10 @@ def simulate_free(
     N, rate = recording.samples, recording.sample_rate
     u = delay_input(plant_input(loop, recording.u), recording.restart, round(loop.delay * rate))
     u = u - (offset + drift * np.linspace(-0.5, 0.5, N)) / plant.input_gain
-    first = max(start, 1)
-    speed = float(recording.y[first + 1] - recording.y[first - 1]) * rate / SPEED_OVER
+    first = start
+    if speed is None:
+        first = max(start, 1)
+        speed = float(recording.y[first + 1] - recording.y[first - 1]) * rate / SPEED_OVER
     y = np.empty(N - first)
     run_free_axis(axis_constants([plant], loop), float(recording.y[first]), speed, np.ascontiguousarray(u[first:]), y)
     return y

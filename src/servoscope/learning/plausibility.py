@@ -28,6 +28,14 @@ def check_wraps(recordings: Sequence[Recording]) -> None:
                 )
 
 
+def negative_coefficients(baseline: Baseline) -> list[tuple[str, float, float]]:
+    """Return names, values and standard deviations of coefficients that are negative and cannot be."""
+    each = zip(
+        baseline.names, baseline.theta, (math.sqrt(row[i]) for i, row in enumerate(baseline.covariance)), strict=True
+    )
+    return [one for one in each if one[0] in POSITIVE and one[1] + CERTAIN * one[2] < 0.0]
+
+
 def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
     """Refuse a baseline that no machine has; with `force`, return what is odd as notes instead.
 
@@ -38,9 +46,8 @@ def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
     if baseline.explained < LEAST_EXPLAINED and baseline.instrument is None:
         odd.append(message("learning.unexplained", share=baseline.explained))
     below = [
-        message("learning.negative", name=name, value=value, deviation=math.sqrt(baseline.covariance[i][i]))
-        for i, (name, value) in enumerate(zip(baseline.names, baseline.theta, strict=True))
-        if name in POSITIVE and value + CERTAIN * math.sqrt(baseline.covariance[i][i]) < 0.0
+        message("learning.negative", name=name, value=value, deviation=deviation)
+        for name, value, deviation in negative_coefficients(baseline)
     ]
     if below:
         all_below = len(below) > 1 and len(below) == sum(name in POSITIVE for name in baseline.names)

@@ -35,8 +35,10 @@ def find_axis_change(baseline: Baseline, recording: Recording) -> AxisChange | N
 
     A stretch is compared with itself, so scatter between recordings hides nothing; offset and drift are its own.
     """
+    assert baseline.axis is not None
+    faults = baseline.axis.visible_faults(baseline.plant.faults)
     for window in _stretches(baseline, recording):
-        found = _change_within(window, baseline.plant.faults)
+        found = _change_within(window, faults)
         if found is not None:
             return found
     return None

@@ -18,6 +18,7 @@ UNSEEN = 3.0  # standard deviations below which a size is as good as none
 REACH = 5.0  # standard deviations of the size over which its likelihood is integrated
 POINTS = 31
 AT_BOUND = 1e-6
+NEARLY_ZERO = 1e-4  # of all logarithms where a search begins
 EPSILON = float(np.finfo(np.float64).eps)
 IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
 
@@ -98,6 +99,8 @@ def fit_hypothesis(
     ends = []
     for x in starts:
         z = np.clip(np.concatenate([d, x])[held:], lowest + AT_BOUND, highest - AT_BOUND)
+        if np.abs(z).max() < NEARLY_ZERO:  # the first step is as long as the start, and as long as it likes from 0
+            z = np.zeros_like(z)
         try:
             found = minimise(
                 residual,

@@ -107,10 +107,10 @@ def fit_hypotheses(
 
     The search for the onset starts at the sample `onset` and ends at that of the alarm, `announced`.
     """
-    search = _HypothesisSearch(
-        onset_window(baseline, recording, onset, last), baseline.plant.all_faults, onset, announced, progress
-    )
-    return search.run()
+    faults = baseline.plant.all_faults
+    if baseline.axis is not None:
+        faults = baseline.axis.visible_faults(faults)
+    return _HypothesisSearch(onset_window(baseline, recording, onset, last), faults, onset, announced, progress).run()
 
 
 def fit_stretch(window: ChangeWindow, faults: Sequence[Fault], progress: Callable[[], None]) -> RefitResult:
