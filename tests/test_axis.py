@@ -78,9 +78,9 @@ class TestAxis:
         """Against an integrator with small steps, whose friction changes its sign over a speed of 1 mm/s."""
         from scipy.integrate import solve_ivp
 
-        terms = ["viscous", "coulomb", "stribeck", "gravity", "cogging"]
+        terms = ["viscous", "coulomb", "stribeck", "gravity", "load_friction", "cogging"]
         values = {"inertia": 2.0, "viscous_friction": 0.3, "coulomb_friction": 0.5, "stribeck_friction": 0.4}
-        values |= {"gravity": 9.0, "cogging_sin": 0.7, "cogging_cos": -0.3}
+        values |= {"gravity": 9.0, "load_friction": 0.6, "cogging_sin": 0.7, "cogging_cos": -0.3}
         shapes = {"stribeck_speed": 0.2, "period": 0.5, "hanging_at": 0.2}
         loop = Loop.from_dict({
             "sample_rate": 500.0,
@@ -95,7 +95,8 @@ class TestAxis:
 
             def motion(_: float, x: np.ndarray[Any, Any], force: float = force) -> list[float]:
                 q, v = x
-                friction = np.tanh(v / 1e-3) * (0.5 + 0.4 / (1.0 + (v / 0.2) ** 2)) + 0.3 * v
+                rubs = 0.5 + 0.4 / (1.0 + (v / 0.2) ** 2) + 0.6 * abs(np.sin(q - 0.2))
+                friction = np.tanh(v / 1e-3) * rubs + 0.3 * v
                 waves = 9.0 * np.sin(q - 0.2) + 0.7 * np.sin(4.0 * np.pi * q) - 0.3 * np.cos(4.0 * np.pi * q)
                 return [v, (force - friction - waves) / 2.0]
 

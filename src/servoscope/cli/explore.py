@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -76,11 +77,14 @@ def explore(
 
 def plant_table(structure: AxisStructure) -> str:
     """Return the section of a loop file; the constant force joins, which every recording has of its own."""
+    from servoscope.models.plants.axis import AxisPlant
+
     plant = structure.plant
     terms = ", ".join(f'"{term}"' for term in (*plant.terms, "offset"))
     lines = ["[plant]", 'kind = "axis"', f"terms = [{terms}]", f"input_gain = {plant.input_gain!r}"]
-    if plant.stribeck_speed is not None:
-        lines.append(f"stribeck_speed = {plant.stribeck_speed!r}")
+    for key in ("stribeck_speed", "hanging_at", "payload_arm", "y"):
+        if (value := getattr(plant, key)) != AxisPlant.model_fields[key].default:
+            lines.append(f"{key} = {json.dumps(value)}")
     return "\n".join(lines) + "\n"
 
 

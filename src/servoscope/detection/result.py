@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, computed_field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, computed_field, model_validator
 
 from servoscope.core.messages import Message, MessageField, MessageText, message, read_messages, render, text_message
 from servoscope.core.short_repr import ShortRepr
@@ -30,6 +30,8 @@ class FaultEstimate(_ResultModel):
     parameter: str
     ratio: float
     interval: tuple[float, float]
+    # of a payload at a place that the loop file knows: its mass [kg] and the 95 % interval of it
+    mass_kg: tuple[float, float, float] | None = Field(default=None, exclude_if=lambda value: value is None)
 
     @property
     def learned(self) -> bool:

@@ -155,8 +155,20 @@ def _size_messages(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
     first, *others = faults
     if not others and first.parameter == first.name:
         return (message("diagnosis.size_of_it", **_size_values(first)),)
+    if first.mass_kg is not None:
+        mass, low, high = first.mass_kg
+        size = message(
+            "diagnosis.size_mass",
+            mass=mass,
+            mass_low=low,
+            mass_high=high,
+            parameter=first.parameter,
+            **_size_values(first),
+        )
+    else:
+        size = message("diagnosis.size", parameter=first.parameter, **_size_values(first))
     return (
-        message("diagnosis.size", parameter=first.parameter, **_size_values(first)),
+        size,
         *(message("diagnosis.size_next", parameter=each.parameter, **_size_values(each)) for each in others),
     )
 

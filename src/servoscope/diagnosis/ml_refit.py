@@ -14,6 +14,7 @@ from servoscope.detection.chi2_test import Onset
 from servoscope.detection.result import UNKNOWN, Candidate, DiagnosisWarning, FaultEstimate, Mimic, RefitSummary
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.warnings import warning_throughout
+from servoscope.models.plants import Fault, Plant
 
 if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
     from servoscope.isolation.ml import Hypothesis, OnsetEstimate, RefitResult
@@ -42,7 +43,7 @@ def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:
     """Return all single faults, the pairs worth listing and ``unknown``, the most probable first."""
     least = min(each.fitted.cost for each in refined.hypotheses)
     candidates = [
-        _candidate(each, least, refined.noise_variance)
+        _candidate(each, refined.window.plant, least, refined.noise_variance)
         for each in refined.hypotheses
         if len(each.fitted.faults) == 1 or each.probability >= WORTH_LISTING
     ]
@@ -131,13 +132,11 @@ def size_distance_std(a: FaultEstimate, b: FaultEstimate) -> float:
     return abs(float(np.log(a.ratio / b.ratio))) / max(spread, 1e-12)
 
 
-def _candidate(each: Hypothesis, least: float, noise_variance: float) -> Candidate:
+def _candidate(each: Hypothesis, plant: Plant, least: float, noise_variance: float) -> Candidate:
     fitted = each.fitted
     ratios, intervals = np.exp(fitted.x), np.exp(np.array(each.evidence.intervals))
     faults = tuple(
-        FaultEstimate(
-            name=fault.name, parameter=fault.parameter, ratio=float(ratio), interval=(float(low), float(high))
-        )
+        _fault_estimate(fault, plant, float(ratio), float(low), float(high))
         for fault, ratio, (low, high) in zip(fitted.faults, ratios, intervals, strict=True)
     )
     covariance = tuple(tuple(row) for row in (noise_variance * fitted.covariance).tolist()) if len(faults) > 1 else None
@@ -148,3 +147,9 @@ def _candidate(each: Hypothesis, least: float, noise_variance: float) -> Candida
         misfit=max(fitted.cost - least, 0.0) / noise_variance,
         covariance=covariance,
     )
+
+
+def _fault_estimate(fault: Fault, plant: Plant, ratio: float, low: float, high: float) -> FaultEstimate:
+    value, least, most = (plant.added_mass(fault.parameter, x) for x in (ratio, low, high))
+    mass = None if value is None or least is None or most is None else (value, least, most)
+    return FaultEstimate(name=fault.name, parameter=fault.parameter, ratio=ratio, interval=(low, high), mass_kg=mass)

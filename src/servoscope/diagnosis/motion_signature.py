@@ -50,7 +50,9 @@ def motion_signature(recording: Recording, loop: Loop, from_s: float, to_s: floa
     window = 2 * max(2, round(0.5 * WINDOW * loop.sample_rate / loop.cutoff)) + 1
     if rows.samples < 2 * window:
         return None
-    y, v, a = _smoothed(rows.y, rows.restart, window, loop.sample_rate)
+    # of a speed, the way since the beginning
+    way = np.cumsum(rows.y) / loop.sample_rate if loop.plant.derivative else rows.y
+    y, v, a = _smoothed(way, rows.restart, window, loop.sample_rate)
     u, _, _ = _smoothed(rows.u, rows.restart, window, loop.sample_rate)
     ahead, _, _ = _smoothed(rows.r - rows.y, rows.restart, window, loop.sample_rate)
     known = np.isfinite(v)
@@ -66,7 +68,11 @@ def motion_signature(recording: Recording, loop: Loop, from_s: float, to_s: floa
     band = _width_at_rest(u, y, v, a, moving, block)
     if band is None:
         return None
-    lost = None if np.array_equal(rows.r, rows.u) else _width_at_rest(ahead, y, v, a, moving, block)
+    lost = (
+        None
+        if np.array_equal(rows.r, rows.u) or loop.plant.derivative
+        else _width_at_rest(ahead, y, v, a, moving, block)
+    )
     return MotionSignature(
         0.5 * (position[1:] + position[:-1]),
         _bin_means(y, u, moving & (v > 0.0), position),

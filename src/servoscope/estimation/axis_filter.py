@@ -52,21 +52,22 @@ class AxisFilter:
     settling: int  # samples after which it has forgotten a false step of the acceleration
 
     @classmethod
-    def design(cls, noise: AxisNoise, sample_rate: float) -> AxisFilter:
-        """Solve for the steady gain (Anderson and Moore, 1979, chapter 4)."""
+    def design(cls, noise: AxisNoise, sample_rate: float, derivative: int = 0) -> AxisFilter:
+        """Solve for the steady gain (Anderson and Moore, 1979, chapter 4); `derivative`: 1 where y is a speed."""
         from scipy.linalg import expm
         from scipy.signal import ss2tf
 
         T, tau = 1.0 / sample_rate, noise.correlation_s
-        A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / tau]])
-        B, C = np.array([[0.0], [1.0], [0.0]]), np.array([[1.0, 0.0, 0.0]])
-        whole = expm(np.block([[A, B], [np.zeros((1, 4))]]) * T)
-        Phi, Gamma = whole[:3, :3], whole[:3, 3:]
-        q = np.diag([0.0, 0.0, 2.0 * noise.acceleration_std**2 / tau])
-        loan = expm(np.block([[-A, q], [np.zeros((3, 3)), A.T]]) * T)  # Van Loan (1978)
-        Q = loan[3:, 3:].T @ loan[:3, 3:]
-        # in units in which the three states are of one size
-        size = np.array([noise.acceleration_std * T**2, noise.acceleration_std * T, noise.acceleration_std])
+        n = 3 - derivative  # position, speed and the force, or the last two
+        A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / tau]])[derivative:, derivative:]
+        B, C = np.array([[0.0], [1.0], [0.0]])[derivative:], np.eye(1, n)
+        whole = expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * T)
+        Phi, Gamma = whole[:n, :n], whole[:n, n:]
+        q = np.diag([0.0, 0.0, 2.0 * noise.acceleration_std**2 / tau])[derivative:, derivative:]
+        loan = expm(np.block([[-A, q], [np.zeros((n, n)), A.T]]) * T)  # Van Loan (1978)
+        Q = loan[n:, n:].T @ loan[:n, n:]
+        # in units in which the states are of one size
+        size = noise.acceleration_std * np.array([T**2, T, 1.0])[derivative:]
         scaled = Phi * size / size[:, None]
         C = C * size
         r = max(noise.y_std**2, RELATIVE_FLOOR * float((C @ C.T)[0, 0]))
@@ -79,7 +80,11 @@ class AxisFilter:
         from_y, _ = ss2tf(F, inputs, C, np.zeros((1, 2)), 1)
         slowest = float(np.abs(np.linalg.eigvals(F)).max())
         settling = int(np.ceil(np.log(FORGOTTEN) / np.log(min(max(slowest, 0.01), 0.999))))
-        return cls(numerator[0], poles - from_y[0], poles, S, settling)
+        # kernels take three poles, of which that of a position may be missing
+        to_acceleration, to_y, poles = (
+            np.pad(one, (0, derivative)) for one in (numerator[0], poles - from_y[0], poles)
+        )
+        return cls(to_acceleration, to_y, poles, S, settling)
 
     def of_acceleration(self, acceleration: Any, runs: Sequence[slice]) -> Any:
         """Return what accelerations (..., N) add to y's prediction; every run begins anew."""
@@ -114,15 +119,19 @@ class AxisSignals:
     y: FloatArray
     restart: BoolArray
     sample_rate: float
+    derivative: int = 0  # 1 where y is a speed
 
     @classmethod
-    def thinned(cls, u: FloatArray, y: FloatArray, restart: BoolArray, sample_rate: float, stride: int) -> AxisSignals:
+    def thinned(
+        cls, u: FloatArray, y: FloatArray, restart: BoolArray, sample_rate: float, stride: int, derivative: int = 0
+    ) -> AxisSignals:
         """Take every `stride`-th sample; runs that are shorter are joined to what follows."""
         N = len(y) // stride
         blocks = slice(0, N * stride)
         new: BoolArray = np.any(restart[blocks].reshape(N, stride), axis=1)
         new[0] = True
-        return cls(u[blocks].reshape(N, stride).mean(axis=1), y[blocks][::stride], new, sample_rate / stride)
+        acting = u[blocks].reshape(N, stride).mean(axis=1)
+        return cls(acting, y[blocks][::stride], new, sample_rate / stride, derivative)
 
     @cached_property
     def runs(self) -> tuple[slice, ...]:
@@ -132,13 +141,17 @@ class AxisSignals:
 
     @cached_property
     def speed(self) -> FloatArray:
-        """The slope of a parabola through the samples around each (Savitzky and Golay, 1964), shape (N,)."""
+        """The slope of a parabola through the samples around each (Savitzky and Golay, 1964), shape (N,).
+
+        Of a y that is a speed, its value.
+        """
         from scipy.signal import savgol_filter
 
         def slope(y: FloatArray) -> FloatArray:
             if len(y) < SPEED_SAMPLES:
-                return np.zeros(len(y))
-            return np.asarray(savgol_filter(y, SPEED_SAMPLES, 2, deriv=1, delta=1.0 / self.sample_rate))
+                return y if self.derivative else np.zeros(len(y))
+            order, delta = 1 - self.derivative, 1.0 / self.sample_rate
+            return np.asarray(savgol_filter(y, SPEED_SAMPLES, 2, deriv=order, delta=delta))
 
         return np.concatenate([slope(self.y[r]) for r in self.runs])
 

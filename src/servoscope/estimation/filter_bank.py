@@ -214,7 +214,8 @@ def build_filter_bank(loop: Loop, instrument: InstrumentModel | None = None) -> 
     # second-order differentiator of its own: the sign of a strongly filtered velocity lags (THEORY section 8)
     cutoff = getattr(plant, "sign_cutoff", None) or 50.0
     differentiator = state_variable_filter(min(cutoff, 0.25 * loop.sample_rate), 2)
-    velocity = sample_system(differentiator, loop.sample_rate, "foh").output(np.array([[0.0, 1.0]]))
+    # of an output that is a speed, its low pass
+    velocity = sample_system(differentiator, loop.sample_rate, "foh").output(np.eye(1, 2, 1 - plant.derivative))
     return FilterBank(
         system=LinearSystem(whole.A, whole.B @ route, C, D),
         velocity=velocity,

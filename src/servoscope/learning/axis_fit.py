@@ -53,7 +53,7 @@ class AxisRegression:
 
     def regress(self, noise: AxisNoise, rest_speed: float) -> tuple[FloatArray, FloatArray, AxisFilter]:
         """Return regressors (N, p) and target (N,) of the innovations that count, in standard deviations."""
-        filter = AxisFilter.design(noise, self.signals.sample_rate)
+        filter = AxisFilter.design(noise, self.signals.sample_rate, self.signals.derivative)
         where = self.signals.moving(rest_speed, filter.settling)
         X = filter.of_acceleration(self.columns, self.signals.runs)[:, where].T
         e = filter.of_output(self.signals.y, self.signals.runs)[where]

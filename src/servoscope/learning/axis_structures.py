@@ -15,6 +15,7 @@ from servoscope.estimation.axis_filter import axis_stride
 from servoscope.isolation.ml.axis_window import axis_signals
 from servoscope.learning.axis_fit import AxisRegression, fit_axis_noise, rest_speed
 from servoscope.models.loop import Loop
+from servoscope.models.plants import Plant
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 
@@ -61,7 +62,7 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
     slow = rest_speed(signals)
     speed = float(np.sqrt(np.mean(np.concatenate([one.speed for one in signals]) ** 2)))
     half = 0.5 * max(float(np.ptp(one.y)) for one in signals)
-    plants = list(_candidates(loop.plant.input_gain, speed, half))
+    plants = list(_candidates(loop.plant, speed, half))
     richest = max(plants, key=lambda plant: len(plant.columns))
     noise = fit_axis_noise([AxisRegression.of(richest, one) for one in signals], slow)
     block = max(1, round(BLOCK_S * signals[0].sample_rate))
@@ -102,14 +103,18 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
     return supported, *(one for one in ordered if one is not supported)
 
 
-def _candidates(gain: float, speed: float, half: float) -> Iterator[AxisPlant]:
+def _candidates(declared: Plant, speed: float, half: float) -> Iterator[AxisPlant]:
     """Yield axes without the term ``offset``, which is every recording's own."""
     viscous: tuple[tuple[str, ...], ...] = (), ("viscous",), ("viscous_by_direction",)
     dry: list[tuple[tuple[str, ...], dict[str, Any]]] = [((), {}), (("coulomb",), {})]
     dry += [(("coulomb", "stribeck"), {"stribeck_speed": float(f"{share * speed:.2g}")}) for share in SLOW_SHARES]
-    position: tuple[tuple[str, ...], ...] = (), ("stiffness",), *((("gravity",),) if half > CURVED else ())
+    swings = (("gravity",), ("gravity", "load_friction")) if half > CURVED else ()
+    position: tuple[tuple[str, ...], ...] = ((),) if declared.derivative else ((), ("stiffness",), *swings)
+    known: dict[str, Any] = {"input_gain": declared.input_gain}
+    if isinstance(declared, AxisPlant):
+        known |= {"y": declared.y, "payload_arm": declared.payload_arm, "hanging_at": declared.hanging_at}
     for rub, (stick, keys), hold in product(viscous, dry, position):
-        yield AxisPlant.model_validate({"terms": (*rub, *stick, *hold), "input_gain": gain, **keys})
+        yield AxisPlant.model_validate({"terms": (*rub, *stick, *hold), **known, **keys})
 
 
 def _scatter(without: FloatArray) -> FloatArray:

@@ -146,7 +146,8 @@ def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
         source = rec.r if getattr(loop.plant, "sign_from", "output") == "reference" else rec.y
         stretch = np.cumsum(rec.restart)
         together = stretch[span:] == stretch[:-span]
-        speeds.append(np.abs(source[span:] - source[:-span])[together] * loop.sample_rate / span)
+        moved = source[span:] if loop.plant.derivative else (source[span:] - source[:-span]) * loop.sample_rate / span
+        speeds.append(np.abs(moved)[together])
     speed = np.concatenate(speeds)
     if not len(speed) or not speed.max() > 0.0:
         return 0.0

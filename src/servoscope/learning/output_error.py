@@ -63,7 +63,10 @@ def simulate_free(
         first = max(start, 1)
         speed = float(recording.y[first + 1] - recording.y[first - 1]) * rate / SPEED_OVER
     y = np.empty(N - first)
-    run_free_axis(axis_constants([plant], loop), float(recording.y[first]), speed, np.ascontiguousarray(u[first:]), y)
+    position = float(recording.y[first])
+    if plant.derivative:
+        position, speed = 0.0, position
+    run_free_axis(axis_constants([plant], loop), position, speed, np.ascontiguousarray(u[first:]), y)
     return y
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +15,14 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import IrregularTimeError, RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.learning.inspection import Inspection, inspect
+from servoscope.learning.inspection.model_order import WORTH_FRICTION, ModelOrderFit
 from servoscope.models.loop import Columns, Loop, MonitorSettings
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, read
 from servoscope.signals.readers.axes import find_axes, signal_names
 from servoscope.signals.readers.columns import LinearCombination, parse_combination
 from servoscope.signals.readers.formats import open_file
-from servoscope.signals.readers.guess_columns import FIELDS, guess_mapping, quoted_channel
+from servoscope.signals.readers.guess_columns import FIELDS, guess_mapping, names_speed, quoted_channel
 from servoscope.signals.readers.table import number_column
 from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
@@ -30,6 +31,7 @@ MEMORIES = 10.0  # that a recording to learn from should have at least
 LONGEST_MEMORY_S, LEAST_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
 WORTH = 0.005  # share of u that a higher order or a stiffness has to explain
 JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
+SPEED_AXIS = {"kind": "axis", "y": "speed", "terms": ["viscous", "coulomb", "offset"]}
 CLEAR = 0.9  # share of u that a plant explains; below it, the choice is in doubt
 
 
@@ -94,16 +96,17 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
     Raises RecordingError if the log cannot be read, or nothing moves in it.
     """
     columns, wraps = _unwrapped_columns(path, columns)
+    is_speed = names_speed(columns.outputs[0])
     try:
         recording = read(path, columns=columns)
-        found = inspect(recording)
+        found = _inspect(recording, is_speed)
         irregular = found.sampling.jitter_percent > JITTER_PERCENT
     except IrregularTimeError:
         irregular = True
     if irregular:
         columns = columns.model_copy(update={"resample": True})
         recording = read(path, columns=columns)
-        found = inspect(recording)
+        found = _inspect(recording, is_speed)
     best = found.best_order
     if best is None or found.suggested_cutoff_hz is None:
         raise RecordingError(f"{path}: {found.summary}")
@@ -122,46 +125,78 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
         "monitor": {"cutoff": cutoff, "memory": memory, "frequencies": frequencies},
     }
 
-    def loop_of(order: int, stiffness: bool) -> Loop:
-        plant = {
-            "kind": "polynomial",
-            "order": order,
-            "friction": best.friction,
-            "stiffness": stiffness,
-            "offset": True,
-        }
+    def loop_of(plant: Mapping[str, object]) -> Loop:
         return Loop.from_dict({**settings, "plant": plant}, source=str(path))
 
-    order, stiffness, share = best.order, best.stiffness, best.explained
-    # beside friction, a higher order and a stiffness may explain what friction leaves over: the simpler plant is taken
-    for simpler in ((order, False), (order - 1, False)):
-        if (
-            simpler[0]
-            and (fit := inspect(recording, loop_of(*simpler)).fit) is not None
-            and fit.explained > share - WORTH
-        ):
-            order, stiffness, share = *simpler, fit.explained
-    loop = loop_of(order, stiffness)
-    explained = message("init.explained", share=100.0 * share)
-    doubtful = share < CLEAR
+    def explained_by(plant: Mapping[str, object]) -> float:
+        fit = inspect(recording, loop_of(plant)).fit
+        return 0.0 if fit is None else fit.explained
+
+    # friction that changes its sign with y itself; what no rigid axis explains is a polynomial in s of its y
+    plant, plant_lines = _propose_speed_axis(explained_by) if is_speed else ({}, ())
+    if not plant:
+        plant, plant_lines = _propose_polynomial(best, explained_by)
+    loop = loop_of(plant)
     lines = (
         ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
         *_column_lines(columns, wraps, recording),
-        ProposalLine("plant", "kind", '"polynomial"', message("init.kind")),
-        ProposalLine("plant", "order", str(order), explained, doubtful),
-        ProposalLine("plant", "friction", json.dumps(best.friction), _friction_reason(best.friction)),
-        ProposalLine(
-            "plant",
-            "stiffness",
-            json.dumps(stiffness),
-            message("init.stiffness" if stiffness else "init.free"),
-        ),
-        ProposalLine("plant", "offset", "true", message("init.offset")),
+        *plant_lines,
         ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff")),
         ProposalLine("monitor", "memory", repr(memory), message("init.memory", length=recording.duration_s)),
         ProposalLine("monitor", "frequencies", repr(frequencies), message("init.frequencies")),
     )
     return LoopProposal(loop, lines)
+
+
+def _inspect(recording: Recording, is_speed: bool) -> Inspection:
+    """Inspect a recording before its plant is known; where y is a speed, that of a steady motion is no rest."""
+    if not is_speed:
+        return inspect(recording)
+    return inspect(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
+
+
+def _propose_speed_axis(
+    explained_by: Callable[[Mapping[str, object]], float],
+) -> tuple[Mapping[str, object], tuple[ProposalLine, ...]]:
+    """Return a motor axis whose y is a speed with its lines, nothing where it does not explain u."""
+    plain = SPEED_AXIS | {"terms": ["viscous", "offset"]}
+    shares = [explained_by(plant) for plant in (SPEED_AXIS, plain)]
+    rubs = 1.0 - shares[0] < (1.0 - WORTH_FRICTION) * (1.0 - shares[1])
+    plant, share = (SPEED_AXIS, shares[0]) if rubs else (plain, shares[1])
+    if share < CLEAR:
+        return {}, ()
+    explained = message("init.axis", share=100.0 * share)
+    return plant, (
+        ProposalLine("plant", "kind", '"axis"', explained),
+        ProposalLine("plant", "y", '"speed"', message("init.speed")),
+        ProposalLine("plant", "terms", json.dumps(plant["terms"]), _friction_reason("coulomb" if rubs else "none")),
+    )
+
+
+def _propose_polynomial(
+    best: ModelOrderFit, explained_by: Callable[[Mapping[str, object]], float]
+) -> tuple[Mapping[str, object], tuple[ProposalLine, ...]]:
+    """Return a polynomial in s with its lines."""
+
+    def plant_of(order: int, stiffness: bool) -> dict[str, object]:
+        known = {"kind": "polynomial", "order": order, "friction": best.friction}
+        return {**known, "stiffness": stiffness, "offset": True}
+
+    order, stiffness, share = best.order, best.stiffness, best.explained
+    # beside friction, a higher order and a stiffness may explain what friction leaves over: the simpler plant is taken
+    for simpler in ((order, False), (order - 1, False)):
+        if simpler[0] and (found := explained_by(plant_of(*simpler))) > share - WORTH:
+            order, stiffness, share = *simpler, found
+    explained = message("init.explained", share=100.0 * share)
+    return plant_of(order, stiffness), (
+        ProposalLine("plant", "kind", '"polynomial"', message("init.kind")),
+        ProposalLine("plant", "order", str(order), explained, share < CLEAR),
+        ProposalLine("plant", "friction", json.dumps(best.friction), _friction_reason(best.friction)),
+        ProposalLine(
+            "plant", "stiffness", json.dumps(stiffness), message("init.stiffness" if stiffness else "init.free")
+        ),
+        ProposalLine("plant", "offset", "true", message("init.offset")),
+    )
 
 
 def propose(path: str | Path, columns: Columns | None = None) -> tuple[LoopProposal, Inspection]:

@@ -52,8 +52,10 @@ class AxisConstants(NamedTuple):
     offset: FloatArray  # (p,)
     # (p, 2), force at no speed and one over the speed of half of it, of Stribeck friction
     stribeck: FloatArray
+    load: FloatArray  # (p, 3), amplitude, factor on y and phase of the friction that follows the magnitude of a sine
     waves: FloatArray  # (p, w, 3), amplitude, factor on y and phase of each force that is a sine of y
     steps: int  # sub-steps per sample
+    speed: bool  # whether y is the speed
 
 
 @subroutine
@@ -128,8 +130,8 @@ def run_axis(
     m, past = settings.delay_samples, settings.delay_samples + 2
     position, speed, total = s[HEADER_SIZE], s[HEADER_SIZE + 1], s[INTEGRAL]
     for k in range(len(r)):
-        y[k] = position
-        u[k], limited[k], acting[past + k], total = control_step(settings, r[k], n_u[k], n_y[k], position, 0.0, total)
+        y[k] = speed if motion.speed else position
+        u[k], limited[k], acting[past + k], total = control_step(settings, r[k], n_u[k], n_y[k], y[k], 0.0, total)
         p = which[k]
         now, late = acting[past + k - m], acting[past + k - 1 - m]
         for step in range(motion.steps):
@@ -142,7 +144,7 @@ def run_axis(
 def run_free_axis(motion: AxisConstants, position: float, speed: float, u: FloatArray, y: FloatArray) -> None:
     """Run the first axis driven by what acts on it, u (N,), from a position and a speed on; y (N,) is filled."""
     for k in range(len(u)):
-        y[k] = position
+        y[k] = speed if motion.speed else position
         for _ in range(motion.steps):
             position, speed = _axis_step(motion, 0, position, speed, motion.gain[0] * u[k])
 
@@ -162,6 +164,7 @@ def _axis_step(motion: AxisConstants, p: int, position: float, speed: float, dri
         return position + step, step
     coasting = Phi[1, 0] * position + Phi[1, 1] * speed + g[1] * drive
     coulomb = motion.coulomb[p] + motion.stribeck[p, 0] / (1.0 + (motion.stribeck[p, 1] * speed) ** 2)
+    coulomb += motion.load[p, 0] * abs(np.sin(motion.load[p, 1] * position + motion.load[p, 2]))
     if abs(coasting) <= coulomb * g[1]:
         force = drive - coasting / g[1]
         return Phi[0, 0] * position + Phi[0, 1] * speed + g[0] * force, 0.0
@@ -200,8 +203,10 @@ def axis_constants(plants: Sequence[Plant], loop: Loop) -> AxisConstants:
         coulomb=coulomb,
         offset=offset,
         stribeck=np.array([each.pop("stribeck_v", (0.0, 0.0, 0.0))[:2] for each in columns]),
+        load=np.array([each.pop("load_v", (0.0, 0.0, 0.0)) for each in columns]),
         waves=np.array([list(each.values()) for each in columns]).reshape(len(plants), -1, 3),
         steps=SUB_STEPS,
+        speed=bool(loop.plant.derivative),
     )
 
 

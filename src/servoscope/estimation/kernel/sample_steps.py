@@ -327,11 +327,17 @@ class SampleSteps:
         return w
 
     def _shaped_input(self, c: Any, k: int, kind: int, y: Any, speed: Any) -> Any:
-        """Return Stribeck friction at a speed scaled by c[k], or the sine of y scaled by c[k] and moved by c[k + 1]."""
+        """Return Stribeck friction at a speed scaled by c[k], or the sine of y scaled by c[k] and moved by c[k + 1].
+
+        Friction that grows with a load has the magnitude of that sine, and the sign of the speed.
+        """
+        if kind in (5, 6, 7):
+            return sine(fma(c[k], y, c[k + 1]))
+        sign = where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0))
         if kind == 4:
             slow = c[k] * speed
-            return where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0)) / fma(slow, slow, 1.0)
-        return sine(fma(c[k], y, c[k + 1]))
+            return sign / fma(slow, slow, 1.0)
+        return sign * abs(sine(fma(c[k], y, c[k + 1])))
 
     def _mean_square(self, c: Any, s: Any, residual: Any) -> Any:
         return fma(fma(residual, residual, -s[self.to.power]), c[self.at.share], s[self.to.power])

@@ -94,12 +94,12 @@ class AxisWindow(ChangeWindow):
     @cached_property
     def filter(self) -> AxisFilter:
         """The filter."""
-        return AxisFilter.design(self.model.noise, self.rate)
+        return AxisFilter.design(self.model.noise, self.rate, self.plant.derivative)
 
     @cached_property
     def signals(self) -> AxisSignals:
         """The samples of the window."""
-        return AxisSignals(self.u, self.y, self.restart, self.rate)
+        return AxisSignals(self.u, self.y, self.restart, self.rate, self.plant.derivative)
 
     @cached_property
     def columns(self) -> FloatArray:
@@ -177,7 +177,8 @@ class AxisWindow(ChangeWindow):
     def unmodelled_signals(self) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return forces that no term of the axis has: of position, of its square, and of the speed's."""
         v, y = self.signals.speed, self.y - self.y.mean()
-        return [], [y, y**2, v * np.abs(v), v, np.sign(v), np.ones(self.samples)]
+        placed = [] if self.plant.derivative else [y, y**2]
+        return [], [*placed, v * np.abs(v), v, np.sign(v), np.ones(self.samples)]
 
     def inflation(self, jacobian: FloatArray, residual: FloatArray, sizes: int) -> float:
         """Return the long-run variance of the scores of the sizes over that of white innovations, at least 1.
@@ -228,7 +229,7 @@ def axis_signals(loop: Loop, recording: Recording, stride: int) -> AxisSignals:
     restart = recording.restart.copy()
     restart[0] = True
     u = delay_input(plant_input(loop, recording.u), restart, round(loop.delay * loop.sample_rate))
-    return AxisSignals.thinned(u, recording.y, restart, loop.sample_rate, stride)
+    return AxisSignals.thinned(u, recording.y, restart, loop.sample_rate, stride, loop.plant.derivative)
 
 
 @kernel

@@ -169,7 +169,7 @@ def _measure_with_model(
     own_rate = 2.0 * math.pi * cutoff
     generic = model_order.generic_loop(rate, cutoff, 3.0 * noise * math.sqrt(sign_rate**3 / (4.0 * rate)))
     g = model_order.form_regressors(recording, generic)
-    v = g.phi[:, 1]
+    v = g.phi[:, 1 if loop is None else 1 - loop.plant.derivative]
     at_rest, rest = signals.detect_rest(recording, v, noise * math.sqrt(own_rate**3 / (32.0 * rate)))
     moving = _motion_mask(g, at_rest)
     block = settling_samples(cutoff, 4, 1.0 / rate)

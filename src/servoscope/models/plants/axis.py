@@ -13,9 +13,18 @@ from servoscope.core.arrays import FloatArray
 from servoscope.models.plants.base import CoefficientPlant, Fault, StateSpace
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+LATER = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 TermName = Literal[
-    "stiffness", "viscous", "viscous_by_direction", "coulomb", "stribeck", "offset", "gravity", "cogging"
+    "stiffness",
+    "viscous",
+    "viscous_by_direction",
+    "coulomb",
+    "stribeck",
+    "offset",
+    "gravity",
+    "load_friction",
+    "cogging",
 ]
 
 
@@ -46,12 +55,18 @@ TERMS: dict[str, tuple[AxisColumn, ...]] = {
     ),
     "offset": (AxisColumn("offset", "one", lambda _, y, v: np.ones_like(y), signed=True),),
     "gravity": (AxisColumn("gravity", "sin_y", lambda p, y, v: np.sin(y - p.hanging_at), signed=True),),
+    # friction of a gear in proportion to the weight that it carries (Bittencourt and Gunnarsson, 2012)
+    "load_friction": (
+        AxisColumn("load_friction", "load_v", lambda p, y, v: np.abs(np.sin(y - p.hanging_at)) * np.sign(v)),
+    ),
     "cogging": (
         AxisColumn("cogging_sin", "cogging_sin", lambda p, y, v: np.sin(p.wave_number * y), signed=True),
         AxisColumn("cogging_cos", "cogging_cos", lambda p, y, v: np.cos(p.wave_number * y), signed=True),
     ),
 }
 """What may act on an axis besides its inertia, by the name that a loop file declares."""
+
+OF_POSITION = "stiffness", "gravity", "load_friction", "cogging"
 
 # parameter -> name of the fault, and all that does the same to u and y
 FAULTS = {
@@ -65,13 +80,23 @@ FAULTS = {
 }
 BY_DIRECTION = "viscous_friction_forward", "viscous_friction_backward"
 
+# where a payload has weight and a known place
+PAYLOAD_FAULTS = {
+    "moved_mass": ("payload", "more moved mass: a payload, a tool"),
+    "inertia": ("inertia", "more inertia without more weight: a coupling, a flywheel, a balanced load"),
+}
+EARTH = 9.81  # m/s^2
+
 
 def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value  # TOML has lists, and plants are read strictly
 
 
 class AxisPlant(CoefficientPlant):
-    """Motor axis ``input_gain u = inertia y'' + sum of terms``, each a coefficient times a function of y and y'."""
+    """Motor axis ``input_gain u = inertia y'' + sum of terms``, each a coefficient times a function of y and y'.
+
+    Where y is a speed, y' and y'' are y itself and its derivative.
+    """
 
     kind: Literal["axis"] = "axis"
     terms: Annotated[tuple[TermName, ...], BeforeValidator(_as_tuple)] = ("viscous", "coulomb", "offset")
@@ -81,6 +106,10 @@ class AxisPlant(CoefficientPlant):
     period: Positive | None = None
     # output at which the load of the term ``gravity`` hangs, in rad
     hanging_at: Finite = 0.0
+    # distance of a payload from the joint [m], with input_gain u in N m; 1 on a linear axis, with input_gain u in N
+    payload_arm: Annotated[Positive | None, LATER] = None
+    # what the output is: a position, or a speed, as drives log it; then no term can depend on the position
+    y: Annotated[Literal["position", "speed"], LATER] = "position"
     # speed [output per s] below which sign(y') is not trusted and set to 0
     sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
     # where the sign of the recursion comes from: the measured output, or the reference where y is noisy or slow
@@ -99,6 +128,11 @@ class AxisPlant(CoefficientPlant):
         for term, key in (("stribeck", "stribeck_speed"), ("cogging", "period")):
             if (term in self.terms) != (getattr(self, key) is not None):
                 raise ValueError(f"{key}: belongs to the term {term}, give both or none of them")
+        placed = [term for term in self.terms if term in OF_POSITION]
+        if placed and self.derivative:
+            raise ValueError(f'terms: {placed[0]} acts by the position, which y = "speed" does not tell, remove it')
+        if "load_friction" in self.terms and "gravity" not in self.terms:
+            raise ValueError("terms: load_friction grows with the load of gravity, add gravity")
         if self.coefficients is not None:
             unknown = sorted(set(self.coefficients) ^ set(self.names))
             if unknown:
@@ -124,8 +158,14 @@ class AxisPlant(CoefficientPlant):
 
     @property
     def powers(self) -> tuple[int, ...]:
-        """Powers of s: those of the terms, and 2."""
-        return (*(column.column for column in self.columns if isinstance(column.column, int)), 2)
+        """Powers of s: those of the terms, and 2; one less where y is a speed."""
+        powers = (*(column.column for column in self.columns if isinstance(column.column, int)), 2)
+        return tuple(power - self.derivative for power in powers)
+
+    @property
+    def derivative(self) -> int:
+        """The power of s by which y is ahead of a position."""
+        return int(self.y == "speed")
 
     @property
     def extras(self) -> tuple[str, ...]:
@@ -138,6 +178,7 @@ class AxisPlant(CoefficientPlant):
         return {
             "stribeck_v": (1.0 / (self.stribeck_speed or 1.0), 0.0),
             "sin_y": (1.0, -self.hanging_at),
+            "load_v": (1.0, -self.hanging_at),
             "cogging_sin": (self.wave_number, 0.0),
             "cogging_cos": (self.wave_number, 0.5 * np.pi),
         }
@@ -158,9 +199,24 @@ class AxisPlant(CoefficientPlant):
         """Changes that are told by name; friction that differs by direction changes in both."""
         by_direction = "viscous_by_direction" in self.terms
         known = {*self.names, "input_gain", *(("viscous_friction",) if by_direction else ())}
+        told = FAULTS | PAYLOAD_FAULTS if self._lifts else FAULTS
+        known |= {"moved_mass"} & {*told}
         return tuple(
-            self._fault(name, parameter, words) for parameter, (name, words) in FAULTS.items() if parameter in known
+            self._fault(name, parameter, words) for parameter, (name, words) in told.items() if parameter in known
         )
+
+    @property
+    def _lifts(self) -> bool:
+        return self.payload_arm is not None and "gravity" in self.terms
+
+    def added_mass(self, parameter: str, ratio: float) -> float | None:
+        """Return the payload [kg] that a ratio of the inertia or of the moved mass stands for.
+
+        None: it is no mass, or the loop file does not know where the payload is.
+        """
+        if self.payload_arm is None or parameter != ("moved_mass" if self._lifts else "inertia"):
+            return None
+        return (ratio - 1.0) * self._nominal()["inertia"] / self.payload_arm**2
 
     def scaled(self, factors: Mapping[str, Any]) -> Self:
         """Return the same axis with coefficients multiplied; ``input_gain`` multiplies all of them."""
@@ -168,8 +224,24 @@ class AxisPlant(CoefficientPlant):
         common, both = factors.pop("input_gain", 1.0), factors.pop("viscous_friction", 1.0)
         for name in BY_DIRECTION if "viscous_by_direction" in self.terms else ("viscous_friction",):
             factors[name] = factors.get(name, 1.0) * both
+        mass = factors.pop("moved_mass", None)
         scaled = {name: value * common * factors.get(name, 1.0) for name, value in self._nominal().items()}
+        if mass is not None:
+            self._load(scaled, (mass - 1.0) * self._nominal()["inertia"] * common)
         return self.model_copy(update={"coefficients": scaled})
+
+    def _load(self, coefficients: dict[str, Any], inertia: Any) -> None:
+        """Add the inertia m l^2 of a payload, its weight m g l on the side of the arm's own, and its share of friction.
+
+        It is added to the nominal inertia, so that the mass does not hang on how well a recording shows the inertia.
+        """
+        assert self.payload_arm is not None
+        own = coefficients["gravity"]
+        weight = np.sign(np.real(own)) * inertia * EARTH / self.payload_arm
+        coefficients["inertia"] += inertia
+        coefficients["gravity"] += weight
+        if "load_friction" in coefficients:
+            coefficients["load_friction"] *= 1.0 + weight / own
 
     def acceleration_coefficients(self) -> Any:
         """Return b and all a_i of ``y'' = b u - sum a_i column_i``, in the order of `columns`; they may be complex."""
@@ -178,9 +250,11 @@ class AxisPlant(CoefficientPlant):
         return np.array(each) / nominal["inertia"]
 
     def state_space(self) -> StateSpace:
-        """Continuous linear part: states y and y'; friction by direction enters with the mean of both."""
+        """Continuous linear part: position and speed, or speed alone; friction by direction enters with its mean."""
         nominal = self._nominal()
         viscous = nominal.get("viscous_friction", 0.5 * sum(nominal.get(name, 0.0) for name in BY_DIRECTION))
         inertia = nominal["inertia"]
+        if self.derivative:
+            return np.array([[-viscous / inertia]]), np.array([[self.input_gain / inertia]]), np.ones((1, 1))
         A = np.array([[0.0, 1.0], [-nominal.get("stiffness", 0.0) / inertia, -viscous / inertia]])
         return A, np.array([[0.0], [self.input_gain / inertia]]), np.array([[1.0, 0.0]])

@@ -17,9 +17,12 @@ StateSpace = tuple[FloatArray, FloatArray, FloatArray]
 
 BEYOND = 1.5  # times the logarithms of the full size of a fault ray, as far as it is searched
 
-EXTRA_COLUMNS = ("sign_v", "forward_v", "backward_v", "one", "stribeck_v", "sin_y", "cogging_sin", "cogging_cos")
+EXTRA_COLUMNS = (
+    *("sign_v", "forward_v", "backward_v", "one"),
+    *("stribeck_v", "sin_y", "cogging_sin", "cogging_cos", "load_v"),
+)
 """Columns beyond the powers of s: sign(y'), max(y', 0), min(y', 0), the constant one, and those with a shape: Stribeck
-friction, and sines of y."""
+friction, sines of y, and friction that follows the magnitude of a sine."""
 
 
 def _not_zero(value: float) -> float:
@@ -87,6 +90,11 @@ class Plant(BaseModel, abc.ABC):
     @abc.abstractmethod
     def powers(self) -> tuple[int, ...]:
         """Powers of s of the linear columns; the first ``len(powers)`` coefficients belong to them."""
+
+    @property
+    def derivative(self) -> int:
+        """The power of s by which y is ahead of a position: 1 where it is a speed."""
+        return 0
 
     @property
     def extras(self) -> tuple[str, ...]:
@@ -176,6 +184,10 @@ class Plant(BaseModel, abc.ABC):
                     expanded[name] = expanded.get(name, 1.0) * size**exponent
         return expanded
 
+    def added_mass(self, parameter: str, ratio: float) -> float | None:
+        """Return the mass [kg] that was added where a parameter has a ratio to its nominal value; None: not known."""
+        return None
+
     @property
     def unwatched(self) -> tuple[str, ...]:
         """Kinds of change of which no coefficient tells, by their key among the catalogue's causes."""
@@ -226,7 +238,11 @@ class CoefficientPlant(Plant):
     """Plant whose parameters are the coefficients themselves, with nominal values by name in a field `coefficients`."""
 
     # smallest and largest ratio to the nominal value that is searched, by parameter, and of all others
-    RATIO_RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {"inertia": (0.2, 5.0), "input_gain": (0.3, 3.0)}
+    RATIO_RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "inertia": (0.2, 5.0),
+        "moved_mass": (0.2, 5.0),
+        "input_gain": (0.3, 3.0),
+    }
     DEFAULT_RANGE: ClassVar[tuple[float, float]] = (0.1, 10.0)
 
     if TYPE_CHECKING:  # a field of each plant, at the place that it has in its loop file

@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from servoscope.signals.readers.units import si_factor, split_unit
+from servoscope.signals.readers.units import SPEEDS, si_factor, split_unit
 
 # Words in names, the most telling first; the order of the letters decides which signal chooses first. English, then
 # German, French, Italian, Spanish; without accents. Chinese names have no blanks: its words are looked for inside.
@@ -79,6 +79,10 @@ ERRORS = {
     "schleppabstand",
     "erreur",
     "ecart",
+}
+SPEED_WORDS = {
+    *("speed", "velocity", "rpm", "drehzahl", "istdrehzahl", "geschwindigkeit", "istgeschwindigkeit"),
+    *("vitesse", "velocita", "velocidad", "速度", "转速"),
 }
 OF_CONTROLLER = {"control", "controller", "command", "cmd", "drive"}  # whose output is u
 COMMAND = ("command", "cmd")  # what the controller commands where there is a reference besides, else the reference
@@ -166,6 +170,12 @@ def guess_mapping(names: Sequence[str]) -> dict[str, Any]:
         fields["time"] = " + ".join(clock)
     unit = "s" if len(clock) > 1 else TIME_UNITS.get(split_unit(found.get("t", ""))[1], "s")
     return {**fields, "time_unit": unit, "segment": []}
+
+
+def names_speed(channel: str) -> bool:
+    """Tell whether a channel, as `[columns]` names it, is a speed: by its unit, or by a word in its name."""
+    column = channel.rpartition("* ")[2].strip("`")
+    return split_unit(column)[1] in SPEEDS or bool(_words(column) & SPEED_WORDS)
 
 
 def format_mapping(fields: dict[str, Any]) -> str:
