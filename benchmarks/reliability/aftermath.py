@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 
 from reliability.checks import NUMBERED, numbers_of, opened
-from reliability.fleet import BLOCK_S, Fleet
-from reliability.plc import BEGAN, tape
+from reliability.fleet import Fleet
+from reliability.plc import tape
 from servoscope.service.checkpoint import unpack_state
-from servoscope.service.sources.replay import ReplayStream
 from servoscope.service.store import Store
 from servoscope.service.store.tables import audit
 
 __all__ = ["looked_at"]
 
 
-def looked_at(fleet: Fleet, config: Path, sent: int, written: Mapping[str, set[int]]) -> dict[str, Any]:
+def looked_at(
+    fleet: Fleet, config: Path, plain: tuple[set[int], set[int]], written: Mapping[str, Mapping[str, set[int]]]
+) -> dict[str, Any]:
     """Compare.
 
     Parameters
@@ -28,13 +29,13 @@ def looked_at(fleet: Fleet, config: Path, sent: int, written: Mapping[str, set[i
         Whose recordings were published.
     config
         Of the service.
-    sent
-        How many blocks the sender has sent that keeps nothing.
+    plain
+        Numbers of the blocks that the sender has sent that keeps nothing, and of those by a clock that was wrong.
     written
-        Numbers of the blocks that the OPC UA server has written, by asset.
+        Numbers of the blocks that each OPC UA server has written, by asset.
     """
     store = opened(config)
-    rows = store.checkpoints([*fleet.names, "plain", *written])
+    rows = store.checkpoints([*fleet.names, "plain", *(name for one in written.values() for name in one)])
     lost = doubled = other = misnumbered = repeated = blocks = 0
     for name, (expected, _, digest) in fleet.expected().items():
         counted = rows[name]["status"]["counted"]
@@ -48,38 +49,44 @@ def looked_at(fleet: Fleet, config: Path, sent: int, written: Mapping[str, set[i
             window.number for window in unpack_state(rows[name]["state"], name).pending_diagnoses
         ]  # still to be diagnosed
         misnumbered += sorted(numbers) != list(range(1, counted["rows"] + 1))
-    played = tape(fleet.folder)
-    others = {
-        "plain": named(store, played, {"plain": set(range(sent))}, rows),
-        "plc": named(store, played, written, rows),
-    }
+    others = {"plain": named(store, fleet, {"plain": plain[0]}, rows, plain[1])}
+    others |= {stack: named(store, fleet, each, rows) for stack, each in written.items()}
     store.close()
     told = {"lost": lost, "doubled": doubled, "other": other, "misnumbered": misnumbered}
     return {"blocks": blocks, **told, "left out as repeated": repeated, **others}
 
 
 def named(
-    store: Store, played: ReplayStream, sent: Mapping[str, set[int]], rows: Mapping[str, Mapping[str, Any]]
+    store: Store,
+    fleet: Fleet,
+    sent: Mapping[str, set[int]],
+    rows: Mapping[str, Mapping[str, Any]],
+    misdated: Collection[int] = (),
 ) -> dict[str, int]:
     """Hold what the audit names as lost against what was sent, up to the last block that was stored.
 
-    What is stored must be what is left: as many blocks, with the samples of just these, by their digest.
+    What is stored must be what is left: as many blocks, with the samples of just these, by their digest. What a wrong
+    clock has dated must be counted as such, and left out.
     """
-    found = dict.fromkeys(("sent", "stored", "named", "unnamed", "other"), 0)
+    played, found = tape(fleet), dict.fromkeys(("sent", "stored", "named", "future", "unnamed", "other"), 0)
     for name, numbers in sent.items():
         counted = rows[name]["status"]["counted"]
-        first = round((counted["began"] - BEGAN) / BLOCK_S)
+        first = round((counted["began"] - fleet.began) / fleet.block_s)
         lost = told_lost(store, name)
-        stored = [number for number in range(first, counted["sequence"] + 1) if number not in lost]
+        reached = range(first, counted["sequence"] + 1)
+        stored = [number for number in reached if number not in lost and number not in misdated]
+        future = sum(number in misdated for number in reached if number not in lost)
         digest = 0
         for number in stored:
-            block = played.block(name, number, BEGAN)
+            block = played.block(name, number, fleet.began)
             assert block is not None
             digest = block.digest(digest)
         found["sent"] += sum(first <= number <= counted["sequence"] for number in numbers)
         found["stored"] += counted["blocks"]
         found["named"] += len(lost)
-        found["unnamed"] += abs(len(stored) - counted["blocks"]) + len(set(stored) - numbers)
+        found["future"] += counted["future"]
+        found["unnamed"] += abs(len(stored) - counted["blocks"]) + abs(future - counted["future"])
+        found["unnamed"] += len(set(stored) - numbers)
         found["other"] += digest != counted["digest"]
     return found
 

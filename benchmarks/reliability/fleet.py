@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from servoscope.detection.baseline import Baseline
@@ -18,6 +19,7 @@ MINUTES = 10  # of each recording
 LEAKS_AT = 300  # s into the recording with a fault
 BLOCK_S = 30.0  # of a block: of 200 assets, 40 times as fast, 267 come per second
 HEALTHY = 4  # different recordings
+BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Fleet:
         How many, for how long (simulated), at how many times the true speed.
     block_s
         Length of a block [s].
+    began
+        Time of the first sample (epoch, s).
     """
 
     folder: Path
@@ -39,6 +43,12 @@ class Fleet:
     hours: float
     speed: float
     block_s: float = BLOCK_S
+    began: float = BEGAN
+
+    @property
+    def start(self) -> str:
+        """Time of the first sample, as files say it."""
+        return datetime.fromtimestamp(self.began, UTC).isoformat()
 
     @property
     def rounds(self) -> int:
@@ -78,7 +88,7 @@ class Fleet:
             f'[store]\nurl = "{store}"',
             "[diagnosis]\nevery_s = 3600.0",
             "[alarms.fault]\noff_delay_s = 10.0",
-            f'[sources.line]\nkind = "replay"\nspeed = {speed}\nblock = {self.block_s}\nstart = 2026-01-01T00:00:00Z',
+            f'[sources.line]\nkind = "replay"\nspeed = {speed}\nblock = {self.block_s}\nstart = {self.start}',
         ]
         lines += [
             f'[assets.{asset}]\nbaseline = "baseline.json"\nsource = "line"\nfiles = {self.files(asset)}'.replace(
@@ -95,7 +105,6 @@ class Fleet:
         baseline = Baseline.load(self.folder / "baseline.json")
         loop = baseline.loop
         recordings = {path.name: read(path, loop) for path in self.folder.glob("*.csv")}
-        began = 1767225600.0  # 2026-01-01T00:00:00Z
         found: dict[str, tuple[int, int, int]] = {}
         known: dict[tuple[str, ...], tuple[int, int, int]] = {}
         for name in self.names:
@@ -105,7 +114,7 @@ class Fleet:
                     tuple(recordings[file] for file in files), round(self.block_s * loop.sample_rate), False
                 )
                 blocks = samples = digest = 0
-                while (block := tape.block(name, blocks, began)) is not None:
+                while (block := tape.block(name, blocks, self.began)) is not None:
                     blocks, samples, digest = blocks + 1, samples + block.t.size, block.digest(digest)
                 known[files] = blocks, samples, digest
             found[name] = known[files]

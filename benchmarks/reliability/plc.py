@@ -1,50 +1,44 @@
-"""An OPC UA server whose assets write blocks as a PLC would: a process of its own, to be killed.
+"""OPC UA servers whose assets write blocks as a PLC would: processes of their own, to be killed.
 
-    python benchmarks/reliability/plc.py PORT FOLDER ASSETS SPEED BEGAN
+    python benchmarks/reliability/plc.py SETTINGS
 
-Which block is written depends on the clock alone, so that those of the time while it is dead are never written. What
-was written is noted in `FOLDER/written`, line by line: asset and number.
+One is asyncua's (this file), one node-opcua's (`tests/opcua_server/blocks.js`), both with the same settings, a JSON
+file. Which block is written depends on the clock alone, so that those of the time while it is dead are never written.
+What was written is noted in the file `written` of the settings, line by line: asset and number.
 """
 
 from __future__ import annotations
 
 import asyncio
+import json
+import shutil
 import subprocess
 import sys
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 BENCHMARKS = Path(__file__).resolve().parent.parent
 if __name__ == "__main__":
     sys.path[0] = str(BENCHMARKS)
 
-from reliability.fleet import BLOCK_S, LOOP  # noqa: E402
+from reliability.fleet import LOOP, Fleet  # noqa: E402
 from servoscope.models.loop import Loop  # noqa: E402
-from servoscope.service.sources.block import Block  # noqa: E402
-from servoscope.service.sources.replay import ReplayStream  # noqa: E402
+from servoscope.service.sources.replay import SEPARATION_SAMPLES, ReplayStream  # noqa: E402
 from servoscope.signals.readers import read  # noqa: E402
 
-__all__ = ["BEGAN", "Plc", "names", "node", "tape"]
+__all__ = ["STACKS", "Plc", "tape"]
 
-BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
 REMEMBERED = 60  # blocks of each asset in the server's history, which dies with it
+STACKS = {"asyncua": 2, "node": 1}  # and the namespace of its nodes
+SCRIPT = BENCHMARKS.parent / "tests" / "opcua_server" / "blocks.js"
 
 
-def names(assets: int) -> list[str]:
-    """Return the names of its assets."""
-    return [f"plc-{i}" for i in range(assets)]
-
-
-def node(name: str) -> str:
-    """Return where an asset's blocks are written."""
-    return f"ns=2;s={name}.block"
-
-
-def tape(folder: Path) -> ReplayStream:
+def tape(fleet: Fleet) -> ReplayStream:
     """Return what is measured, over and over."""
     loop = Loop.load(LOOP)
-    return ReplayStream((read(folder / "healthy-0.csv", loop),), round(BLOCK_S * loop.sample_rate), True)
+    return ReplayStream((read(fleet.folder / "healthy-0.csv", loop),), round(fleet.block_s * loop.sample_rate), True)
 
 
 class Plc:
@@ -52,24 +46,53 @@ class Plc:
 
     Parameters
     ----------
+    stack
+        One of `STACKS`.
     port
         Where it listens.
-    folder
-        Of the recordings.
-    assets, speed
-        How many, and at how many times the true speed.
+    fleet
+        Whose recordings it plays.
+    assets
+        How many it has.
     """
 
-    def __init__(self, port: int, folder: Path, assets: int, speed: float) -> None:
-        self._words = [str(port), str(folder), str(assets), str(speed), str(time.time())]
-        self.port, self.written = port, folder / "written"
+    def __init__(self, stack: str, port: int, fleet: Fleet, assets: int) -> None:
+        self.port, self.written, self.names = port, fleet.folder / f"written-{stack}", names(stack, assets)
+        self._settings, self._log = fleet.folder / f"{stack}.json", fleet.folder / f"{stack}.log"
+        self._settings.write_text(json.dumps(self._told(stack, fleet)), encoding="utf-8")
+        node = shutil.which("node")
+        assert node or stack != "node", "Node.js is missing: scripts/install-test-servers installs it"
+        program = [sys.executable, __file__] if stack == "asyncua" else [str(node), str(SCRIPT)]
+        self._command, self._stack = [*program, str(self._settings)], stack
+
+    def _told(self, stack: str, fleet: Fleet) -> dict[str, Any]:
+        """Return the settings; every block of one round is in them, its times from the start of the round."""
+        recording, played = read(fleet.folder / "healthy-0.csv", Loop.load(LOOP)), tape(fleet)
+        starts = range(0, recording.samples, played.block_samples)
+        signals = (recording.t - recording.t[0], recording.r, recording.u, recording.y)
+        return {
+            "port": self.port,
+            "nodes": {name: self.node(name, stack) for name in self.names},
+            "written": str(self.written),
+            "first": fleet.began,  # time of the first sample
+            "began": time.time(),  # when it is played
+            "every_s": fleet.block_s / fleet.speed,
+            "remembered": REMEMBERED,
+            "round_s": recording.t[-1] - recording.t[0] + SEPARATION_SAMPLES / recording.sample_rate,
+            "blocks": [[x[k : k + played.block_samples].tolist() for x in signals] for k in starts],
+        }
+
+    def node(self, name: str, stack: str = "") -> str:
+        """Return where an asset's blocks are written."""
+        return f"ns={STACKS[stack or self._stack]};s={name}.block"
 
     def start(self) -> None:
         """Start it, and wait until it is there."""
-        command = [sys.executable, __file__, *self._words]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        assert self._process.stdout is not None and self._process.stdout.readline() == b"ready\n"
-        self._process.stdout.close()
+        with self._log.open("wb") as log:  # a pipe that nobody reads would end it
+            self._process = subprocess.Popen(self._command, stdout=log, stderr=log)
+        while b"ready\n" not in self._log.read_bytes():
+            assert self._process.poll() is None, f"the server has ended, see {self._log}"
+            time.sleep(0.05)
 
     def kill(self) -> None:
         """Kill it."""
@@ -85,38 +108,47 @@ class Plc:
         return found
 
 
-async def serve(port: int, folder: Path, assets: int, speed: float, began: float) -> None:
+def names(stack: str, assets: int) -> list[str]:
+    """Return the names of a server's assets."""
+    return [f"{stack}-{i}" for i in range(assets)]
+
+
+def cells(settings: dict[str, Any], number: int) -> list[float]:
+    """Return what a block's node holds: its number, then t, r, u and y."""
+    rounds, within = divmod(number, len(settings["blocks"]))
+    t, *signals = settings["blocks"][within]
+    start = settings["first"] + rounds * settings["round_s"]
+    return [float(number), *(start + x for x in t), *(x for signal in signals for x in signal)]
+
+
+async def serve(settings: dict[str, Any]) -> None:
     """Write blocks until killed."""
     from asyncua import Server, ua
 
-    def told(block: Block) -> ua.DataValue:
-        cells = [float(block.sequence), *(x for signal in block.signals for x in signal.tolist())]
-        stamp = datetime.fromtimestamp(float(block.t[-1]), UTC)
-        return ua.DataValue(ua.Variant(cells, ua.VariantType.Double), SourceTimestamp=stamp)
-
-    server, played = Server(), tape(folder)
+    server, every, began = Server(), settings["every_s"], settings["began"]
     await server.init()
-    server.set_endpoint(f"opc.tcp://127.0.0.1:{port}/plc")
+    server.set_endpoint(f"opc.tcp://127.0.0.1:{settings['port']}/plc")
     server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     await server.register_namespace("plc")
-    with (folder / "written").open("a", encoding="utf-8") as notes:
+    with Path(settings["written"]).open("a", encoding="utf-8") as notes:
         async with server:
             nodes = {}
-            for name in names(assets):
+            for name, node in settings["nodes"].items():
                 at = server.nodes.objects
-                nodes[name] = await at.add_variable(node(name), f"2:{name}", [0.0], ua.VariantType.Double)
-                await server.historize_node_data_change(nodes[name], timedelta(days=3650), REMEMBERED)
+                nodes[name] = await at.add_variable(node, f"2:{name}", [0.0], ua.VariantType.Double)
+                await server.historize_node_data_change(nodes[name], timedelta(days=3650), settings["remembered"])
             print("ready", flush=True)
-            number = int((time.time() - began) * speed / BLOCK_S)
+            number = int((time.time() - began) / every)
             while True:
                 number += 1
-                await asyncio.sleep(max(0.0, began + number * BLOCK_S / speed - time.time()))
-                block = played.block("plc", number, BEGAN)
-                assert block is not None
+                await asyncio.sleep(max(0.0, began + number * every - time.time()))
+                block = cells(settings, number)
+                stamp = datetime.fromtimestamp(block[len(block) // 4], UTC)  # of the last sample
+                value = ua.DataValue(ua.Variant(block, ua.VariantType.Double), SourceTimestamp=stamp)
                 for name, variable in nodes.items():
                     print(name, number, file=notes, flush=True)
-                    await variable.write_value(told(block))
+                    await variable.write_value(value)
 
 
 if __name__ == "__main__":
-    asyncio.run(serve(int(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), *map(float, sys.argv[4:])))
+    asyncio.run(serve(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))))

@@ -91,7 +91,10 @@ def told(measured: Measured) -> dict[str, Any]:
         "recoveries": {name: [round(one, 2) for one in times] for name, times in measured.recoveries.items()},
         "latency_s": {
             state: {f"p{share:g}": quantile(buckets, share / 100.0) for share in (50.0, 99.0)}
-            for state, buckets in (("undisturbed", measured.latencies), ("disturbed", measured.disturbed))
+            for state, buckets in (
+                ("undisturbed", measured.latencies.calm),
+                ("disturbed", measured.latencies.disturbed),
+            )
         },
         "memory": {"early_mb": round(early, 1), "late_mb": round(late, 1), "over_s": round(0.7 * life, 1)},
     }

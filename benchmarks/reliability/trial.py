@@ -51,13 +51,39 @@ class Disturbance:
     kills: bool = False
 
 
+class Latencies:
+    """Latencies of blocks, from the histogram that a service shows, apart for times when it is disturbed and not."""
+
+    def __init__(self) -> None:
+        self.calm: dict[float, float] = {}  # upper end of the bucket -> blocks
+        self.disturbed: dict[float, float] = {}
+        self._seen: dict[float, float] = {}
+
+    def restart(self) -> None:
+        """Forget what the last process counted."""
+        self._seen = {}
+
+    @property
+    def seen(self) -> float:
+        """Blocks that this process has counted."""
+        return sum(self._seen.values())
+
+    def look(self, text: str, *, calm: bool) -> None:
+        """Take what came since the last time from the text of the metrics."""
+        ends = {float(end): float(count) for end, count in BUCKET.findall(text)}
+        within = dict(zip(ends, np.diff([0.0, *ends.values()]).tolist(), strict=True))
+        to = self.calm if calm else self.disturbed
+        for end, count in within.items():
+            to[end] = to.get(end, 0.0) + max(0.0, count - self._seen.get(end, 0.0))
+        self._seen = within
+
+
 @dataclass
 class Measured:
     """What was seen from outside."""
 
     recoveries: dict[str, list[float]] = field(default_factory=dict)
-    latencies: dict[float, float] = field(default_factory=dict)  # undisturbed: upper end of the bucket -> blocks
-    disturbed: dict[float, float] = field(default_factory=dict)
+    latencies: Latencies = field(default_factory=Latencies)
     memory: list[tuple[float, float]] = field(default_factory=list)  # of the last life: s since its start, MB
     lives: int = 0
     seconds: float = 0.0
@@ -98,7 +124,6 @@ class Trial:
         self._disturbances, self._every, self._chance = disturbances, every_s, random.Random(seed)
         self._blocks, self._calm = blocks, (1.0 - calm_share) * blocks
         self._log = config.with_suffix(".log").open("ab")
-        self._seen: dict[float, float] = {}
         self._up = True
         self.measured = Measured()
 
@@ -133,7 +158,8 @@ class Trial:
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
         words = [sys.executable, "-m", "servoscope", "run", str(self._config)]
         self._process = subprocess.Popen(words, stderr=self._log, env=environment)
-        self._started, self._seen = time.monotonic(), {}
+        self._started = time.monotonic()
+        self.measured.latencies.restart()
         self.measured.memory = []
         self.measured.lives += 1
 
@@ -158,13 +184,13 @@ class Trial:
             raise RuntimeError(f"{what.name}: not noticed within {LONGEST_NOTICE_S:g} s")
         time.sleep(what.lasts_s)
         self._look(calm=False)
-        before = sum(self._seen.values())
+        before = self.measured.latencies.seen
         what.end()
         ended = time.monotonic()
         if what.kills:
             self._start()
             before = 0.0
-        while self._alive() and sum(self._seen.values()) <= before:
+        while self._alive() and self.measured.latencies.seen <= before:
             if time.monotonic() - ended > LONGEST_RECOVERY_S:
                 raise RuntimeError(f"{what.name}: no recovery within {LONGEST_RECOVERY_S:g} s")
             time.sleep(0.05)
@@ -180,13 +206,8 @@ class Trial:
         except (OSError, ValueError, HTTPException):
             return 0.0
         self.measured.memory.append((time.monotonic() - self._started, int(pages) * resource.getpagesize() / 2**20))
-        ends = {float(end): float(count) for end, count in BUCKET.findall(text)}
         self._up = UP.findall(text) == ["1.0"]
-        within = dict(zip(ends, np.diff([0.0, *ends.values()]).tolist(), strict=True))
-        to = self.measured.latencies if calm else self.measured.disturbed
-        for end, count in within.items():
-            to[end] = to.get(end, 0.0) + count - self._seen.get(end, 0.0)
-        self._seen = within
+        self.measured.latencies.look(text, calm=calm)
         return sum(float(count) for count in COUNTED.findall(text))
 
 
