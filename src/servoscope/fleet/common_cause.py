@@ -95,9 +95,13 @@ class Cause:
 
 def fault_probability(evidence: Evidence, prior: Prior = PRIOR) -> float:
     """Return the probability that an asset has a fault, without regard to its groups."""
-    score, information = _evidence_arrays(evidence)
-    with_fault = np.log(prior.fault) + _log_mean(_log_bayes_factor(score, information, prior.size))
+    with_fault = np.log(prior.fault) + log_fault_evidence(evidence, prior)
     return float(1.0 / (1.0 + np.exp(min(np.log1p(-prior.fault) - with_fault, 700.0))))
+
+
+def log_fault_evidence(evidence: Evidence, prior: Prior = PRIOR) -> float:
+    """Return the logarithm of how much likelier the evidence is under a fault of any parameter than under none."""
+    return float(_log_mean(_log_bayes_factor(*_evidence_arrays(evidence), prior.size)))
 
 
 def causes(

@@ -7,12 +7,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from servoscope.core.files import atomic_write, make_folder
+from servoscope.fleet.discoveries import RATE
 from servoscope.fleet.rows import MICRO
 from servoscope.fleet.summary import COMMON, FAILED, Fleet
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_size
 from servoscope.report.page import render_page, write_page
 
 MOST_ROWS = 300  # of a table: a page is read by people
+MOST_NAMES = 20  # in a sentence
 MOST_DAYS = 60  # of the picture of days
 LEAST_SHOWN = 0.05  # probability of a common cause that is worth its row
 MIN_EPOCH_S = 1e9  # s since 1970 from which a time is a date, not a time since some start
@@ -48,6 +50,7 @@ def render_fleet_page(fleet: Fleet, lake: str) -> str:
         fleet=fleet,
         items=sum(len(days) for days in fleet.states.values()),
         headline=headline(fleet),
+        discoveries=describe_discoveries(fleet),
         counts=[(state, n) for state in states if (n := fleet.count(state)) or state == "healthy"],
         causes=[
             (cause, since)
@@ -76,6 +79,17 @@ def headline(fleet: Fleet) -> str:
     if ill:
         parts.append(f"{ill} asset{'s' * (ill > 1)} ill by {'themselves' if ill > 1 else 'itself'}")
     return " and ".join(parts) if parts else "No asset has changed from its healthy baseline"
+
+
+def describe_discoveries(fleet: Fleet) -> str:
+    """Return which assets have changed at the false discovery rate, as plain text; empty where none has."""
+    names = fleet.discovered
+    if not names:
+        return ""
+    listed = ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)
+    which = f"these {len(names)} have" if len(names) > 1 else "this one has"
+    of = f"Of {len(fleet.assets)} assets, {which} changed: {listed}."
+    return f"{of} At most {RATE:.0%} of such names are wrong, on average."
 
 
 def _format_time(t_us: int | None) -> str:

@@ -20,10 +20,12 @@ LEAST_SHOWN = 0.05  # probability of a common cause that is worth its line
 
 def print_fleet(out: Console, f: Fleet) -> None:
     """Print what a fleet's results say."""
-    from servoscope.fleet.report import headline
+    from servoscope.fleet.report import describe_discoveries, headline
 
     colour = COLOURS["fault" if f.count("fault") or f.accepted else "healthy"]
     out.print(Text.assemble((f"{len(f.assets)} assets", "bold"), ": ", (headline(f), f"bold {colour}")))
+    if told := describe_discoveries(f):
+        out.print(told, soft_wrap=True)
     states = ("healthy", "fault", "common cause", "undetermined", "failed")
     print_facts(out, [(state, str(f.count(state))) for state in states if f.count(state)])
     shared = [(cause, since) for cause, since in zip(f.causes, f.since, strict=True) if cause.probability > LEAST_SHOWN]
