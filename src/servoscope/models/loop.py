@@ -337,6 +337,8 @@ class Loop(ShortRepr, Settings):
             del plain["implausible"]
         if self.monitor.feature_false_alarms == FEATURE_FALSE_ALARMS:
             del plain["monitor"]["feature_false_alarms"]  # came later: files and hashes of loops without it stay
+        if self.monitor.sequential_step == "update":
+            del plain["monitor"]["sequential_step"]
         return {key: value for key, value in plain.items() if value is not None}
 
     def hash(self) -> str:
