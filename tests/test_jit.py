@@ -214,7 +214,7 @@ class TestCache:
             ("estimation/estimators/akf.py", "1.0 / (R + dot(phi, phi))", "2.0 / (R + dot(phi, phi))", akf),
             ("estimation/moments.py", "* 0.5 - dot", "* 0.25 - dot", blocks),  # a function that traced ones call
             ("estimation/kernel/sample_steps.py", "MAX_PHYSICAL = 1e100", "MAX_PHYSICAL = 1e99", blocks),  # a constant
-            ("estimation/kernel/build.py", "(sizes.n + LAGS + 1) * TILE", "(sizes.n + LAGS + 2) * TILE", blocks),
+            ("estimation/kernel/build.py", "(steps.columns + 1) * TILE", "(steps.columns + 2) * TILE", blocks),
             ("estimation/estimators/sliding_window.py", "weakest = 8.0", "weakest = 9.0", {"window"}),
             ("core/jit/compile.py", "CACHE_LINE = 64", "CACHE_LINE = 128", set(before)),
             ("core/jit/vector.py", "width == 1:\n        return one", "width <= 1:\n        return one", set(before)),

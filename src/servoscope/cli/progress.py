@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, ProgressColumn
 
-LINE_INTERVAL_S = 10.0  # from one line to the next, where stderr is no terminal: what takes less says nothing
+LINE_INTERVAL_S = 10.0  # until the first line where stderr is no terminal: what takes less says nothing
+RAREST = 60.0  # times as long is the longest silence between two lines: a stream may run for months
 
 
 class StepProgress:
@@ -108,12 +109,14 @@ def show_spinner(what: str) -> Iterator[None]:
 
 @contextmanager
 def _lines(describe: Callable[[], str]) -> Iterator[None]:
-    """Write what goes on to stderr as a line every `LINE_INTERVAL_S`, from a thread: a step may take long."""
+    """Write what goes on to stderr as lines, ever more rarely, from a thread: a step may take long."""
     ended, begin = threading.Event(), time.monotonic()
 
     def write() -> None:
+        wait = LINE_INTERVAL_S
         with suppress(OSError, ValueError):  # nobody reads it any more
-            while not ended.wait(LINE_INTERVAL_S):
+            while not ended.wait(wait):
+                wait = min(2.0 * wait, RAREST * LINE_INTERVAL_S)
                 print(f"{describe() or 'working'}, {time.monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
 
     writer = threading.Thread(target=write, name="servoscope-progress", daemon=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,8 +53,14 @@ def session(master: str | None = None, **settings: str) -> SparkSession:
         builder = builder.master(master)
     # times of day are UTC everywhere; one thread of linear algebra per worker, as on one machine
     fixed = {"spark__sql__session__timeZone": "UTC", "spark__executorEnv__OPENBLAS_NUM_THREADS": "1"}
+    # what PySpark thinks of the pandas beside it is nothing that its user can change
+    warnings.filterwarnings("ignore", "PySpark does not yet fully support pandas", FutureWarning)
+    fixed |= {"spark__executorEnv__PYTHONWARNINGS": "ignore::FutureWarning", "spark__ui__showConsoleProgress": "false"}
     for key, value in (fixed | settings).items():
         builder = builder.config(key.replace("__", "."), value)
+    if "SPARK_CONF_DIR" not in os.environ:  # else its log4j2.properties says what Spark writes to the terminal
+        log = Path(__file__).parent / "templates" / "log4j2.properties"
+        os.environ.setdefault("SPARK_SUBMIT_OPTS", f"-Dlog4j2.configurationFile={log.as_uri()}")
     try:
         return builder.getOrCreate()
     except (PySparkException, FileNotFoundError) as error:

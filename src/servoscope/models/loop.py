@@ -346,6 +346,8 @@ class Loop(ShortRepr, Settings):
             del plain["monitor"]["feature_false_alarms"]  # came later: files and hashes of loops without it stay
         if not self.monitor.hidden_warm_up:
             del plain["monitor"]["hidden_warm_up"]
+        if self.monitor.sequential_step == "update":
+            del plain["monitor"]["sequential_step"]
         return {key: value for key, value in plain.items() if value is not None}
 
     def hash(self) -> str:
