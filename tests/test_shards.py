@@ -134,6 +134,7 @@ def test_shards_say_what_one_process_says_although_one_is_killed(tmp_path: Path)
         pool.stop()
         thread.join()
         server.shutdown()
+        server.server_close()
     for what, query in SHARED.items():
         assert halls.asked(config, query) == halls.asked(alone, query), what
 

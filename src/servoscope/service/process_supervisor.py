@@ -104,6 +104,9 @@ class ProcessSupervisor:
                 process.stdout.read()  # until it ends
                 process.stdout.close()
             code = process.wait()
+            with self._lock, suppress(OSError):
+                if process.stdin is not None:
+                    process.stdin.close()
             if self._stop_event.is_set() or (self._may_end and not code):
                 return
             log("error", f"{self.name} ended, started again soon", code=code, seconds=wait)

@@ -52,7 +52,7 @@ def merge_metrics(texts: Iterable[str]) -> str:
     lines = []
     for family, head in heads.items():
         lines += [*head, *(f"{key} {value!r}" for key, value in values.get(family, {}).items())]
-    return "\n".join(lines) + "\n"
+    return "".join(f"{line}\n" for line in lines)
 
 
 class _Worker:
