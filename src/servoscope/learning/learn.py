@@ -342,9 +342,8 @@ def _assemble_baseline(
     duration = sum(rec.duration_s for rec in recordings)
     if excess > WORTH_A_LOOK and loop.monitor.model_error < suggestion:
         notes.append(message("learning.model_error", excess=excess, model_error=suggestion))
-    memory, least = loop.monitor.memory, SHORTEST * loop.monitor.memory
-    if duration < least:
-        notes.append(message("learning.short", duration_s=duration, memory_s=memory, least_s=least))
+    if duration < (least := SHORTEST * loop.monitor.memory):
+        notes.append(message("learning.short", duration_s=duration, memory_s=loop.monitor.memory, least_s=least))
     supported = supported_budget(pipeline.bank.n, loop, fit.dof, excess)
     if supported > (budget := loop.monitor.false_alarms_per_year):
         notes.append(message("learning.budget", supported=supported, budget=budget))

@@ -147,9 +147,7 @@ def _decode_json(asset: str, message: bytes, received_at: float, covariates: Seq
     return _build_block(asset, found.stream, found.sequence, found.oldest, signals, received_at)
 
 
-def _decode_loose_json(
-    asset: str, message: bytes, received_at: float, covariates: Sequence[str]
-) -> DecodedBlock:
+def _decode_loose_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> DecodedBlock:
     try:
         plain = parse_json(message)
     except (ValueError, RecursionError) as error:
