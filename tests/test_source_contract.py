@@ -82,9 +82,7 @@ def replay(tmp_path: Path) -> Iterator[Harness]:
 @pytest.fixture
 def mqtt(tmp_path: Path) -> Iterator[Harness]:
     server = started_broker(tmp_path)
-    harness = Harness(
-        "mqtt", {"host": "127.0.0.1", "port": server.port}, SourceAsset(SimpleNamespace(), None), tmp_path
-    )  # type: ignore[arg-type]
+    harness = Harness("mqtt", {"host": "127.0.0.1", "port": server.port}, SourceAsset(LOOP_STUB, None), tmp_path)  # type: ignore[arg-type]
     first = harness.open()  # the broker keeps what is sent from now on
     until(lambda: first.connected)
     time.sleep(0.2)
@@ -98,6 +96,7 @@ def mqtt(tmp_path: Path) -> Iterator[Harness]:
 
 TIMES = 1767225600.0 + 0.01 * np.arange(50 * (BLOCKS + 1))
 PAYLOAD = {"topics": ["line/{asset}"], "time": {"t": "s"}, "block": 0.5}
+LOOP_STUB = SimpleNamespace(columns=SimpleNamespace(covariates={}))  # of a source that reads no more of it
 AXIS = SourceAsset(SimpleNamespace(sample_rate=100.0), None)  # type: ignore[arg-type]
 
 
