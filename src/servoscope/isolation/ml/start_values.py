@@ -61,9 +61,11 @@ def pair_start_values(window: ChangeWindow, faults: Sequence[Fault], profile: Ch
     near, names = window.cut(first, end), [fault.parameter for fault in faults]
     low, high = log_ratio_bounds(faults)
     axes = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]
-    x = np.array([[a, b] for a in axes[0] for b in axes[1]])
-    z = np.column_stack([np.zeros((len(x), window.nuisance_count)), x])
-    cost = (near.residuals(z, names, ChangeProfile(step - first)) ** 2).sum(axis=1).reshape(GRID, GRID)
+    z = np.column_stack([np.zeros((GRID, window.nuisance_count + 1)), axes[1]])
+    cost = np.empty((GRID, GRID))
+    for row, x in zip(cost, axes[0], strict=True):  # all at once would take hundreds of megabytes of a fast loop
+        z[:, -2] = x
+        row[:] = (near.residuals(z, names, ChangeProfile(step - first)) ** 2).sum(axis=1)
     return [np.array([axes[0][i], axes[1][j]]) for i, j in _local_minima(cost)]
 
 
