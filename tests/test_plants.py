@@ -52,6 +52,22 @@ def tustin(theta: np.ndarray, sample_rate: float) -> np.ndarray:
     return total.coef
 
 
+@pytest.mark.parametrize("friction", ["none", "directional", "eha"])
+def test_many_plants_at_once_are_each_of_them_alone(eha: EHA, friction: Any) -> None:
+    """Real parameters and complex ones, as derivatives have them."""
+    plant: Plant = eha
+    names: tuple[str, ...] = ("C_ie", "p_s", "m_p")
+    if friction != "eha":
+        plant = PolynomialPlant(order=3, stiffness=True, friction=friction)
+        names = (plant.names[0], "inertia", "input_gain")
+        plant = plant.model_copy(update={"coefficients": {name: 2.0 + i for i, name in enumerate(plant.names)}})
+    for imaginary in (0.0, 1e-30j):
+        factors = dict(zip(names, np.exp([[0.0, 0.3, -1.0], [0.1, 0.0, 2.0], [0.0, 0.0, imaginary]]), strict=True))
+        for mine, slow in zip(plant.state_spaces(factors, 3), Plant.state_spaces(plant, factors, 3), strict=True):
+            assert mine == pytest.approx(slow, rel=1e-14)
+            assert mine.imag == pytest.approx(slow.imag, rel=1e-14)
+
+
 class TestEHA:
     def test_theta(self, eha: EHA) -> None:
         assert eha.theta() == pytest.approx(THETA, rel=1e-6)

@@ -102,6 +102,14 @@ class TestPredictor:
                 if ratios is step:
                     assert mine[0].imag == pytest.approx(exact.imag, rel=0, abs=1e-13 * np.abs(exact.imag).max())
 
+    @pytest.mark.parametrize("growth", [ChangeProfile(0), ChangeProfile(900), ChangeProfile(1100, 300)])
+    def test_many_changes_at_once_are_each_of_them_alone(self, window: RefitWindow, growth: ChangeProfile) -> None:
+        """Neighbours share the healthy plant and what it predicts up to the change: no bit of theirs may differ."""
+        names, d = ("C_ie", SENSOR_GAIN), np.array([0.01, 0.0, -0.02, 0.005])
+        z = np.array([[*(i // 2 * d), 0.1 * i, 0.02 - 0.01 * i] for i in range(5)])
+        alone = [window.innovations(window.predictor(row[:4], names, row[4:], growth), growth) for row in z]
+        assert np.array_equal(window.residuals(z, names, growth)[:, : window.samples], alone)
+
     def test_derivatives_by_complex_steps_are_those_of_differences(self, window: RefitWindow) -> None:
         z, growth = np.array([0.01, -0.01, 0.02, 0.0, 0.1, -0.3]), ChangeProfile(900, 300)
         names, h = ("C_ie", "beta"), 1e-5

@@ -221,10 +221,8 @@ def _evidence_along_size(
     sizes = np.unique(np.clip(best + reach * np.linspace(-1.0, 1.0, POINTS), low, high))
     H = found.jacobian.T @ found.jacobian
     follow = -np.linalg.solve(H[:m, :m], H[:m, m]) if m else np.zeros(0)
-    J = []
-    for x in sizes:
-        z = np.append(found.d + follow * (x - best), x)
-        J.append(float((window.residual(z, found.names, found.profile) ** 2).sum()))
-    log_weight = -0.5 * np.array(J) / noise_variance + scale.log_density(sizes)
+    z = np.column_stack([found.d + np.outer(sizes - best, follow), sizes])
+    J = (window.residuals(z, found.names, found.profile) ** 2).sum(axis=1)
+    log_weight = -0.5 * J / noise_variance + scale.log_density(sizes)
     found_at = Posterior.from_log_density(sizes, log_weight)
     return HypothesisEvidence(volume + found_at.log_area, (found_at.interval,))

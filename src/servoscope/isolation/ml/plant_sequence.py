@@ -46,8 +46,8 @@ class SequenceCost:
 
 def _stack(predictors: Sequence[Predictor]) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
     """Return the last plant of each predictor, and log S relative to the first one's."""
-    A, b, late, c, K, S = (np.stack([part[-1:] for part in parts]) for parts in zip(*predictors, strict=True))
-    return A, b, late, c, K, S, np.log(S[:, 0] / S[:1, 0])
+    A, b, late, c, K, S = (np.stack([part[-1] for part in parts]) for parts in zip(*predictors, strict=True))
+    return A, b, late, c, K, S, np.log(S / S[:1])
 
 
 @kernel
@@ -56,15 +56,17 @@ def sequence_cost(
     u: Array, y: Array, restart: BoolArray,
 ) -> float:  # fmt: skip
     """Return what `SequenceCost` does: plant v, from 1 on, holds from sample bounds[v - 1] to bounds[v]."""
-    V, n = A.shape[0], A.shape[2]
-    age, by = samples_since_restart(restart, S.shape[2]), inverse_std(S)
+    V, n = b.shape
+    age, by = samples_since_restart(restart, S.shape[1]), inverse_std(S, 0)
+    plants = np.arange(V).reshape(V, 1)
     x, x_next, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, len(y)))
     cost = 0.0
     for v in range(1, V):
         for i in range(n):
             x[v, i] = x[v - 1, i]
-        run_constant_plant(A, b, b_late, c, K, by, v, 0, bounds[v - 1], bounds[v], age, u, y, restart, x, x_next, e, 0)
-        for k in range(bounds[v - 1], bounds[v]):
+        begin, end = bounds[v - 1], bounds[v]
+        run_constant_plant(A, b, b_late, c, K, by, plants, 0, v, v + 1, begin, end, age, u, y, restart, x, x_next, e, 0)
+        for k in range(begin, end):
             cost += e[v, k] * e[v, k] + volume[v, age[k]]
     return cost
 
@@ -76,12 +78,13 @@ def switching_costs(
 ) -> Array:  # fmt: skip
     """Return the cost of the cheapest sequence that ends in each of V plants, shape (V,).
 
-    `A, b, b_late, c, K, S`: one plant each, shapes (V, 1, ...), as for `innovations`; `volume`: log S relative to the
+    `A, b, b_late, c, K, S`: the plants, shapes (V, ...), as for `innovations`; `volume`: log S relative to the
     first plant's, shape (V, L); `previous` (N, V) becomes the plant of the sample before, on the sequence that is in a
     plant at a sample.
     """
-    V, n, N = A.shape[0], A.shape[2], len(y)
-    age, by = samples_since_restart(restart, S.shape[2]), inverse_std(S)
+    V, n, N = b.shape[0], b.shape[1], len(y)
+    age, by = samples_since_restart(restart, S.shape[1]), inverse_std(S, 0)
+    plants = np.arange(V).reshape(V, 1)
     x, x_next, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, 1))
     cost: Array = prices.copy()
     cost[0] = 0.0
@@ -93,6 +96,8 @@ def switching_costs(
                 previous[k, v], cost[v] = best, cost[best] + prices[v]
                 for i in range(n):
                     x[v, i] = x[best, i]
-            run_constant_plant(A, b, b_late, c, K, by, v, 0, k, k + 1, age, u, y, restart, x, x_next, e, k)
+            run_constant_plant(
+                A, b, b_late, c, K, by, plants, 0, v, v + 1, k, k + 1, age, u, y, restart, x, x_next, e, k
+            )
             cost[v] += e[v, 0] * e[v, 0] + volume[v, age[k]]
     return cost

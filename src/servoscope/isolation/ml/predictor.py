@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.kernels import Array
 from servoscope.models.discretise import discretise, split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
+from servoscope.models.plants.base import StateSpace
 
 LONGEST = 1024  # samples after a restart until the gain stays as it is
 LOUD = 3.0  # standard deviations of u that the unknown first state may come from
@@ -36,12 +37,24 @@ class Predictor(NamedTuple):
         """Put plants in a row."""
         return cls(*(np.ascontiguousarray(np.concatenate(parts)) for parts in zip(*each, strict=True)))
 
-    def innovations(self, since: int, over: int, u: FloatArray, y: FloatArray, restart: BoolArray) -> Array:
-        """Return the innovations of a recording in standard deviations, shape (N,), under a change of the plant."""
+    def innovations(
+        self,
+        onset: int,
+        duration: int,
+        u: FloatArray,
+        y: FloatArray,
+        restart: BoolArray,
+        plants: IntArray | None = None,
+    ) -> Array:
+        """Return the innovations of a recording in standard deviations under a change of the plant.
+
+        Shape (N,), or (V, N) for V variants of the change, the rows of `plants` (V, p): which ones it goes through.
+        """
         from servoscope.isolation.ml.kernels import innovations
 
-        A, b, late, c, K, S = (part[None] for part in self)
-        return innovations(A, b, late, c, K, S, since, over, u, y, restart)
+        each = np.arange(len(self.b))[None] if plants is None else plants
+        e: Array = innovations(*self, each, onset, duration, u, y, restart)
+        return e[0] if plants is None else e
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,28 +80,25 @@ class PredictorFactory:
         self, plant: Plant, output_gain: float = 1.0, later_s: float = 0.0, noise: WhiteNoise | None = None
     ) -> Predictor:
         """Return the predictor of a plant, as `predictors` does of several."""
-        return self.predictors([plant], [output_gain], later_s, noise)
+        A, B, C = plant.state_space()
+        return self.predictors((A[None], B[None], C[None]), np.array([output_gain]), later_s, noise)
 
     def predictors(
-        self,
-        plants: Sequence[Plant],
-        output_gains: Sequence[float],
-        later_s: float = 0.0,
-        noise: WhiteNoise | None = None,
+        self, state_spaces: StateSpace, output_gains: Array, later_s: float = 0.0, noise: WhiteNoise | None = None
     ) -> Predictor:
-        """Return the predictors of plants in a row.
+        """Return the predictors of P plants in a row, of matrices (P, n, n), (P, n, 1) and (P, 1, n).
 
         ``x(k+1) = A x + b (u + n_u),  y = c x + n_y`` with the input held between samples. u as logged is known, so
         the loop being closed changes nothing, and no controller is needed (Ljung, 1999, section 13.4).
 
-        The parameters of the plants may be complex, and `output_gains` multiply their y. `later_s` [s] is delay beyond
-        the loop file's; `noise` takes the place of the factory's, but for the state after a restart.
+        The parameters of the plants may be complex, and `output_gains` (P,) multiply their y. `later_s` [s] is delay
+        beyond the loop file's; `noise` takes the place of the factory's, but for the state after a restart.
         """
         from servoscope.isolation.ml.plant_kernels import sample_plants
 
-        F, g, c = (np.stack(each) for each in zip(*(plant.state_space() for plant in plants), strict=True))
+        F, g, c = state_spaces
         F, g = F * self.scale / self.scale[:, None], g[..., 0] / self.scale
-        c = c[:, 0] * self.scale * np.array(output_gains)[:, None]
+        c = c[:, 0] * self.scale * output_gains[:, None]
         kind = np.result_type(F, g, c)  # one for all: each further mixture would be compiled anew
         F, g, c = (np.ascontiguousarray(part, dtype=kind) for part in (F, g, c))
         samples, late = split_delay(self.fractional_delay_s + later_s, self.loop.sample_rate)

@@ -138,14 +138,13 @@ class _HypothesisSearch:
             self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
             for one, other in combinations([f for f in singles if f.faults[0] not in self.rays], 2)
         ]
-        found, everything = self._iterate_onset(found, [*singles, *pairs])
+        found, best = self._iterate_onset(found, [*singles, *pairs])
+        everything = [best] if self._is_hopeless(best) else self._follow_onset([*singles, *pairs])
         if self._misfit(self._update_noise_variance(everything)) > 1.0:
             # no fault alone is near the truth, nor are the sizes that the pairs started from
-            pairs = [
-                self._fit(p.faults, nothing, [p.x, *pair_start_values(self.window, p.faults, self.profile)])
-                for p in pairs
-            ]
-            found, everything = self._iterate_onset(found, [*singles, *pairs])
+            pairs = [self._refit_from_valleys(pair) for pair in pairs]
+            found, _ = self._iterate_onset(found, [*singles, *pairs])
+            everything = self._follow_onset([*singles, *pairs])
         best = self._update_noise_variance(everything)
         everything = [self._refit_own_onset(f, best) for f in everything]
         if found.high - found.low <= SHARP and not found.profile.duration:
@@ -175,10 +174,17 @@ class _HypothesisSearch:
         everything = self._refit_contenders([self._refit_at(f, profile) for f in fitted])
         return onset, [best if f.names == best.names else f for f in everything]
 
+    def _refit_from_valleys(self, pair: HypothesisFit) -> HypothesisFit:
+        """Fit a pair from where a grid over all its sizes is lowest, and from where it is unless it has ended there."""
+        starts = pair_start_values(self.window, pair.faults, self.profile)
+        if pair.profile != self.profile:
+            return self._fit(pair.faults, np.zeros_like(pair.d), [pair.x, *starts])
+        return min(pair, self._fit(pair.faults, np.zeros_like(pair.d), starts), key=lambda fitted: fitted.cost)
+
     def _iterate_onset(
         self, found: OnsetEstimate, fitted: Sequence[HypothesisFit]
-    ) -> tuple[OnsetEstimate, list[HypothesisFit]]:
-        """Find the onset and the sizes of the best hypothesis in turns if it is a pair, then let the others follow."""
+    ) -> tuple[OnsetEstimate, HypothesisFit]:
+        """Find the onset and the sizes of the best hypothesis in turns if it is a pair."""
         best = self._update_noise_variance(fitted)
         for _ in range(LOOKS if len(best.faults) > 1 else 0):
             found = self._onset(best)
@@ -188,9 +194,17 @@ class _HypothesisSearch:
             if gained < WORTH_A_LOOK * self.noise_variance or self._misfit(best) > HOPELESS:
                 break
         self.profile = found.profile
-        everything = self._refit_contenders([self._refit_at(f, found.profile) for f in fitted])
+        return found, best
+
+    def _follow_onset(self, fitted: Sequence[HypothesisFit]) -> list[HypothesisFit]:
+        """Let all hypotheses follow to the onset that was found."""
+        everything = self._refit_contenders([self._refit_at(f, self.profile) for f in fitted])
         self._update_noise_variance(everything)
-        return found, everything
+        return everything
+
+    def _is_hopeless(self, fitted: HypothesisFit) -> bool:
+        """Whether a hypothesis is far off, the healthy parameters following too."""
+        return self._misfit(fitted) > HOPELESS and self._misfit(self._refit_jointly(fitted)) > HOPELESS
 
     def _misfit(self, fitted: HypothesisFit) -> float:
         """Return what a hypothesis leaves unexplained, in units of what noise leaves at most."""

@@ -31,19 +31,20 @@ class SizeGrid:
     """Sizes of one fault from one end of its range to the other, where a search may begin."""
 
     sizes: FloatArray  # logarithms of the ratios
-    predictors: tuple[Any, ...]  # of the healthy plant and the one of each size
+    variants: Any  # a window's, of a step to each size
 
     @classmethod
     def from_window(cls, window: ChangeWindow, fault: Fault, d: FloatArray) -> Self:
         """Make the predictors, for errors d (m,) of the healthy parameters."""
         (low,), (high,) = log_ratio_bounds([fault])
-        sizes, step = np.linspace(low, high, RUNGS), ChangeProfile(0)
-        return cls(sizes, tuple(window.predictor(d, (fault.parameter,), np.array([x]), step) for x in sizes))
+        sizes = np.linspace(low, high, RUNGS)
+        z = np.column_stack([np.tile(d, (RUNGS, 1)), sizes])
+        return cls(sizes, window.variants(z, (fault.parameter,), ChangeProfile(0)))
 
     def sums_of_squares(self, window: ChangeWindow, profile: ChangeProfile) -> FloatArray:
         """Return the sum of squares of each size, a drift taken as a step in its middle."""
         step = ChangeProfile(profile.onset + profile.duration // 2)
-        return np.array([float((window.innovations(each, step) ** 2).sum()) for each in self.predictors])
+        return np.asarray((window.variant_innovations(self.variants, step) ** 2).sum(axis=1))
 
     def local_minima(self, window: ChangeWindow, profile: ChangeProfile) -> list[FloatArray]:
         """Return the sizes (1,) at the lowest valleys: what a fault does to fast dynamics comes back as an alias."""
@@ -57,13 +58,14 @@ def pair_start_values(window: ChangeWindow, faults: Sequence[Fault], profile: Ch
     """
     rate, step = window.sample_rate, profile.onset + profile.duration // 2
     first, end = max(step - round(BESIDE_S[0] * rate), 0), step + round(BESIDE_S[1] * rate)
-    near, names, d = window.cut(first, end), [fault.parameter for fault in faults], np.zeros(window.nuisance_count)
+    near, names = window.cut(first, end), [fault.parameter for fault in faults]
     low, high = log_ratio_bounds(faults)
     axes = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]
+    z = np.column_stack([np.zeros((GRID, window.nuisance_count + 1)), axes[1]])
     cost = np.empty((GRID, GRID))
-    for i, x in enumerate(axes[0]):
-        for j, z in enumerate(axes[1]):
-            cost[i, j] = (near.residual(np.append(d, [x, z]), names, ChangeProfile(step - first)) ** 2).sum()
+    for row, x in zip(cost, axes[0], strict=True):  # all at once would take hundreds of megabytes of a fast loop
+        z[:, -2] = x
+        row[:] = (near.residuals(z, names, ChangeProfile(step - first)) ** 2).sum(axis=1)
     return [np.array([axes[0][i], axes[1][j]]) for i, j in _local_minima(cost)]
 
 

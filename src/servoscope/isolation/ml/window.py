@@ -43,6 +43,8 @@ class ChangeProfile:
         return np.arange(1, PIECES + 1) / PIECES if self.duration else np.ones(1)
 
 
+DRIFT = ChangeProfile(0, 1)  # whenever it comes, however long it takes
+
 ChangeSums = Callable[[IntArray, IntArray], tuple[FloatArray, FloatArray]]
 """From onsets and durations (M,) to the sums of products, (M, V, V + m), and of log S, (M,), of V = 1 + k columns: the
 innovations and their derivatives by the k sizes; the last m are products with the rows of Q."""
@@ -140,11 +142,23 @@ class ChangeWindow(abc.ABC):
         """The predictor of the healthy plant as learned."""
         return self.predictor(np.zeros(self.nuisance_count), (), np.zeros(0), ChangeProfile(0))
 
+    def variants(self, z: Array, names: Sequence[str], profile: ChangeProfile) -> Any:
+        """Return the predictors of V changes, one for each row z = [d, x], shape (V, m + len(names))."""
+        m = self.nuisance_count
+        return [self.predictor(row[:m], names, row[m:], profile) for row in z]
+
+    def variant_innovations(self, variants: Any, profile: ChangeProfile) -> Array:
+        """Return the innovations of each in standard deviations, shape (V, N)."""
+        return np.array([self.innovations(predictor, profile) for predictor in variants])
+
+    def residuals(self, z: Array, names: Sequence[str], profile: ChangeProfile) -> Array:
+        """Return what least squares makes small: innovations and prior, (V, N + m), at z = [d, x], (V, m + k)."""
+        e = self.variant_innovations(self.variants(z, names, profile), profile)
+        return np.hstack([e, z[:, : self.nuisance_count] @ self.prior.T])
+
     def residual(self, z: Array, names: Sequence[str], profile: ChangeProfile) -> Array:
-        """Return what least squares makes small: innovations and prior, shape (N + m,), at z = [d, x]."""
-        d, x = z[: self.nuisance_count], z[self.nuisance_count :]
-        e = self.innovations(self.predictor(d, names, x, profile), profile)
-        return np.concatenate([e, self.prior @ d])
+        """Return the `residuals` of one z, shape (N + m,)."""
+        return np.asarray(self.residuals(z[None], names, profile)[0])
 
     def jacobian(
         self, z: FloatArray, names: Sequence[str], profile: ChangeProfile, by: slice = slice(None)
@@ -153,12 +167,10 @@ class ChangeWindow(abc.ABC):
 
         By complex steps: no difference is taken, so nothing is lost by rounding (Squire and Trapp, 1998).
         """
-        columns = []
-        for i in np.arange(len(z))[by]:
-            moved = z.astype(np.complex128)
-            moved[i] += 1j * TINY
-            columns.append(self.residual(moved, names, profile).imag / TINY)
-        return np.array(columns).reshape(-1, self.samples + self.nuisance_count).T
+        moved = (z + 1j * TINY * np.eye(len(z)))[by]
+        if not len(moved):
+            return np.zeros((self.samples + self.nuisance_count, 0))
+        return np.asarray(self.residuals(moved, names, profile).imag.T / TINY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,19 +213,36 @@ class RefitWindow(ChangeWindow):
 
     def predictor(self, d: Array, names: Sequence[str], x: Array, profile: ChangeProfile) -> Predictor:
         """Return the predictors of the healthy plant and of all that follow; d are errors of logarithms."""
-        healthy = dict(zip(self.names, np.exp(d), strict=True)) if np.any(d) else {}
-        plants, output_gains = [self.plant.scaled(healthy) if healthy else self.plant], [1.0]
-        for share in profile.shares:
-            faulty = dict(healthy)
-            for name, value in zip(names, np.exp(share * x), strict=True):
-                faulty[name] = faulty.get(name, 1.0) * value
-            output_gains.append(faulty.pop(SENSOR_GAIN, 1.0))
-            plants.append(self.plant.scaled(self.plant.expand_rays(faulty)))
-        return self.factory.predictors(plants, output_gains)
+        return self.variants(np.concatenate([d, x])[None], names, profile)[0]
+
+    def variants(self, z: Array, names: Sequence[str], profile: ChangeProfile) -> tuple[Predictor, IntArray]:
+        """Return predictors in a row, and which of them each change goes through, shape (V, p).
+
+        Neighbours of the same d share the healthy one.
+        """
+        m, shares = self.nuisance_count, profile.shares
+        d, x = z[:, :m], z[:, m:]
+        new = np.append(True, (d[1:] != d[:-1]).any(axis=1))
+        own, count = np.cumsum(new) - 1, int(new.sum())  # the healthy ones come first
+        # a column of logarithms for each name, one row per plant
+        faulty = (shares[None, :, None] * x[:, None]).reshape(len(z) * len(shares), len(names))
+        healthy = np.concatenate([d[new], np.repeat(d, len(shares), axis=0)])
+        factors = dict(zip(self.names, np.exp(healthy).T, strict=True))
+        for name, column in zip(names, np.exp(np.concatenate([np.zeros((count, len(names))), faulty])).T, strict=True):
+            factors[name] = factors[name] * column if name in factors else column
+        output_gains = factors.pop(SENSOR_GAIN, np.ones(len(healthy)))
+        spaces = self.plant.state_spaces(self.plant.expand_rays(factors), len(healthy))
+        after = count + np.arange(len(faulty)).reshape(len(z), len(shares))
+        return self.factory.predictors(spaces, output_gains), np.column_stack([own, after])
 
     def innovations(self, predictor: Predictor, profile: ChangeProfile) -> Array:
         """Return the innovations in standard deviations, shape (N,)."""
         return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart)
+
+    def variant_innovations(self, variants: tuple[Predictor, IntArray], profile: ChangeProfile) -> Array:
+        """Return the innovations of each in standard deviations, shape (V, N)."""
+        predictor, plants = variants
+        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart, plants)
 
     def disturbance_response(
         self, predictor: Predictor, profile: ChangeProfile, u: FloatArray, y: FloatArray
@@ -226,17 +255,16 @@ class RefitWindow(ChangeWindow):
         """Prepare the sums of products by onset: one pass over the window, in which every predictor settles anew."""
         from servoscope.isolation.ml.kernels import sum_over_onsets
 
-        sizes = [x, *(x + step * e for e in np.eye(len(x)))]
-        each = [self.predictor(d, names, size, ChangeProfile(0, 1)) for size in sizes]
-        drifting = Predictor(*(np.stack(parts) for parts in zip(*each, strict=True)))
-        stepping = Predictor(*(np.ascontiguousarray(part[:, [0, -1]]) for part in drifting))
-        A, K, c = stepping.A[0], stepping.K[0, :, -1], stepping.c[0]
+        moved = np.vstack([np.zeros(len(x)), step * np.eye(len(x))])
+        each, drifting = self.variants(np.column_stack([np.tile(d, (len(moved), 1)), x + moved]), names, DRIFT)
+        stepping = np.ascontiguousarray(drifting[:, [0, -1]])
+        A, K, c = each.A[stepping[0]], each.K[stepping[0], -1], each.c[stepping[0]]
         slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
         settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), self.samples)
 
         def sums(onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
-            parts = drifting if overs.any() else stepping
-            return sum_over_onsets(*parts, step, onsets, overs, settle, self.u, self.y, self.restart, Q)
+            plants = drifting if overs.any() else stepping
+            return sum_over_onsets(*each, plants, step, onsets, overs, settle, self.u, self.y, self.restart, Q)
 
         return sums
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
@@ -23,6 +23,15 @@ EXTRA_COLUMNS = (
 )
 """Columns beyond the powers of s: sign(y'), max(y', 0), min(y', 0), the constant one, and those with a shape: Stribeck
 friction, sines of y, and friction that follows the magnitude of a sine."""
+
+
+def matrices(rows: Sequence[Sequence[Any]], count: int) -> Any:
+    """Return so many matrices, (count, r, c), of entries by row and column: numbers, or arrays (count,)."""
+    stack = np.empty((count, len(rows), len(rows[0])), np.result_type(np.float64, *(x for row in rows for x in row)))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            stack[:, i, j] = entry
+    return stack
 
 
 def _not_zero(value: float) -> float:
@@ -224,6 +233,15 @@ class Plant(BaseModel, abc.ABC):
 
         Raises LoopError if no nominal values are known.
         """
+
+    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
+        """Return the `state_space` of so many plants at once: A (count, n, n), B (count, n, 1), C (count, 1, n).
+
+        `factors`: what `scaled` takes, an array (count,) for each.
+        """
+        plants = (self.scaled({name: each[i] for name, each in factors.items()}) for i in range(count))
+        A, B, C = (np.stack(each) for each in zip(*(plant.state_space() for plant in plants), strict=True))
+        return A, B, C
 
     def _check_ratios(self, ratios: Mapping[str, float]) -> None:
         for name, ratio in ratios.items():

@@ -13,7 +13,7 @@ from pydantic import Field
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
 from servoscope.core.settings import NonNegative
-from servoscope.models.plants.base import Fault, Plant, StateSpace
+from servoscope.models.plants.base import Fault, Plant, StateSpace, matrices
 
 PlausiblePositive = Annotated[float, Field(gt=1e-30, lt=1e30, allow_inf_nan=False)]  # SI values beyond are typos
 
@@ -105,19 +105,20 @@ class EHA(Plant):
 
         Where the actuator is not `linear` this is the linear part: flow at p_L = 0, no Coulomb friction.
         """
-        m_p, capacity = self.m_p, self.capacity
-        A = np.array(
-            [
-                [0.0, 1.0, 0.0],
-                [-self.k_p / m_p, -self.b_p / m_p, self.A_p / m_p],
-                [0.0, -self.A_p / capacity, -self.C_ie / capacity],
-            ]
-        )
-        return (
-            A,
-            np.array([[0.0], [0.0], [self.input_gain * self.flow_gain / capacity]]),
-            np.array([[1.0, 0.0, 0.0]]),
-        )
+        A, B, C = self.state_spaces({}, 1)
+        return A[0], B[0], C[0]
+
+    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
+        """Return those of so many actuators at once: their parameters are arrays."""
+        one = self.scaled(factors)
+        m_p, capacity = one.m_p, one.capacity
+        A = [
+            [0.0, 1.0, 0.0],
+            [-one.k_p / m_p, -one.b_p / m_p, one.A_p / m_p],
+            [0.0, -one.A_p / capacity, -one.C_ie / capacity],
+        ]
+        B = [[0.0], [0.0], [one.input_gain * one.flow_gain / capacity]]
+        return matrices(A, count), matrices(B, count), matrices([[1.0, 0.0, 0.0]], count)
 
     def frequency_response(self, f_hz: npt.ArrayLike) -> npt.NDArray[np.complex128]:
         """Inverse frequency response H(j 2 pi f) [A/m] at frequencies [Hz], same shape as `f_hz`, eq. (2)."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from servoscope.models.plants.base import CoefficientPlant, Fault, StateSpace
+from servoscope.models.plants.base import CoefficientPlant, Fault, StateSpace, matrices
 
 POWER_NAMES = ("stiffness", "viscous_friction", "inertia", "jerk", "snap")
 EXTRA_NAMES = {
@@ -114,13 +114,17 @@ class PolynomialPlant(CoefficientPlant):
 
         Friction by direction enters with the mean of both directions; sign and offset are left out.
         """
-        nominal = dict(self._nominal())
+        A, B, C = self.state_spaces({}, 1)
+        return A[0], B[0], C[0]
+
+    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
+        """Return those of so many plants at once: their coefficients are arrays."""
+        nominal = dict(self.scaled(factors)._nominal())
         if self.friction == "directional":
             nominal["viscous_friction"] = 0.5 * (
                 nominal["viscous_friction_forward"] + nominal["viscous_friction_backward"]
             )
         polynomial = [nominal.get(POWER_NAMES[power], 0.0) for power in range(self.order + 1)]
-        last = -np.array(polynomial[:-1]) / polynomial[-1]
-        A = np.vstack([np.eye(self.order, k=1)[:-1], last])
-        B = np.append(np.zeros(self.order - 1), self.input_gain / polynomial[-1])[:, None]
-        return A, B, np.eye(1, self.order)
+        A = [*np.eye(self.order, k=1)[:-1].tolist(), [-each / polynomial[-1] for each in polynomial[:-1]]]
+        B = [[0.0]] * (self.order - 1) + [[self.input_gain / polynomial[-1]]]
+        return matrices(A, count), matrices(B, count), matrices(np.eye(1, self.order).tolist(), count)
