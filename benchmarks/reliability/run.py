@@ -171,7 +171,7 @@ def free_port() -> int:
 def render() -> None:
     """Write the tables of all results between their markers on the page."""
     page = PAGE.read_text(encoding="utf-8")
-    paths = [RESULTS / f"{name}.json" for name in TRIALS]
+    paths = [RESULTS / f"{name}{part}.json" for part in ("", "-reduced") for name in TRIALS]
     found = [json.loads(path.read_text(encoding="utf-8")) for path in paths if path.is_file()]
     marked = re.compile("<!-- trials -->.*?<!-- end of trials -->", re.DOTALL)
     if not marked.search(page):
@@ -190,7 +190,7 @@ def markdown(found: list[dict[str, Any]]) -> str:
     columns = [column(one) for one in found]
     lines += [(rows[0][0], *(value for _, value in rows)) for rows in zip(*columns, strict=True)]
     reduced = [one for one in found if one["settings"]["hours"] * one["settings"]["assets"] < FULL_DAY]
-    words = " **Reduced: not the whole day of 200 assets yet.**" if reduced else ""
+    words = " **Reduced: not the whole day of 200 assets**, where the table says so." if reduced else ""
     machines = "; ".join(sorted({one["machine"] for one in found}))
     loads = ", ".join(f"{one['settings']['load']:g}" for one in found)
     words += f" Load of the machine by other work, before each: {loads}."
@@ -246,7 +246,9 @@ def main() -> None:
         for name in given.names or TRIALS:
             found = trial(name, (given.assets, given.hours, given.speed), given.every)
             RESULTS.mkdir(exist_ok=True)
-            atomic_write(RESULTS / f"{name}.json", (json.dumps(found, indent=1) + "\n").encode())
+            full = given.hours * given.assets >= FULL_DAY
+            file = RESULTS / (f"{name}.json" if full else f"{name}-reduced.json")
+            atomic_write(file, (json.dumps(found, indent=1) + "\n").encode())
             print(json.dumps(found, indent=1))
     if given.render:
         render()
