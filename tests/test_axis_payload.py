@@ -70,6 +70,11 @@ class TestPayload:
         assert plant().added_mass("moved_mass", 2.75 / 2.0) == pytest.approx(3.0)
         assert plant().added_mass("inertia", 1.1) is None
 
+    def test_the_side_of_its_weight_is_known(self) -> None:
+        coefficients = {**dict.fromkeys(plant().names, 1.0), "gravity": 0.0}
+        with pytest.raises(ValueError, match="gravity must not be 0 beside payload_arm"):
+            AxisPlant.model_validate(plant().model_dump() | {"coefficients": coefficients})
+
     def test_what_a_payload_is_called(self) -> None:
         named = {fault.name: fault.parameter for fault in plant().faults}
         assert (named["payload"], named["inertia"]) == ("moved_mass", "inertia")

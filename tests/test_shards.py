@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -20,7 +21,7 @@ from servoscope.core.errors import ConfigError, StoreError
 from servoscope.service.config import ServiceFile, shard_number
 from servoscope.service.health import serve_health
 from servoscope.service.store import Store
-from servoscope.service.workers import WorkerPool, merge_metrics
+from servoscope.service.workers import WorkerPool, _Worker, merge_metrics
 
 WORKERS = 'listen = "127.0.0.1:0"\nworkers = 2'
 SHARED = {key: query.replace("<> 'hall'", "NOT LIKE 'hall%'") for key, query in halls.RESULTS.items()}
@@ -109,6 +110,24 @@ def test_metrics_of_workers_add_up_to_those_of_one_service() -> None:
         "# HELP servoscope_store_up x",
         "servoscope_store_up 0.0",  # it is up where all say so
     ]
+
+
+def test_a_worker_that_ends_while_it_answers_does_not_end_the_others(tmp_path: Path) -> None:
+    config = shared_hall(tmp_path, "hall", 0.0)
+    worker = _Worker(ServiceFile.load(config), config, 0, (), ())
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer_half() -> None:
+            with server.accept()[0] as one:
+                one.recv(4096)
+                one.sendall(b'HTTP/1.0 200 OK\r\nContent-Length: 100\r\n\r\n{"ok"')
+
+        thread = threading.Thread(target=answer_half)
+        thread.start()
+        worker._take_address(f"127.0.0.1:{server.getsockname()[1]}")
+        with pytest.raises(OSError, match="no answer"):
+            worker.ask("/health/live")
+        thread.join()
 
 
 @pytest.mark.slow

@@ -55,6 +55,34 @@ def test_the_course_solves_the_differential_equation() -> None:
     assert toy(power, 1.0).basis(T, 2.0) @ x == pytest.approx(solved.y[0], abs=0.03)
 
 
+@pytest.mark.parametrize("seen", [0.0, 1.0])
+@pytest.mark.parametrize("blocks", [1, 3, 20, 3000])
+def test_what_a_recording_does_not_show_stays_in_the_middle(seen: float, blocks: int) -> None:
+    """A machine at rest, one that shows a single coefficient, and a day of a machine that is warm in seconds."""
+    model = CovariateModel(
+        names=("warm_up",),
+        low=(0.0,),
+        high=(1.0,),
+        degrees=(1,),
+        proportional=(True, True),
+        slopes=((-0.3, 0.1),),
+        covariance=((0.0, 0.0), (0.0, 0.0)),
+    )
+    theta, sums = np.array([1.0, 2.0]), toy(np.zeros(blocks), 1.0)
+    normal = np.tile(np.diag([100.0 * seen, 0.0]), (blocks, 1, 1))
+    sums = replace(sums, normal=normal, moment=normal @ model.theta(theta, np.array([[0.5]]))[0])
+    fit, smallest = find_course(sums, WarmUp(time_constant_s=3.0, power=0.0, variance=1.0), theta, model)
+    assert fit.course == pytest.approx(0.5) and not fit.jumps
+    assert np.isfinite(fit.std).all() and (smallest < np.inf) == (seen > 0.0 and blocks > 5)
+
+
+def test_a_machine_at_rest_says_nothing_of_its_warmth(baseline: ss.Baseline) -> None:
+    moved, _ = warm_up(9, 30.0, 8.0)
+    still = np.zeros(moved.samples)
+    found = ss.diagnose(baseline, replace(moved, r=still, u=still, y=still))
+    assert found.verdict == "undetermined"
+
+
 def test_a_jump_is_found_where_it_is_and_leaves_the_course_alone() -> None:
     model = CovariateModel(
         names=("warm_up",),

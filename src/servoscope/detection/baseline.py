@@ -10,13 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    ValidationError,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError
@@ -189,6 +183,11 @@ class Baseline(ShortRepr, BaselineModel):
     def loop(self) -> Loop:
         """The loop."""
         return Loop.from_dict(self.loop_settings)
+
+    @property
+    def logged_covariates(self) -> tuple[str, ...]:
+        """Names of the channels that a recording must have beside r, u and y; a warm-up that nobody logs is none."""
+        return () if self.covariates is None or self.covariates.warm_up is not None else self.covariates.names
 
     @property
     def points(self) -> tuple[str, ...]:

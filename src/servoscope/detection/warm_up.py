@@ -28,6 +28,7 @@ BY_CHANCE = 1e-6  # probability with which a smooth course is called broken, ove
 MOST_JUMPS = 3
 ROUNDS = 8  # of Gauss and Newton
 STEP = 1e-4  # of w, for derivatives
+UNSEEN = 1e-30  # of the best known information: less is rounding, as of a machine at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +122,7 @@ def fit_course(
         fitted = model.theta(theta, w) + J[:, :, k:] @ p[k:]
         left = sums.moment - np.einsum("mij,mj->mi", A, fitted)
         H = np.einsum("mia,mij,mjb->ab", J, A, J) + np.diag(prior)
+        H += np.diag(np.diag(H) <= UNSEEN * H.max())  # what the recording does not show stays as it is
         size = np.sqrt(np.diag(H))
         C = np.linalg.inv(H / np.outer(size, size)) / np.outer(size, size)
         if not last:
@@ -136,7 +138,7 @@ def _most_likely_jump(sums: BlockSums, fit: WarmUpFit, variance: float) -> tuple
     of the moment that shows one best.
     """
     A, J = sums.normal, fit.jacobian
-    slope = J[:, :, 0] / fit.basis[:, :1]
+    slope = J[:, :, 0] + J[:, :, 1]  # what w_0 and s contribute adds up to 1 at all times
     known = np.linalg.pinv(np.einsum("mia,mij,mjb->ab", J, A, J), hermitian=True)
 
     def since(values: FloatArray) -> FloatArray:

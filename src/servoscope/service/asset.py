@@ -96,7 +96,7 @@ class Asset:
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
         nothing, monitor = np.full(2, np.nan), self.monitor
-        monitor.run(monitor.init(), *(nothing,) * 3, channels=dict.fromkeys(monitor.loop.columns.covariates, nothing))
+        monitor.run(monitor.init(), *(nothing,) * 3, channels=dict.fromkeys(self.baseline.logged_covariates, nothing))
         quality.check_block(self._limits, quality.init_state(), np.arange(2.0), nothing, nothing, nothing)
 
     def resume(self, state: AssetState, stored: Iterable[Block]) -> list[Block]:

@@ -56,7 +56,7 @@ class BlockLanes:
         order.restart[:1] |= accepted.restart
         t, signals = block[0, order.rows], block[1:, order.rows]
         r, u, y, *covariates = np.where(np.isfinite(signals), signals, np.nan)
-        channels = dict(zip(monitor.loop.columns.covariates, covariates, strict=False))
+        channels = dict(zip(monitor.baselines[0].logged_covariates, covariates, strict=False))
         new, trace = monitor.run(state.monitor, r, u, y, order.restart, channels=channels)
         checked, _ = quality.check_block(self._limits, state.quality, *block[:4, order.order])
         last_t = order.t if np.isfinite(order.t) else None

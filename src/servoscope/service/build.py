@@ -162,17 +162,18 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
                 baseline = files[path] if point is None else files[path].at(point)
             except BaselineError as error:
                 raise ConfigError(f"[assets] {name}.point: {path.name}: {error}") from None
-            if baseline.covariates is not None and not config.sources[settings.source].carries_covariates:
-                names = ", ".join(baseline.covariates.names)
+            names = ", ".join(baseline.logged_covariates)
+            if names and not config.sources[settings.source].carries_covariates:
                 raise ConfigError(
                     f"[assets] {name}.baseline: {path.name} depends on {names}, which source {settings.source} "
                     "does not carry: learn operating points for it"
                 )
             try:
                 shared[path, point] = baseline, Monitor(baseline)
-            except BaselineError:
-                points = ", ".join(baseline.points)
-                raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
+            except BaselineError as error:
+                if points := ", ".join(baseline.points):
+                    raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
+                raise ConfigError(f"[assets] {name}.baseline: {path.name}: {error}") from None
         faults = [fault.name for fault in shared[path, point][0].loop.plant.all_faults]
         if settings.limits is None:
             limits = {fault: limit for fault, limit in config.prognosis.limits.items() if fault in faults}
@@ -212,12 +213,14 @@ def _resolve_limits(loop: Loop, limits: Mapping[str, float | LimitKind], asset: 
 
 def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str) -> dict[str, SourceAsset]:
     """Return what a source is told of its assets."""
-    key = config.sources[source].asset_key
-    return {
-        name: SourceAsset(assets[name].baseline.loop, getattr(one, key) if key else None, config.service.ahead_s)
-        for name, one in config.assets.items()
-        if one.source == source
-    }
+    key, found = config.sources[source].asset_key, dict[str, SourceAsset]()
+    for name, one in config.assets.items():
+        if one.source == source:
+            baseline, address = assets[name].baseline, getattr(one, key) if key else None
+            found[name] = SourceAsset(
+                baseline.loop, address, config.service.ahead_s, covariates=baseline.logged_covariates
+            )
+    return found
 
 
 def build_source(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> BlockSource:

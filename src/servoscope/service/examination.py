@@ -159,9 +159,11 @@ def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) 
     """
     t, r, u, y, *covariates = np.concatenate([block.signals for block in blocks], axis=1)
     # a thermometer may tell less often than the motion is sampled
-    rows = [np.where(np.isfinite(c), c, np.nan) for c in covariates]
-    held = [hold_last(c[:, None], c[~np.isnan(c)][:1])[:, 0] for c in rows if not np.isnan(c).all()]
-    channels = dict(zip(baseline.loop.columns.covariates, held, strict=False))
+    channels = {
+        name: hold_last(np.where(known, c, np.nan)[:, None], c[known][:1])[:, 0]
+        for name, c in zip(baseline.logged_covariates, covariates, strict=False)
+        if (known := np.isfinite(c)).any()
+    }
     loop, start = baseline.loop, float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0
     limits = loop.input_limits
     found = clean(t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=limits, channels=channels or None)

@@ -9,6 +9,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
+from http.client import HTTPException
 from json import loads
 from pathlib import Path
 
@@ -90,12 +91,13 @@ class _Worker:
     def ask(self, path: str) -> bytes:
         """Return its answer; raises OSError where it has none."""
         try:
-            with urllib.request.urlopen(f"http://{self._address}{path}", timeout=ANSWER_S) as answer:
-                return bytes(answer.read())
-        except urllib.error.HTTPError as error:  # it is not ready, and says why
-            return error.read()
-        except ValueError:
-            raise OSError("it has not started yet") from None
+            try:
+                with urllib.request.urlopen(f"http://{self._address}{path}", timeout=ANSWER_S) as answer:
+                    return bytes(answer.read())
+            except urllib.error.HTTPError as error:  # it is not ready, and says why
+                return error.read()
+        except (ValueError, HTTPException) as error:  # it has not started yet, or ended while it answered
+            raise OSError(f"no answer: {error}") from None
 
 
 @dataclass

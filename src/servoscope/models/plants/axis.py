@@ -141,6 +141,10 @@ class AxisPlant(CoefficientPlant):
             wrong = [name for name, value in self.coefficients.items() if value < 0.0 and name not in signed]
             if wrong or not self.coefficients["inertia"]:
                 raise ValueError(f"coefficients: {(wrong or ['inertia'])[0]} must be positive")
+            if self._lifts and not self.coefficients["gravity"]:
+                raise ValueError(
+                    "coefficients: gravity must not be 0 beside payload_arm, its sign says where a payload pulls"
+                )
         return self
 
     @property

@@ -113,7 +113,7 @@ def _decode_binary(asset: str, message: bytes, received_at: float, covariates: S
     t = np.frombuffer(body[BODY_HEADER.size : at], "<f8").astype(np.float64) if stamps else _uniform_times(t0, dt, n)
     numbers = np.frombuffer(body[at:], f"<f{width}").astype(np.float64).reshape(3 + further, -1)
     if covariates and further != len(covariates):
-        raise MessageError("covariates", f"{further} further columns, expected {', '.join(covariates)}")
+        raise MessageError("covariates", f"{further} covariates, expected {', '.join(covariates)}")
     signals = _join_columns(t, numbers[: 3 + len(covariates)])
     return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, signals, received_at)
 
@@ -164,7 +164,7 @@ def _decode_loose_json(asset: str, message: bytes, received_at: float, covariate
     if covariates:
         named = plain.get("covariates")
         if not isinstance(named, dict) or not set(covariates) <= set(named):
-            raise MessageError("covariates", f"missing, expected {', '.join(covariates)}")
+            raise MessageError("covariates", f"covariates: missing, expected {', '.join(covariates)}")
         columns |= {f"covariates.{name}": named[name] for name in covariates}
     numbers = np.stack(_parse_columns(columns, ("r", "u", "y", *(f"covariates.{name}" for name in covariates))))
     if "t" in plain:

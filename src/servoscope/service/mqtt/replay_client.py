@@ -89,7 +89,8 @@ class ReplayClient:
             name: (tuple(settings.folder / file for file in one.files), Loop.load(settings.folder / one.loop))
             for name, one in settings.assets.items()
         }
-        self._replay = ReplaySource(settings.replay.model_copy(update={"start": start}), files)
+        covariates = {name: tuple(loop.columns.covariates) for name, (_, loop) in files.items()}
+        self._replay = ReplaySource(settings.replay.model_copy(update={"start": start}), files, covariates)
         self._client = create_mqtt_client(settings.broker, settings.folder, "")
         self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
         self._client.on_message = self._on_message

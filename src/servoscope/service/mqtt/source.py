@@ -52,13 +52,13 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
 
     @property
     def carries_covariates(self) -> bool:  # type: ignore[override]  # a plant's own messages do not
-        """Whether its blocks carry the columns under ``[columns.covariates]``."""
+        """Whether its blocks carry the `covariates` of an asset."""
         return self.payload is None
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
         """Return the source."""
         if self.payload is None:
-            covariates = {asset: tuple(one.loop.columns.covariates) for asset, one in assets.items()}
+            covariates = {asset: one.covariates for asset, one in assets.items()}
             return MqttSource(self, frozenset(assets), folder, name, covariates)
         return PlantSource(self, assets, folder, name)
 

@@ -122,6 +122,7 @@ class SourceAsset(NamedTuple):
     loop: Loop
     address: Any
     ahead_s: float = math.inf  # how far its time stamps may be ahead of our clock [s]
+    covariates: tuple[str, ...] = ()  # channels that its blocks carry beside r, u and y
 
 
 class SourceSettings(Settings):
@@ -130,7 +131,7 @@ class SourceSettings(Settings):
     asset_key: ClassVar[str] = ""  # the key of ``[assets.NAME]`` under which such a source finds an asset; empty: none
     asset_example: ClassVar[str] = ""  # what to write there
     visit_changes: ClassVar[Mapping[str, Any]] = {}  # values of keys for a client that only listens for a while
-    carries_covariates: ClassVar[bool] = False  # whether its blocks carry the columns under ``[columns.covariates]``
+    carries_covariates: ClassVar[bool] = False  # whether its blocks carry the `covariates` of an asset
     _is_visit: bool = PrivateAttr(default=False)
 
     kind: str

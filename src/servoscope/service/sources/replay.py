@@ -44,7 +44,7 @@ class ReplaySettings(SourceSettings):
             each: (tuple(Path(file) if is_address(file) else folder / file for file in one.address), one.loop)
             for each, one in assets.items()
         }
-        return ReplaySource(self, files)
+        return ReplaySource(self, files, {each: one.covariates for each, one in assets.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,13 @@ class ReplayStream:
 class ReplaySource(BlockSource):
     """Replays recordings for several assets, in the order of time; a file has to be acknowledged nothing."""
 
-    def __init__(self, settings: ReplaySettings, assets: Mapping[str, tuple[tuple[Path, ...], Loop]]) -> None:
+    def __init__(
+        self,
+        settings: ReplaySettings,
+        assets: Mapping[str, tuple[tuple[Path, ...], Loop]],
+        covariates: Mapping[str, tuple[str, ...]] | None = None,
+    ) -> None:
+        """`covariates`: names of the channels that blocks of an asset carry."""
         super().__init__()
         self.settings, self.clock_rate = settings, settings.speed
         self._streams: dict[str, tuple[ReplayStream, float]] = {}  # with their start [UTC s], once it is open
@@ -101,10 +107,8 @@ class ReplaySource(BlockSource):
                     shared[path, loop.hash()] = read(path, loop)
             samples = max(1, round(settings.block * loop.sample_rate))
             recordings = tuple(shared[path, loop.hash()] for path in files)
-            self._streams[asset] = (
-                ReplayStream(recordings, samples, settings.repeat, tuple(loop.columns.covariates)),
-                math.nan,
-            )
+            carried = (covariates or {}).get(asset, ())
+            self._streams[asset] = ReplayStream(recordings, samples, settings.repeat, carried), math.nan
         self._queue: list[tuple[float, int, Block]] = []  # a heap of the next block of each asset: end, order, block
         self._clock_origin = (0.0, 0.0)  # the same moment by the monotonic clock and by that of the samples
 
