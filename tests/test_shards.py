@@ -18,8 +18,10 @@ import pytest
 
 import halls
 from servoscope.core.errors import ConfigError, StoreError
+from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile, shard_number
 from servoscope.service.health import serve_health
+from servoscope.service.service import Service
 from servoscope.service.store import Store
 from servoscope.service.workers import WorkerPool, _Worker, merge_metrics
 
@@ -110,6 +112,19 @@ def test_metrics_of_workers_add_up_to_those_of_one_service() -> None:
         "# HELP servoscope_store_up x",
         "servoscope_store_up 0.0",  # it is up where all say so
     ]
+
+
+def test_a_worker_that_loses_its_last_asset_has_nothing_left_to_do(tmp_path: Path) -> None:
+    halls.files(tmp_path)
+    config = shared_hall(tmp_path, "hall", 0.0)
+    part = ServiceFile.load(config).shard(1)
+    service = Service(part, build_components(part))
+    assert list(service.assets) == ["press"]
+    before, after = config.read_text(encoding="utf-8").split("[assets.press]")
+    config.write_text(before + after[after.index("[assets.lift]") :], encoding="utf-8")
+    service.reload(config)
+    service.run()
+    assert not service.assets
 
 
 def test_a_worker_that_ends_while_it_answers_does_not_end_the_others(tmp_path: Path) -> None:

@@ -352,7 +352,8 @@ class Service:
     @property
     def _pause_s(self) -> float:
         """How long to sleep before the next turn [s]."""
-        due = min(source.next_block_s for source in self.sources.values()) if self.writer.free else math.inf
+        nexts = (source.next_block_s for source in self.sources.values())  # none: a worker that lost its last asset
+        due = min(nexts, default=math.inf) if self.writer.free else math.inf
         return min(due, MAX_PAUSE_S, max(0.0, self._next_commit - time.monotonic()))
 
     def _commit_all(self) -> None:
