@@ -145,8 +145,11 @@ def test_no_command_overwrites_its_inputs(made: Path, tmp_path: Path) -> None:
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_an_interrupt_is_quiet(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("compiled", [False, True])
+def test_an_interrupt_is_quiet(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: bool) -> None:
     def interrupted(path: Path) -> None:
+        if compiled:  # what Python makes of one that comes while compiled code runs
+            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
         raise KeyboardInterrupt
 
     monkeypatch.setattr("servoscope.models.loop.Loop.load", interrupted)

@@ -203,9 +203,10 @@ def test_who_carries_no_covariates_refuses_them(carried: ss.Baseline, tmp_path: 
         Baselines.from_source(carried, 1, 60.0).day_monitor("press")
     carried.save(tmp_path / "baseline.json")
     hall = (
-        'name = "hall"\n[sources.line]\nkind = "replay"\n[assets.press]\nbaseline = "baseline.json"\nsource = "line"\n'
+        'name = "hall"\n[sources.line]\nkind = "opcua"\nurl = "opc.tcp://localhost"\n'
+        '[assets.press]\nbaseline = "baseline.json"\nsource = "line"\nnodes = { block = "ns=1;s=press" }\n'
     )
-    (tmp_path / "hall.toml").write_text(f'{hall}files = ["x.csv"]\n', encoding="utf-8")
+    (tmp_path / "hall.toml").write_text(hall, encoding="utf-8")
     told = run("run", tmp_path / "hall.toml", "--check")
     assert told.code == 1
     assert "[assets] press.baseline: baseline.json depends on load" in told.err

@@ -31,6 +31,10 @@ class CommandGroup(typer.core.TyperGroup):
             raise typer.Exit(EXIT_INPUT) from None
         except KeyboardInterrupt:
             raise typer.Exit(EXIT_INTERRUPTED) from None
+        except SystemError as error:
+            if not isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C in the middle of compiled code
+                raise
+            raise typer.Exit(EXIT_INTERRUPTED) from None
         except OSError as error:
             if error.errno != errno.ENOSPC:
                 raise

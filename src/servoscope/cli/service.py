@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -78,7 +79,8 @@ def run(
 
     SIGHUP reads the service file again: what has not changed in it goes on without losing a block.
     """
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # nothing has begun yet
+    # nothing has begun yet that would have to be ended; an exception may be lost in the middle of an import
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
     from servoscope.service import log
     from servoscope.service.build import build_components, check_service_file
     from servoscope.service.config import ServiceFile
