@@ -55,19 +55,24 @@ def test_the_course_solves_the_differential_equation() -> None:
     assert toy(power, 1.0).basis(T, 2.0) @ x == pytest.approx(solved.y[0], abs=0.03)
 
 
-@pytest.mark.parametrize("seen", [0.0, 1.0])
-@pytest.mark.parametrize("blocks", [1, 3, 20, 3000])
-def test_what_a_recording_does_not_show_stays_in_the_middle(seen: float, blocks: int) -> None:
-    """A machine at rest, one that shows a single coefficient, and a day of a machine that is warm in seconds."""
-    model = CovariateModel(
+def two_coefficients(slopes: tuple[float, float]) -> CovariateModel:
+    """Return a model of two coefficients that move so with the warm-up, from cold (0) to warm (1)."""
+    return CovariateModel(
         names=("warm_up",),
         low=(0.0,),
         high=(1.0,),
         degrees=(1,),
         proportional=(True, True),
-        slopes=((-0.3, 0.1),),
+        slopes=(slopes,),
         covariance=((0.0, 0.0), (0.0, 0.0)),
     )
+
+
+@pytest.mark.parametrize("seen", [0.0, 1.0])
+@pytest.mark.parametrize("blocks", [1, 3, 20, 3000])
+def test_what_a_recording_does_not_show_stays_in_the_middle(seen: float, blocks: int) -> None:
+    """A machine at rest, one that shows a single coefficient, and a day of a machine that is warm in seconds."""
+    model = two_coefficients((-0.3, 0.1))
     theta, sums = np.array([1.0, 2.0]), toy(np.zeros(blocks), 1.0)
     normal = np.tile(np.diag([100.0 * seen, 0.0]), (blocks, 1, 1))
     sums = replace(sums, normal=normal, moment=normal @ model.theta(theta, np.array([[0.5]]))[0])
@@ -84,15 +89,7 @@ def test_a_machine_at_rest_says_nothing_of_its_warmth(baseline: ss.Baseline) -> 
 
 
 def test_a_jump_is_found_where_it_is_and_leaves_the_course_alone() -> None:
-    model = CovariateModel(
-        names=("warm_up",),
-        low=(0.0,),
-        high=(1.0,),
-        degrees=(1,),
-        proportional=(True, True),
-        slopes=((0.5, -0.1),),
-        covariance=((0.0, 0.0), (0.0, 0.0)),
-    )
+    model = two_coefficients((0.5, -0.1))
     theta, known = np.array([2.0, 1.0]), WarmUp(time_constant_s=20.0, power=0.0, variance=1e-3)
     blank, rng = toy(np.zeros(60), 1.0), np.random.default_rng(0)
     true = blank.basis(20.0, 0.0) @ np.array([0.1, 0.8, 0.0])
