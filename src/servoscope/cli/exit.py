@@ -15,6 +15,11 @@ import typer.core
 
 from servoscope.core.errors import ServoscopeError
 
+SERVICE_MODULES = (
+    "sqlalchemy",
+    "msgspec",
+    "httpx",
+)  # what `servoscope[service]` brings, on which its commands are built
 EXIT_INPUT, EXIT_FAULT, EXIT_INTERRUPTED = 1, 3, 130  # exit codes; 2 is the command line's
 
 
@@ -28,6 +33,11 @@ class CommandGroup(typer.core.TyperGroup):
             sys.stdout.flush()
         except ServoscopeError as error:
             print_error(error)
+            raise typer.Exit(EXIT_INPUT) from None
+        except ModuleNotFoundError as error:
+            if (module := str(error.name).partition(".")[0]) not in SERVICE_MODULES:
+                raise
+            print_error(f"{module} is missing, pip install 'servoscope[service]'")
             raise typer.Exit(EXIT_INPUT) from None
         except KeyboardInterrupt:
             raise typer.Exit(EXIT_INTERRUPTED) from None
