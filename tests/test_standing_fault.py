@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import halls
+from servoscope.detection.result import FaultEstimate
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.fleet.summary import summarise_fleet
 from servoscope.service.alarms import AlarmSettings
@@ -57,6 +58,12 @@ def test_it_does_not_matter_when_a_full_diagnosis_comes_back() -> None:
     before = examined(accept_diagnosis(ill, window, named, first=True)[0], 1000.0, HEALTHY)
     after = accept_diagnosis(examined(ill, 1000.0, HEALTHY), window, named, first=True)[0]
     assert before == after and before.diagnosed is None
+    # the size that an examination finds where the name is known already is older than the diagnosis, so it is not kept
+    sized = FAULT.model_copy(
+        update={"size": FaultEstimate(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.1, 1.3))}
+    )
+    assert accept_diagnosis(examined(ill, 15.0, sized), window, named, first=True)[0].size == {}
+    assert accept_diagnosis(examined(ill, 25.0, sized), window, named, first=True)[0].sized == 25.0
 
 
 @pytest.fixture(scope="module")

@@ -147,6 +147,9 @@ def accept_diagnosis(
         if faults or not examination.named:
             until = window.until if stands else examination.diagnosed
             examination = replace(examination, named=diagnosis.summary, diagnosed=until)
+            if examination.sized is not None and examination.sized <= window.until:
+                # older than what the diagnosis says; whether it was found depends on when an earlier one came back
+                examination = replace(examination, size={}, sized=None)
         if stands:
             onset = diagnosis.onset if first and diagnosis.onset is not None else examination.onset
             examination = replace(examination, faults=faults or examination.faults, onset=onset)
