@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,8 +63,9 @@ def test_it_does_not_matter_when_a_full_diagnosis_comes_back() -> None:
     sized = FAULT.model_copy(
         update={"size": FaultEstimate(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.1, 1.3))}
     )
-    assert accept_diagnosis(examined(ill, 15.0, sized), window, named, first=True)[0].size == {}
-    assert accept_diagnosis(examined(ill, 25.0, sized), window, named, first=True)[0].sized == 25.0
+    due = replace(ill, due=0.0)
+    assert accept_diagnosis(examined(due, 15.0, sized), window, named, first=True)[0].size == {}
+    assert accept_diagnosis(examined(due, 25.0, sized), window, named, first=True)[0].sized == 25.0
 
 
 @pytest.fixture(scope="module")
