@@ -190,7 +190,8 @@ def build_reasons(exam: Examination, trace: Trace, interval: FaultInterval) -> t
 def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
     if interval.detected_at_s is None:
         return None  # the alarm was there already
-    first = int(np.searchsorted(exam.t(slice(None)), interval.detected_at_s))
+    # a change of an axis may be detected after the last evaluation
+    first = min(int(np.searchsorted(exam.t(slice(None)), interval.detected_at_s)), exam.evaluations - 1)
     if exam.estimates.level[first] >= 1.0:
         return message("diagnosis.alarm_cusum", t=interval.detected_at_s)
     value = float(exam.statistic[first])

@@ -95,7 +95,11 @@ def _change_within(window: AxisWindow, faults: tuple[Fault, ...]) -> AxisChange 
 
 
 def _detection(healthy: HypothesisFit, changed: HypothesisFit, N: int, enough: float) -> int:
-    """Return the sample at which the change had lowered the sum of squares by enough."""
+    """Return the sample at which the change had lowered the sum of squares by enough.
+
+    The last one where only the past does: a change lowers its sum too, for the healthy axis no longer stands in for it.
+    """
     lowered: FloatArray = np.cumsum(healthy.residual[:N] ** 2 - changed.residual[:N] ** 2)
     since = changed.profile.onset
-    return min(since + int(np.argmax(lowered[since:] - lowered[since] >= enough)), N - 1)
+    reached = lowered[since:] - lowered[since] >= enough
+    return since + int(np.argmax(reached)) if reached.any() else N - 1

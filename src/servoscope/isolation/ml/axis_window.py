@@ -41,6 +41,7 @@ class AxisWindow(ChangeWindow):
     rate: float
 
     systematic = 2e-2  # the terms are simpler than friction is
+    follows = True  # healthy recordings differ by more than small changes do
 
     @classmethod
     def from_recording(cls, baseline: Baseline, recording: Recording, first: int, end: int) -> AxisWindow:

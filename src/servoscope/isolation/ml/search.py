@@ -132,6 +132,9 @@ class _HypothesisSearch:
 
     def run(self) -> RefitResult:
         nothing = np.zeros(self.window.nuisance_count)
+        if self.window.follows:  # held, they would pass for the change
+            never = ChangeProfile(self.window.samples)
+            nothing = fit_hypothesis(self.window, [], never, nothing, [np.zeros(0)], free=True).d
         found, singles = self._fit_singles(nothing)
         self.profile = found.profile
         pairs = [
@@ -247,7 +250,7 @@ class _HypothesisSearch:
 
     def _fit(self, faults: Sequence[Fault], d: FloatArray, starts: Sequence[FloatArray]) -> HypothesisFit:
         self.progress()
-        return fit_hypothesis(self.window, faults, self.profile, d, starts, free=False)
+        return fit_hypothesis(self.window, faults, self.profile, d, starts, free=self.window.follows)
 
     def _refit_contenders(self, fitted: Sequence[HypothesisFit]) -> list[HypothesisFit]:
         """Let the healthy parameters follow: a second fault that stands in for their error must not outrun the first.
@@ -268,7 +271,7 @@ class _HypothesisSearch:
     def _refit_at(self, fitted: HypothesisFit, profile: ChangeProfile) -> HypothesisFit:
         if fitted.profile == profile:
             return fitted
-        return fit_hypothesis(self.window, fitted.faults, profile, fitted.d, [fitted.x], free=False)
+        return fit_hypothesis(self.window, fitted.faults, profile, fitted.d, [fitted.x], free=self.window.follows)
 
     def _refit_own_onset(self, fitted: HypothesisFit, best: HypothesisFit) -> HypothesisFit:
         """Let another single fault that is within reach have its own onset."""
