@@ -184,9 +184,10 @@ MACHINES: dict[str, Callable[[Path], Iterator[Case]]] = {
 }
 
 
-def inject(case: Case, count: int, rng: np.random.Generator) -> tuple[list[Injection], dict[str, int], int]:
+def inject(
+    case: Case, baseline: ss.Baseline, count: int, rng: np.random.Generator
+) -> tuple[list[Injection], dict[str, int], int]:
     """Return what was said of random changes, false alarms by detector, and how many recordings were healthy."""
-    baseline = ss.learn(case.loop, case.learned)
     change = case.changed(baseline)
     healthy = [case.judged, *case.healthy]
     drawn, judged = [], []
@@ -222,9 +223,8 @@ def inject(case: Case, count: int, rng: np.random.Generator) -> tuple[list[Injec
     return made, false, len(healthy)
 
 
-def smallest_changes(case: Case) -> dict[str, float]:
+def smallest_changes(case: Case, baseline: ss.Baseline) -> dict[str, float]:
     """Return by kind the change half-way whose likelihood ratio comes to the limit of the scan."""
-    baseline = ss.learn(case.loop, case.learned)
     if baseline.axis is None:
         return {}
     window = AxisWindow.from_recording(baseline, case.judged, 0, case.judged.samples)
@@ -269,9 +269,12 @@ def main() -> None:
             groups.setdefault(case.name, []).append(case)
         for name, cases in groups.items():
             made: list[Injection] = []
+            shown: list[dict[str, float]] = []
             false, healthy = dict[str, int](), 0
             for case in cases:
-                some, of_healthy, n = inject(case, -(-given.count // len(cases)), rng)
+                baseline = ss.learn(case.loop, case.learned)
+                shown += filter(None, [smallest_changes(case, baseline)])
+                some, of_healthy, n = inject(case, baseline, -(-given.count // len(cases)), rng)
                 made, healthy = made + some, healthy + n
                 false = {key: false.get(key, 0) + of_healthy[key] for key in of_healthy}
             rows = [
@@ -279,7 +282,7 @@ def main() -> None:
             ]
             found_rows += rows
             told_rows.append(told_cells(name, made))
-            if shown := [one for one in map(smallest_changes, cases) if one]:
+            if shown:
                 medians = {kind: float(np.median([one[kind] for one in shown])) for kind in shown[0]}
                 shown_rows.append((name, *(f"{100 * medians[k]:.0f} %" if k in medians else "" for k in SHOWN)))
                 values |= {f"{name}.smallest.{kind}": f"{100 * size:.0f} %" for kind, size in medians.items()}

@@ -149,29 +149,46 @@ class AxisWindow(ChangeWindow):
         each = np.where(degrees == 0, output_gain, 1.0) * each
         return np.concatenate([each, output_gain * np.asarray(added) / plant.coefficients["inertia"]])
 
-    def _acceleration(self, predictor: Array, profile: ChangeProfile, columns: FloatArray) -> Array:
-        """Return the acceleration that follows from the coefficients in force, shape (N,)."""
-        p, k = len(predictor) - 1, np.arange(self.samples)
+    def _shares(self, profile: ChangeProfile, predictors: int) -> FloatArray:
+        """Return how far each set of coefficients is in force, shape (p, N)."""
+        p, k = predictors - 1, np.arange(self.samples)
         if profile.duration:
             at = np.clip((k - profile.onset) / profile.duration, 0.0, 1.0) * p
-            low = np.minimum(at.astype(np.int64), p - 1)
-            each = predictor @ columns
-            return np.asarray(each[low, k] * (1.0 - (at - low)) + each[low + 1, k] * (at - low))
-        return np.asarray(np.where(k < profile.onset, predictor[0] @ columns, predictor[-1] @ columns))
+            return np.asarray(np.maximum(1.0 - np.abs(at - np.arange(predictors)[:, None]), 0.0))
+        return np.array([k < profile.onset, k >= profile.onset], dtype=np.float64)
+
+    def _responses(self, profile: ChangeProfile, predictors: int) -> FloatArray:
+        """Return what a unit of each coefficient, in force by its share, takes off the innovations, (p (1 + n + 2), N).
+
+        A search tries many sizes of one profile: the last one is kept.
+        """
+        if self._kept.get("profile") != (profile, predictors):
+            parts = self._shares(profile, predictors)[:, None] * self.columns
+            found = self.filter.of_acceleration(parts.reshape(-1, self.samples), self.signals.runs)
+            self._kept.update(profile=(profile, predictors), responses=found * self._weight)
+        return np.asarray(self._kept["responses"])
+
+    @cached_property
+    def _kept(self) -> dict[str, Any]:
+        return {}
 
     def innovations(self, predictor: Array, profile: ChangeProfile) -> Array:
         """Return the innovations in standard deviations, shape (N,); 0 where they do not count."""
-        acceleration = self._acceleration(predictor, profile, self.columns)
-        left = self._of_output - self.filter.of_acceleration(acceleration, self.signals.runs)
-        return np.asarray(left * self._weight)
+        return np.asarray(self.variant_innovations([predictor], profile)[0])
+
+    def variant_innovations(self, variants: Sequence[Array], profile: ChangeProfile) -> Array:
+        """Return the innovations of each in standard deviations, shape (V, N)."""
+        each = np.array(variants)
+        responses, each = self._responses(profile, each.shape[1]), each.reshape(len(each), -1)
+        found = self._of_output * self._weight - each.real @ responses
+        return found - 1j * (each.imag @ responses) if np.iscomplexobj(each) else found
 
     def disturbance_response(
         self, predictor: Array, profile: ChangeProfile, u: FloatArray, y: FloatArray
     ) -> FloatArray:
         """Return what disturbances of u and of y, shape (N,), add to the innovations."""
-        columns = np.vstack([u, np.zeros((len(self.columns) - 1, self.samples))])
-        acceleration = self._acceleration(np.real(predictor), profile, columns)
-        runs = self.signals.runs
+        predictor, runs = np.real(predictor), self.signals.runs
+        acceleration = predictor[:, 0] @ self._shares(profile, len(predictor)) * u
         added = self.filter.of_output(y, runs) - self.filter.of_acceleration(acceleration, runs)
         return np.asarray(added * self._weight)
 
