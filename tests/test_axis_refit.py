@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from accuracy.axis import AXES, moves, record
 from accuracy.axis import loop as axis_loop
+from scipy.signal import lfilter
 
 import servoscope as ss
 from servoscope.core.arrays import FloatArray
@@ -19,6 +20,7 @@ from servoscope.core.jit import sine
 from servoscope.detection.axis_model import AxisModel
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals
 from servoscope.isolation.ml.axis_scan import FALSE_ALARMS, TRIM, scan_limit
+from servoscope.isolation.ml.axis_vibration import find_vibration
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import fit_hypothesis
 from servoscope.isolation.ml.window import ChangeProfile
@@ -46,7 +48,17 @@ def random_signals(N: int = 300) -> AxisSignals:
 
 @pytest.fixture
 def window() -> AxisWindow:
-    signals = random_signals()
+    return window_of(random_signals())
+
+
+@pytest.fixture(scope="module")
+def long_window() -> AxisWindow:
+    """A minute at 100 Hz, of a motion with a period of five seconds."""
+    y, restart = np.sin(np.arange(6000) * 0.004 * np.pi), np.zeros(6000, dtype=np.bool_)
+    return window_of(AxisSignals(np.zeros(6000), y, restart, 100.0))
+
+
+def window_of(signals: AxisSignals) -> AxisWindow:
     plant = AxisPlant.model_validate({"terms": ("viscous", "coulomb", "offset"), "coefficients": {
         "inertia": 2.0, "viscous_friction": 1.0, "coulomb_friction": 0.5, "offset": 0.1}})  # fmt: skip
     model = AxisModel(
@@ -60,8 +72,8 @@ def window() -> AxisWindow:
         drift_std=0.1,
     )
     loop = ss.Loop.from_dict({"sample_rate": 100.0, "plant": {"kind": "axis"}})
-    t = np.arange(300) / 100.0
-    r, run = np.zeros(300), np.zeros(300, dtype=np.int32)
+    N = len(signals.y)
+    t, r, run = np.arange(N) / 100.0, np.zeros(N), np.zeros(N, dtype=np.int32)
     recording = ss.Recording(
         t=t, r=r, u=signals.u, y=signals.y, restart=signals.restart, name="random", sample_rate=100.0, run=run
     )
@@ -187,14 +199,57 @@ def test_output_error_finds_the_coefficients_and_the_force_of_each_recording() -
     assert max(found.rmse) < 1e-3 * float(np.abs(r).max())
 
 
+class TestVibration:
+    """What no coefficient explains: white noise as of a healthy axis, and more of it from 30 s on."""
+
+    @staticmethod
+    def residual(window: AxisWindow, seed: int, added: FloatArray) -> FloatArray:
+        e = np.random.default_rng(seed).normal(size=window.samples) * window.counted
+        e[3000:] += added[3000:] * window.counted[3000:]
+        return np.append(e, np.zeros(window.nuisance_count))
+
+    def test_a_ringing_is_found_with_its_time(self, long_window: AxisWindow) -> None:
+        # 12 Hz, struck every 0.7 s, damped to a third in a third of a second
+        kicks = np.where(np.arange(long_window.samples) % 70 == 0, 6.0, 0.0)
+        ringing = lfilter([1.0], [1.0, -1.94 * np.cos(2.0 * np.pi * 0.12), 0.97**2], kicks)
+        found = find_vibration(long_window, self.residual(long_window, 1, ringing), 26.6)
+        assert found is not None
+        assert found.onset[0] <= 3000 <= found.onset[2]
+        assert found.onset[2] - found.onset[0] <= 400
+        assert found.onset[1] <= found.detected < 4500
+        assert 2.0 < found.interval[0] < found.ratio < found.interval[1]
+
+    def test_louder_noise_of_the_sensor_is_none(self, long_window: AxisWindow) -> None:
+        f, noise = long_window.filter, np.random.default_rng(2).normal(size=long_window.samples)
+        assert (
+            find_vibration(long_window, self.residual(long_window, 1, lfilter(f.to_y, f.poles, 6.0 * noise)), 26.6)
+            is None
+        )
+
+    def test_what_never_changed_is_found_as_often_as_the_limit_says(self, long_window: AxisWindow) -> None:
+        """Counted at a limit that simulation can count: of Student's t where the bound is of a normal variable."""
+        limit, nothing = scan_limit(5, 0.1), np.zeros(long_window.samples)
+        each = (find_vibration(long_window, self.residual(long_window, seed, nothing), limit) for seed in range(100))
+        found = sum(one is not None for one in each)
+        assert found <= 10  # upwards only, and bands of whitened innovations are nearly independent
+
+
 @pytest.mark.slow
-def test_a_worn_belt_gets_no_wrong_name_and_a_payload_on_it_its_own() -> None:
+def test_a_worn_belt_is_a_vibration_and_a_payload_on_it_has_its_own_name() -> None:
     """Two masses, the encoder at the motor: a belt a quarter as stiff, or loose by half a millimetre, has no term."""
     belt = AXES["belt"]
     loop = ss.Loop.from_dict(axis_loop().to_dict() | {"plant": {"kind": "axis"}})
     baseline = ss.learn(loop, [record(belt, moves(seed), seed) for seed in range(2)])
-    for worn in (replace(belt, belt_hz=0.5 * belt.belt_hz), replace(belt, slack=5e-4)):
-        assert ss.diagnose(baseline, record(belt, moves(10), 10, worn)).faults == ()
+    softer, loose = (
+        ss.diagnose(baseline, record(belt, moves(10), 10, worn))
+        for worn in (replace(belt, belt_hz=0.5 * belt.belt_hz), replace(belt, slack=5e-4))
+    )
+    assert {fault.name for fault in softer.faults} <= {"vibration"}
+    assert [fault.name for fault in loose.faults] == ["vibration"]
+    assert loose.onset_s is not None
+    assert loose.onset_s[0] <= 30.0 <= loose.onset_s[2]
+    assert "no coefficient explains" in str(loose.reasons[0])
+    assert "backlash" in str(loose.checks[0])
     # 2 kg more behind the same belt
     heavier = replace(belt, mass=22.0, load_share=12.0 / 22.0, belt_hz=belt.belt_hz * (22.0 / 24.0) ** 0.5)
     (fault,) = ss.diagnose(baseline, record(belt, moves(10), 10, heavier)).faults

@@ -13,6 +13,7 @@ from servoscope.signals import Defect
 
 Verdict = Literal["healthy", "fault", "undetermined"]
 UNKNOWN = "unknown"
+VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
 SEVERITY = "severity"  # the parameter of a fault that was learned from labelled recordings
 
 

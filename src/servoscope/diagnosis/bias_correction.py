@@ -12,7 +12,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.detection.chi2_test import Onset
 from servoscope.detection.expectation import Expectation
-from servoscope.detection.result import UNKNOWN, Candidate
+from servoscope.detection.result import UNKNOWN, VIBRATION, Candidate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
 from servoscope.estimation import frequency_response
@@ -51,7 +51,9 @@ def estimate_bias_correction(
     if onset is None:
         return BiasCorrection(np.eye(exam.pipeline.bank.n), at)
     likely = next((c for c in candidates if c.name != UNKNOWN), None)
-    guess = baseline.plant.expand_rays({fault.parameter: fault.ratio for fault in likely.faults} if likely else {})
+    ratios = {fault.parameter: fault.ratio for fault in likely.faults} if likely else {}
+    ratios.pop(VIBRATION, None)  # it changes no parameter
+    guess = baseline.plant.expand_rays(ratios)
     first, start = exam.memory_start(at), np.array(baseline.model_theta)
     expectation, since = exam.expectation(first, int(e.index[at]) + 1), max(onset.sample - first, 0)
     plant, gain = fit_actuator(expectation, baseline.plant, start, e.theta[at], exam.covariance(at), since, guess)

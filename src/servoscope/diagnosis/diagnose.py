@@ -272,6 +272,8 @@ def _explain_alarm(
     exam: Examination, alarm: RecordingAlarm, progress: Callable[[str], None]
 ) -> tuple[tuple[FaultInterval, ...], Onset, list[DiagnosisWarning]]:
     """Return the intervals that begin with an alarm, the onset of the explained one, and doubts about explanations."""
+    if exam.change is not None and exam.change.vibration is not None:
+        return (ml_refit.vibration_interval(exam, exam.change.vibration),), alarm.onset, []
     onset, refit, doubts = alarm.onset, None, list[DiagnosisWarning]()
     recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
     progress("refit")
@@ -349,8 +351,9 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
     at = exam.evaluations - 1 if exam.alarm[-1] else first + int(np.argmax(exam.statistic[first:]))
     progress("onset")
     if (change := exam.change) is not None:
-        t = exam.recording.t
-        return RecordingAlarm(change.detected, at, Onset(*(float(t[change.onset]),) * 3, change.onset))
+        ends = (change.onset,) * 3 if change.vibration is None else change.vibration.onset
+        low, likely, high = (float(exam.recording.t[k]) for k in ends)
+        return RecordingAlarm(change.detected, at, Onset(low, likely, high, change.onset))
     onset = estimate_onset(
         exam.pipeline,
         exam.recording,

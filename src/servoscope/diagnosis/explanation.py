@@ -12,6 +12,7 @@ from servoscope.core.messages import Message, message
 from servoscope.core.number_format import ratio_digits
 from servoscope.detection.result import (
     UNKNOWN,
+    VIBRATION,
     Candidate,
     DiagnosisWarning,
     FaultEstimate,
@@ -190,6 +191,8 @@ def build_reasons(exam: Examination, trace: Trace, interval: FaultInterval) -> t
 def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
     if interval.detected_at_s is None:
         return None  # the alarm was there already
+    if interval.candidates[0].name == VIBRATION:
+        return message("diagnosis.alarm_vibration", t=interval.detected_at_s)
     # a change of an axis may be detected after the last evaluation
     first = min(int(np.searchsorted(exam.t(slice(None)), interval.detected_at_s)), exam.evaluations - 1)
     if exam.estimates.level[first] >= 1.0:

@@ -11,13 +11,23 @@ import numpy as np
 from servoscope.core.messages import message
 from servoscope.core.number_format import ratio_digits
 from servoscope.detection.chi2_test import Onset
-from servoscope.detection.result import UNKNOWN, Candidate, DiagnosisWarning, FaultEstimate, Mimic, RefitSummary
+from servoscope.detection.result import (
+    UNKNOWN,
+    VIBRATION,
+    Candidate,
+    DiagnosisWarning,
+    FaultEstimate,
+    FaultInterval,
+    Mimic,
+    RefitSummary,
+)
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.warnings import warning_throughout
 from servoscope.models.plants import Fault, Plant
 
 if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
     from servoscope.isolation.ml import Hypothesis, OnsetEstimate, RefitResult
+    from servoscope.isolation.ml.axis_vibration import AxisVibration
 
 WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
 MAX_SIZE_DISTANCE = 3.0  # standard deviations between two sizes that are called different
@@ -37,6 +47,24 @@ def refit_recording(
     near = exam.recording.rows(slice(begin, onset.sample + most))
     found = fit_hypotheses(exam.baseline, near, onset.sample - begin, alarm - begin, last - begin, progress)
     return replace(found, window=replace(found.window, first_sample=found.window.first_sample + begin))
+
+
+def vibration_interval(exam: Examination, found: AxisVibration) -> FaultInterval:
+    """Return the interval of an axis that swings or rattles: no coefficient changed, so nothing is refitted."""
+    from servoscope.isolation.ml.search import OUTSIDE
+
+    t = exam.recording.t
+    low, likely, high = (float(t[k]) for k in found.onset)
+    fault = FaultEstimate(name=VIBRATION, parameter=VIBRATION, ratio=found.ratio, interval=found.interval)
+    named = Candidate(name=VIBRATION, probability=1.0 - OUTSIDE, faults=(fault,))
+    assert exam.change is not None
+    return FaultInterval(
+        detected_at_s=float(t[exam.change.detected]),
+        onset_s=(low, likely, high),
+        probability=named.probability,
+        faults=(fault,),
+        candidates=(named, Candidate(name=UNKNOWN, probability=OUTSIDE)),
+    )
 
 
 def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:

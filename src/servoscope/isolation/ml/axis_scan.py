@@ -9,6 +9,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.baseline import Baseline
+from servoscope.isolation.ml.axis_vibration import BANDS, AxisVibration, find_vibration
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.onset import ChangeCosts
@@ -28,6 +29,7 @@ class AxisChange:
 
     onset: int  # the most likely one
     detected: int  # when what had been measured by then was enough to tell it
+    vibration: AxisVibration | None = None  # where not a coefficient changed; its onsets are samples of the recording
 
 
 def find_axis_change(baseline: Baseline, recording: Recording) -> AxisChange | None:
@@ -82,16 +84,20 @@ def _change_within(window: AxisWindow, faults: tuple[Fault, ...]) -> AxisChange 
             best = float(costs[at]), fault, int(onsets[at]), float(sizes[at, 0])
     assert best is not None
     _, fault, onset, size = best
-    low, high = np.log(fault.ratio_range)
-    begin = np.clip([size], 0.9 * low, 0.9 * high)
+    begin = np.clip([size], *(0.9 * np.log(fault.ratio_range)))
     changed = fit_hypothesis(window, [fault], ChangeProfile(onset), healthy.d, [begin], free=True)
     variance = window.inflation(changed.jacobian, changed.residual, 1) * changed.cost / window.used
     gain = (healthy.cost - changed.cost) / variance
     limit = scan_limit(len(faults))
-    if gain <= limit:
+    # the larger likelihood ratio has the name: a rattling load moves coefficients a little, and a new mass rings
+    vibration = find_vibration(window, healthy.residual, max(gain, scan_limit(BANDS)))
+    if vibration is None and gain <= limit:
         return None
-    told = _detection(healthy, changed, N, limit * variance)
-    return AxisChange(*(window.first_sample + window.stride * k for k in (onset, max(told, onset))))
+    told = vibration.detected if vibration else max(_detection(healthy, changed, N, limit * variance), onset)
+    ends = vibration.onset if vibration else (onset, onset, onset)
+    low, at, high = (window.first_sample + window.stride * k for k in ends)
+    within = vibration and replace(vibration, onset=(low, at, high))
+    return AxisChange(at, window.first_sample + window.stride * told, within)
 
 
 def _detection(healthy: HypothesisFit, changed: HypothesisFit, N: int, enough: float) -> int:
