@@ -28,6 +28,9 @@ class AxisModel(BaseModel):
     drift_std: float  # and how much it may change within one
     # coefficients that the healthy recordings do not show, and how far one recording's estimate may be from them
     unseen: dict[str, float] = {}
+    # what twice the log-likelihood ratio of a change within a recording has to exceed, where healthy ones exceed what
+    # chance explains; 0 where they do not
+    change_limit: float = 0.0
 
     def scatter(self, names: Sequence[str]) -> FloatArray:
         """Return the standard deviations of coefficients between recordings, shape (len(names),)."""

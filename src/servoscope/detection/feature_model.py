@@ -260,7 +260,8 @@ def score_limit(left_out: Sequence[float], false_alarms: float) -> float:
 def score_std(left_out: Sequence[float]) -> float:
     """Return the standard deviation of the logarithm of a further healthy recording's score around their mean."""
     logs, n = _score_logs(left_out), len(left_out)
-    variance = ((n - 1.0) * float(logs.var(ddof=1)) + SCORE_PRIOR * SCORE_STD**2) / (n - 1.0 + SCORE_PRIOR)
+    own = float(logs.var(ddof=1)) if n > 1 else 0.0
+    variance = ((n - 1.0) * own + SCORE_PRIOR * SCORE_STD**2) / (n - 1.0 + SCORE_PRIOR)
     return float(np.sqrt(variance * (1.0 + 1.0 / n)))
 
 

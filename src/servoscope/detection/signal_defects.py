@@ -22,6 +22,8 @@ CLEARER = 5.0  # times smaller is the residual of the healthy plant where the si
 AS_HEALTHY = 2.0  # the same where that residual is the healthy one, and up to how many times that it counts as such
 FROZEN_S = 1.0  # how long y or u stays exactly the same while the motion demands a change [s]
 TRAVEL = 0.1  # of the range of y, that r moves by then
+UNASKED = 0.5  # of a motion, that r - y moves too where y does not follow r
+SILENT = 1e-6  # of the largest u: what a resampling filter leaves of 0
 JUMP = 0.4  # of the range of y, in one sample: a counter that wraps or is reset
 MOST_JUMPS = 0.1  # share of the samples
 SMOOTHER = 2.0  # times smaller are all other steps of y, and those of r at that time
@@ -77,6 +79,20 @@ def find_signal_defect(recording: Recording) -> SignalDefect | None:
         outofcore.release(*recording.columns)
         if defects := [defect for defect in found if defect is not None]:
             return min(defects, key=lambda defect: defect.begin)
+    return None
+
+
+def find_switched_off(recording: Recording) -> SignalDefect | None:
+    """Return from where on the drive is off: u stays at 0 for long while y moves, and not as r asks it to."""
+    off = (np.abs(recording.u) <= SILENT * np.abs(recording.u).max()) & ~recording.restart
+    edges = np.flatnonzero(np.diff(off, prepend=False, append=False))
+    span = float(np.ptp(recording.y))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        y, e = recording.y[begin:end], recording.r[begin:end] - recording.y[begin:end]
+        moved = float(np.ptp(y))
+        if end - begin > FROZEN_S * recording.sample_rate and moved > TRAVEL * span and np.ptp(e) > UNASKED * moved:
+            text = message("signals.off", name=recording.name, t=float(recording.t[begin]), by=moved)
+            return SignalDefect(begin, text)
     return None
 
 
@@ -173,6 +189,8 @@ def _spread(x: FloatArray) -> float:
 
 def _frozen_defect(recording: Recording, finding: QualityFinding) -> SignalDefect | None:
     name = finding.kind.removeprefix("frozen_")
+    if name == "u" and find_switched_off(recording) is not None:
+        return None
     if not finding.begins or name not in SIGNALS or not finding.value > 0.0:  # at rest nothing is demanded
         return None
     x: FloatArray = getattr(recording, name)

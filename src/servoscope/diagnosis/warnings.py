@@ -9,6 +9,7 @@ from servoscope.core.messages import Message, message
 from servoscope.detection.chi2_test import noncentrality, required_noncentrality, t2_statistic
 from servoscope.detection.plant_fit import MOST_SATURATED, fault_directions, saturated_share
 from servoscope.detection.result import Candidate, DiagnosisWarning
+from servoscope.detection.signal_defects import find_switched_off
 from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
 from servoscope.learning.plausibility import negative_coefficients
 
@@ -115,6 +116,8 @@ def estimate_warnings(exam: Examination) -> list[DiagnosisWarning]:
     """Return warnings about the estimate itself."""
     warnings = []
     e, t = exam.estimates, exam.recording.t
+    if (off := find_switched_off(exam.recording)) is not None:
+        warnings.append(warning_throughout(exam, "signals", off.description))
     if exam.features is not None and exam.features.unfamiliar:
         count, spans = exam.features.unfamiliar, exam.features.unfamiliar + len(exam.features.spans)
         warnings.append(warning_throughout(exam, "features", message("warning.unfamiliar", count=count, spans=spans)))

@@ -10,8 +10,10 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.detection.axis_model import AxisModel
+from servoscope.detection.feature_model import score_limit
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals, axis_stride
 from servoscope.estimation.tuning import sum_covariance
+from servoscope.isolation.ml.axis_scan import largest_change, scan_limit
 from servoscope.isolation.ml.axis_window import LONG_RUN_S, axis_signals
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
@@ -24,6 +26,10 @@ SCATTER_DOF = 2.0  # recordings that this is worth
 LEAST_SCATTER = 0.01
 ADDED_SHARE = 0.05  # of the force (rms), by which the constant one may differ between recordings and within one
 SEEN = 3.0  # standard deviations from which a coefficient is seen
+COMBINED = 30  # steps in which coefficients and their scatter agree
+FALSE_ALARMS = 1.0 / 200.0  # share of healthy recordings that change within themselves beyond a learned limit
+NEAR = 1.5  # times as far as the furthest, a further healthy recording may well come
+LEAST_GAIN = 1.0  # of a likelihood ratio whose logarithm counts
 STEPS = 250  # of the search for the noise
 
 
@@ -85,13 +91,19 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
         (start[2] - 9.0, start[2] + 3.0),
     ]
 
+    first = 0
+
     def cost(x: FloatArray) -> float:
-        total = 0.0
+        nonlocal first
+        total, count = 0.0, 0
         for one in problems:
             X, e, filter = one.regress(AxisNoise(*np.exp(x).tolist()), slow)
             left = e - X @ np.linalg.lstsq(X, e, rcond=None)[0]
             total += len(e) * float(np.log(filter.variance)) + float(left @ left)
-        return total
+            count += len(e)
+        first = first or count
+        # a filter that forgets a reversal sooner counts more innovations, which makes it no likelier
+        return total * first / max(count, 1)
 
     found = minimize(
         cost, start, method="Nelder-Mead", bounds=bounds, options={"maxiter": STEPS, "xatol": 0.02, "fatol": 0.5}
@@ -125,15 +137,17 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     noise = fit_axis_noise(problems, slow)
     fits = [fit_recording(one, noise, slow) for one in problems]
     names = ("inertia", *(column.coefficient for column in plant.columns))
-    values = np.array([_physical(one, plant, len(names)) for one in fits])
-    stds = np.array([np.sqrt(np.diag(_physical_covariance(one, plant, len(names)))) for one in fits])
-    weight = 1.0 / (stds**2 + (SCATTER * values) ** 2)
-    mean = (weight * values).sum(axis=0) / weight.sum(axis=0)
+    center, of_center = combine_fits(fits, len(names))
+    # in physical units, linear around the common coefficients: u alone may hardly show in a recording
+    J = _physical_slope(center, plant)
+    mean = _physical(center, plant)
+    values = np.array([mean + J @ (one.coefficients[: len(names)] - center) for one in fits])
+    covariances = np.array([J @ one.covariance[: len(names), : len(names)] @ J.T for one in fits])
+    stds = np.sqrt(np.array([np.diag(one) for one in covariances]))
     known = [
         i for i, name in enumerate(names) if name == "inertia" or not plant.columns[i - 1].signed or name == "gravity"
     ]
-    # of all recordings together (Stouffer, 1949)
-    seen = (values / stds).sum(axis=0) / np.sqrt(len(fits))
+    seen = mean / np.sqrt(np.diag(J @ of_center @ J.T))  # of all recordings together
     unseen = [i for i in known if seen[i] < SEEN and names[i] != "gravity"]
     of_unseen = tuple(names[i] for i in unseen)
     if 0 in unseen:
@@ -142,16 +156,8 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     off = np.sqrt(np.mean((values - mean) ** 2 + stds**2, axis=0))
     mean[unseen] = np.maximum(mean[unseen], 0.0)  # friction drives nothing
     known = [i for i in known if i not in unseen]
-    covariance = np.zeros((len(known), len(known)))
-    for one in fits:
-        C = _physical_covariance(one, plant, len(names))[np.ix_(known, known)]
-        covariance += C / np.outer(mean[known], mean[known]) / len(fits)
-    logs = values[:, known] / mean[known] - 1.0
-    own = np.diag(covariance)
-    between = (SCATTER_DOF * SCATTER**2 + np.maximum((logs**2).sum(axis=0) - (len(fits) - 1) * own, 0.0)) / (
-        SCATTER_DOF + len(fits) - 1
-    )
-    covariance = covariance / len(fits) + np.diag(np.maximum(between, LEAST_SCATTER**2))
+    covariance = (J @ of_center @ J.T)[np.ix_(known, known)] / np.outer(mean[known], mean[known])
+    covariance = covariance + np.diag(relative_scatter(values[:, known], stds[:, known], mean[known]) ** 2)
     coefficients = dict(zip(names, mean.tolist(), strict=True))
     force = abs(plant.input_gain) * float(np.sqrt(np.mean(np.concatenate([one.u for one in signals]) ** 2)))
     model = AxisModel(
@@ -165,18 +171,64 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
         drift_std=ADDED_SHARE * force,
         unseen=dict(zip(of_unseen, off[unseen].tolist(), strict=True)),
     )
-    return model, notes
+    own = [largest_change(loop, model, one) for one in recordings]
+    usual, most = scan_limit(len(model.visible_faults(plant.faults))), max(own)
+    if NEAR * most <= usual:
+        return model, notes
+    # friction does what the terms do not know, and chance alone is no longer what a change has to exceed
+    limit = max(score_limit([max(one, LEAST_GAIN) for one in own], FALSE_ALARMS), usual)
+    name = recordings[own.index(most)].name
+    notes.append(message("learning.axis_own_change", name=name, times=limit / usual))
+    return model.model_copy(update={"change_limit": limit}), notes
 
 
-def _physical(fit: AxisFit, plant: AxisPlant, n: int) -> FloatArray:
-    """Return inertia and the coefficients of the terms, shape (n,)."""
-    inertia = plant.input_gain / fit.coefficients[0]
-    return np.array([inertia, *(inertia * fit.coefficients[1:n])])
+def combine_fits(fits: Sequence[AxisFit], n: int) -> tuple[FloatArray, FloatArray]:
+    """Return the n coefficients that recordings have in common, and the covariance of that estimate, (n,) and (n, n).
+
+    Each counts by the inverse of its covariance plus that of the scatter between recordings, which is estimated with
+    them: what only one recording shows is taken from that one, and none counts for more than recordings agree (random
+    effects of several coefficients: Jackson, Riley and White, 2011).
+    """
+    values = np.array([one.coefficients[:n] for one in fits])
+    covariances = np.array([one.covariance[:n, :n] for one in fits])
+    stds = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    center, scatter = np.zeros(n), np.full(n, SCATTER)
+    for step in range(COMBINED):
+        weights = np.linalg.inv(covariances + np.diag((scatter * center) ** 2))
+        A = np.linalg.inv(weights.sum(axis=0))
+        center = A @ np.einsum("kij,kj->i", weights, values)
+        if step:  # the first center knows of no scatter
+            scatter = relative_scatter(values, stds, center)
+    return center, np.asarray(A @ (weights @ covariances @ weights).sum(axis=0) @ A)
 
 
-def _physical_covariance(fit: AxisFit, plant: AxisPlant, n: int) -> FloatArray:
-    b, a = fit.coefficients[0], fit.coefficients[1:n]
-    J = np.zeros((n, n))
+def relative_scatter(values: FloatArray, stds: FloatArray, center: FloatArray) -> FloatArray:
+    """Return the standard deviation of coefficients between recordings over their common value, shape (n,).
+
+    `values`, `stds` (m, n): each recording's, and how far chance may be off. The squared deviations beyond what chance
+    explains are averaged (DerSimonian and Laird, 1986) together with `SCATTER`, which counts as `SCATTER_DOF`
+    recordings; one that hardly shows a coefficient says little of how much that scatters.
+    """
+    own = (stds / center) ** 2
+    weight = 1.0 / (own + SCATTER**2) ** 2
+    weight = weight / weight.max(axis=0)
+    share = 1.0 - 1.0 / len(values)  # the center follows each of them
+    beyond = (weight * ((values / center - 1.0) ** 2 - share * own)).sum(axis=0)
+    counted = SCATTER_DOF + share * weight.sum(axis=0)
+    between = (SCATTER_DOF * SCATTER**2 + np.maximum(beyond, 0.0)) / counted
+    return np.asarray(np.sqrt(np.maximum(between, LEAST_SCATTER**2)))
+
+
+def _physical(coefficients: FloatArray, plant: AxisPlant) -> FloatArray:
+    """Return inertia and the coefficients of the terms, shape (n,), of b and a."""
+    inertia = plant.input_gain / coefficients[0]
+    return np.array([inertia, *(inertia * coefficients[1:])])
+
+
+def _physical_slope(coefficients: FloatArray, plant: AxisPlant) -> FloatArray:
+    """Return the derivatives of `_physical`, (n, n)."""
+    b, a = coefficients[0], coefficients[1:]
+    J = np.zeros((len(coefficients), len(coefficients)))
     J[:, 0] = -plant.input_gain / b**2 * np.array([1.0, *a])
-    J[1:, 1:] = np.eye(n - 1) * plant.input_gain / b
-    return np.asarray(J @ fit.covariance[:n, :n] @ J.T)
+    J[1:, 1:] = np.eye(len(a)) * plant.input_gain / b
+    return J

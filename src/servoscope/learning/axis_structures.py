@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError, NotEnoughError
-from servoscope.estimation.axis_filter import axis_stride
+from servoscope.estimation.axis_filter import AxisSignals, axis_stride
 from servoscope.isolation.ml.axis_window import axis_signals
-from servoscope.learning.axis_fit import AxisRegression, fit_axis_noise, rest_speed
+from servoscope.learning.axis_fit import AxisRegression, combine_fits, fit_axis_noise, fit_recording, rest_speed
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.models.plants.axis import AxisPlant
@@ -48,7 +48,7 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
 
     Each is fitted to all recordings but one, and predicts the one that is left out, whose constant force and its drift
     are its own. Of those that predict as well as the best one, to within one standard error, that of fewest
-    coefficients is supported. Structures with a negative inertia or
+    coefficients is supported, and its coefficients are what `learn` would find. Structures with a negative inertia or
     friction are left out. A fit to one recording alone does not order structures.
 
     Raises NotEnoughError with fewer than two recordings, LoopError where the plant is no axis.
@@ -64,7 +64,10 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
     half = 0.5 * max(float(np.ptp(one.y)) for one in signals)
     plants = list(_candidates(loop.plant, speed, half))
     richest = max(plants, key=lambda plant: len(plant.columns))
-    noise = fit_axis_noise([AxisRegression.of(richest, one) for one in signals], slow)
+    # what many terms take up of a short recording is no smaller noise
+    usual = "viscous", "coulomb", *(("gravity",) if _may_swing(loop.plant, half) else ())
+    ordinary = next(plant for plant in plants if plant.terms == usual)
+    noise = fit_axis_noise([AxisRegression.of(ordinary, one) for one in signals], slow)
     block = max(1, round(BLOCK_S * signals[0].sample_rate))
     problems = [[AxisRegression.of(plant, one).regress(noise, slow)[:2] for one in signals] for plant in plants]
     # a recording whose innovations are louder than the others' counts less
@@ -97,10 +100,37 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
             )
         )
     ordered = sorted(found, key=lambda one: one.excess)
+    # what swings far hangs on a weight more often than on a spring, whose force would go on growing
     supported = min(
-        (one for one in ordered if one.as_good_as_the_best), key=lambda one: (len(one.plant.columns), one.excess)
+        (one for one in ordered if one.as_good_as_the_best),
+        key=lambda one: (
+            len(one.plant.columns),
+            _may_swing(loop.plant, half) and "stiffness" in one.plant.terms,
+            one.excess,
+        ),
     )
-    return supported, *(one for one in ordered if one is not supported)
+    return _fit_as_learned(supported, signals, slow), *(one for one in ordered if one is not supported)
+
+
+def _fit_as_learned(structure: AxisStructure, signals: Sequence[AxisSignals], slow: float) -> AxisStructure:
+    """Return the structure with the coefficients that its own noise and the scatter between recordings lead to."""
+    if not all(one.u.any() for one in signals):
+        return structure  # a motor that is off throughout tells nothing of its force
+    plant = structure.plant
+    problems = [AxisRegression.of(plant, one) for one in signals]
+    noise = fit_axis_noise(problems, slow)
+    fits, n = [fit_recording(one, noise, slow) for one in problems], 1 + len(plant.columns)
+    theta = combine_fits(fits, n)[0]
+    jackknife = _scatter(np.array([combine_fits(fits[:k] + fits[k + 1 :], n)[0] for k in range(len(fits))]))
+    if not (_is_plausible(plant, theta, jackknife) and _is_seen(theta, jackknife)):
+        return structure
+    names = [column.coefficient for column in plant.columns]
+    return replace(
+        structure,
+        ratios=dict(zip(names, theta[1:].tolist(), strict=True)),
+        ratios_std=dict(zip(names, jackknife[1:].tolist(), strict=True)),
+        inertia=plant.input_gain / float(theta[0]),
+    )
 
 
 def _candidates(declared: Plant, speed: float, half: float) -> Iterator[AxisPlant]:
@@ -108,13 +138,18 @@ def _candidates(declared: Plant, speed: float, half: float) -> Iterator[AxisPlan
     viscous: tuple[tuple[str, ...], ...] = (), ("viscous",), ("viscous_by_direction",)
     dry: list[tuple[tuple[str, ...], dict[str, Any]]] = [((), {}), (("coulomb",), {})]
     dry += [(("coulomb", "stribeck"), {"stribeck_speed": float(f"{share * speed:.2g}")}) for share in SLOW_SHARES]
-    swings = (("gravity",), ("gravity", "load_friction")) if half > CURVED else ()
+    swings = (("gravity",), ("gravity", "load_friction")) if _may_swing(declared, half) else ()
     position: tuple[tuple[str, ...], ...] = ((),) if declared.derivative else ((), ("stiffness",), *swings)
     known: dict[str, Any] = {"input_gain": declared.input_gain}
     if isinstance(declared, AxisPlant):
         known |= {"y": declared.y, "payload_arm": declared.payload_arm, "hanging_at": declared.hanging_at}
     for rub, (stick, keys), hold in product(viscous, dry, position):
         yield AxisPlant.model_validate({"terms": (*rub, *stick, *hold), **known, **keys})
+
+
+def _may_swing(declared: Plant, half: float) -> bool:
+    """Return whether a weight that turns with y would show that its force is a sine."""
+    return half > CURVED and not declared.derivative
 
 
 def _scatter(without: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ from servoscope.detection.plant_fit import (
     split_residual_noise,
 )
 from servoscope.detection.sensors import learn_sensors
-from servoscope.detection.signal_defects import describe_misfit, find_signal_defect
+from servoscope.detection.signal_defects import describe_misfit, find_signal_defect, find_switched_off
 from servoscope.detection.threshold_calibration import CalibrationFactors, design_sequential_test, t2_threshold
 from servoscope.estimation import estimators, two_stage
 from servoscope.estimation.filter_bank import nominal_theta
@@ -106,7 +106,7 @@ def learn_baseline(
         for check, reason in estimators.exceptions(name).items()
         if check in ("mean", "covariance")
     ]
-    notes += warnings
+    notes += [*warnings, *(off.description for off in map(find_switched_off, recordings) if off is not None)]
     return _assemble_baseline(
         pipeline.loop,
         recordings,

@@ -8,13 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
+from servoscope.detection.axis_model import AxisModel
 from servoscope.detection.baseline import Baseline
 from servoscope.isolation.ml.axis_vibration import BANDS, AxisVibration, find_vibration
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.onset import ChangeCosts
 from servoscope.isolation.ml.window import ChangeProfile
+from servoscope.models.loop import Loop
 from servoscope.models.plants import Fault
+from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 
 FALSE_ALARMS = 1e-4  # share of healthy recordings that are called changed
@@ -37,13 +40,40 @@ def find_axis_change(baseline: Baseline, recording: Recording) -> AxisChange | N
 
     A stretch is compared with itself, so scatter between recordings hides nothing; offset and drift are its own.
     """
-    assert baseline.axis is not None
-    faults = baseline.axis.visible_faults(baseline.plant.faults)
-    for window in _stretches(baseline, recording):
-        found = _change_within(window, faults)
-        if found is not None:
-            return found
+    model = baseline.axis
+    assert model is not None
+    faults = model.visible_faults(baseline.plant.faults)
+    limit = max(scan_limit(len(faults)), model.change_limit)
+    for window in _stretches(baseline.loop, model, recording):
+        found = _likeliest_change(window, faults)
+        change = (
+            None if found is None else _named_change(window, found, limit, max(model.change_limit, scan_limit(BANDS)))
+        )
+        if change is not None:
+            return change
     return None
+
+
+def _named_change(window: AxisWindow, found: _ChangeFit, limit: float, enough: float) -> AxisChange | None:
+    """Return the likeliest change, of a coefficient above `limit` or of the vibration above `enough`; None: neither."""
+    # the larger likelihood ratio has the name: a rattling load moves coefficients a little, and a new mass rings
+    vibration = find_vibration(window, found.healthy.residual, max(found.gain, enough))
+    if vibration is None and found.gain <= limit:
+        return None
+    onset = found.changed.profile.onset
+    told = vibration.detected if vibration else max(found.detection(limit), onset)
+    ends = vibration.onset if vibration else (onset, onset, onset)
+    low, at, high = (window.first_sample + window.stride * k for k in ends)
+    within = vibration and replace(vibration, onset=(low, at, high))
+    return AxisChange(at, window.first_sample + window.stride * told, within)
+
+
+def largest_change(loop: Loop, model: AxisModel, recording: Recording) -> float:
+    """Return twice the log-likelihood ratio of the likeliest change within a healthy recording, 0 at rest."""
+    assert isinstance(loop.plant, AxisPlant)
+    faults = model.visible_faults(loop.plant.faults)
+    found = [_likeliest_change(window, faults) for window in _stretches(loop, model, recording)]
+    return max((one.gain for one in found if one is not None), default=0.0)
 
 
 def scan_limit(faults: int, false_alarms: float = FALSE_ALARMS) -> float:
@@ -58,21 +88,46 @@ def scan_limit(faults: int, false_alarms: float = FALSE_ALARMS) -> float:
     return float(x[np.argmax(probability <= false_alarms)])
 
 
-def _stretches(baseline: Baseline, recording: Recording) -> Iterator[AxisWindow]:
-    assert baseline.axis is not None
-    most = MOST * baseline.axis.stride
+@dataclass(frozen=True)
+class _ChangeFit:
+    """The likeliest change of a stretch, beside none; the squares of both are in units of `variance`."""
+
+    healthy: HypothesisFit
+    changed: HypothesisFit
+    variance: float
+
+    @property
+    def gain(self) -> float:
+        """Twice the logarithm of their likelihood ratio."""
+        return (self.healthy.cost - self.changed.cost) / self.variance
+
+    def detection(self, enough: float) -> int:
+        """Return the sample at which what had been measured by then was enough.
+
+        The last one where only the past does: a change lowers its sum too, for the healthy axis no longer stands in
+        for it.
+        """
+        since, N = self.changed.profile.onset, self.healthy.profile.onset  # which never comes
+        lowered: FloatArray = np.cumsum(self.healthy.residual[:N] ** 2 - self.changed.residual[:N] ** 2)
+        reached = lowered[since:] - lowered[since] >= enough * self.variance
+        return since + int(np.argmax(reached)) if reached.any() else N - 1
+
+
+def _stretches(loop: Loop, model: AxisModel, recording: Recording) -> Iterator[AxisWindow]:
+    most = MOST * model.stride
     for first in range(0, max(recording.samples - most // 2, 1), most // 2):
-        yield AxisWindow.from_recording(baseline, recording, first, min(first + most, recording.samples))
+        rows = recording.rows(slice(first, min(first + most, recording.samples)))
+        yield AxisWindow.of_healthy(loop, model, rows, first)
 
 
-def _change_within(window: AxisWindow, faults: tuple[Fault, ...]) -> AxisChange | None:
+def _likeliest_change(window: AxisWindow, faults: tuple[Fault, ...]) -> _ChangeFit | None:
     N, m = window.samples, window.nuisance_count
     never = ChangeProfile(N)
     healthy = fit_hypothesis(window, [], never, np.zeros(m), [np.zeros(0)], free=True)
     moving = np.cumsum(window.counted)
     share = moving / max(moving[-1], 1)
     inside = np.flatnonzero((share >= TRIM) & (share <= 1.0 - TRIM) & window.counted)
-    if len(inside) < ONSETS // 10:
+    if len(inside) < ONSETS // 10 or not faults:
         return None
     onsets = inside[:: max(1, len(inside) // ONSETS)]
     best: tuple[float, Fault, int, float] | None = None
@@ -87,25 +142,4 @@ def _change_within(window: AxisWindow, faults: tuple[Fault, ...]) -> AxisChange 
     begin = np.clip([size], *(0.9 * np.log(fault.ratio_range)))
     changed = fit_hypothesis(window, [fault], ChangeProfile(onset), healthy.d, [begin], free=True)
     variance = window.inflation(changed.jacobian, changed.residual, 1) * changed.cost / window.used
-    gain = (healthy.cost - changed.cost) / variance
-    limit = scan_limit(len(faults))
-    # the larger likelihood ratio has the name: a rattling load moves coefficients a little, and a new mass rings
-    vibration = find_vibration(window, healthy.residual, max(gain, scan_limit(BANDS)))
-    if vibration is None and gain <= limit:
-        return None
-    told = vibration.detected if vibration else max(_detection(healthy, changed, N, limit * variance), onset)
-    ends = vibration.onset if vibration else (onset, onset, onset)
-    low, at, high = (window.first_sample + window.stride * k for k in ends)
-    within = vibration and replace(vibration, onset=(low, at, high))
-    return AxisChange(at, window.first_sample + window.stride * told, within)
-
-
-def _detection(healthy: HypothesisFit, changed: HypothesisFit, N: int, enough: float) -> int:
-    """Return the sample at which the change had lowered the sum of squares by enough.
-
-    The last one where only the past does: a change lowers its sum too, for the healthy axis no longer stands in for it.
-    """
-    lowered: FloatArray = np.cumsum(healthy.residual[:N] ** 2 - changed.residual[:N] ** 2)
-    since = changed.profile.onset
-    reached = lowered[since:] - lowered[since] >= enough
-    return since + int(np.argmax(reached)) if reached.any() else N - 1
+    return _ChangeFit(healthy, changed, variance)
