@@ -84,13 +84,16 @@ def find_signal_defect(recording: Recording) -> SignalDefect | None:
 
 def find_switched_off(recording: Recording) -> SignalDefect | None:
     """Return from where on the drive is off: u stays at 0 for long while y moves, and not as r asks it to."""
-    off = (np.abs(recording.u) <= SILENT * np.abs(recording.u).max()) & ~recording.restart
-    edges = np.flatnonzero(np.diff(off, prepend=False, append=False))
-    span = float(np.ptp(recording.y))
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    u, span = recording.u, float(np.ptp(recording.y))
+    silent = SILENT * max(float(u.max()), -float(u.min()))
+    off = np.zeros(recording.samples, dtype=np.bool_)
+    for rows in outofcore.iter_chunks(0, recording.samples, *recording.columns):
+        off[rows] = (np.abs(u[rows]) <= silent) & ~recording.restart[rows]
+    edges = np.flatnonzero(np.diff(off, prepend=False, append=False)).reshape(-1, 2)
+    for begin, end in edges[np.diff(edges)[:, 0] > FROZEN_S * recording.sample_rate].tolist():
         y, e = recording.y[begin:end], recording.r[begin:end] - recording.y[begin:end]
         moved = float(np.ptp(y))
-        if end - begin > FROZEN_S * recording.sample_rate and moved > TRAVEL * span and np.ptp(e) > UNASKED * moved:
+        if moved > TRAVEL * span and np.ptp(e) > UNASKED * moved:
             text = message("signals.off", name=recording.name, t=float(recording.t[begin]), by=moved)
             return SignalDefect(begin, text)
     return None
