@@ -13,8 +13,9 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.detection.trace import Trace
-from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key
+from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key, deduplicate
 from servoscope.diagnosis.side_monitors import SideMonitors, SideValues
 from servoscope.estimation.frequency_response import FrequencyResponse
 
@@ -111,9 +112,9 @@ class Monitor:
         self.pipeline = self._constants_of[0].pipeline
         self._groups = self._group_assets()
         self._shared_columns = {
-            "expected": _deduplicate([each.expected_theta for each in self._constants_of]),
-            "H": _deduplicate([each.healthy.H for each in self._constants_of]),
-            "covariance of H": _deduplicate([each.healthy.covariance for each in self._constants_of]),
+            "expected": deduplicate([each.expected_theta for each in self._constants_of]),
+            "H": deduplicate([each.healthy.H for each in self._constants_of]),
+            "covariance of H": deduplicate([each.healthy.covariance for each in self._constants_of]),
         }
         self._limits = np.array([each.limit for each in self.baselines])[:, None]
         self._prefix_size = max(each.prefix_size for each in self._constants_of)  # where the state of stage 2 begins
@@ -215,8 +216,9 @@ class Monitor:
         restart
             True where a sample does not follow its predecessor by one sample time; same shape.
         channels
-            Covariates by name, shape (N,) each, where the baseline has some. Of NaN, the value before holds; nothing is
-            estimated before the first value, and none is ready outside of the range that was learned.
+            Covariates by name, shape (N,) each, where the baseline has some. Of NaN, the value before holds, for
+            `covariate_hold_s` at most; nothing is estimated before the first value or after that, and none is ready
+            outside of the range that was learned.
 
         Returns
         -------
@@ -338,6 +340,10 @@ class Monitor:
         last = int(rows[0, SAMPLE]) - 1
         return self._trace(out[:, None, :], np.array([last]), last, beside)
 
+    def covariate_history(self, state: FloatArray) -> CovariateHistory:
+        """Return what the state of one asset knows of its covariates: by name, seconds before now, and values then."""
+        return {} if self._side is None else self._side.covariate_history(state[self._side_at :])
+
     @property
     def _shape(self) -> tuple[int, ...]:
         return (len(self.baselines), self._size) if self.fleet else (self._size,)
@@ -390,8 +396,3 @@ def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
     if updates.size and (updates[:, 0] > 0.0).all():
         return np.broadcast_to(np.True_, updates.shape)
     return updates > 0.0
-
-
-def _deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
-    """Stack arrays; where all are the same object, it stands once, with a first axis of length one."""
-    return np.array(values if len({id(value) for value in values}) > 1 else values[:1])

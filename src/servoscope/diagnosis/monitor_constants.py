@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.baseline import Baseline
@@ -51,3 +52,8 @@ class MonitorConstants:
             pipeline.bank, frequencies, expected, baseline.covariance_array()
         )
         return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, expected, healthy)
+
+
+def deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Stack arrays; where all are the same object, it stands once, with a first axis of length one."""
+    return np.array(values if len({id(value) for value in values}) > 1 else values[:1])

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.covariate_monitor import CovariateMonitor
+from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
 from servoscope.detection.feature_monitor import FeatureMonitor, hold
 from servoscope.detection.motion_monitor import MotionEvidence, MotionMonitor
 from servoscope.detection.trace import Trace
@@ -94,10 +94,14 @@ class SideMonitors:
         none = np.zeros(0)
         return SideValues(
             None if self.features is None else (none, none.astype(np.int64), self.features.value(of_features)),
-            None if self.covariates is None else self.covariates.average.latest(of_covariates)[None],
+            None if self.covariates is None else self.covariates.latest(of_covariates)[None],
             None,
             None if self.motion is None else self.motion.latest(of_motion),
         )
+
+    def covariate_history(self, state: FloatArray) -> CovariateHistory:
+        """Return what is known of the covariates lately."""
+        return {} if self.covariates is None else self.covariates.history(self._split(state)[1])
 
     def compare(self, trace: Trace, values: SideValues, index: npt.NDArray[np.int64]) -> Trace:
         """Return the evaluations at some samples of a block, compared with what is healthy at the covariates there."""
