@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.side_monitors import SideMonitors
 from servoscope.estimation import frequency_response
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.pipeline import Pipeline
@@ -36,6 +37,7 @@ class MonitorConstants:
     constants: RecursionConstants
     expected_theta: FloatArray
     healthy: FrequencyResponse
+    side: SideMonitors
 
     @classmethod
     def from_baseline(cls, baseline: Baseline) -> MonitorConstants:
@@ -51,7 +53,8 @@ class MonitorConstants:
         healthy = frequency_response.frequency_response(
             pipeline.bank, frequencies, expected, baseline.covariance_array()
         )
-        return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, expected, healthy)
+        prefix_size, side = pipeline.valve.size + stage.size, SideMonitors(baseline, pipeline)
+        return cls(pipeline, stage, prefix_size, constants, expected, healthy, side)
 
 
 def deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:

@@ -49,7 +49,7 @@ class SideMonitors:
     @property
     def is_joinable(self) -> bool:
         """Whether the asset can be followed side by side with others."""
-        return self.features is None and self.covariates is None
+        return self.covariates is None
 
     def check_motion(self) -> None:
         """Let a motion never seen make an alarm harder."""
@@ -108,3 +108,54 @@ class SideMonitors:
         if self.covariates is None or values.averages is None:
             return trace
         return self.covariates.compare(trace, values.averages[index])
+
+
+class SideLanes:
+    """Those of several assets, one after the other, in the rows of their states from `column` on."""
+
+    def __init__(self, lanes: Sequence[SideMonitors], column: int) -> None:
+        self._lanes, self._column, self.first = lanes, column, lanes[0]
+
+    @property
+    def size(self) -> int:
+        """Numbers of the longest state."""
+        return max(one.size for one in self._lanes)
+
+    def select(self, assets: npt.NDArray[np.intp]) -> SideLanes:
+        """Return those of some assets."""
+        return SideLanes([self._lanes[asset] for asset in assets.tolist()], self._column)
+
+    def _states(self, rows: FloatArray) -> list[FloatArray]:
+        """Return the part of each row that is theirs; none where all of them are empty."""
+        ends = [self._column + one.size for one in self._lanes] if rows.shape[1] > self._column else []
+        return [row[self._column : end] for row, end in zip(rows, ends, strict=False)]
+
+    def start(self, rows: FloatArray) -> None:
+        """Write the states before the first sample, shape (assets, ...)."""
+        for state, one in zip(self._states(rows), self._lanes, strict=False):
+            state[:] = one.start()
+
+    def run(
+        self,
+        rows: FloatArray,
+        signals: Sequence[npt.NDArray[Any]],
+        restart: BoolArray,
+        channels: Mapping[str, Any],
+    ) -> list[SideValues]:
+        """Feed r, u and y of a block, shape (assets, N) each; the states are changed in place."""
+        return [
+            one.run(state, [signal[i] for signal in signals], restart[i], channels)
+            for i, (one, state) in enumerate(zip(self._lanes, self._states(rows), strict=False))
+        ]
+
+    def latest(self, rows: FloatArray) -> list[SideValues]:
+        """Return what holds at the last sample of each state."""
+        return [one.latest(state) for one, state in zip(self._lanes, self._states(rows), strict=False)]
+
+
+def stack_features(values: Sequence[SideValues], index: npt.NDArray[np.int64]) -> FloatArray | None:
+    """Return what the features of each asset say, shape (assets, K), 0 without features; None: none has."""
+    found = [one.features_at(index) for one in values]
+    if all(one is None for one in found):
+        return None
+    return np.array([np.zeros(index.size) if one is None else one for one in found])
