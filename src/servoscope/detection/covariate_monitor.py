@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import BaselineError, RecordingError
+from servoscope.core.errors import RecordingError
 from servoscope.core.messages import message
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import t2_statistic
@@ -33,11 +33,6 @@ class CovariateMonitor:
     """Follows covariates block by block beside a recursion that starts at the coefficients of their first values."""
 
     def __init__(self, baseline: Baseline, model: CovariateModel) -> None:
-        if model.warm_up is not None:
-            raise BaselineError(
-                "a warm-up without a thermometer is known at the end of a recording only: diagnose recordings, or "
-                "log the temperature and name its column under [columns.covariates]"
-            )
         pipeline = baseline.pipeline()
         self.model, self._theta, self._bank = model, np.array(baseline.theta), pipeline.bank
         self._covariance = baseline.covariance_array()
@@ -95,11 +90,18 @@ class CovariateMonitor:
     def compare(self, trace: Trace, averages: FloatArray) -> Trace:
         """Return evaluations compared with what is healthy at averages of the covariates (K, k).
 
-        Where these are not known, or outside of what was learned, none is ready.
+        One that is not measured comes with its standard deviation behind it, shape (K, 2). Where these are not known,
+        or outside of what was learned, none is ready.
         """
+        averages, std = np.split(averages, [len(self.model.names)], axis=1)
         known = np.isfinite(averages).all(axis=1) & self.model.is_inside(averages)
         c = np.where(known[:, None], self.model.clip(averages), self.model.origin)
         more = self.model.theta_covariance(self._theta, c)
+        if std.size:
+            off = self.model.theta(self._theta, c + np.where(known[:, None], std, 0.0)) - self.model.theta(
+                self._theta, c
+            )
+            more = more + off[:, :, None] * off[:, None, :]
         expected = trace.expected + self.model.theta(self._theta, c) - self._theta
         C, healthy, ready = trace.covariance + more, trace.ifrf_expected, trace.ready & known
         return replace(

@@ -15,6 +15,7 @@ from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMo
 from servoscope.detection.feature_monitor import FeatureMonitor, hold
 from servoscope.detection.motion_monitor import MotionEvidence, MotionMonitor
 from servoscope.detection.trace import Trace
+from servoscope.detection.warm_up_monitor import WarmUpMonitor
 from servoscope.estimation.pipeline import Pipeline
 
 
@@ -38,7 +39,11 @@ class SideMonitors:
         self._baseline, self._pipeline = baseline, pipeline
         model, covariates = baseline.features, baseline.covariates
         self.features = None if model is None else FeatureMonitor(model)
-        self.covariates = None if covariates is None else CovariateMonitor(baseline, covariates)
+        self.covariates: CovariateMonitor | None = None
+        if covariates is not None and covariates.warm_up is not None:
+            self.covariates = WarmUpMonitor(baseline, covariates, covariates.warm_up)
+        elif covariates is not None:
+            self.covariates = CovariateMonitor(baseline, covariates)
         self.motion: MotionMonitor | None = None
 
     @property
@@ -84,7 +89,9 @@ class SideMonitors:
             features = np.array([span.value for span in spans]), ends, before
         if self.motion is not None:
             motion = self.motion.run(of_motion, r, u, y, restart)
-        if self.covariates is not None:
+        if isinstance(self.covariates, WarmUpMonitor):
+            averages, start = self.covariates.follow(of_covariates, (r, u, y), restart)
+        elif self.covariates is not None:
             averages, start = self.covariates.run(of_covariates, channels, len(r))
         return SideValues(features, averages, start, motion)
 

@@ -15,6 +15,7 @@ from servoscope.detection.baseline import Baseline
 from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
 from servoscope.detection.covariates import hold_last
 from servoscope.detection.result import FaultEstimate, Verdict
+from servoscope.detection.warm_up import FOLLOWED
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
 
@@ -174,10 +175,8 @@ def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) 
     Raises RecordingError if they cannot be used as one.
     """
     t, r, u, y, *covariates = np.concatenate([block.signals for block in blocks], axis=1)
-    told = {
-        name: np.where(np.isfinite(c), c, np.nan)
-        for name, c in zip(baseline.logged_covariates, covariates, strict=False)
-    }
+    names = baseline.logged_covariates if baseline.covariates is None or baseline.logged_covariates else FOLLOWED
+    told = {name: np.where(np.isfinite(c), c, np.nan) for name, c in zip(names, covariates, strict=False)}
     hold_s, rate = baseline.loop.monitor.covariate_hold_s, baseline.loop.sample_rate
     if (
         baseline.covariates is not None
