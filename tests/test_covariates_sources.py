@@ -26,6 +26,7 @@ from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.lake import AssetDay
 from servoscope.fleet.rows import Rows
 from servoscope.fleet.tasks import ExamineTask
+from servoscope.models.loop import Columns
 from servoscope.service.kafka.source import KafkaSourceSettings
 from servoscope.service.mapping.collector import MessageCollector
 from servoscope.service.mapping.settings import PayloadSettings
@@ -255,7 +256,8 @@ def lake_day(folder: Path, name: str, made: ss.Recording, baseline: ss.Baseline,
     pq.write_table(table, folder / f"{name}.parquet", row_group_size=700)
     baseline.save(folder / "baseline.json")
     item = AssetDay(name, "all", (str(folder / f"{name}.parquet"),), "stamp")
-    return ExamineTask(item, str(folder / "baseline.json"), "", 1, None, 60.0, None).run()
+    # columns that a user gave say nothing of covariates
+    return ExamineTask(item, str(folder / "baseline.json"), "", 1, Columns(), 60.0, None).run()
 
 
 def test_lakes_carry_them(baseline: ss.Baseline, tmp_path: Path) -> None:
