@@ -1,13 +1,14 @@
 """What logged covariates are worth: alarms in warm-ups and under loads, and the wear found there; a Markdown table.
 
-python benchmarks/covariates.py [--count 100] [--json]
+python benchmarks/covariates.py [--count 100] [--live] [--json]
 
 Oil that warms thins by 4 % per kelvin, which leakage and friction of a linear actuator follow: a minute from 30 to 38
 degC on, by 5 to 30 K with a time constant of a minute. A motor axis carries a load that adds 10 % of its inertia per
 unit. Worn recordings leak 10 % more, or have half as much friction again, from their middle on. Beside it, what is
 learned from the same healthy recordings without the covariate: with a warm-up that the coefficients tell, with their
 scatter, and from one state; of the latter two the monitor's alarms are counted. And three simple detectors that learned
-from the same recordings.
+from the same recordings. With --live the same recordings are followed as streams instead, by a monitor that sees no
+later sample.
 """
 
 from __future__ import annotations
@@ -102,6 +103,36 @@ def with_covariate(loop: ss.Loop, name: str) -> ss.Loop:
     return loop.model_copy(update={"columns": loop.columns.model_copy(update={"covariates": {name: name}})})
 
 
+def learn_covariates(scene: Scene, plain: ss.Loop) -> dict[str, ss.Baseline]:
+    """Return what is learned with the covariate, and where it warms without."""
+    learned = {"the covariate": ss.learn(scene.loop, scene.healthy)}
+    if scene.warms:
+        hidden = plain.monitor.model_copy(update={"hidden_warm_up": True})
+        learned["a hidden warm-up"] = ss.learn(plain.model_copy(update={"monitor": hidden}), scene.healthy)
+    return learned
+
+
+@with_one_blas_thread
+def live_rows(count: int) -> list[tuple[str, ...]]:
+    """Follow healthy and worn recordings of each machine as streams: alarms, and how long after the onset."""
+    found = []
+    for scene in scenes():
+        plain = scene.loop.model_copy(update={"columns": ss.Loop.from_dict(AXIS).columns})
+        rng = np.random.default_rng(4)
+        recordings = [scene.draw(rng, worn) for worn in (False, True) for _ in range(count)]
+        for name, baseline in learn_covariates(scene, plain).items():
+            monitor, first = ss.Monitor(baseline), []
+            for one in recordings:
+                _, trace = monitor.run(monitor.init(), one.r, one.u, one.y, one.restart, channels=one.channels)
+                first.append(float(trace.t[np.argmax(trace.exceeded)]) if trace.exceeded.any() else np.inf)
+            onset = recordings[0].duration_s / 2.0
+            late = np.array([t - onset for t in first[count:] if np.isfinite(t) and t > onset])
+            early = sum(t <= onset for t in first[count:]) + sum(np.isfinite(first[:count]))
+            delay = f"{np.median(late):.2g} s" if late.size else "-"
+            found.append((scene.name, name, f"{early}", f"{late.size}", delay))
+    return found
+
+
 @with_one_blas_thread
 def rows(count: int) -> list[tuple[str, ...]]:
     """Judge healthy and worn recordings of each machine by three baselines."""
@@ -110,11 +141,7 @@ def rows(count: int) -> list[tuple[str, ...]]:
         plain = scene.loop.model_copy(update={"columns": ss.Loop.from_dict(AXIS).columns})
         rng = np.random.default_rng(4)
         recordings = [scene.draw(rng, worn) for worn in (False, True) for _ in range(count)]
-        learned = {"the covariate": ss.learn(scene.loop, scene.healthy)}
-        if scene.warms:
-            hidden = plain.monitor.model_copy(update={"hidden_warm_up": True})
-            learned["a hidden warm-up"] = ss.learn(plain.model_copy(update={"monitor": hidden}), scene.healthy)
-        for name, baseline in learned.items():
+        for name, baseline in learn_covariates(scene, plain).items():
             said = [ss.diagnose(baseline, one) for one in recordings]
             alarms = [one.verdict == "fault" for one in said]
             sizes = [one.faults[0].ratio for one in said[count:] if len(one.faults) == 1]
@@ -136,7 +163,13 @@ def main() -> None:
     """Run the command line of this process."""
     command = parser(__doc__)
     command.add_argument("--count", type=int, default=100, help="recordings judged, healthy and worn each")
+    command.add_argument("--live", action="store_true", help="follow the recordings as streams")
     given = command.parse_args()
+    if given.live:
+        note = f"{given.count} healthy and {given.count} worn recordings a row, followed sample by sample."
+        live = "what varies", "learned with", "alarms without wear", "worn ones found", "median delay"
+        show([Table("Covariates live", note, live, tuple(live_rows(given.count)))], given.json)
+        return
     heads = ("what varies", "learned with", "alarms, healthy", "alarms, worn", "one fault named", "size within 3 %")
     note = f"{given.count} healthy and {given.count} worn recordings a row; six healthy ones to learn from."
     show([Table("Covariates", note, heads, tuple(rows(given.count)))], given.json)

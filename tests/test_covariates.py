@@ -14,7 +14,6 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
 from servoscope.detection.covariates import CovariateAverage, CovariateModel, hold_last
 from servoscope.export.constants import ExportConstants
-from servoscope.fleet.baselines import Baselines
 from servoscope.signals import writers
 from servoscope.simulation import FaultEvent, reference, simulate
 from servoscope.simulation.nonlinear_eha import Rig, simulate_rig
@@ -199,14 +198,14 @@ def test_averages_hold_what_was_known_last() -> None:
 def test_who_carries_no_covariates_refuses_them(carried: ss.Baseline, tmp_path: Path) -> None:
     with pytest.raises(BaselineError, match="knows no covariates"):
         ExportConstants.of(carried)
-    with pytest.raises(BaselineError, match="depends on load"):
-        Baselines.from_source(carried, 1, 60.0).day_monitor("press")
     carried.save(tmp_path / "baseline.json")
     hall = (
         'name = "hall"\n[sources.line]\nkind = "opcua"\nurl = "opc.tcp://localhost"\n'
-        '[assets.press]\nbaseline = "baseline.json"\nsource = "line"\nnodes = { block = "ns=1;s=press" }\n'
+        '[assets.press]\nbaseline = "baseline.json"\nsource = "line"\n'
+        'nodes = { r = "ns=1;s=r", u = "ns=1;s=u", y = "ns=1;s=y" }\n'
     )
     (tmp_path / "hall.toml").write_text(hall, encoding="utf-8")
     told = run("run", tmp_path / "hall.toml", "--check")
     assert told.code == 1
     assert "[assets] press.baseline: baseline.json depends on load" in told.err
+    assert "name it under [assets.press] nodes.covariates" in told.err

@@ -27,10 +27,14 @@ from servoscope.detection.homogeneity import leave_one_out, scatter
 from servoscope.diagnosis.follower import Follower, FollowerState
 from servoscope.estimation.window_features import FeatureLayout, Window, WindowFeatures
 from servoscope.learning.features import choose_layout, learn_features
+from servoscope.service.asset import Asset
+from servoscope.service.asset_groups import AssetGroups, BlockOffer
+from servoscope.service.checkpoint import pack_state
 from servoscope.service.examination import examine_blocks
 from servoscope.service.sources.block import Block
 from servoscope.signals import clean
 from servoscope.signals.samples import Samples
+from test_turns import BEGAN, POLICY
 
 PROJECT = Path(__file__).parents[1]
 RATE, PERIOD_S = 50.0, 4.0
@@ -306,10 +310,53 @@ class TestStreams:
         assert (trace.features > 1.0).any() and due <= first + 1.0 / RATE and first <= due + 0.2
         assert trace.statistics[-1].name == "features" and trace.exceeded[-1]
 
-    def test_a_fleet_has_none(self, baseline: ss.Baseline) -> None:
-        rec, fleet = axis(301), ss.Monitor([baseline, baseline])
-        both = [np.stack([x, x]) for x in (rec.r, rec.u, rec.y)]
-        assert fleet.run(fleet.init(), *both)[1].features is None
+    def test_each_asset_of_a_fleet_cuts_its_own_windows(self, baseline: ss.Baseline) -> None:
+        """To the bits that each has alone, wherever its gaps are; one without features has none."""
+        plain = baseline.model_copy(update={"features": None})
+        kinds, recs = (
+            (baseline, plain, baseline),
+            [axis(301 + i, seconds=150.0, ripple=0.15 * (i == 0)) for i in range(3)],
+        )
+        r, u, y = (np.stack([getattr(one, name) for one in recs]) for name in "ruy")
+        restart = np.zeros(r.shape, dtype=np.bool_)
+        restart[2, 500], y[0, 900:903] = True, np.nan
+        fleet, states, features = ss.Monitor(kinds), [], []
+        state = fleet.init()
+        for a, b in pairwise([0, 777, 778, 4001, r.shape[1]]):
+            state, trace = fleet.run(state.copy(), r[:, a:b], u[:, a:b], y[:, a:b], restart[:, a:b])
+            features.append(trace.features)
+        together = np.concatenate(features, axis=1)
+        for i, one in enumerate(kinds):
+            monitor = ss.Monitor(one)
+            end, alone = monitor.run(monitor.init(), r[i], u[i], y[i], restart[i])
+            states.append(end)
+            assert np.array_equal(
+                together[i], np.zeros(together.shape[1]) if alone.features is None else alone.features
+            )
+            assert np.array_equal(state[i][: end.size], end)
+        assert (together[0] > 1.0).any() and not (together[2] > 1.0).any()
+        latest = fleet.latest(state)
+        assert latest.features is not None and np.array_equal(latest.features[:, 0], together[:, -1])
+        assert latest.lane(0).exceeded.all() and not latest.lane(1).exceeded.any()
+
+    def test_a_service_follows_such_assets_together_to_the_same_bits(self, baseline: ss.Baseline) -> None:
+        monitor = ss.Monitor(baseline)
+        assert monitor.lane_key is not None
+        recs = {f"axis{i}": axis(310 + i, seconds=150.0, ripple=0.15 * i) for i in range(2)}
+        alone, together = ({name: Asset(name, baseline, monitor, POLICY) for name in recs} for _ in range(2))
+        groups = AssetGroups(together)
+        for k in range(0, 7500, 50):
+            rows = slice(k, k + 50)
+            blocks = [
+                Block(name, k // 50, BEGAN + x.t[rows], x.r[rows], x.u[rows], x.y[rows]) for name, x in recs.items()
+            ]
+            expected = [alone[one.asset].process(one).rows for one in blocks]
+            found = [result.rows for _, result in groups.process([BlockOffer(one, np.inf) for one in blocks])]
+            assert found == expected
+        for name, asset in alone.items():
+            assert asset.state is not None and together[name].state is not None
+            assert pack_state(asset.state) == pack_state(together[name].state)
+            assert (asset.state.evaluation.features or 0.0) > 0.0
 
     def test_the_service_believes_the_monitor(self, baseline: ss.Baseline) -> None:
         rec, follower = axis(302, seconds=150.0, ripple=0.15), Follower(baseline)

@@ -28,12 +28,18 @@ from servoscope.service.opcua.server import OpcuaServer, OpcuaServerSettings
 from servoscope.service.opcua.settings import OpcuaNodes
 from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
 from servoscope.service.opcua.subscriptions import parse_block, parse_value, read_history
+from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.resample import Resampler
 
 RATE = 20.0
 # asyncua leaves sockets of connections that were cut to the garbage collector
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+def source_assets(nodes: OpcuaNodes, rate: float, covariates: tuple[str, ...] = ()) -> dict[str, SourceAsset]:
+    """One asset as a source is told of it."""
+    return {"press": SourceAsset(SimpleNamespace(sample_rate=rate), nodes, covariates=covariates)}  # type: ignore[arg-type]
 
 
 @given(st.data())
@@ -155,7 +161,7 @@ class Following:
 
     def __init__(self, plant: Plant, nodes: OpcuaNodes, resume: dict[str, ResumePosition] | None = None) -> None:
         given_ = {"kind": "opcua", "url": f"opc.tcp://127.0.0.1:{plant.port}/plant", "block": 0.25, "heartbeat_s": 3.0}
-        self.source = OpcuaSource(OpcuaSourceSettings.model_validate(given_), {"press": (nodes, RATE)}, Path())
+        self.source = OpcuaSource(OpcuaSourceSettings.model_validate(given_), source_assets(nodes, RATE), Path())
         self.source.open(resume or {})
         self.began, self.blocks = plant.began, list[Block]()
         self.refused: dict[str, int] = {}
@@ -286,7 +292,7 @@ def test_verdicts_are_offered_signed_and_encrypted(tmp_path: Path) -> None:
 
     def source(**keys: str) -> OpcuaSource:
         made = OpcuaSourceSettings.model_validate({"kind": "opcua", "url": url, **keys})
-        return OpcuaSource(made, {"press": (nodes, 1.0)}, tmp_path)
+        return OpcuaSource(made, source_assets(nodes, 1.0), tmp_path)
 
     async def read() -> dict[str, Any]:
         from servoscope.service.opcua.source import create_opcua_client

@@ -23,7 +23,7 @@ from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.resample import Resampler
 from servoscope.service.sources.update_rate import STEPS, UpdateRate
-from test_opcua import certificate, free_port
+from test_opcua import certificate, free_port, source_assets
 
 SERVER = Path(__file__).with_name("opcua_server") / "plant.js"
 RATE = 20.0
@@ -56,7 +56,8 @@ class ForeignPlant:
         settings = OpcuaSourceSettings.model_validate(
             {"kind": "opcua", "url": f"opc.tcp://127.0.0.1:{self.port}/plant", "block": 0.5}
         )
-        return OpcuaSource(settings, assets, Path())
+        told = {name: source_assets(*one)["press"] for name, one in assets.items()}
+        return OpcuaSource(settings, told, Path())
 
 
 @pytest.fixture(scope="module")
@@ -164,4 +165,4 @@ def test_a_certificate_that_has_expired_is_told_while_samples_go_on(tmp_path: Pa
 def test_a_node_that_cannot_be_one_is_refused_before_anything_starts() -> None:
     settings = OpcuaSourceSettings.model_validate({"kind": "opcua", "url": "opc.tcp://plc"})
     with pytest.raises(ConfigError, match=r"'press\.y' is no node id, write for example ns=2;s=press.y"):
-        OpcuaSource(settings, {"press": (OpcuaNodes(block="press.y"), RATE)}, Path())
+        OpcuaSource(settings, source_assets(OpcuaNodes(block="press.y"), RATE), Path())

@@ -13,6 +13,7 @@ import servoscope as ss
 from servoscope.core.errors import BaselineError, LoopError, NotEnoughError
 from servoscope.detection.covariates import CovariateModel, WarmUp
 from servoscope.detection.warm_up import BlockSums, find_course, fit_course
+from servoscope.export.constants import ExportConstants
 from servoscope.simulation import FaultEvent, reference, simulate
 from servoscope.simulation.nonlinear_eha import Rig, simulate_rig
 
@@ -149,8 +150,8 @@ def test_what_cannot_be_told_apart_is_said(baseline: ss.Baseline) -> None:
 
 
 def test_who_cannot_carry_it_says_so(baseline: ss.Baseline, tmp_path: Path) -> None:
-    with pytest.raises(BaselineError, match="at the end of a recording only"):
-        ss.Monitor(baseline)
+    with pytest.raises(BaselineError, match="an exported monitor knows no covariates"):
+        ExportConstants.of(baseline)
     with pytest.raises(LoopError, match="leave it out beside"):
         ss.Loop.from_dict({**LOOP.to_dict(), "columns": {"covariates": {"oil": "T_oil"}}})
     still = [simulate(PLAIN, reference("profile", 60.0, 100.0), seed=i)[0] for i in range(2)]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import BaselineError, RecordingError
+from servoscope.core.errors import RecordingError
 from servoscope.core.messages import message
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import t2_statistic
@@ -17,46 +17,91 @@ from servoscope.detection.covariates import CovariateAverage, CovariateModel
 from servoscope.detection.trace import Trace
 from servoscope.estimation.frequency_response import frequency_response
 
+# of each covariate: how long before the last sample [s], ascending in time, and the values then; shape (m,) each
+CovariateHistory = Mapping[str, tuple[FloatArray, FloatArray]]
+
+
+def fill_channels(
+    channels: Mapping[str, FloatArray], before_s: FloatArray, history: CovariateHistory
+) -> dict[str, FloatArray]:
+    """Return channels, shape (N,) each, at times that end at 0, with what is known of those without any value."""
+    absent = {name for name in history if name not in channels or not np.isfinite(channels[name]).any()}
+    return {**channels, **{name: np.interp(before_s, *history[name]) for name in history if name in absent}}
+
 
 class CovariateMonitor:
     """Follows covariates block by block beside a recursion that starts at the coefficients of their first values."""
 
     def __init__(self, baseline: Baseline, model: CovariateModel) -> None:
-        if model.warm_up is not None:
-            raise BaselineError(
-                "a warm-up without a thermometer is known at the end of a recording only: diagnose recordings, or "
-                "log the temperature and name its column under [columns.covariates]"
-            )
         pipeline = baseline.pipeline()
         self.model, self._theta, self._bank = model, np.array(baseline.theta), pipeline.bank
         self._covariance = baseline.covariance_array()
         self.average = CovariateAverage(len(model.names), pipeline.memory_samples)
-        self.size, self.start = self.average.size, self.average.start
+        self._hold = baseline.loop.monitor.covariate_hold_s * baseline.loop.sample_rate
+        self.size = self.average.size + len(model.names)
+
+    def start(self) -> FloatArray:
+        """Return the state before the first sample: of the averages, then how old each value is, in samples."""
+        return np.concatenate([self.average.start(), np.zeros(len(self.model.names))])
 
     def run(
         self, state: FloatArray, channels: Mapping[str, npt.ArrayLike], samples: int
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the averages (N, k), and once, as soon as all are known, the coefficients (n,) to start from."""
+        """Return the averages (N, k), and once, as soon as all are known, the coefficients (n,) to start from.
+
+        An average is NaN before the first value, and where the newest value is too old.
+        """
         found = {name: np.asarray(channel, dtype=np.float64) for name, channel in channels.items()}
         if (missing := next((name for name in self.model.names if name not in found), None)) is not None:
             raise RecordingError(str(message("covariate.missing", covariate=missing)))
         if any(found[name].shape != (samples,) for name in self.model.names):
             raise RecordingError("covariates must have the shape of r")
-        began = not np.isnan(state).any()
-        averages = self.average.run(state, self.model.values(found))
+        of_average, age = np.split(state, [self.average.size])
+        began, values = not np.isnan(of_average).any(), self.model.values(found)
+        averages = self.average.run(of_average, values)
+        averages[self._ages(age, values) > self._hold] = np.nan
         known = np.flatnonzero(~np.isnan(averages).any(axis=1))
         if began or not known.size:
             return averages, None
         return averages, self.model.theta(self._theta, self.model.clip(averages[known[0]]))
 
+    def _ages(self, age: FloatArray, values: FloatArray) -> FloatArray:
+        """Return how many samples ago each covariate had a value, shape (N, k); carries `age` (k,) on."""
+        at = np.arange(len(values))[:, None]
+        latest = np.maximum.accumulate(np.where(np.isnan(values), -1, at), axis=0)
+        ages = np.where(latest >= 0, at - latest, age + at + 1.0)
+        age[:] = ages[-1] if len(ages) else age
+        return ages
+
+    def latest(self, state: FloatArray) -> FloatArray:
+        """Return the averages in a state, shape (k,); NaN where the newest value is too old."""
+        of_average, age = np.split(state, [self.average.size])
+        return np.where(age > self._hold, np.nan, self.average.latest(of_average))
+
+    def history(self, state: FloatArray) -> CovariateHistory:
+        """Return the newest value of each covariate that is not too old."""
+        last, age = state[: len(self.model.names)], state[self.average.size :]
+        return {
+            name: (np.zeros(1), last[j : j + 1])
+            for j, name in enumerate(self.model.names)
+            if not np.isnan(last[j]) and age[j] <= self._hold
+        }
+
     def compare(self, trace: Trace, averages: FloatArray) -> Trace:
         """Return evaluations compared with what is healthy at averages of the covariates (K, k).
 
-        Where these are not known, or outside of what was learned, none is ready.
+        One that is not measured comes with its standard deviation behind it, shape (K, 2). Where these are not known,
+        or outside of what was learned, none is ready.
         """
+        averages, std = np.split(averages, [len(self.model.names)], axis=1)
         known = np.isfinite(averages).all(axis=1) & self.model.is_inside(averages)
         c = np.where(known[:, None], self.model.clip(averages), self.model.origin)
         more = self.model.theta_covariance(self._theta, c)
+        if std.size:
+            off = self.model.theta(self._theta, c + np.where(known[:, None], std, 0.0)) - self.model.theta(
+                self._theta, c
+            )
+            more = more + off[:, :, None] * off[:, None, :]
         expected = trace.expected + self.model.theta(self._theta, c) - self._theta
         C, healthy, ready = trace.covariance + more, trace.ifrf_expected, trace.ready & known
         return replace(

@@ -85,6 +85,15 @@ class CovariateModel(BaseModel):
                 return message("covariate.missing", covariate=name)
         return None
 
+    def describe_stale(self, channels: Mapping[str, FloatArray], hold_s: float, sample_rate: float) -> Message | None:
+        """Return that a covariate had no new value for longer than one holds [s]; None where none is that old."""
+        for name in self.names if self.warm_up is None else ():
+            known = np.flatnonzero(~np.isnan(channels[name])) if name in channels else np.zeros(0, dtype=np.intp)
+            ends = np.concatenate([[-1], known, [len(channels[name]) if name in channels else 0]])
+            if not known.size or np.diff(ends).max() > hold_s * sample_rate + 1:
+                return message("covariate.stale", covariate=name, hold_s=hold_s)
+        return None
+
     def is_inside(self, c: FloatArray) -> BoolArray:
         """Return whether all covariates (..., k) are within the learned range, or next to it."""
         edge = EDGE * (np.array(self.high) - np.array(self.low))

@@ -84,6 +84,7 @@ class Trace(ShortRepr):
         responses = {name: getattr(self, name) for name in ("ifrf", "ifrf_expected")}
         for name, one in responses.items():
             part[name] = FrequencyResponse(one.frequencies, one.H[asset], one.covariance[asset])
+        part["features"] = None if self.features is None else self.features[asset]
         return Trace(self.t, self.names, threshold=float(np.asarray(self.threshold)[asset, 0]), **part)
 
     @cached_property

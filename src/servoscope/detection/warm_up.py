@@ -20,7 +20,9 @@ from servoscope.detection.covariates import CovariateModel, CovariatePath, WarmU
 from servoscope.estimation.pipeline import Pipeline, RegressionRunner
 from servoscope.signals import Recording
 
-NAME = "warm_up"  # as a covariate; the learned range is 0 to 1
+# channels of a course that a monitor has followed: the warm-up as a covariate, whose learned range is 0 to 1, its
+# standard deviation, and the smallest jump that would be found
+FOLLOWED = NAME, STD, JUMP = "warm_up", "warm_up_std", "warm_up_jump"
 BLOCK = 0.2  # memories over which the sums are taken
 MOST_BLOCKS = 400
 PRIOR_STD = 1.0  # of w_0, s and k around the middle of the learned range, where the recording does not tell
@@ -178,6 +180,9 @@ def follow_warm_up(
 ) -> CovariatePath:
     """Return how the healthy coefficients of a recording move with the warm-up that they tell themselves."""
     assert model.warm_up is not None, "the covariates are measured"
+    if STD in recording.channels:
+        path, jump = CovariatePath.of(model, theta, recording.channels, memory), recording.channels[JUMP][-1]
+        return replace(path, std=recording.channels[STD], jump=float(jump))
     sums = BlockSums.of(pipeline, recording)
     fit, smallest = find_course(sums, model.warm_up, theta, model)
     course, std = (sums.at_samples(values, recording.samples) for values in (fit.course, fit.std))

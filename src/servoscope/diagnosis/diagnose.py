@@ -155,6 +155,9 @@ def _judge_signals(
     exams = [Examination.from_recording(one, recording) for one in points]
     if exams[0].along is not None and (outside := exams[0].along.outside) is not None:
         return leave_undetermined(exams[0], outside), exams[0], None
+    hold_s, rate = baseline.loop.monitor.covariate_hold_s, recording.sample_rate
+    if model is not None and (stale := model.describe_stale(recording.channels, hold_s, rate)) is not None:
+        return leave_undetermined(exams[0], stale), exams[0], None
     if recording.y.min() == recording.y.max():  # without the sensor's noise, which every likelihood divides by
         return leave_undetermined(exams[0], message("warning.no_motion")), exams[0], None
     if (own := next(filter(None, map(examine_by_own_past, exams)), None)) is not None and own.alarm.any():

@@ -13,9 +13,10 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.detection.trace import Trace
-from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key
-from servoscope.diagnosis.side_monitors import SideMonitors, SideValues
+from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key, deduplicate
+from servoscope.diagnosis.side_monitors import SideLanes, SideValues, stack_features
 from servoscope.estimation.frequency_response import FrequencyResponse
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ class Monitor:
 
     Its state is one plain array, shape (size,) for one asset and (assets, size) for a fleet: it is saved by copying it,
     resuming is bit-identical, and splitting the samples into blocks anywhere changes nothing. The states of a valve law
-    and of stage 1 precede that of stage 2, that of the features follows it. A fleet is followed without features: each
-    asset cuts its windows elsewhere, and vector instructions need all of them at the same place.
+    and of stage 1 precede that of stage 2, that of the features follows it. Recursions of a fleet go side by side, by
+    vector instructions; its assets cut windows for their features one after the other, each where its own end.
 
     Parameters
     ----------
@@ -99,10 +100,10 @@ class Monitor:
         self._single_precision = precision == "single"
         self._assemble([constants[id(each)] for each in self.baselines])
         if motion_check:
-            if self._side is None:
+            if self.fleet:
                 raise BaselineError("the motion of a fleet is not checked: make one monitor for each asset")
-            self._side.check_motion()
-            self._size = self._side_at + self._side.size
+            self._sides.first.check_motion()
+            self._size = self._side_at + self._sides.size
 
     def _assemble(self, constants: Sequence[MonitorConstants]) -> None:
         """Take the constants of each asset."""
@@ -111,16 +112,15 @@ class Monitor:
         self.pipeline = self._constants_of[0].pipeline
         self._groups = self._group_assets()
         self._shared_columns = {
-            "expected": _deduplicate([each.expected_theta for each in self._constants_of]),
-            "H": _deduplicate([each.healthy.H for each in self._constants_of]),
-            "covariance of H": _deduplicate([each.healthy.covariance for each in self._constants_of]),
+            "expected": deduplicate([each.expected_theta for each in self._constants_of]),
+            "H": deduplicate([each.healthy.H for each in self._constants_of]),
+            "covariance of H": deduplicate([each.healthy.covariance for each in self._constants_of]),
         }
         self._limits = np.array([each.limit for each in self.baselines])[:, None]
         self._prefix_size = max(each.prefix_size for each in self._constants_of)  # where the state of stage 2 begins
         self._side_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
-        # None in a fleet: each asset cuts its windows elsewhere, and lanes need all of them at the same place
-        self._side = None if self.fleet else SideMonitors(self.baselines[0], self.pipeline)
-        self._size = self._side_at + (0 if self._side is None else self._side.size)
+        self._sides = SideLanes([each.side for each in self._constants_of], self._side_at)
+        self._size = self._side_at + self._sides.size
         self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
         self._step_constants = np.zeros(0)
 
@@ -148,19 +148,19 @@ class Monitor:
             name: values if len(values) == 1 else values[assets] for name, values in self._shared_columns.items()
         }
         part._limits = self._limits[assets]
+        part._sides = self._sides.select(assets)
         return part
 
     @property
     def lane_key(self) -> Hashable | None:
         """What assets must have in common to be followed side by side by `join`; None: this one cannot be.
 
-        Features cut windows of their own, valve laws and stage 1 run one asset after the other.
+        Valve laws and stage 1 run one asset after the other, and covariates move what an estimate begins with.
         """
         ((_, recursion), *others) = self._groups
-        alone = self._side is None or not self._side.is_joinable
-        if alone or others or self._prefix_size or not recursion.has_lanes:
+        if self.fleet or not self._sides.first.is_joinable or others or self._prefix_size or not recursion.has_lanes:
             return None
-        return recursion.layout, *compatibility_key(self.baselines[0])
+        return recursion.layout, self._size, *compatibility_key(self.baselines[0])
 
     def phase(self, state: FloatArray) -> npt.NDArray[np.int64]:
         """Return where between two evaluations each asset is, shape (assets,): those of one phase go together."""
@@ -190,8 +190,7 @@ class Monitor:
         if self._prefix_size:
             for row, each in zip(states, self._constants_of, strict=True):
                 row[: each.prefix_size] = np.concatenate([each.pipeline.valve.start(), each.stage.start()])
-        if self._side is not None:
-            states[0, self._side_at :] = self._side.start()
+        self._sides.start(states)
         return states if self.fleet else states[0]
 
     def run(
@@ -215,8 +214,9 @@ class Monitor:
         restart
             True where a sample does not follow its predecessor by one sample time; same shape.
         channels
-            Covariates by name, shape (N,) each, where the baseline has some. Of NaN, the value before holds; nothing is
-            estimated before the first value, and none is ready outside of the range that was learned.
+            Covariates by name, shape (N,) each, where the baseline has some. Of NaN, the value before holds, for
+            `covariate_hold_s` at most; nothing is estimated before the first value or after that, and none is ready
+            outside of the range that was learned.
 
         Returns
         -------
@@ -248,7 +248,7 @@ class Monitor:
         if self._size > self._groups[0][1].size:
             rows = rows.copy()
         first = int(rows[0, self._prefix_size + SAMPLE])
-        beside = self._follow_side(rows[0], signals, gaps, channels or {})
+        beside = self._follow_sides(rows, signals, gaps, channels or {})
         if self._prefix_size:
             signals[1] = self._apply_input_stages(rows, signals[0], signals[1], signals[2], gaps)
         if len(self._groups) == 1 and rows.shape[1] == self._groups[0][1].size:
@@ -281,7 +281,7 @@ class Monitor:
 
         Read it with `latest`. NaN in any of the three is a gap.
         """
-        if self._side is not None and self._side.covariates is not None:
+        if self._sides.first.covariates is not None:
             raise RecordingError("step knows no covariates, which this baseline has: use run")
         if self._step is None or len(state) != self._size or state.ndim != 1:
             if state.shape != self._shape or self.fleet or self._single_precision:
@@ -290,7 +290,7 @@ class Monitor:
                 )
             self._step, self._step_constants = self._groups[0][1].stepper
         one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
-        self._follow_side(state, list(one), gap, {})
+        self._follow_sides(state[None, :], list(one), gap, {})
         if self._prefix_size:
             u = float(self._apply_input_stages(state[None, :], one[0], one[1], one[2], gap)[0, 0])
             state = state[self._prefix_size :]
@@ -307,23 +307,23 @@ class Monitor:
             flow[i] = each.stage.run(rows[i, valve.size : each.prefix_size], r[i], behind_valve, flags[i])
         return flow
 
-    def _follow_side(
+    def _follow_sides(
         self,
-        state: FloatArray,
+        rows: FloatArray,
         signals: list[npt.NDArray[Any]],
         gaps: npt.NDArray[np.bool_],
         channels: Mapping[str, npt.ArrayLike],
-    ) -> SideValues | None:
-        """Return what is seen beside the recursion; changes its state, and starts theta where covariates say so."""
-        if self._side is None or not self._side.size:
-            return None
-        found = self._side.run(state[self._side_at :], [signal.reshape(-1) for signal in signals], gaps[0], channels)
-        if found.averages is not None:
-            signals[0] = np.where(np.isnan(found.averages).any(axis=1), np.nan, signals[0])
-        if found.start is not None:
+    ) -> list[SideValues]:
+        """Return what is seen beside the recursions; changes its state, and starts theta where covariates say so."""
+        found = self._sides.run(rows, signals, gaps, channels)
+        if not found:
+            return found
+        if found[0].averages is not None:  # of one asset
+            signals[0] = np.where(np.isnan(found[0].averages).any(axis=1), np.nan, signals[0])
+        if found[0].start is not None:
             ((_, recursion),), constants = self._groups, self._constants_of[0].constants
-            theta = state[self._prefix_size :][recursion.slices["theta"]]
-            theta[:] = np.linalg.solve(constants.basis, found.start - constants.origin)
+            theta = rows[0, self._prefix_size :][recursion.slices["theta"]]
+            theta[:] = np.linalg.solve(constants.basis, found[0].start - constants.origin)
         return found
 
     def latest(self, state: FloatArray) -> Trace:
@@ -334,9 +334,12 @@ class Monitor:
         out = np.empty((len(rows), self._groups[0][1].sizes.row))
         for assets, recursion in self._groups:
             out[assets] = recursion.evaluate(rows[assets, : recursion.size])
-        beside = None if self._side is None else self._side.latest(state[self._side_at :])
-        last = int(rows[0, SAMPLE]) - 1
+        beside, last = self._sides.latest(np.atleast_2d(state)), int(rows[0, SAMPLE]) - 1
         return self._trace(out[:, None, :], np.array([last]), last, beside)
+
+    def covariate_history(self, state: FloatArray) -> CovariateHistory:
+        """Return what the state of one asset knows of its covariates: by name, seconds before now, and values then."""
+        return self._sides.first.covariate_history(state[self._side_at :])
 
     @property
     def _shape(self) -> tuple[int, ...]:
@@ -347,10 +350,10 @@ class Monitor:
         out: npt.NDArray[Any],
         index: npt.NDArray[np.int64],
         first: int,
-        beside: SideValues | None,
+        beside: Sequence[SideValues],
     ) -> Trace:
         """Return complete evaluations, shape (assets, K, row), as a trace; the block begins at sample `first`."""
-        motion = None if beside is None else beside.motion
+        motion = beside[0].motion if beside else None
         n, f = len(self._constants_of[0].expected_theta), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)
         shape = out.shape[:2]
         H = out[..., 4 + n + n * n :].reshape(*shape, len(f), 6)
@@ -378,11 +381,11 @@ class Monitor:
             threshold=threshold,
             ifrf=FrequencyResponse(f, *response),
             ifrf_expected=expected,
-            features=None if beside is None else beside.features_at(index),
+            features=stack_features(beside, index) if self.fleet or not beside else beside[0].features_at(index),
             motion=None if motion is None else motion.excess,
             **columns,
         )
-        return trace if beside is None or self._side is None else self._side.compare(trace, beside, index - first)
+        return self._sides.first.compare(trace, beside[0], index - first) if beside else trace
 
 
 def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
@@ -390,8 +393,3 @@ def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
     if updates.size and (updates[:, 0] > 0.0).all():
         return np.broadcast_to(np.True_, updates.shape)
     return updates > 0.0
-
-
-def _deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
-    """Stack arrays; where all are the same object, it stands once, with a first axis of length one."""
-    return np.array(values if len({id(value) for value in values}) > 1 else values[:1])

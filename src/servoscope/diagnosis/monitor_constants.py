@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.baseline import Baseline
+from servoscope.diagnosis.side_monitors import SideMonitors
 from servoscope.estimation import frequency_response
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.pipeline import Pipeline
@@ -35,6 +37,7 @@ class MonitorConstants:
     constants: RecursionConstants
     expected_theta: FloatArray
     healthy: FrequencyResponse
+    side: SideMonitors
 
     @classmethod
     def from_baseline(cls, baseline: Baseline) -> MonitorConstants:
@@ -50,4 +53,10 @@ class MonitorConstants:
         healthy = frequency_response.frequency_response(
             pipeline.bank, frequencies, expected, baseline.covariance_array()
         )
-        return cls(pipeline, stage, pipeline.valve.size + stage.size, constants, expected, healthy)
+        prefix_size, side = pipeline.valve.size + stage.size, SideMonitors(baseline, pipeline)
+        return cls(pipeline, stage, prefix_size, constants, expected, healthy, side)
+
+
+def deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Stack arrays; where all are the same object, it stands once, with a first axis of length one."""
+    return np.array(values if len({id(value) for value in values}) > 1 else values[:1])

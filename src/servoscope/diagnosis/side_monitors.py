@@ -11,10 +11,11 @@ import numpy.typing as npt
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.detection.baseline import Baseline
-from servoscope.detection.covariate_monitor import CovariateMonitor
+from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
 from servoscope.detection.feature_monitor import FeatureMonitor, hold
 from servoscope.detection.motion_monitor import MotionEvidence, MotionMonitor
 from servoscope.detection.trace import Trace
+from servoscope.detection.warm_up_monitor import WarmUpMonitor
 from servoscope.estimation.pipeline import Pipeline
 
 
@@ -38,7 +39,11 @@ class SideMonitors:
         self._baseline, self._pipeline = baseline, pipeline
         model, covariates = baseline.features, baseline.covariates
         self.features = None if model is None else FeatureMonitor(model)
-        self.covariates = None if covariates is None else CovariateMonitor(baseline, covariates)
+        self.covariates: CovariateMonitor | None = None
+        if covariates is not None and covariates.warm_up is not None:
+            self.covariates = WarmUpMonitor(baseline, covariates, covariates.warm_up)
+        elif covariates is not None:
+            self.covariates = CovariateMonitor(baseline, covariates)
         self.motion: MotionMonitor | None = None
 
     @property
@@ -49,7 +54,7 @@ class SideMonitors:
     @property
     def is_joinable(self) -> bool:
         """Whether the asset can be followed side by side with others."""
-        return self.features is None and self.covariates is None
+        return self.covariates is None
 
     def check_motion(self) -> None:
         """Let a motion never seen make an alarm harder."""
@@ -84,7 +89,9 @@ class SideMonitors:
             features = np.array([span.value for span in spans]), ends, before
         if self.motion is not None:
             motion = self.motion.run(of_motion, r, u, y, restart)
-        if self.covariates is not None:
+        if isinstance(self.covariates, WarmUpMonitor):
+            averages, start = self.covariates.follow(of_covariates, (r, u, y), restart)
+        elif self.covariates is not None:
             averages, start = self.covariates.run(of_covariates, channels, len(r))
         return SideValues(features, averages, start, motion)
 
@@ -94,13 +101,68 @@ class SideMonitors:
         none = np.zeros(0)
         return SideValues(
             None if self.features is None else (none, none.astype(np.int64), self.features.value(of_features)),
-            None if self.covariates is None else self.covariates.average.latest(of_covariates)[None],
+            None if self.covariates is None else self.covariates.latest(of_covariates)[None],
             None,
             None if self.motion is None else self.motion.latest(of_motion),
         )
+
+    def covariate_history(self, state: FloatArray) -> CovariateHistory:
+        """Return what is known of the covariates lately."""
+        return {} if self.covariates is None else self.covariates.history(self._split(state)[1])
 
     def compare(self, trace: Trace, values: SideValues, index: npt.NDArray[np.int64]) -> Trace:
         """Return the evaluations at some samples of a block, compared with what is healthy at the covariates there."""
         if self.covariates is None or values.averages is None:
             return trace
         return self.covariates.compare(trace, values.averages[index])
+
+
+class SideLanes:
+    """Those of several assets, one after the other, in the rows of their states from `column` on."""
+
+    def __init__(self, lanes: Sequence[SideMonitors], column: int) -> None:
+        self._lanes, self._column, self.first = lanes, column, lanes[0]
+
+    @property
+    def size(self) -> int:
+        """Numbers of the longest state."""
+        return max(one.size for one in self._lanes)
+
+    def select(self, assets: npt.NDArray[np.intp]) -> SideLanes:
+        """Return those of some assets."""
+        return SideLanes([self._lanes[asset] for asset in assets.tolist()], self._column)
+
+    def _states(self, rows: FloatArray) -> list[FloatArray]:
+        """Return the part of each row that is theirs; none where all of them are empty."""
+        ends = [self._column + one.size for one in self._lanes] if rows.shape[1] > self._column else []
+        return [row[self._column : end] for row, end in zip(rows, ends, strict=False)]
+
+    def start(self, rows: FloatArray) -> None:
+        """Write the states before the first sample, shape (assets, ...)."""
+        for state, one in zip(self._states(rows), self._lanes, strict=False):
+            state[:] = one.start()
+
+    def run(
+        self,
+        rows: FloatArray,
+        signals: Sequence[npt.NDArray[Any]],
+        restart: BoolArray,
+        channels: Mapping[str, Any],
+    ) -> list[SideValues]:
+        """Feed r, u and y of a block, shape (assets, N) each; the states are changed in place."""
+        return [
+            one.run(state, [signal[i] for signal in signals], restart[i], channels)
+            for i, (one, state) in enumerate(zip(self._lanes, self._states(rows), strict=False))
+        ]
+
+    def latest(self, rows: FloatArray) -> list[SideValues]:
+        """Return what holds at the last sample of each state."""
+        return [one.latest(state) for one, state in zip(self._lanes, self._states(rows), strict=False)]
+
+
+def stack_features(values: Sequence[SideValues], index: npt.NDArray[np.int64]) -> FloatArray | None:
+    """Return what the features of each asset say, shape (assets, K), 0 without features; None: none has."""
+    found = [one.features_at(index) for one in values]
+    if all(one is None for one in found):
+        return None
+    return np.array([np.zeros(index.size) if one is None else one for one in found])

@@ -85,9 +85,4 @@ def _parse_day_monitor(text: str, assets: int, window_s: float) -> DayMonitor:
 
 
 def _day_monitor(baseline: Baseline, assets: int, window_s: float) -> DayMonitor:
-    if baseline.covariates is not None:
-        names = ", ".join(baseline.covariates.names)
-        raise BaselineError(
-            f"depends on {names}, which lakes do not carry: learn without covariates and hidden_warm_up"
-        )
     return DayMonitor(baseline.shared(assets), window_s)

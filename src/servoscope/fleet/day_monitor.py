@@ -16,6 +16,7 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import ServoscopeError
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.covariate_monitor import fill_channels
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.follower import DiagnosisSchedule, Follower, FollowerState
 from servoscope.fleet.common_cause import trace_evidence
@@ -119,7 +120,7 @@ class DayMonitor:
         repeated = self._timebase.is_repeat(steps)
         steps, taken = steps[~repeated], rows[~repeated]
         restart = self._timebase.is_gap(steps)
-        samples = Samples(taken.t_us / MICRO, taken.r, taken.u, taken.y, restart)
+        samples = Samples(taken.t_us / MICRO, taken.r, taken.u, taken.y, restart, taken.channels)
         new, (trace, sample, alarms) = self._follower.follow(state, samples)
         limits = np.full(len(trace.t), self.baseline.limit)
         block = EvaluationBlock(taken.t_us[sample], trace.theta, trace.statistic, limits, trace.level, trace.exceeded)
@@ -156,6 +157,8 @@ class DayMonitor:
         # without an alarm features stay out: their limit over single windows is no part of the fleet's budget
         baseline = self.baseline if state.alarm_us is not None else self.baseline.model_copy(update={"features": None})
         rows = history(max(end_us - self._window, state.first_us - 1), end_us)
+        known, now = self._follower.monitor.covariate_history(state.monitor), state.last_us or 0
+        rows = replace(rows, channels=fill_channels(rows.channels, (rows.t_us - now) / MICRO, known))
         try:
             recording = rows.to_recording(state.first_us, self.baseline.loop, "window")
             diagnosis, trace = diagnose_with_trace(baseline, recording)

@@ -10,7 +10,7 @@ import numpy as np
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.fleet.day_monitor import DayMonitor
-from servoscope.fleet.rows import Rows, rows_from_table, signals_from_table
+from servoscope.fleet.rows import Rows, covariates_from_table, rows_from_table, signals_from_table
 from servoscope.fleet.tasks import examine_day, failed_result
 from servoscope.models.loop import Columns
 from servoscope.signals.readers.table import Table
@@ -121,7 +121,9 @@ def pack_blocks(batches: Iterator[pa.RecordBatch], columns: Columns) -> Iterator
         if not batch.num_rows:
             continue
         signals = {name: pa.chunked_array([batch[name]]) for name in batch.schema.names if name not in (*keys, "at_us")}
-        rows = Rows(np.asarray(batch["at_us"]), *signals_from_table(Table("the stream", signals), columns))
+        table = Table("the stream", signals)
+        channels = covariates_from_table(table, columns)
+        rows = Rows(np.asarray(batch["at_us"]), *signals_from_table(table, columns), channels)
         assets, baselines = (batch[key].dictionary_encode(null_encoding="encode") for key in keys)
         code = np.asarray(assets.indices, np.int64) * len(baselines.dictionary) + np.asarray(baselines.indices)
         order = np.argsort(code, kind="stable")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.core.errors import RecordingError
+from servoscope.core.errors import LoopError, RecordingError
 from servoscope.models.loop import Columns, Loop
 from servoscope.signals import Recording, clean
 from servoscope.signals.readers.columns import LinearCombination, find_channel, parse_combination, parse_output
@@ -27,6 +29,7 @@ class Rows:
     r: FloatArray  # r, u, y: reference, control input, measured output, shape (N,); NaN where a cell was empty
     u: FloatArray
     y: FloatArray
+    channels: Mapping[str, FloatArray] = field(default_factory=dict)  # covariates by name, shape (N,); NaN likewise
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -34,7 +37,8 @@ class Rows:
 
     def __getitem__(self, which: slice | npt.NDArray[Any]) -> Rows:
         """Return some of the rows."""
-        return Rows(self.t_us[which], self.r[which], self.u[which], self.y[which])
+        channels = {name: channel[which] for name, channel in self.channels.items()}
+        return Rows(self.t_us[which], self.r[which], self.u[which], self.y[which], channels)
 
     def between(self, after_us: int, to_us: int) -> Rows:
         """Return the rows with after_us < t <= to_us."""
@@ -44,15 +48,16 @@ class Rows:
         """Return them in the order of time; rows of one time in an order that depends on nothing but themselves."""
         if len(self) < 2 or bool((np.diff(self.t_us) > 0).all()):
             return self
-        return self[np.lexsort((self.y, self.u, self.r, self.t_us))]
+        return self[np.lexsort((*self.channels.values(), self.y, self.u, self.r, self.t_us))]
 
     def to_recording(self, origin_us: int, loop: Loop, name: str) -> Recording:
         """Return rows in the order of time as a recording whose time is 0 at `origin_us`.
 
         Raises RecordingError if they cannot be used as one.
         """
-        t = (self.t_us - origin_us) / MICRO
-        return clean(t, self.r, self.u, self.y, name=name, sample_rate=loop.sample_rate, limits=loop.input_limits)
+        t, limits, rate = (self.t_us - origin_us) / MICRO, loop.input_limits, loop.sample_rate
+        channels = self.channels or None
+        return clean(t, self.r, self.u, self.y, name=name, sample_rate=rate, limits=limits, channels=channels)
 
     @classmethod
     def empty(cls) -> Rows:
@@ -62,23 +67,36 @@ class Rows:
     @classmethod
     def concatenate(cls, parts: Sequence[Rows]) -> Rows:
         """Return several blocks as one."""
+        parts = [part for part in parts if len(part)] or parts[:1]
         if len(parts) == 1:
             return parts[0]
         if not parts:
             return cls.empty()
         t_us, r, u, y = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t_us", "r", "u", "y"))
-        return cls(t_us, r, u, y)
+        channels = {name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels}
+        return cls(t_us, r, u, y, channels)
 
     def pack(self) -> bytes:
-        """Return them as bytes, 32 per row."""
-        return b"".join(np.ascontiguousarray(x).tobytes() for x in (self.t_us, self.r, self.u, self.y))
+        """Return them as bytes, 32 per row; channels add 8 each, and their names with a byte for the length."""
+        columns = (self.t_us, self.r, self.u, self.y, *self.channels.values())
+        packed = b"".join(np.ascontiguousarray(x).tobytes() for x in columns)
+        if not self.channels:
+            return packed
+        names = json.dumps(list(self.channels)).encode()
+        names += b" " * (-len(names) % 8)
+        return packed + names + bytes([len(names) // 8])
 
     @classmethod
     def unpack(cls, content: bytes) -> Rows:
         """Return what `pack` packed."""
-        n = len(content) // 32
-        floats = np.frombuffer(content, dtype=np.float64, offset=8 * n)
-        return cls(np.frombuffer(content, dtype=np.int64, count=n), floats[:n], floats[n : 2 * n], floats[2 * n :])
+        names = []
+        if len(content) % 8:
+            end = len(content) - 1 - 8 * content[-1]
+            names, content = json.loads(content[end:-1]), content[:end]
+        n = len(content) // (8 * (4 + len(names)))
+        r, u, y, *channels = np.frombuffer(content, dtype=np.float64, offset=8 * n).reshape(3 + len(names), n)
+        t_us = np.frombuffer(content, dtype=np.int64, count=n)
+        return cls(t_us, r, u, y, dict(zip(names, channels, strict=True)))
 
 
 def required_columns(columns: Columns, known: Sequence[str], where: str) -> list[str]:
@@ -94,6 +112,9 @@ def required_columns(columns: Columns, known: Sequence[str], where: str) -> list
         named += parse_combination(getattr(columns, key), known, f"{where}: [columns] {key}").factors
     for sensor in parse_output(columns, known, f"{where}: [columns] output"):
         named += sensor.factors
+    for text in columns.covariates.values():
+        with suppress(LoopError, RecordingError):  # who needs one that is not there will say so
+            named += parse_combination(text, known, where).factors
     return list(dict.fromkeys(named))
 
 
@@ -103,7 +124,7 @@ def rows_from_table(table: Table, columns: Columns) -> Rows:
     Raises RecordingError, LoopError if the columns cannot be used.
     """
     t_us, known = time_from_table(table, columns)
-    rows = Rows(t_us, *signals_from_table(table, columns))
+    rows = Rows(t_us, *signals_from_table(table, columns), covariates_from_table(table, columns))
     return rows if known.all() else rows[known]
 
 
@@ -119,6 +140,18 @@ def signals_from_table(table: Table, columns: Columns) -> tuple[FloatArray, Floa
     )
     sensors = [_mix(table, one, "output") for one in parse_output(columns, known, f"{where} output")]
     return r, u, sensors[0] if len(sensors) == 1 else np.asarray(np.mean(sensors, axis=0))
+
+
+def covariates_from_table(table: Table, columns: Columns) -> dict[str, FloatArray]:
+    """Return those covariates of a table that it has, by name, shape (N,) each."""
+    found, known = {}, list(table.columns)
+    for name, text in columns.covariates.items():
+        try:
+            combination = parse_combination(text, known, table.name)
+        except (LoopError, RecordingError):
+            continue
+        found[name] = _mix(table, combination, f"covariates.{name}")
+    return found
 
 
 def _mix(table: Table, mix: LinearCombination, key: str) -> FloatArray:

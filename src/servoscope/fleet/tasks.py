@@ -120,7 +120,10 @@ class ExamineTask:
             if self.baseline is None:
                 raise ServoscopeError(f"no baseline: {self.baseline_error}")
             monitor = load_day_monitor(self.baseline, self.assets, self.window_s)
-            columns = self.columns if self.columns is not None else monitor.baseline.loop.columns
+            learned = monitor.baseline.loop.columns
+            columns = self.columns if self.columns is not None else learned
+            if not columns.covariates:  # --columns says where r, u and y are
+                columns = columns.model_copy(update={"covariates": learned.covariates})
             result, trace = examine_day(monitor, read_blocks(self.item.files, columns))
             if self.trace is not None and trace:
                 make_folder(Path(self.trace).parent)

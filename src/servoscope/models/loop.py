@@ -24,6 +24,7 @@ from servoscope.models import plants
 
 DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
 FEATURE_FALSE_ALARMS = 0.005
+COVARIATE_HOLD_S = 600.0  # a thermometer may tell rarely, and only what has changed
 RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # names that mean something else
 LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a rule
 
@@ -123,6 +124,7 @@ class MonitorSettings(Settings):
     false_alarms_per_year: Positive = 1.0  # budget that the alarm is set for, after its delays
     # share of healthy recordings that the features beside the coefficients may call changed; 0: no features
     feature_false_alarms: Annotated[float, Field(ge=0.0, le=0.5)] = FEATURE_FALSE_ALARMS
+    covariate_hold_s: Positive = COVARIATE_HOLD_S  # how long a value of a covariate holds without a new one [s]
     # whether coefficients follow a warm-up that no column tells
     hidden_warm_up: bool = False
     on_delay: NonNegative = 0.0  # how long a limit must be exceeded before the alarm is raised [s]
@@ -346,6 +348,8 @@ class Loop(ShortRepr, Settings):
             del plain["monitor"]["feature_false_alarms"]  # came later: files and hashes of loops without it stay
         if not self.monitor.hidden_warm_up:
             del plain["monitor"]["hidden_warm_up"]
+        if self.monitor.covariate_hold_s == COVARIATE_HOLD_S:
+            del plain["monitor"]["covariate_hold_s"]
         if self.monitor.sequential_step == "update":
             del plain["monitor"]["sequential_step"]
         return {key: value for key, value in plain.items() if value is not None}

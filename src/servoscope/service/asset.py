@@ -32,7 +32,7 @@ from servoscope.service.asset_status import AssetStatus, asset_metadata, asset_s
 from servoscope.service.block_lanes import BlockLanes, LaneInput, LaneOutput
 from servoscope.service.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.config import DiagnosisSettings
-from servoscope.service.examination import StoredDiagnosis, examine_blocks
+from servoscope.service.examination import StoredDiagnosis, carry_covariates, examine_blocks
 from servoscope.service.examination_schedule import (
     ExaminationState,
     PendingDiagnosis,
@@ -169,15 +169,12 @@ class Asset:
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
         accepted = self.accept(block, latest)
-        return (
-            accepted if isinstance(accepted, StepResult) else self.conclude(self.lanes.follow(self.monitor, accepted))
-        )
+        if isinstance(accepted, StepResult):
+            return accepted
+        return self.conclude(self.lanes.follow(self.monitor, accepted))
 
     def accept(self, block: Block, latest: float = math.inf) -> LaneInput | StepResult:
-        """Begin to process a block: return what is to be followed, and then concluded, or that it has no effect.
-
-        Raises RecordingError as `process` does.
-        """
+        """Begin to process a block, as `process` does: return what is to be followed and concluded, or no effect."""
         self.is_repeatable = False
         start, credible = block.start_time(), block.until(latest)
         if credible is None:
@@ -255,14 +252,19 @@ class Asset:
         self._add_transitions(transitions)
         return self._result
 
-    def due_diagnoses(self, *, ended: bool = False) -> list[tuple[PendingDiagnosis, list[Block]]]:
+    def due_diagnoses(self, *, ended: bool = False) -> list[tuple[PendingDiagnosis, Sequence[Block]]]:
         """Return the full diagnoses whose windows are complete, or end here, with their samples."""
         if self.state is None:
             return []
         t, after_s, pending = self.state.position.t, self._schedule.after, self.state.pending_diagnoses
         # complete, or never to be because the clock was set back
         ready = [window for window in pending if ended or not window.until - after_s <= t < window.until]
-        return [(window, self._window.within(window)) for window in ready]
+        return [(window, self._carry_covariates(self._window.within(window))) for window in ready]
+
+    def _carry_covariates(self, blocks: Sequence[Block]) -> Sequence[Block]:
+        state = self._current
+        history = self.monitor.covariate_history(state.monitor)
+        return carry_covariates(self.baseline, blocks, history, state.position.t)
 
     def is_news(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> bool:
         """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
@@ -346,7 +348,7 @@ class Asset:
     def _examine(self) -> None:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self._current, self.policy.diagnosis
-        t = state.position.t
+        t, features, fault = state.position.t, state.evaluation.features, single_fault(state.examination.faults)
         if is_at_rest(state.examination, t, state.evaluation.exceeded):
             return
         recent = partial(self._window.after, t - settings.window_s)
@@ -355,9 +357,7 @@ class Asset:
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(
-                self.baseline, self.name, recent(), state.evaluation.features, single_fault(state.examination.faults)
-            ),
+            lambda: examine_blocks(self.baseline, self.name, self._carry_covariates(recent()), features, fault),
             self._phase,
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )

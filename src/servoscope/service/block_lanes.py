@@ -121,7 +121,8 @@ class BlockLanes:
                     history = HistoryState(history.period, max(history.excess, known), max(history.level, level))
             else:
                 history, rows = update_history(history, trace.lane(i), times[i], self._residual_every_s)
-            evaluation = LatestEvaluation(exceeded, (excess, level), None, evaluated, _writer(trace, times, i))
+            features = None if trace.features is None else float(trace.features[i, -1])
+            evaluation = LatestEvaluation(exceeded, (excess, level), features, evaluated, _writer(trace, times, i))
             # copies: an asset that falls silent must not hold the arrays of all others
             new, seen = monitors[i].copy(), checked[i].copy()
             found.append(LaneOutput(new, seen, state.samples + size, at, history, rows, evaluation))

@@ -162,18 +162,13 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
                 baseline = files[path] if point is None else files[path].at(point)
             except BaselineError as error:
                 raise ConfigError(f"[assets] {name}.point: {path.name}: {error}") from None
-            names = ", ".join(baseline.logged_covariates)
-            if names and not config.sources[settings.source].carries_covariates:
-                raise ConfigError(
-                    f"[assets] {name}.baseline: {path.name} depends on {names}, which source {settings.source} "
-                    "does not carry: learn operating points for it"
-                )
             try:
                 shared[path, point] = baseline, Monitor(baseline)
             except BaselineError as error:
                 if points := ", ".join(baseline.points):
                     raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
                 raise ConfigError(f"[assets] {name}.baseline: {path.name}: {error}") from None
+        _check_covariates(config, name, shared[path, point][0])
         faults = [fault.name for fault in shared[path, point][0].loop.plant.all_faults]
         if settings.limits is None:
             limits = {fault: limit for fault, limit in config.prognosis.limits.items() if fault in faults}
@@ -190,6 +185,24 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
     for asset in {id(one.baseline): one for one in assets.values()}.values():
         asset.compile_kernels()
     return assets
+
+
+def _check_covariates(config: ServiceFile, name: str, baseline: Baseline) -> None:
+    """Raise ConfigError if an asset's source does not carry what its baseline depends on."""
+    asset = config.assets[name]
+    source, key = config.sources[asset.source], config.sources[asset.source].asset_key
+    address = getattr(asset, key) if key else None
+    lacking = [one for one in baseline.logged_covariates if not source.carries(one, address)]
+    if lacking:
+        where = (
+            f"[assets.{name}] nodes.covariates"
+            if key == "nodes"
+            else f"[sources.{asset.source}.payload] fields.covariates"
+        )
+        raise ConfigError(
+            f"[assets] {name}.baseline: {Path(asset.baseline).name} depends on {', '.join(lacking)}, which source "
+            f"{asset.source} does not carry: name it under {where}, or learn operating points for it"
+        )
 
 
 def _resolve_limits(loop: Loop, limits: Mapping[str, float | LimitKind], asset: str) -> AssetLimits:

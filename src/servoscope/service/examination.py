@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from servoscope.core.errors import ServoscopeError
+from servoscope.core.errors import RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
 from servoscope.detection.covariates import hold_last
 from servoscope.detection.result import FaultEstimate, Verdict
+from servoscope.detection.warm_up import FOLLOWED
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
 
@@ -89,6 +92,8 @@ def examine_blocks(
         exam = Examination.from_recording(baseline.model_copy(update={"features": None}), recording)
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
+    if exam.along is not None and (outside := exam.along.outside) is not None:
+        return undetermined("unusable", error=outside)
     if not exam.alarm.any():
         if features is not None and features > 1.0:
             headline = message("service.examination.features", excess=features)
@@ -152,18 +157,34 @@ def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> S
     return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
 
 
+def carry_covariates(
+    baseline: Baseline, blocks: Sequence[Block], history: CovariateHistory, now: float
+) -> Sequence[Block]:
+    """Return blocks with what a monitor knows at `now` [UTC s] of covariates of which they have no value themselves."""
+    if not history or not blocks:
+        return blocks
+    t, _, _, _, *rows = np.concatenate([block.signals for block in blocks], axis=1)
+    filled = fill_channels(dict(zip(baseline.logged_covariates, rows, strict=True)), t - now, history)
+    columns = np.split(np.array(list(filled.values())), np.cumsum([one.t.size for one in blocks])[:-1], axis=1)
+    return [replace(block, covariates=own) for block, own in zip(blocks, columns, strict=True)]
+
+
 def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) -> tuple[Recording, float]:
     """Return blocks as a recording, whose time begins at 0, and the time of its beginning [UTC s].
 
     Raises RecordingError if they cannot be used as one.
     """
     t, r, u, y, *covariates = np.concatenate([block.signals for block in blocks], axis=1)
+    names = baseline.logged_covariates if baseline.covariates is None or baseline.logged_covariates else FOLLOWED
+    told = {name: np.where(np.isfinite(c), c, np.nan) for name, c in zip(names, covariates, strict=False)}
+    hold_s, rate = baseline.loop.monitor.covariate_hold_s, baseline.loop.sample_rate
+    if (
+        baseline.covariates is not None
+        and (stale := baseline.covariates.describe_stale(told, hold_s, rate)) is not None
+    ):
+        raise RecordingError(str(stale))
     # a thermometer may tell less often than the motion is sampled
-    channels = {
-        name: hold_last(np.where(known, c, np.nan)[:, None], c[known][:1])[:, 0]
-        for name, c in zip(baseline.logged_covariates, covariates, strict=False)
-        if (known := np.isfinite(c)).any()
-    }
+    channels = {name: hold_last(c[:, None], c[~np.isnan(c)][:1])[:, 0] for name, c in told.items()}
     loop, start = baseline.loop, float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0
     limits = loop.input_limits
     found = clean(t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=limits, channels=channels or None)

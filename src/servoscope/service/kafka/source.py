@@ -58,6 +58,10 @@ class KafkaSourceSettings(TlsSettings, SourceSettings):
         """Return what no other source may share: the group at these brokers."""
         return f"group {self.client or name} at {', '.join(sorted(self.brokers))}"
 
+    def carries(self, covariate: str, address: Any) -> bool:
+        """Messages have what the payload names."""
+        return self.payload.carries(covariate)
+
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> KafkaSource:
         """Return the source."""
         return KafkaSource(self, assets, folder, name)

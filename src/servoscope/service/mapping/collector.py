@@ -7,7 +7,7 @@ import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -58,8 +58,11 @@ class _OpenMessage(NamedTuple):
 class _AssetStream:
     """What has come of one asset, and is in no block that is stored."""
 
-    def __init__(self, assembler: BlockAssembler, span_s: float) -> None:
+    def __init__(self, assembler: BlockAssembler, span_s: float, covariates: Sequence[str]) -> None:
+        """`covariates`: those of the messages, in their order; the asset wants some of them, in its own."""
         self.assembler, self._span_s = assembler, span_s
+        known = (*SIGNALS, *covariates)
+        self._places = [assembler.signals.index(one) if one in assembler.signals else -1 for one in known]
         self.open = deque[_OpenMessage]()
         self.polled = deque[tuple[Receipt, ...]]()  # by block that was polled, in order
         self.ready = deque[tuple[Block, list[Receipt]]]()
@@ -83,13 +86,17 @@ class _AssetStream:
 
     def add(self, values: list[SignalValue], complete: bool) -> None:
         """Take values; `complete`: each moment of them has all signals."""
-        newest = self._newest
+        newest, sampled = self._newest, False
         for signal, t, value in values:
-            self.assembler.add(signal, t, value)
-            self.assembler.rates[signal].add(t, value)
-            newest[signal] = max(newest[signal], t)
+            place = self._places[signal]
+            if place < 0:
+                continue
+            self.assembler.add(place, t, value)
+            self.assembler.rates[place].add(t, value)
+            if place < len(SIGNALS):
+                newest[place], sampled = max(newest[place], t), True
         self.values += len(values)
-        self._complete, self.is_flushed = complete, False
+        self._complete, self.is_flushed = complete if sampled else self._complete, False
         if math.isnan(self._from):
             self._from = values[0].t
         if abs(values[-1].t - self._from) >= self._span_s or self.values >= len(SIGNALS) * MAX_VALUES:
@@ -150,8 +157,9 @@ class MessageCollector:
         for name, asset in self._assets.items():
             rate = asset.loop.sample_rate
             at, size = resume.get(name, ResumePosition(-1, math.nan)), max(1, round(self._settings.block * rate))
-            assembler = BlockAssembler(name, at, self._rejections, rate, size, self._settings.hold_s)
-            self._streams[name] = _AssetStream(assembler, (size - 0.5) / rate)
+            assembler = BlockAssembler(name, at, self._rejections, rate, size, self._settings.hold_s, asset.covariates)
+            covariates = tuple(self._settings.fields.covariates)
+            self._streams[name] = _AssetStream(assembler, (size - 0.5) / rate, covariates)
             self._streams[name].restart()
 
     def add(self, topic: str, content: bytes, acknowledge: Callable[[], None], *, old: bool = False) -> None:

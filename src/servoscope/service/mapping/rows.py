@@ -1,4 +1,4 @@
-"""Messages to values of r, u and y by asset, as a table ``[sources.NAME.payload]`` says where they are."""
+"""Messages to values of r, u, y and covariates by asset, as a table ``[sources.NAME.payload]`` says where they are."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ from servoscope.service.sources.assembly import SIGNALS
 PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts
 MAX_STAMP = 10**30  # beyond any time, in any unit
 SHOWN = 8  # names that a message lists
+_ALWAYS = frozenset(range(len(SIGNALS)))  # what each sample has; covariates come when they like
 Reject = Callable[[str, str, str], None]  # counts what cannot be used: of which asset, of which kind, why
 
 
 class SignalValue(NamedTuple):
     """A value of one signal."""
 
-    signal: int  # place in `SIGNALS`
+    signal: int  # place among r, u, y and the covariates, in the order of the settings
     t: float  # [UTC s]
     value: float  # NaN: it is known to be bad
 
@@ -73,7 +74,9 @@ class MessageMapping:
         self._fields = [split_path(one) for one in settings.fields.all]
         self._by_name = {name: k for k, name in enumerate(settings.fields.all)} if settings.has_signal_names else {}
         self._value = split_path(settings.value)
-        self._scale = (settings.scale.r, settings.scale.u, settings.scale.y)
+        scale, covariates = settings.scale, tuple(settings.fields.covariates)
+        self._scale = (scale.r, scale.u, scale.y, *(scale.covariates.get(name, 1.0) for name in covariates))
+        self._signals = (*SIGNALS, *covariates)
         self._sparkplug = SparkplugDecoder() if settings.decoder == "sparkplug" else None
         self._senders: dict[str, dict[str, str]] = {}  # by asset, what its last topic said
         # where nothing but r, u and y is expected: the table of all of them, and what else may stand in it
@@ -131,7 +134,7 @@ class MessageMapping:
                 if signals:
                     made = self._read_values(around, signals, received_at, self._rates[asset])
                     values.setdefault(asset, []).extend(made)
-                complete = complete and len(signals) == len(SIGNALS)
+                complete = complete and len(signals.keys() & _ALWAYS) == len(SIGNALS)
             except MessageError as error:
                 self._reject(asset, error.kind, str(error))
         if not rows and not gone and self._sparkplug is None:
@@ -193,10 +196,10 @@ class MessageMapping:
         good = all(find_around(around, path) in contents for path, contents in self._good)
         if not any(isinstance(one, list) for one in signals.values()) and isinstance(stamps, float):
             return [SignalValue(k, stamps, self._number(k, one, good)) for k, one in signals.items()]
-        lengths = {len(one) if isinstance(one, list) else 1 for one in signals.values()}
+        lengths = {len(one) if isinstance(one, list) else 1 for k, one in signals.items() if self._is_sampled(k, one)}
         if len(lengths) > 1:
             raise MessageError("lengths", f"lists of {' and '.join(map(str, sorted(lengths)))} values in one row")
-        n = lengths.pop()
+        n = lengths.pop() if lengths else 1
         if isinstance(stamps, float):
             step = self.settings.step_s or 1.0 / rate
             first = stamps if self.settings.stamp == "first" else stamps - (n - 1) * step
@@ -206,8 +209,12 @@ class MessageMapping:
         return [
             SignalValue(k, t, self._number(k, value, good))
             for k, one in signals.items()
-            for t, value in zip(stamps, one if isinstance(one, list) else [one], strict=True)
+            for t, value in zip(stamps, one if isinstance(one, list) else [one], strict=self._is_sampled(k, one))
         ]
+
+    def _is_sampled(self, signal: int, value: Any) -> bool:
+        """Return whether a signal has a value of each sample; a covariate may have one for all, of the first."""
+        return signal in _ALWAYS or isinstance(value, list)
 
     def _read_times(self, around: list[Any], received_at: float) -> float | list[float]:
         """Return the time stamp of a row, or of each of its samples [UTC s]."""
@@ -235,7 +242,7 @@ class MessageMapping:
     def _number(self, signal: int, value: Any, good: bool) -> float:
         if value is None or not good:
             return float("nan")
-        return _parse_number(value, SIGNALS[signal]) * self._scale[signal]
+        return _parse_number(value, self._signals[signal]) * self._scale[signal]
 
 
 def describe_keys(tree: Any) -> str:

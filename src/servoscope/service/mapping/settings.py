@@ -58,11 +58,12 @@ class SignalNames(Settings):
     r: NonEmptyStr = "r"
     u: NonEmptyStr = "u"
     y: NonEmptyStr = "y"
+    covariates: dict[NonEmptyStr, NonEmptyStr] = Field(default_factory=dict)  # the same by name, as in the loop file
 
     @property
-    def all(self) -> tuple[str, str, str]:
-        """Those of r, u and y."""
-        return self.r, self.u, self.y
+    def all(self) -> tuple[str, ...]:
+        """Those of r, u and y, and of the covariates."""
+        return self.r, self.u, self.y, *self.covariates.values()
 
 
 class SignalScales(Settings):
@@ -71,6 +72,7 @@ class SignalScales(Settings):
     r: Finite = 1.0
     u: Finite = 1.0
     y: Finite = 1.0
+    covariates: dict[NonEmptyStr, Finite] = Field(default_factory=dict)
 
 
 class PayloadSettings(Settings):
@@ -113,10 +115,16 @@ class PayloadSettings(Settings):
         if any(signal) and not all(signal):
             raise ValueError("topics: {signal} must stand in all of them, or in none")
         if len(set(self.fields.all)) < len(self.fields.all):
-            raise ValueError("fields: r, u and y must be three different ones")
+            raise ValueError("fields: r, u, y and covariates must all be different ones")
+        if strange := set(self.scale.covariates) - set(self.fields.covariates):
+            raise ValueError(f"scale.covariates: {min(strange)} does not stand under fields.covariates")
         if self.value and not any(signal):
             raise ValueError("value: leave it out, or say by {signal} in topics, rows or match of which signal it is")
         return self
+
+    def carries(self, covariate: str) -> bool:
+        """Return whether the plant's messages carry a covariate."""
+        return covariate in self.fields.covariates
 
     @property
     def _row_names(self) -> frozenset[str]:

@@ -50,10 +50,9 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
 
     visit_changes: ClassVar[Mapping[str, Any]] = {"client": None, "session_s": 1.0}  # which the broker does not keep
 
-    @property
-    def carries_covariates(self) -> bool:  # type: ignore[override]  # a plant's own messages do not
-        """Whether its blocks carry the `covariates` of an asset."""
-        return self.payload is None
+    def carries(self, covariate: str, address: Any) -> bool:
+        """Blocks have what the loop's columns name; a plant's own messages, what the payload names."""
+        return self.payload is None or self.payload.carries(covariate)
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
         """Return the source."""

@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
@@ -40,23 +40,25 @@ class CertificateSettings(Settings):
 class OpcuaNodes(Settings):
     """The nodes of one asset: either `block`, or `r`, `u` and `y`."""
 
-    # an array of Double, written as a whole: number of the block, then N time stamps [UTC s], N of r, of u and of y
+    # an array of Double, written as a whole: number of the block, then N time stamps [UTC s], N of r, of u, of y and of
+    # each covariate, in the order of the loop file
     block: NonEmptyStr | None = None
     # r, u, y: numbers, up to 100 Hz; they are resampled to one clock by the time stamps of their source
     r: NonEmptyStr | None = None
     u: NonEmptyStr | None = None
     y: NonEmptyStr | None = None
+    covariates: dict[NonEmptyStr, NonEmptyStr] = Field(default_factory=dict)  # numbers too, by name; they may be slower
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
-        if (self.block is None) == (None in self.signals) or (self.block is not None and any(self.signals)):
+        if (self.block is None) == (None in self.signals) or (self.block is not None and any(self.given[1:])):
             raise ValueError("give block, or r, u and y")
         return self
 
     @property
     def given(self) -> tuple[str, ...]:
         """All nodes."""
-        return tuple(node for node in (self.block, *self.signals) if node is not None)
+        return tuple(node for node in (self.block, *self.signals, *self.covariates.values()) if node is not None)
 
     @property
     def signals(self) -> tuple[str | None, ...]:

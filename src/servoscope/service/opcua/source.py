@@ -77,7 +77,11 @@ class OpcuaSourceSettings(ConnectionSettings, CertificateSettings, SourceSetting
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> OpcuaSource:
         """Return the source of these nodes."""
-        return OpcuaSource(self, {each: (one.address, one.loop.sample_rate) for each, one in assets.items()}, folder)
+        return OpcuaSource(self, assets, folder)
+
+    def carries(self, covariate: str, address: OpcuaNodes) -> bool:
+        """Arrays have what the loop's columns name; single values, what the nodes name."""
+        return address.block is not None or covariate in address.covariates
 
 
 async def create_opcua_client(settings: OpcuaSourceSettings, password: str | None, folder: Path) -> Any:
@@ -119,21 +123,19 @@ class _SubscriptionHandler:
 
 
 class OpcuaSource(BlockSource):
-    """Subscribes to the nodes of several assets, given with their sample rates [Hz].
+    """Subscribes to the nodes of several assets.
 
     A server waits for no acknowledgement: what was not stored is read from its history after a restart.
     """
 
-    def __init__(
-        self, settings: OpcuaSourceSettings, assets: Mapping[str, tuple[OpcuaNodes, float]], folder: Path
-    ) -> None:
+    def __init__(self, settings: OpcuaSourceSettings, assets: Mapping[str, SourceAsset], folder: Path) -> None:
         super().__init__()
         import_asyncua()
         self.settings, self._folder = settings, folder
         self._password = read_password(settings.password_file, folder)
         check_files(folder, settings.cert_file, settings.key_file, settings.server_cert_file)
         self._assets = dict(assets)
-        check_nodes(settings.heartbeat, *(node for nodes, _ in self._assets.values() for node in nodes.given))
+        check_nodes(settings.heartbeat, *(node for one in self._assets.values() for node in one.address.given))
         self._waiting: deque[Block] = deque()
         self._handles = 1  # of the next item that is monitored
         self._stop_event = threading.Event()
@@ -164,14 +166,15 @@ class OpcuaSource(BlockSource):
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as the server is there."""
-        for name, (nodes, rate) in self._assets.items():
+        for name, asset in self._assets.items():
+            nodes, rate, wanted = asset.address, asset.loop.sample_rate, asset.covariates
             at, common = resume.get(name, ResumePosition(-1, math.nan)), (self._enqueue, self.rejections)
             if nodes.block is not None:
-                self._subscriptions.append(ArraySubscription(name, [nodes.block], at, *common))
+                self._subscriptions.append(ArraySubscription(name, [nodes.block], at, *common, len(wanted)))
             else:
-                signals = [node for node in nodes.signals if node is not None]
+                signals = [*nodes.signals, *(nodes.covariates[one] for one in wanted)]
                 size = max(1, round(self.settings.block * rate))
-                self._subscriptions.append(ScalarSubscription(name, signals, at, *common, rate, size))
+                self._subscriptions.append(ScalarSubscription(name, signals, at, *common, rate, size, wanted))
         self._thread.start()
 
     def _enqueue(self, block: Block) -> None:

@@ -89,6 +89,18 @@ class ArraySubscription(_Subscription):
 
     sampling_ms = 0.0  # as fast as the server can
 
+    def __init__(
+        self,
+        asset: str,
+        nodes: Sequence[str],
+        resume: ResumePosition,
+        emit: Callable[[Block], None],
+        rejections: RejectionCounter,
+        covariates: int = 0,
+    ) -> None:
+        super().__init__(asset, nodes, resume, emit, rejections)
+        self._covariates = covariates
+
     async def read_missed(self, client: Any, now: float) -> None:
         """Read the blocks that were missed."""
         if not math.isnan(self._last_t):
@@ -98,7 +110,7 @@ class ArraySubscription(_Subscription):
     def add_value(self, node: int, value: Any) -> None:
         """Take a block, unless history or a new subscription repeats it."""
         try:
-            block = parse_block(self.asset, value)
+            block = parse_block(self.asset, value, self._covariates)
         except MessageError as error:
             self._rejections.add(self.asset, error.kind, str(error))
             return
@@ -108,7 +120,7 @@ class ArraySubscription(_Subscription):
 
 
 class ScalarSubscription(_Subscription):
-    """Nodes of single values: r, u, y, at a sample `rate` [Hz], for blocks of `size` samples."""
+    """Nodes of single values: r, u, y and covariates, at a sample `rate` [Hz], for blocks of `size` samples."""
 
     def __init__(
         self,
@@ -119,17 +131,18 @@ class ScalarSubscription(_Subscription):
         rejections: RejectionCounter,
         rate: float,
         size: int,
+        covariates: tuple[str, ...] = (),
     ) -> None:
         super().__init__(asset, nodes, resume, emit, rejections)
         self.value_s, self.sampling_ms = 1.0 / rate, 1000.0 / rate
-        self._assembler = BlockAssembler(asset, resume, rejections, rate, size)
+        self._assembler = BlockAssembler(asset, resume, rejections, rate, size, covariates=covariates)
         self._read_until = [-math.inf] * len(nodes)  # the last time that was read from the history of each node
         self._granted_ms: dict[int, float] = {}  # what the server says of signals that it would sample too slowly
         self._short_queues, self._undecided = "", False
 
     def longest_interval_s(self, grants: Mapping[str, ItemGrant]) -> float:
         """Return how long messages may be apart before the shortest queue of its nodes runs over [s]."""
-        queues = [grants[node].queue for node in self.nodes if not grants[node].refusal]
+        queues = [grants[node].queue for node in self.nodes[: len(SIGNALS)] if not grants[node].refusal]
         return self.value_s * max(1, min(queues, default=0)) if queues else math.inf
 
     def check_grants(self, grants: Mapping[str, ItemGrant], publishing_s: float) -> None:
@@ -137,7 +150,7 @@ class ScalarSubscription(_Subscription):
         super().check_grants(grants, publishing_s)
         self._assembler.restart_rates()
         needed = math.ceil(publishing_s / self.value_s)
-        granted = [grants[node] for node in self.nodes]
+        granted = [grants[node] for node in self.nodes[: len(SIGNALS)]]
         limit_ms = SLOW_PERIODS * self.sampling_ms
         self._granted_ms = {k: one.sampling_ms for k, one in enumerate(granted) if one.sampling_ms > limit_ms}
         values = {"publishing_ms": 1000.0 * publishing_s, "needed": needed}
@@ -173,7 +186,7 @@ class ScalarSubscription(_Subscription):
         histories = []
         if not math.isnan(last):
             histories = [await read_history(client, node, last, now + CLOCK_MARGIN_S) for node in self.nodes]
-        if None in histories or not any(histories):  # one signal alone may have none: it did not change
+        if None in histories[: len(SIGNALS)] or not any(histories):  # one signal alone may have none: it did not change
             self._assembler.resampler.restart(now)
             return
         for k, node in enumerate(self.nodes):  # what held then: the subscription reports what holds now
@@ -260,21 +273,27 @@ def parse_value(value: Any) -> tuple[float, float]:
         raise MessageError("wrong type", "a number that no computer can hold") from None
 
 
-def parse_block(asset: str, value: Any) -> Block:
-    """Return the block of an array: its number, then time stamps, r, u and y; raises MessageError if it is none."""
+def parse_block(asset: str, value: Any, covariates: int = 0) -> Block:
+    """Return the block of an array: its number, then time stamps, r, u, y and covariates.
+
+    Raises MessageError if it is none.
+    """
+    rows = 4 + covariates
     if value.StatusCode is not None and value.StatusCode.is_bad():
         raise MessageError("status", f"status {value.StatusCode.name}")
     cells = value.Value.Value if value.Value is not None else None
     if not isinstance(cells, list) or not all(isinstance(x, int | float) and not isinstance(x, bool) for x in cells):
         raise MessageError("wrong type", f"{type(cells).__name__}: the node must hold an array of numbers")
-    if len(cells) < 5 or (len(cells) - 1) % 4:
-        raise MessageError("lengths", f"{len(cells)} numbers: number of the block, then t, r, u and y of one length")
+    if len(cells) <= rows or (len(cells) - 1) % rows:
+        also = f", and {covariates} covariates," if covariates else ""
+        words = f"{len(cells)} numbers: number of the block, then t, r, u and y{also} of one length"
+        raise MessageError("lengths", words)
     try:
-        t, r, u, y = np.array(cells[1:], dtype=np.float64).reshape(4, -1)
+        signals = np.array(cells[1:], dtype=np.float64).reshape(rows, -1)
     except OverflowError:
         raise MessageError("wrong type", "holds a number that no computer can hold") from None
     if not (0 <= cells[0] < MAX_EXACT_INT and cells[0] == int(cells[0])):
         raise MessageError("out of range", f"number of the block: {cells[0]}, must be whole, from 0 to 2^53")
-    if not ((t >= 0.0) & (t < MAX_TIME_S)).all():
+    if not ((signals[0] >= 0.0) & (signals[0] < MAX_TIME_S)).all():
         raise MessageError("times", "a time stamp is missing, or outside of the years 1970 to 9999")
-    return Block(asset, int(cells[0]), t.copy(), r.copy(), u.copy(), y.copy(), time.monotonic())
+    return Block.from_signals(asset, int(cells[0]), signals, time.monotonic())

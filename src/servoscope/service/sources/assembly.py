@@ -1,4 +1,4 @@
-"""Blocks of one asset from single values of r, u and y, each with a time stamp of its own."""
+"""Blocks of one asset from single values of r, u, y and covariates, each with a time stamp of its own."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class BlockAssembler:
     """Assembles blocks of `size` samples at a sample `rate` [Hz], behind what was counted before.
 
     `hold_s`: how long a value holds without a new one [s]; infinite where a source tells each change. `rejections`
-    counts what is missing or late.
+    counts what is missing or late. `covariates`: names of further signals, behind r, u and y.
     """
 
     def __init__(
@@ -33,29 +33,31 @@ class BlockAssembler:
         rate: float,
         size: int,
         hold_s: float = math.inf,
+        covariates: tuple[str, ...] = (),
     ) -> None:
         self.asset, self.period, self._size = asset, 1.0 / rate, size
         self._sequence, self._rejections = resume.sequence, rejections
-        self.resampler = Resampler(len(SIGNALS), 1.0 / rate, resume.last_t, hold_s)
-        self._t, self._values = np.zeros(0), np.zeros((len(SIGNALS), 0))
-        self.rates = [UpdateRate() for _ in SIGNALS]
+        self.resampler = Resampler(len(SIGNALS), 1.0 / rate, resume.last_t, hold_s, len(covariates))
+        self.signals = (*SIGNALS, *covariates)
+        self._t, self._values = np.zeros(0), np.zeros((len(self.signals), 0))
+        self.rates = [UpdateRate() for _ in self.signals]
 
     def restart_rates(self) -> None:
         """Measure anew how often values come."""
-        self.rates = [UpdateRate() for _ in SIGNALS]
+        self.rates = [UpdateRate() for _ in self.signals]
 
     @property
     def intervals_s(self) -> dict[str, float]:
         """Time between two updates of each signal, as measured [s]; without those of which too few have come."""
-        found = {name: rate.interval_s for name, rate in zip(SIGNALS, self.rates, strict=True)}
+        found = {name: rate.interval_s for name, rate in zip(self.signals, self.rates, strict=True)}
         return {name: interval for name, interval in found.items() if not math.isnan(interval)}
 
     @property
     def slow_ms(self) -> dict[int, float]:
-        """Time between two updates of the signals that come too slowly, as measured [ms]."""
+        """Time between two updates of the signals that come too slowly, as measured [ms]; covariates may."""
         return {  # more digits would change with each look
             k: float(f"{1000.0 * one.interval_s:.2g}")
-            for k, one in enumerate(self.rates)
+            for k, one in enumerate(self.rates[: len(SIGNALS)])
             if one.is_too_slow(self.period)
         }
 
@@ -89,9 +91,8 @@ class BlockAssembler:
         found = []
         while self._t.size >= (1 if short else self._size):
             self._sequence += 1
-            r, u, y = self._values[:, : self._size].copy()
-            t = self._t[: self._size].copy()
-            found.append(Block(self.asset, self._sequence, t, r, u, y, time.monotonic()))
+            signals = np.vstack([self._t[: self._size], self._values[:, : self._size]])
+            found.append(Block.from_signals(self.asset, self._sequence, signals, time.monotonic()))
             self._t, self._values = self._t[self._size :], self._values[:, self._size :]
         return found
 

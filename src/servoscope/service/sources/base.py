@@ -131,7 +131,6 @@ class SourceSettings(Settings):
     asset_key: ClassVar[str] = ""  # the key of ``[assets.NAME]`` under which such a source finds an asset; empty: none
     asset_example: ClassVar[str] = ""  # what to write there
     visit_changes: ClassVar[Mapping[str, Any]] = {}  # values of keys for a client that only listens for a while
-    carries_covariates: ClassVar[bool] = False  # whether its blocks carry the `covariates` of an asset
     _is_visit: bool = PrivateAttr(default=False)
 
     kind: str
@@ -150,6 +149,10 @@ class SourceSettings(Settings):
     def is_visit(self) -> bool:
         """Whether the client only listens, and may hear what is not for its assets, too."""
         return self._is_visit
+
+    def carries(self, covariate: str, address: Any) -> bool:
+        """Return whether blocks of an asset carry a covariate; `address`: the value of `asset_key`, if there is one."""
+        return False
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> BlockSource:
         """Return the source, not yet open; `name` is unique among services, paths are relative to `folder`.

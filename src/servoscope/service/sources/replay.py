@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AwareDatetime
@@ -31,12 +31,15 @@ class ReplaySettings(SourceSettings):
     asset_example: ClassVar[str] = "recordings: files = [...]"
 
     kind: Literal["replay"] = "replay"
-    carries_covariates: ClassVar[bool] = True
 
     speed: NonNegative = 1.0  # how many times as fast as they were recorded; 0: as fast as they are polled
     block: Seconds = 1.0  # length of a block [s]
     repeat: bool = False  # whether the recordings begin again when they have ended
     start: AwareDatetime | None = None  # time of the first sample; None: when the service first ran
+
+    def carries(self, covariate: str, address: Any) -> bool:
+        """Files have what the loop's columns name."""
+        return True
 
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> ReplaySource:
         """Return the source of these recordings."""

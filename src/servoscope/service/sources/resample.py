@@ -12,6 +12,7 @@ from servoscope.core.arrays import FloatArray
 
 MAX_FILL_SAMPLES = 100_000  # samples of constant values that are made at once
 HOLE_S = 10.0  # in a history: a pause that is longer is a hole
+COVARIATE_LAG_S = 10.0  # how late a covariate may come and still belong to the next sample
 CLOCK_STEP_S = 10.0  # a value that is older than the last sample by more shows that the clock was set back
 
 
@@ -38,12 +39,18 @@ class Resampler:
     as the source is known to be alive; after `restart` it is not, and the next sample begins anew. Where a source
     repeats its values, one holds for `hold_s` only [s]: later it is missing, and a longer pause is a gap; and what is
     older than the last sample is late, however much.
+
+    The last of them, `covariates`, come when they like: they make no samples, and no sample waits for them. The next
+    one has a new value, others have it as long as it holds.
     """
 
-    def __init__(self, signals: int, period: float, last_t: float = math.nan, hold_s: float = math.inf) -> None:
+    def __init__(
+        self, signals: int, period: float, last_t: float = math.nan, hold_s: float = math.inf, covariates: int = 0
+    ) -> None:
+        self._signals, signals = signals, signals + covariates
         self._period, self._values = period, np.full(signals, math.nan)
         self._value_t, self._hold_s = np.full(signals, -math.inf), hold_s
-        self._known = np.zeros(signals, dtype=np.bool_)
+        self._known, self._new = (np.zeros(signals, dtype=np.bool_) for _ in range(2))
         self._pending: list[tuple[float, int, int, float]] = []  # a heap: time, order, signal, value
         self._order = 0
         self._newest = -math.inf
@@ -62,14 +69,16 @@ class Resampler:
         """
         self._restarted, self._restart_t, self._history_until = True, t, history_until
         if not complete:
-            self._known[:] = False
+            self._known[:] = self._new[:] = False
+            self._values[self._signals :] = math.nan
             self._pending.clear()
             self._newest = -math.inf
 
     def add(self, signal: int, t: float, value: float) -> None:
         """Take a value; NaN where its status says that it is bad."""
         self._order += 1
-        self._newest = max(self._newest, t)
+        if signal < self._signals:
+            self._newest = max(self._newest, t)
         heapq.heappush(self._pending, (t, self._order, signal, value))
 
     def take_late(self) -> int:
@@ -91,12 +100,24 @@ class Resampler:
         """
         settled = max(alive_until, self._newest) if settled is None else settled
         while self._pending and self._pending[0][0] + 0.5 * self._period <= settled:
-            t, group = self._pending[0][0], dict[int, float]()
+            t, _, signal, value = self._pending[0]
+            if signal >= self._signals:
+                heapq.heappop(self._pending)
+                self._take_covariate(t, signal, value)
+                continue
+            group = dict[int, float]()
             while self._pending and self._pending[0][0] < t + 0.5 * self._period:
-                _, _, signal, value = heapq.heappop(self._pending)
-                group[signal] = value
+                at, _, signal, value = heapq.heappop(self._pending)
+                if signal < self._signals:
+                    group[signal] = value
+                else:
+                    self._take_covariate(at, signal, value)
             self._add_group(t, group)
-        if self._restarted and self._known.all() and self._restart_t + 2.0 * self._period <= alive_until:
+        if (
+            self._restarted
+            and self._known[: self._signals].all()
+            and self._restart_t + 2.0 * self._period <= alive_until
+        ):
             self._add_sample(self._restart_t)  # nothing has changed since then
         if not self._restarted and alive_until - self.last_t < MAX_FILL_SAMPLES * self._period:
             while self.last_t + 2.0 * self._period <= alive_until:
@@ -107,6 +128,11 @@ class Resampler:
         gaps, self._gaps = self._gaps, []
         values = np.array([held for _, held in samples]).reshape(-1, self._values.size).T
         return ResampledSignals(np.array([t for t, _ in samples]), values, gaps)
+
+    def _take_covariate(self, t: float, signal: int, value: float) -> None:
+        if t >= self._value_t[signal] or not self._known[signal]:
+            self._values[signal], self._value_t[signal] = value, t
+            self._known[signal] = self._new[signal] = True
 
     def _add_group(self, t: float, group: dict[int, float]) -> None:
         """Take values of one moment."""
@@ -132,7 +158,7 @@ class Resampler:
                 self._add_sample(between)
         for signal, value in group.items():
             self._values[signal], self._known[signal], self._value_t[signal] = value, True, t
-        if is_new and self._known.all():
+        if is_new and self._known[: self._signals].all():
             self._add_sample(t)
 
     def _add_sample(self, t: float) -> None:
@@ -140,6 +166,8 @@ class Resampler:
         missing = round((t - self.last_t) / self._period) - 1 if first else 0
         if missing > 0:
             self._gaps.append(SampleGap(self.last_t, t, missing))
-        held = t - self._value_t <= self._hold_s + 0.5 * self._period
+        age = t - self._value_t
+        held = (age <= self._hold_s + 0.5 * self._period) | (self._new & (age <= COVARIATE_LAG_S))
+        self._new[:] = False
         self._samples.append((t, np.where(held, self._values, math.nan)))
         self.last_t, self._restarted = t, False

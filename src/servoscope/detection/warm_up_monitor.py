@@ -1,0 +1,226 @@
+"""A warm-up that nobody measures, followed while it goes on: a Kalman filter for the course, a test for what breaks it.
+
+The state x = (w, s, k, j) holds the warmth, the surroundings, what losses warm (`servoscope.detection.warm_up`), and
+what changes of the machine look like in all, which no warmth is. Each block of time measures w + j by least squares.
+A change of the machine is a jump of j: for each of the last blocks the filter carries what a jump there would have done
+to it (Willsky and Jones, 1976, IEEE Transactions on Automatic Control 21), and takes the likeliest for real where it is
+unlikely enough by chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.chi2_test import required_noncentrality
+from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
+from servoscope.detection.covariates import CovariateModel, WarmUp
+from servoscope.detection.warm_up import BLOCK, BY_CHANCE, JUMP, NAME, PRIOR_STD, STD, STEP, UNSEEN
+from servoscope.estimation.pipeline import RegressionRunner
+
+ONSETS = 40  # newest blocks with which a jump may have begun
+SHORTEST = 2  # blocks that a jump has to last
+SETTLED = 0.1  # standard deviation of w below which it is known
+DRIFT = 0.03  # of the learned range by which the surroundings drift within a time constant
+ROUNDS = 4  # of Gauss and Newton
+POINTS, PER_CONSTANT = 32, 8.0  # of the course that is kept, and how many of them lie within a time constant
+LOOK = np.array([1.0, 0.0, 0.0, 1.0])  # what a block sees of x
+
+
+class _Parts(NamedTuple):
+    """Views of the state."""
+
+    head: FloatArray  # samples of the block that runs, last y, blocks since the last point was kept
+    sums: FloatArray  # phi phi', phi eta, losses, samples with losses
+    x: FloatArray  # (4,)
+    P: FloatArray  # (4, 4)
+    onsets: FloatArray  # by block: what a jump there does to x, its information and its score, (ONSETS, 6)
+    course: FloatArray  # (POINTS, 2): w and its standard deviation
+    average: FloatArray
+    filters: FloatArray
+
+
+class WarmUpMonitor(CovariateMonitor):
+    """Follows the warm-up of one machine; its state is one array, changed in place."""
+
+    def __init__(self, baseline: Baseline, model: CovariateModel, warm_up: WarmUp) -> None:
+        from scipy import special
+
+        super().__init__(baseline, model)
+        self._pipeline, self._warm_up = baseline.pipeline(), warm_up
+        self._rate = baseline.loop.sample_rate
+        self._block = max(round(BLOCK * self._pipeline.memory_samples), 1)
+        self._seconds = self._block / self._rate
+        self._keep = float(np.exp(-self._seconds / warm_up.time_constant_s))
+        self._every = max(round(warm_up.time_constant_s / PER_CONSTANT / self._seconds), 1)
+        self._limit = float(special.chdtri(1.0, BY_CHANCE / ONSETS))
+        self._noncentrality = required_noncentrality(1, self._limit)
+        n = self._n = len(baseline.theta)
+        filters = RegressionRunner(self._pipeline).state.size
+        shapes = (
+            (3,),
+            (n * n + n + 2,),
+            (4,),
+            (4, 4),
+            (ONSETS, 6),
+            (POINTS, 2),
+            (self.average.size,),
+            (filters,),
+        )
+        self._shapes, self._ends = shapes, np.cumsum([int(np.prod(shape)) for shape in shapes])
+        self.size = int(self._ends[-1])
+
+    def _parts(self, state: FloatArray) -> _Parts:
+        pieces = np.split(state, self._ends[:-1])
+        return _Parts(*(piece.reshape(shape) for piece, shape in zip(pieces, self._shapes, strict=True)))
+
+    def start(self) -> FloatArray:
+        """Return the state before the first sample: nothing is known of the warmth."""
+        state = np.zeros(self.size)
+        parts = self._parts(state)
+        parts.x[:2] = 0.5
+        parts.P[:3, :3] = PRIOR_STD**2 * np.eye(3)
+        parts.average[:] = self.average.start()
+        parts.filters[:] = RegressionRunner(self._pipeline).state
+        self._begin(parts)
+        return state
+
+    def _begin(self, parts: _Parts) -> None:
+        """Begin anew behind a gap, of which nobody knows how long it was: the warmth is unknown, the rest is kept."""
+        parts.head[:], parts.sums[:], parts.onsets[:] = (0.0, np.nan, 0.0), 0.0, 0.0
+        parts.P[0], parts.P[:, 0] = 0.0, 0.0
+        parts.P[0, 0] = PRIOR_STD**2
+        parts.course[:] = np.nan
+
+    def follow(
+        self, state: FloatArray, signals: tuple[FloatArray, FloatArray, FloatArray], restart: BoolArray
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Feed r, u and y of a block, shape (N,) each; return averages of w and standard deviations, shape (N, 2).
+
+        They are NaN until the warmth is known. Once, as soon as it is, the coefficients (n,) to start from come too.
+        """
+        parts, (r, u, y), start = self._parts(state), signals, None
+        g = RegressionRunner(self._pipeline, parts.filters).advance(r, u, y, restart)
+        before = np.concatenate([parts.head[1:2], y[:-1]])
+        loss = np.where(restart, np.nan, u * (y - before) * self._rate)
+        lossy = np.isfinite(loss)
+        products = (g.phi[:, :, None] * g.phi[:, None, :]).reshape(len(r), -1)
+        used = np.column_stack([products, g.phi * g.eta[:, None]])
+        columns = np.column_stack([np.where(g.ok[:, None], used, 0.0), np.where(lossy, loss, 0.0), lossy])
+        found, k = np.full((len(r), 2), np.nan), 0
+        gaps = [*np.flatnonzero(restart).tolist(), len(r)]
+        while k < len(r):
+            if restart[k]:
+                self._begin(parts)
+            ahead = next(gap for gap in gaps if gap > k)
+            end = min(k + self._block - int(parts.head[0]), ahead)
+            rows = slice(k, end)
+            # one after the other, whatever the blocks: pairwise sums would differ in the last bit
+            parts.sums[:] = np.cumsum(np.vstack([parts.sums, columns[rows]]), axis=0)[-1]
+            if parts.P[0, 0] < SETTLED**2:
+                if np.isnan(parts.average).any():
+                    start = self.model.theta(self._theta, self.model.clip(parts.x[:1]))
+                found[rows, 0] = self.average.run(parts.average, np.full((end - k, 1), parts.x[0]))[:, 0]
+                found[rows, 1] = np.sqrt(parts.P[0, 0])
+            parts.head[0] += end - k
+            if parts.head[0] >= self._block:
+                self._end_block(parts)
+            parts.head[1], k = y[end - 1], end
+        return found, start
+
+    def _end_block(self, parts: _Parts) -> None:
+        """Take what a block measures, see whether a jump explains the last ones, and go on to the next one."""
+        n, sums = self._n, parts.sums
+        A, b, (loss, count) = sums[: n * n].reshape(n, n), sums[n * n : -2], sums[-2:]
+        measured = self._measure(parts, A, b)
+        F = self._transition(parts, float(loss), float(count))
+        if measured is not None:
+            self._update(parts, *measured)
+        parts.head[2] += 1.0
+        if parts.head[2] >= self._every:
+            parts.course[:-1] = parts.course[1:].copy()
+            parts.course[-1] = parts.x[0], np.sqrt(parts.P[0, 0])
+            parts.head[2] = 0.0
+        keep, drift = self._keep, DRIFT**2 * self._seconds / self._warm_up.time_constant_s
+        known = count >= 0.5 * self._block
+        parts.x[:] = F @ parts.x
+        parts.P[:] = F @ parts.P @ F.T
+        parts.P[0, 0] += 0.0 if known else (0.5 * (1.0 - keep) * parts.x[2]) ** 2  # it may have run, or stood still
+        parts.P[1, 1] += drift
+        parts.onsets[:, :4] = parts.onsets[:, :4] @ F.T
+        parts.head[0], parts.sums[:] = 0.0, 0.0
+
+    def _transition(self, parts: _Parts, loss: float, count: float) -> FloatArray:
+        """Return what leads x to the next block, with the losses of this one, or half of the usual ones."""
+        known, power = count >= 0.5 * self._block, self._warm_up.power
+        p = 0.0 if not power else loss / count / power if known else 0.5
+        F = np.eye(4)
+        F[0, :3] = self._keep, 1.0 - self._keep, (1.0 - self._keep) * p
+        return F
+
+    def _measure(self, parts: _Parts, A: FloatArray, b: FloatArray) -> tuple[float, float] | None:
+        """Return w + j as a block shows it, and its variance; None where the block shows nothing."""
+        x, P, z, variance = parts.x, parts.P, float(LOOK @ parts.x), 0.0
+        prior = float(LOOK @ P @ LOOK)
+        w = z
+        for _ in range(ROUNDS):
+            at = np.array([[w + STEP], [w - STEP]])
+            upper, lower = self.model.theta(self._theta, at)
+            slope = (upper - lower) / (2.0 * STEP)
+            information = float(slope @ A @ slope)
+            if not information > UNSEEN:
+                return None
+            z = w + float(slope @ (b - A @ self.model.theta(self._theta, np.array([w])))) / information
+            variance = self._warm_up.variance / information
+            w = float(LOOK @ x) + prior / (prior + variance) * (z - float(LOOK @ x))
+        return z, variance
+
+    def _update(self, parts: _Parts, z: float, variance: float) -> None:
+        """Correct x by a measurement, and then by a jump where one is needed."""
+        x, P, onsets = parts.x, parts.P, parts.onsets
+        S = float(LOOK @ P @ LOOK) + variance
+        gain, off = P @ LOOK / S, z - float(LOOK @ x)
+        x += gain * off
+        P[:] = P - np.outer(gain, gain) * S
+        onsets[:-1] = onsets[1:].copy()
+        onsets[-1] = 0.0
+        seen = 1.0 - onsets[:, :4] @ LOOK
+        seen[onsets[:, 4] == 0.0] = 0.0  # before the first block
+        seen[-1] = 1.0
+        onsets[:, :4] += seen[:, None] * gain
+        onsets[:, 4] += seen**2 / S
+        onsets[:, 5] += seen * off / S
+        information, score = onsets[: -SHORTEST + 1, 4], onsets[: -SHORTEST + 1, 5]
+        statistic = np.divide(score**2, information, out=np.zeros_like(score), where=information > 0.0)
+        best = int(np.argmax(statistic))
+        if statistic[best] > self._limit:
+            towards = np.array([0.0, 0.0, 0.0, 1.0]) - onsets[best, :4]
+            x += towards * score[best] / information[best]
+            P[:] = P + np.outer(towards, towards) / information[best]
+            onsets[:] = 0.0
+
+    def run(self, state: FloatArray, channels: Mapping[str, Any], samples: int) -> tuple[FloatArray, FloatArray | None]:
+        """Nobody has logged it: see `follow`."""
+        raise NotImplementedError
+
+    def latest(self, state: FloatArray) -> FloatArray:
+        """Return the average of w in a state, and its standard deviation, shape (2,)."""
+        parts = self._parts(state)
+        known = parts.P[0, 0] < SETTLED**2
+        return np.array([self.average.latest(parts.average)[0] if known else np.nan, np.sqrt(parts.P[0, 0])])
+
+    def history(self, state: FloatArray) -> CovariateHistory:
+        """Return the course lately, its standard deviation, and the smallest jump that would be found."""
+        parts = self._parts(state)
+        known = np.isfinite(parts.course[:, 0])
+        since = float(parts.head[0]) + (parts.head[2] + 0.5) * self._block
+        ago = (since + self._every * self._block * np.arange(POINTS - 1, -1, -1.0)[known]) / self._rate
+        t = np.append(-ago, 0.0)
+        now, information = (parts.x[0], np.sqrt(parts.P[0, 0])), parts.onsets[:, 4].max()
+        w, std = np.vstack([parts.course[known], now]).T
+        jump = np.sqrt(self._noncentrality / information) if information > 0.0 else np.inf
+        return {NAME: (t, w), STD: (t, std), JUMP: (np.zeros(1), np.array([min(jump, 1.0 / STEP)]))}
