@@ -35,6 +35,7 @@ FACTS = (
     "scaling of a fleet over cores, share of the ideal",
     "processor time of a fleet on one core, share of that on all",
     "cores",
+    "filterpy's update over everything of a fleet's sample, one core",
     "100 simulations of 60 s, s",
     "100 simulations followed as a fleet, s",
     "alarms among those with a leak, share",
@@ -54,6 +55,10 @@ def test_a_small_run_finds_every_figure_and_peers_that_agree() -> None:
         assert 0.0 < low <= median <= high and figure["processor"] > 0.0, name
         assert (figure["ratio"] is None) == (figure["to"] == ""), name
         assert figure["error"] is None or figure["error"] < 1e-9, name
+    spent = [
+        figures[name]["processor"] for name in ("Kalman filter, filterpy", "fleet of 100, double, everything, 1 core")
+    ]
+    assert found["facts"][FACTS[9]] == pytest.approx(spent[0] / spent[1])
     assert {name for name, figure in figures.items() if figure["error"] is not None} >= {*FIGURES[-3:], FIGURES[1]}
     assert all(number >= 0.0 for number in found["facts"].values())
 

@@ -107,8 +107,22 @@ class TestPredictor:
         """Neighbours share the healthy plant and what it predicts up to the change: no bit of theirs may differ."""
         names, d = ("C_ie", SENSOR_GAIN), np.array([0.01, 0.0, -0.02, 0.005])
         z = np.array([[*(i // 2 * d), 0.1 * i, 0.02 - 0.01 * i] for i in range(5)])
-        alone = [window.innovations(window.predictor(row[:4], names, row[4:], growth), growth) for row in z]
-        assert np.array_equal(window.residuals(z, names, growth)[:, : window.samples], alone)
+        for each in (z, np.column_stack([np.tile(d, (5, 1)), z[:, 4:]])):  # some share a healthy plant, or all do
+            alone = [window.innovations(window.predictor(row[:4], names, row[4:], growth), growth) for row in each]
+            assert np.array_equal(window.residuals(each, names, growth)[:, : window.samples], alone)
+
+    @pytest.mark.parametrize("drifts", [False, True])
+    def test_sums_of_many_onsets_at_once_are_those_of_each_alone(self, window: RefitWindow, drifts: bool) -> None:
+        """More changes than lanes, in any order, before, at and after a gap, up to the last sample."""
+        rng, N = np.random.default_rng(3), window.samples
+        onsets = np.concatenate([[1199, 1200, N - 1, 0], rng.integers(0, N, 46)])
+        overs = rng.choice([20, 300, 900], len(onsets), p=[0.8, 0.1, 0.1]) if drifts else np.zeros_like(onsets)
+        Q = np.linalg.qr(rng.normal(size=(N, 2)))[0]
+        sums = window.change_sums(np.zeros(4), ("C_ie", "beta"), np.array([0.1, -0.3]), STEP, Q)
+        together, volumes = sums(onsets, overs)
+        for i in range(len(onsets)):
+            (alone,), (volume,) = sums(onsets[i : i + 1], overs[i : i + 1])
+            assert np.array_equal(together[i], alone) and volumes[i] == volume
 
     def test_derivatives_by_complex_steps_are_those_of_differences(self, window: RefitWindow) -> None:
         z, growth = np.array([0.01, -0.01, 0.02, 0.0, 0.1, -0.3]), ChangeProfile(900, 300)

@@ -1,4 +1,4 @@
-"""The compiled loops of the exact predictor: innovations through changing plants, and their sums."""
+"""The compiled loops of the exact predictor: innovations through changing plants."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = npt.NDArray[Any]  # float64, or complex128 for complex-step derivatives
 @kernel
 def innovations(
     A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, plants: IntArray, onset: int, duration: int,
-    u: Array, y: Array, restart: BoolArray,
+    u: Array, y: Array, restart: BoolArray, known: Array, states: Array,
 ) -> Array:  # fmt: skip
     """Return e(k) = y(k) - y_hat(k | k-1) in standard deviations, shape (V, N), through changes of the plant.
 
@@ -26,6 +26,9 @@ def innovations(
     samples later on; in between it goes through the others, evenly and in straight lines. The state goes on. All are
     multiplied by one factor, the geometric mean of the deviations relative to the first plant's, so that the sum of
     squares ranks hypotheses as the likelihood does whose noise is known but for a common factor.
+
+    `known` (N,), `states` (N + 1, n): innovations and states of plant 0 all the way, as `run_plant` returns them; empty
+    where they are not known.
     """
     N, V, last = len(y), plants.shape[0], plants.shape[1] - 1
     e, age = np.empty((V, N), A.dtype), samples_since_restart(restart, S.shape[1])
@@ -40,6 +43,9 @@ def innovations(
     for v in range(V):
         if v > 0 and plants[v, 0] == plants[v - 1, 0]:  # up to the change it is the variant before
             e[v, :begin], x[v] = e[v - 1, :begin], x[v - 1]
+            continue
+        if plants[v, 0] == 0 and len(known):
+            e[v, :begin], x[v] = known[:begin], states[begin]
             continue
         if begin > 0:
             fill_inverse_std(by, S, plants[v, 0], 0)
@@ -56,6 +62,20 @@ def innovations(
             volume += log_S[p, age[k]] - log_S[first, age[k]]
         e[v] *= np.exp(0.5 * volume / N)
     return e
+
+
+@kernel
+def run_plant(
+    A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, u: Array, y: Array, restart: BoolArray
+) -> tuple[Array, Array]:
+    """Return innovations of one plant in standard deviations, shape (N,), and the states before them, (N + 1, n)."""
+    N, n = len(y), A.shape[1]
+    x, x_next, e, states = np.zeros((1, n)), np.zeros(n), np.zeros((1, N)), np.zeros((N + 1, n))
+    age, by, plants = samples_since_restart(restart, S.shape[1]), inverse_std(S, 0), np.zeros((1, 1), np.int64)
+    for k in range(N):
+        run_constant_plant(A, b, b_late, c, K, by, plants, 0, 0, 1, k, k + 1, age, u, y, restart, x, x_next, e, 0)
+        states[k + 1] = x[0]
+    return e[0], states
 
 
 @kernel
@@ -160,86 +180,3 @@ def run_drifting_plant(
             for i in range(n):
                 x[v, i] = x_next[i]
             e[v, k - first] = error * (by[p, j] + w * (by[q, j] - by[p, j]))
-
-
-@kernel
-def sum_over_onsets(
-    A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, plants: IntArray, step: float,
-    onsets: IntArray, durations: IntArray, settle: int, u: Array, y: Array, restart: BoolArray, Q: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Sum up innovations for changes that come at many times, and for their derivatives by the sizes.
-
-    Before a change they are those of the healthy plant, and once the predictor has forgotten when it came, those of the
-    changed one: only what lies in between is computed for each.
-
-    `A, b, b_late, c, K, S, plants`: as for `innovations`, variant 0 being as it is and variant i with size i moved by
-    `step`; `onsets, durations`: first changed sample and duration of each change, shapes (M,); `settle`: samples after
-    which the predictor has forgotten; `Q`: orthonormal columns, shape (N, m); returns sums: shape (M, v, v + m):
-    products of [e, its derivatives by the sizes] with themselves and with Q; returns volume: sum of log S relative
-    to the healthy plant's, shape (M,).
-    """
-    V, last, n, L = plants.shape[0], plants.shape[1] - 1, A.shape[1], K.shape[1]
-    N, m, M = len(y), Q.shape[1], len(onsets)
-    age = samples_since_restart(restart, L)
-    x, x_next, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, N))
-    states = np.zeros((N + 1, V, n))
-    before, after = np.zeros((N + 1, V, V + m)), np.zeros((N + 1, V, V + m))
-    log_S, by = log_variances(S, 0), inverse_std(S, 0)
-    for k in range(N):  # the healthy plant all the way
-        run_constant_plant(A, b, b_late, c, K, by, plants, 0, 0, V, k, k + 1, age, u, y, restart, x, x_next, e, 0)
-        states[k + 1] = x
-    accumulate_products(before, e, 0.0, Q)
-    x[:] = 0.0  # and the changed one
-    run_constant_plant(A, b, b_late, c, K, by, plants, last, 0, V, 0, N, age, u, y, restart, x, x_next, e, 0)
-    accumulate_products(after, e, 1.0 / step, Q)
-    volume_after = np.zeros(N + 1)
-    for k in range(N - 1, -1, -1):
-        volume_after[k] = volume_after[k + 1] + log_S[plants[0, last], age[k]] - log_S[plants[0, 0], age[k]]
-    sums, volume = np.zeros((M, V, V + m)), np.zeros(M)
-    row = np.zeros(V)
-    for i in range(M):
-        onset, duration = onsets[i], durations[i]
-        end, stop = min(onset + duration, N), min(onset + duration + settle, N)
-        volume[i] = volume_after[end]
-        for k in range(onset, end):
-            p = plants[0, (k - onset) * last // duration]
-            volume[i] += log_S[p, age[k]] - log_S[plants[0, 0], age[k]]
-        x[:] = states[onset]
-        run_drifting_plant(
-            A, b, b_late, c, K, by, plants, V, onset, duration, onset, end, age, u, y, restart, x, x_next, e, onset
-        )
-        run_constant_plant(
-            A, b, b_late, c, K, by, plants, last, 0, V, end, stop, age, u, y, restart, x, x_next, e, onset
-        )
-        for v in range(V):
-            for o in range(V + m):
-                sums[i, v, o] = before[onset, v, o] + after[N, v, o] - after[stop, v, o]
-        for k in range(onset, stop):
-            fill_row(row, e, k - onset, 1.0 / step)
-            for v in range(V):
-                for o in range(V):
-                    sums[i, v, o] += row[v] * row[o]
-                for o in range(m):
-                    sums[i, v, V + o] += row[v] * Q[k, o]
-    return sums, volume
-
-
-@functools.partial(subroutine, heap=True)
-def accumulate_products(sums: Array, e: Array, by: float, Q: Array) -> None:
-    """Sum up products of innovations, their derivatives and Q: sums[k + 1] is what they are up to sample k."""
-    V, N, m, row = e.shape[0], e.shape[1], Q.shape[1], np.zeros(e.shape[0])
-    for k in range(N):
-        fill_row(row, e, k, by)
-        for v in range(V):
-            for o in range(V):
-                sums[k + 1, v, o] = sums[k, v, o] + row[v] * row[o]
-            for o in range(m):
-                sums[k + 1, v, V + o] = sums[k, v, V + o] + row[v] * Q[k, o]
-
-
-@subroutine
-def fill_row(row: Array, e: Array, k: int, by: float) -> None:
-    """Put the innovations of a sample and their derivatives, the differences of the variants e[v, k] times `by`."""
-    row[0] = e[0, k]
-    for v in range(1, len(row)):
-        row[v] = (e[v, k] - row[0]) * by

@@ -14,12 +14,11 @@ from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.detection.baseline import Baseline
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.kernels import Array
-from servoscope.isolation.ml.predictor import Predictor, PredictorFactory
+from servoscope.isolation.ml.predictor import HealthyRun, PlantVariants, Predictor, PredictorFactory
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
-FORGOTTEN = 1e-3  # share of its state from before a change that a predictor may still hold
 LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
 PIECES = 8  # of a drift, within which the predictor changes in straight lines
 TINY = 1e-30  # complex step
@@ -216,7 +215,7 @@ class RefitWindow(ChangeWindow):
         """Return the predictors of the healthy plant and of all that follow; d are errors of logarithms."""
         return self.variants(np.concatenate([d, x])[None], names, profile)[0]
 
-    def variants(self, z: Array, names: Sequence[str], profile: ChangeProfile) -> tuple[Predictor, IntArray]:
+    def variants(self, z: Array, names: Sequence[str], profile: ChangeProfile) -> PlantVariants:
         """Return predictors in a row, and which of them each change goes through, shape (V, p).
 
         Neighbours of the same d share the healthy one.
@@ -224,7 +223,10 @@ class RefitWindow(ChangeWindow):
         m, shares = self.nuisance_count, profile.shares
         d, x = z[:, :m], z[:, m:]
         new = np.append(True, (d[1:] != d[:-1]).any(axis=1))
-        own, count = np.cumsum(new) - 1, int(new.sum())  # the healthy ones come first
+        own = np.cumsum(new) - 1  # the healthy ones come first
+        run = self._healthy_run(d[0].real) if not own[-1] and not d.imag.any() else None
+        new[0] = run is None
+        count = int(new.sum())
         # a column of logarithms for each name, one row per plant
         faulty = (shares[None, :, None] * x[:, None]).reshape(len(z) * len(shares), len(names))
         healthy = np.concatenate([d[new], np.repeat(d, len(shares), axis=0)])
@@ -233,17 +235,32 @@ class RefitWindow(ChangeWindow):
             factors[name] = factors[name] * column if name in factors else column
         output_gains = factors.pop(SENSOR_GAIN, np.ones(len(healthy)))
         spaces = self.plant.state_spaces(self.plant.expand_rays(factors), len(healthy))
-        after = count + np.arange(len(faulty)).reshape(len(z), len(shares))
-        return self.factory.predictors(spaces, output_gains), np.column_stack([own, after])
+        after = own[-1] + 1 + np.arange(len(faulty)).reshape(len(z), len(shares))
+        made, plants = self.factory.predictors(spaces, output_gains), np.column_stack([own, after])
+        return PlantVariants(made if run is None else Predictor.concatenate([run.predictor, made]), plants, run)
+
+    @cached_property
+    def _healthy_runs(self) -> dict[bytes, HealthyRun]:
+        return {}
+
+    def _healthy_run(self, d: FloatArray) -> HealthyRun:
+        """Return a healthy plant all the way; the last one is kept, for a search tries many sizes beside it."""
+        key = d.tobytes()
+        if key not in self._healthy_runs:
+            factors = self.plant.expand_rays(dict(zip(self.names, np.exp(d)[:, None], strict=True)))
+            predictor = self.factory.predictors(self.plant.state_spaces(factors, 1), np.ones(1))
+            self._healthy_runs.clear()
+            self._healthy_runs[key] = predictor.run(self.u, self.y, self.restart)
+        return self._healthy_runs[key]
 
     def innovations(self, predictor: Predictor, profile: ChangeProfile) -> Array:
         """Return the innovations in standard deviations, shape (N,)."""
         return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart)
 
-    def variant_innovations(self, variants: tuple[Predictor, IntArray], profile: ChangeProfile) -> Array:
+    def variant_innovations(self, variants: PlantVariants, profile: ChangeProfile) -> Array:
         """Return the innovations of each in standard deviations, shape (V, N)."""
-        predictor, plants = variants
-        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart, plants)
+        predictor, plants, run = variants
+        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart, plants, run)
 
     def disturbance_response(
         self, predictor: Predictor, profile: ChangeProfile, u: FloatArray, y: FloatArray
@@ -254,20 +271,11 @@ class RefitWindow(ChangeWindow):
 
     def change_sums(self, d: FloatArray, names: Sequence[str], x: FloatArray, step: float, Q: FloatArray) -> ChangeSums:
         """Prepare the sums of products by onset: one pass over the window, in which every predictor settles anew."""
-        from servoscope.isolation.ml.kernels import sum_over_onsets
+        from servoscope.isolation.ml.onset_sums import prepare_sums
 
         moved = np.vstack([np.zeros(len(x)), step * np.eye(len(x))])
-        each, drifting = self.variants(np.column_stack([np.tile(d, (len(moved), 1)), x + moved]), names, DRIFT)
-        stepping = np.ascontiguousarray(drifting[:, [0, -1]])
-        A, K, c = each.A[stepping[0]], each.K[stepping[0], -1], each.c[stepping[0]]
-        slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
-        settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), self.samples)
-
-        def sums(onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
-            plants = drifting if overs.any() else stepping
-            return sum_over_onsets(*each, plants, step, onsets, overs, settle, self.u, self.y, self.restart, Q)
-
-        return sums
+        variants = self.variants(np.column_stack([np.tile(d, (len(moved), 1)), x + moved]), names, DRIFT)
+        return prepare_sums(variants, step, self.u, self.y, self.restart, Q)
 
 
 def plant_input(loop: Loop, u: FloatArray) -> FloatArray:

@@ -93,6 +93,7 @@ def run_benchmarks(
     figures += _measure_layers(baseline, recording, amount)
     tell("peers")
     figures += _measure_peers(baseline, recording, max(3, repeats // 3), amount)
+    facts |= _compare_fleet_with_peer(figures)
     tell("a thousand simulations")
     facts |= monte_carlo(baseline, amount.simulations)
     return BenchmarkResult(tuple(figures), facts)
@@ -268,6 +269,13 @@ def _measure_peers(baseline: Baseline, recording: Recording, repeats: int, amoun
             error = float(np.abs(results[name] - results["servoscope"]).max() / np.abs(results["servoscope"]).max())
             figures.append(replace(figure, error=error))
     return figures
+
+
+def _compare_fleet_with_peer(figures: list[BenchmarkRow]) -> dict[str, float]:
+    """Return how often all of a fleet's sample goes into one update of the best-known peer, if that is installed."""
+    fleet = next(each.processor for each in figures if each.name.endswith("double, everything, 1 core"))
+    peer = next((each.processor for each in figures if each.name == "Kalman filter, filterpy"), None)
+    return {} if peer is None else {"filterpy's update over everything of a fleet's sample, one core": peer / fleet}
 
 
 def monte_carlo(baseline: Baseline, count: int, seconds: float = 60.0) -> dict[str, float]:
