@@ -194,3 +194,42 @@ def test_workers_end_with_their_service(tmp_path: Path) -> None:
     process.terminate()
     assert process.wait(60.0) == 0
     assert not processes(config)
+
+
+def test_a_worker_that_has_not_begun_is_spared_signals_and_begins_anew_once_more(tmp_path: Path) -> None:
+    config = shared_hall(tmp_path, "hall", 0.0)
+    worker, sent = _Worker(ServiceFile.load(config), config, 1, ("press",), ()), list[int]()
+    worker.supervisor.send_signal = sent.append  # type: ignore[method-assign]
+    assert worker._command()[-2:] == ["--anew", "press"]
+    worker.reload()
+    worker._take_address("")  # it was killed before it began
+    assert worker._command()[-2:] == ["--anew", "press"] and not sent
+    worker._take_address("127.0.0.1:1")
+    assert sent == [signal.SIGHUP]
+    assert "--anew" not in worker._command()  # its new state is stored
+    worker._take_address("-")  # one that listens nowhere says so
+    worker.reload()
+    assert sent == 2 * [signal.SIGHUP]
+
+
+@pytest.mark.slow
+def test_a_service_file_that_is_read_again_while_workers_start_ends_none_of_them(tmp_path: Path) -> None:
+    halls.files(tmp_path)
+    config, told = shared_hall(tmp_path, "hall", 1.0), tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(told))
+        systemd.settimeout(120.0)
+        words = [sys.executable, "-m", "servoscope", "run", str(config), "--anew", "press"]
+        process = subprocess.Popen(words, env={**os.environ, "NOTIFY_SOCKET": str(told)})
+        try:
+            until(lambda: len(processes(config)) == 2)
+            before = processes(config)
+            os.kill(process.pid, signal.SIGHUP)
+            heard = ""
+            while "READY=1" not in heard or "RELOADING=1" not in heard:
+                heard += systemd.recv(4096).decode()
+            until(lambda: len(halls.asked(config, "SELECT * FROM audit WHERE what = 'reloaded'")) == 2)
+            assert processes(config) == before
+        finally:
+            process.terminate()
+            assert process.wait(60.0) == 0

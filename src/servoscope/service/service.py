@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from servoscope.service.writer import StoreWriter
 
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
 MAX_PAUSE_S = 0.05
-LEAST_TURN_S = 0.1  # blocks that came within a turn are followed together, which costs a fraction of one by one
+LEAST_TURN_S = 0.25  # blocks that came within a turn are followed together, which costs a fraction of one by one
 HOUSEKEEPING_EVERY_S = 1.0
 PROGNOSIS_RETRY_S = 60.0  # after one that failed
 
@@ -89,8 +89,8 @@ class Service:
             return f"the store is unavailable, {self.writer.waiting} blocks wait"
         return ""
 
-    def run(self) -> None:
-        """Run.
+    def run(self, announce: Callable[[], None] = lambda: None) -> None:
+        """Run; `announce` is called when assets that begin anew have their new states in the store.
 
         Raises StoreUnavailableError if at the end the store does not take what is left; the sources return it again.
         """
@@ -99,8 +99,10 @@ class Service:
         self.writer.add(self.config.name, [audit_row("started", document)])
         self._add_restarts(self._components)
         self.dispatcher.start()
-        notify_systemd("READY=1", self._systemd_status)
         try:
+            self._commit()
+            announce()
+            notify_systemd("READY=1", self._systemd_status)
             while not self._stopping and not self._ended:
                 if self._reload_from is not None:
                     path, self._reload_from = self._reload_from, None
@@ -358,7 +360,7 @@ class Service:
         """How long to sleep before the next turn [s]."""
         now = time.monotonic()
         # what is measured now is gathered for a while, unless each block is to be stored soon, or a turn was full
-        gather_s = min(LEAST_TURN_S, 0.2 * self.config.service.commit_every_s) if not self._is_behind else 0.0
+        gather_s = min(LEAST_TURN_S, 0.5 * self.config.service.commit_every_s) if not self._is_behind else 0.0
         rest_s = max(0.0, self.last_turn + gather_s - now)
         nexts = (max(one.next_block_s, rest_s * (one.clock_rate == 1.0)) for one in self.sources.values())
         due = min(nexts, default=math.inf) if self.writer.free else math.inf  # none: a worker that lost its last asset
