@@ -12,9 +12,12 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
+from reliability.servers import Postgres
 
 import halls
 from servoscope.core.errors import ConfigError, StoreError
@@ -23,6 +26,7 @@ from servoscope.service.config import ServiceFile, shard_number
 from servoscope.service.health import serve_health
 from servoscope.service.service import Service
 from servoscope.service.store import Store
+from servoscope.service.store.tables import meta
 from servoscope.service.workers import WorkerPool, _Worker, merge_metrics
 
 WORKERS = 'listen = "127.0.0.1:0"\nworkers = 2'
@@ -233,3 +237,18 @@ def test_a_service_file_that_is_read_again_while_workers_start_ends_none_of_them
         finally:
             process.terminate()
             assert process.wait(60.0) == 0
+
+
+@pytest.mark.slow
+def test_workers_of_a_server_count_what_one_process_counts(tmp_path: Path, postgres: Postgres) -> None:
+    halls.files(tmp_path)
+    alone, config = halls.hall(tmp_path, "alone"), shared_hall(tmp_path, "shared", 0.0)
+    config.write_text(config.read_text(encoding="utf-8").replace("shared.sqlite", postgres.url), encoding="utf-8")
+    halls.service_of(alone).run()
+    WorkerPool(ServiceFile.load(config), config).run()
+    with closing(Store.open(postgres.url)) as found, closing(Store.open("alone.sqlite", tmp_path)) as expected:
+        for name in ("press", "lift"):
+            one, other = (each.checkpoints([name])[name] for each in (found, expected))
+            assert one["state"] == other["state"] and one["status"] == other["status"], name
+        owners = {row["key"] for row in found.fetch(sa.select(meta))}
+    assert {"commit of hall.0", "commit of hall.1"} <= owners  # each wrote its own
