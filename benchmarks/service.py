@@ -1,9 +1,10 @@
-"""What a sample costs on its way through the service: over MQTT, JSON, blocks of a second, SQLite; by layer.
+"""What a sample costs on its way through the service: over MQTT, JSON, blocks of a second; by layer.
 
-    python benchmarks/service.py [--assets 1000] [--blocks 60] [--speed 0] [--workers 1] [--json]
+    python benchmarks/service.py [--assets 1000] [--rate 100] [--blocks 60] [--speed 0] [--workers 1] [--postgres]
+    python benchmarks/service.py --overview [--json]
 
-`--speed 1` sends in true time and shows the latency; 0 sends as fast as broker and service take it. Broker and sender
-run on the same cores, and are reported apart.
+`--speed 1` sends in true time and shows the latency; 0 sends as fast as broker and service take it. Broker, sender and
+PostgreSQL run on the same cores, and are reported apart. `--overview` runs several cases.
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ import urllib.request
 from collections import Counter
 from importlib.resources import files
 from pathlib import Path
+from threading import Thread
+from typing import NamedTuple
 
 import numpy as np
-from reliability.servers import Mosquitto, mosquitto
+from reliability.servers import Mosquitto, Postgres, mosquitto, programs
 from tables import Table, parser, show
 
 import servoscope as ss
@@ -34,21 +37,47 @@ from servoscope.service.sources.block import Block
 from servoscope.simulation import reference, simulate
 
 RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
+START_S = 300.0  # in which a service begins
 WARM_BLOCKS = 10  # of each asset, before anything is counted: filters, first verdicts, memory
 TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
-def make_hall(folder: Path, assets: int, port: int, listen: int, workers: int = 1) -> tuple[Monitor, ss.Recording]:
+class Case(NamedTuple):
+    """What is measured."""
+
+    assets: int
+    rate: float = 100.0  # of samples [Hz]
+    blocks: int = 60  # of each asset
+    speed: float = 1.0  # over true time; 0: as fast as they are taken
+    workers: int = 1
+    postgres: bool = False
+
+    @property
+    def words(self) -> str:
+        """How the table calls it."""
+        store, workers = "PostgreSQL" if self.postgres else "SQLite", f", {self.workers} workers" * (self.workers > 1)
+        return f"{self.assets} at {self.rate:g} Hz, {store}{workers}" + ", as fast as they are taken" * (not self.speed)
+
+
+OVERVIEW = (
+    Case(1000, blocks=20),
+    Case(1000, blocks=20, postgres=True),
+    Case(100, rate=1000.0, blocks=20),
+)
+
+
+def make_hall(folder: Path, case: Case, port: int, listen: int, store: str) -> tuple[Monitor, ss.Recording]:
     """Write baseline and service file; return a monitor of the baseline and a healthy recording."""
-    loop = ss.Loop.load(RIG)
+    loop = ss.Loop.from_dict(ss.Loop.load(RIG).to_dict() | {"sample_rate": case.rate})
     recordings = [simulate(loop, reference("multisine", 120.0, loop.sample_rate), seed=seed)[0] for seed in range(3)]
     baseline = ss.learn(loop, recordings[:2])
     baseline.save(folder / "baseline.json")
     lines = [
-        f'name = "hall"\n[service]\nlisten = "127.0.0.1:{listen}"\nworkers = {workers}\nlog = "error"',
+        f'name = "hall"\n[service]\nlisten = "127.0.0.1:{listen}"\nworkers = {case.workers}\nlog = "error"',
+        f'[store]\nurl = "{store}"',
         '[sources.line]\nkind = "mqtt"',
         f'host = "127.0.0.1"\nport = {port}\nin_flight = 65535',
-        *(f'[assets.axis{i:05d}]\nbaseline = "baseline.json"\nsource = "line"' for i in range(assets)),
+        *(f'[assets.axis{i:05d}]\nbaseline = "baseline.json"\nsource = "line"' for i in range(case.assets)),
     ]
     text = "\n".join(lines) + "\n"
     tomllib.loads(text)
@@ -65,7 +94,7 @@ class Sender:
         self._client.connect("127.0.0.1", port)
         self._client.loop_start()
         self._assets, self._blocks, self._began = assets, blocks, 0.0
-        self._recording, self._n = recording, round(recording.sample_rate)
+        self._recording, self._n = recording, round(recording.sample_rate)  # samples of a block of a second
 
     def send(self, speed: float) -> None:
         """Send all blocks, at so many times the true speed; 0: as they are taken."""
@@ -100,6 +129,15 @@ def scrape(port: int) -> Counter[str]:
     return found
 
 
+def is_connected(port: int) -> bool:
+    """Return whether all of the service follows its source."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/health/ready", timeout=30.0):
+            return bool(scrape(port)['servoscope_source_up{source="line"}'])
+    except OSError:
+        return False
+
+
 def processor_time(pid: int) -> float:
     """Return the processor time of a process and of those that it has started, all threads [s]."""
     found = 0.0
@@ -123,16 +161,16 @@ def quantile(before: Counter[str], after: Counter[str], share: float) -> float:
     return next(edge for edge, count in edges if count >= share * edges[-1][1])
 
 
-def wait_for_blocks(port: int, blocks: float, seconds: float = 3600.0) -> Counter[str]:
-    """Wait until so many blocks are counted and stored."""
+def wait_for_blocks(port: int, blocks: float, seconds: float = 600.0, *, stored: bool = True) -> Counter[str]:
+    """Wait until so many blocks are counted, and `stored`."""
     deadline = time.monotonic() + seconds
     while True:
         found = scrape(port)
-        if found["servoscope_blocks_total"] >= blocks and found["servoscope_buffered_blocks"] == 0.0:
+        if found["servoscope_blocks_total"] >= blocks and (found["servoscope_buffered_blocks"] == 0.0 or not stored):
             return found
         if time.monotonic() > deadline:
             raise TimeoutError(f"{found['servoscope_blocks_total']:.0f} of {blocks:.0f} blocks came")
-        time.sleep(5.0)  # each look makes the service list the metrics of all assets
+        time.sleep(2.0)  # each look makes the service list the metrics of all assets
 
 
 def kernel_time(monitor: Monitor, recording: ss.Recording) -> float:
@@ -146,46 +184,51 @@ def kernel_time(monitor: Monitor, recording: ss.Recording) -> float:
     return best / 6000
 
 
-def measure(assets: int, blocks: int, speed: float, workers: int) -> tuple[Table, dict[str, str]]:
-    """Run broker, service and sender, and return the table and its figures."""
-    program = mosquitto()
-    if program is None:
-        raise SystemExit("mosquitto is not on this machine: scripts/install-test-servers installs it")
+def measure(case: Case) -> tuple[Table, tuple[str, ...]]:
+    """Run broker, service and sender; return the table by layer, and the case's row of the overview."""
+    program, server_programs = mosquitto(), programs() if case.postgres else None
+    if program is None or (case.postgres and server_programs is None):
+        raise SystemExit("mosquitto or PostgreSQL is not on this machine: scripts/install-test-servers installs them")
+    assets, server = case.assets, Postgres.temporary(server_programs) if server_programs is not None else None
     with tempfile.TemporaryDirectory() as name, socket.socket() as free:
         folder = Path(name)
         more = ("allow_anonymous true", "max_inflight_messages 65535", "max_queued_messages 0", "max_queued_bytes 0")
         broker = Mosquitto(folder, program, *more)
         free.bind(("127.0.0.1", 0))
         listen = int(free.getsockname()[1])
-        monitor, recording = make_hall(folder, assets, broker.port, listen, workers)
+        monitor, recording = make_hall(folder, case, broker.port, listen, server.url if server else "history.sqlite")
         free.close()
         broker.start()
+        if server is not None:
+            server.start()
         service = subprocess.Popen([sys.executable, "-m", "servoscope", "run", str(folder / "hall.toml")])
         try:
-            time.sleep(3.0)
-            while True:
-                try:
-                    if scrape(listen)['servoscope_source_up{source="line"}']:
-                        break
-                except OSError:
-                    pass
+            deadline = time.monotonic() + START_S
+            while not is_connected(listen):
+                if time.monotonic() > deadline:
+                    raise TimeoutError("the service does not begin")
                 time.sleep(0.5)
-            sender = Sender(broker.port, assets, recording, WARM_BLOCKS)
-            sender.send(speed)
-            before, used = wait_for_blocks(listen, assets * WARM_BLOCKS), processor_time(service.pid)
+            time.sleep(2.0)  # until the broker knows what each worker wants: earlier blocks are not for it
+            # without a pause between those that warm up and those that count: silence would be an alarm of each asset
+            given = broker.port, assets, recording, WARM_BLOCKS + case.blocks
+            sender = Thread(target=Sender(*given).send, args=(case.speed,))
+            sender.start()
+            before, used = wait_for_blocks(listen, assets * WARM_BLOCKS, stored=False), processor_time(service.pid)
             broker_used, own, begin = processor_time(broker.pid), time.process_time(), time.monotonic()
-            kernel = kernel_time(monitor, recording)
-            own_kernel = time.process_time() - own
-            sender = Sender(broker.port, assets, recording, blocks)
-            sender.send(speed)
-            after = wait_for_blocks(listen, assets * (WARM_BLOCKS + blocks))
+            sender.join()
+            after = wait_for_blocks(listen, assets * (WARM_BLOCKS + case.blocks))
             seconds, used = time.monotonic() - begin, processor_time(service.pid) - used
-            broker_used, own = processor_time(broker.pid) - broker_used, time.process_time() - own - own_kernel
+            broker_used, own = processor_time(broker.pid) - broker_used, time.process_time() - own
+            kernel = kernel_time(monitor, recording)
         finally:
             service.send_signal(signal.SIGTERM)
             service.wait(120)
             broker.stop()
+            if server is not None:
+                server.remove()
     samples = after["servoscope_samples_total"] - before["servoscope_samples_total"]
+    if not samples:
+        raise SystemExit("all blocks came before the first look: more --blocks are needed")
     prefix = 'servoscope_processor_seconds_total{layer="'
     layers = {key.split('"')[1]: after[key] - before[key] for key in after if key.startswith(prefix)}
     receive = layers.pop("receive", 0.0)
@@ -199,25 +242,32 @@ def measure(assets: int, blocks: int, speed: float, workers: int) -> tuple[Table
     ]
     cells = [(words, f"{1e6 * spent / samples:.3f} us", f"{spent / samples / kernel:.1f}") for words, spent in rows]
     cells.append(("one log's kernel, in the same minute", f"{1e6 * kernel:.3f} us", "1"))
-    load = os.getloadavg()[0]
+    load, blocks = f"{os.getloadavg()[0]:.1f}", samples / case.rate / assets
+    late = tuple(f"{quantile(before, after, share):g} s" for share in (0.5, 0.99))
     note = (
-        f"{assets} assets at 100 Hz, blocks of a second as JSON, {blocks} of each after {WARM_BLOCKS} that are not "
-        f"counted, in {seconds:.0f} s; {f'{speed:g} times the true speed' if speed else 'as fast as they are taken'}; "
-        f"latency p50 and p99 {quantile(before, after, 0.5):g} and {quantile(before, after, 0.99):g} s at most. "
-        f"{workers} worker{'s' * (workers > 1)}. Load of the machine at the end: {load:.1f}."
+        f"{case.words}: blocks of a second as JSON, {blocks:.0f} of each after those that warm up, in {seconds:.0f} s; "
+        f"latency p50 and p99 {late[0]} and {late[1]} at most. Load of the machine at the end: {load}."
     )
-    values = {"all": f"{1e6 * used / samples:.2f} us", "kernel": f"{used / samples / kernel:.0f}"}
-    return Table(
-        "A sample through the service", note, ("layer", "processor time per sample", "over the kernel"), tuple(cells)
-    ), values
+    per_sample = (f"{1e6 * spent / samples:.2f}" for spent in (used - receive, used))
+    row = case.words, *per_sample, f"{used / samples / kernel:.0f}", *late, load
+    return Table("A sample through the service", note, ("layer", "time", "over the kernel"), tuple(cells)), row
 
 
 if __name__ == "__main__":
     command = parser(__doc__)
     command.add_argument("--assets", type=int, default=1000)
+    command.add_argument("--rate", type=float, default=100.0, help="of samples [Hz]")
     command.add_argument("--blocks", type=int, default=60, help="of each asset")
     command.add_argument("--speed", type=float, default=0.0, help="over true time; 0: as fast as they are taken")
     command.add_argument("--workers", type=int, default=1)
+    command.add_argument("--postgres", action="store_true", help="the store is a PostgreSQL server")
+    command.add_argument("--overview", action="store_true", help="several cases")
     given = command.parse_args()
-    table, values = measure(given.assets, given.blocks, given.speed, given.workers)
-    show([table], given.json, values)
+    cases = OVERVIEW
+    if not given.overview:
+        cases = (Case(given.assets, given.rate, given.blocks, given.speed, given.workers, given.postgres),)
+    measured = [measure(one) for one in cases]
+    columns = ("assets", "without the client, us", "service, us", "over the kernel", "p50", "p99", "load")
+    note = "Processor time of the service per sample; latency from the last sample of a block to its results stored."
+    rows = tuple(row for _, row in measured)
+    show([measured[0][0], Table("The service end to end", note, columns, rows)], given.json, {})

@@ -12,9 +12,12 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
+from reliability.servers import Postgres
 
 import halls
 from servoscope.core.errors import ConfigError, StoreError
@@ -23,6 +26,7 @@ from servoscope.service.config import ServiceFile, shard_number
 from servoscope.service.health import serve_health
 from servoscope.service.service import Service
 from servoscope.service.store import Store
+from servoscope.service.store.tables import meta
 from servoscope.service.workers import WorkerPool, _Worker, merge_metrics
 
 WORKERS = 'listen = "127.0.0.1:0"\nworkers = 2'
@@ -194,3 +198,57 @@ def test_workers_end_with_their_service(tmp_path: Path) -> None:
     process.terminate()
     assert process.wait(60.0) == 0
     assert not processes(config)
+
+
+def test_a_worker_that_has_not_begun_is_spared_signals_and_begins_anew_once_more(tmp_path: Path) -> None:
+    config = shared_hall(tmp_path, "hall", 0.0)
+    worker, sent = _Worker(ServiceFile.load(config), config, 1, ("press",), ()), list[int]()
+    worker.supervisor.send_signal = sent.append  # type: ignore[method-assign]
+    assert worker._command()[-2:] == ["--anew", "press"]
+    worker.reload()
+    worker._take_address("")  # it was killed before it began
+    assert worker._command()[-2:] == ["--anew", "press"] and not sent
+    worker._take_address("127.0.0.1:1")
+    assert sent == [signal.SIGHUP]
+    assert "--anew" not in worker._command()  # its new state is stored
+    worker._take_address("-")  # one that listens nowhere says so
+    worker.reload()
+    assert sent == 2 * [signal.SIGHUP]
+
+
+@pytest.mark.slow
+def test_a_service_file_that_is_read_again_while_workers_start_ends_none_of_them(tmp_path: Path) -> None:
+    halls.files(tmp_path)
+    config, told = shared_hall(tmp_path, "hall", 1.0), tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(told))
+        systemd.settimeout(120.0)
+        words = [sys.executable, "-m", "servoscope", "run", str(config), "--anew", "press"]
+        process = subprocess.Popen(words, env={**os.environ, "NOTIFY_SOCKET": str(told)})
+        try:
+            until(lambda: len(processes(config)) == 2)
+            before = processes(config)
+            os.kill(process.pid, signal.SIGHUP)
+            heard = ""
+            while "READY=1" not in heard or "RELOADING=1" not in heard:
+                heard += systemd.recv(4096).decode()
+            until(lambda: len(halls.asked(config, "SELECT * FROM audit WHERE what = 'reloaded'")) == 2)
+            assert processes(config) == before
+        finally:
+            process.terminate()
+            assert process.wait(60.0) == 0
+
+
+@pytest.mark.slow
+def test_workers_of_a_server_count_what_one_process_counts(tmp_path: Path, postgres: Postgres) -> None:
+    halls.files(tmp_path)
+    alone, config = halls.hall(tmp_path, "alone"), shared_hall(tmp_path, "shared", 0.0)
+    config.write_text(config.read_text(encoding="utf-8").replace("shared.sqlite", postgres.url), encoding="utf-8")
+    halls.service_of(alone).run()
+    WorkerPool(ServiceFile.load(config), config).run()
+    with closing(Store.open(postgres.url)) as found, closing(Store.open("alone.sqlite", tmp_path)) as expected:
+        for name in ("press", "lift"):
+            one, other = (each.checkpoints([name])[name] for each in (found, expected))
+            assert one["state"] == other["state"] and one["status"] == other["status"], name
+        owners = {row["key"] for row in found.fetch(sa.select(meta))}
+    assert {"commit of hall.0", "commit of hall.1"} <= owners  # each wrote its own

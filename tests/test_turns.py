@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -129,3 +130,17 @@ def test_states_that_waited_are_computed_again_after_a_kill(tmp_path: Path, monk
         for name in ("whole", "cut")
     )
     assert cut == whole
+
+
+def test_what_is_measured_now_is_gathered_into_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    halls.files(tmp_path)
+    service = halls.service_of(hall(tmp_path, "hall"))
+    source = service.sources["line"]
+    assert source.next_block_s == 0.0
+    service.last_turn, service._next_commit = time.monotonic() + 100.0, np.inf  # it has only just begun
+    assert service._pause_s == 0.0  # a recording is replayed as fast as it can be
+    monkeypatch.setattr(source, "clock_rate", 1.0)
+    assert service._pause_s > 90.0
+    service._is_behind, service.last_turn = True, time.monotonic()  # there is a turn's worth of blocks already
+    assert service._pause_s == 0.0
+    service.store.close()

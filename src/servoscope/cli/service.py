@@ -116,14 +116,15 @@ def run(
         signal.signal(number, lambda *_: service.stop())
     if worker is not None:
         call_at_end_of_stdin(service.stop)
-        typer.echo(f"127.0.0.1:{server.server_address[1]}" if server is not None else "")
     if worker is not None or not sys.stderr.isatty():  # a terminal that is closed ends what runs in it
         signal.signal(signal.SIGHUP, lambda *_: service.reload(config))
     pages = supervise_pages(config) if settings.web is not None else None
     try:
         if pages is not None:
             pages.start()
-        service.run()
+        # its parent then knows where it answers, and that a signal does not end it
+        address = "-" if server is None else f"127.0.0.1:{server.server_address[1]}"
+        service.run(lambda: typer.echo(address) if worker is not None else None)
     finally:
         if pages is not None:
             pages.stop()

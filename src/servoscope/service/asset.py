@@ -316,7 +316,7 @@ class Asset:
         """Keep a block and the state after it."""
         state, position, packed = self._current, self._current.position, block.pack()
         # stored under a number of our own, because the sender's may begin anew
-        self._window.append(evolve(block, sequence=position.blocks))
+        self._window.append(block if block.sequence == position.blocks else evolve(block, sequence=position.blocks))
         self._result.rows.append(TableRow("recent", {"sequence": position.blocks, "samples": packed}))
         if continuity.is_broken:
             self._result.rows.append(continuity.audit_row(position, block))

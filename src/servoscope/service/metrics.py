@@ -12,8 +12,10 @@ import numpy as np
 
 from servoscope.core.errors import ConfigError
 from servoscope.service.asset import Asset
+from servoscope.service.checkpoint import evolve
 from servoscope.service.health import status_gauges
 from servoscope.service.layer_times import LayerTimes
+from servoscope.service.residual_history import LatestEvaluation
 from servoscope.service.sources.base import BlockSource, Rejection
 from servoscope.service.writer import StoreWriter
 
@@ -93,7 +95,9 @@ class ServiceMetrics:
         service, followed = self._service, {}
         for name, asset in self._service.assets.items():
             if asset.state is not None:
-                followed[name] = asset.state.position, asset.status(asset.state)
+                # the newest evaluation takes longer than all else to write down, and is no metric
+                state = evolve(asset.state, evaluation=LatestEvaluation())
+                followed[name] = state.position, asset.status(state)
         for key, words in STREAM_COUNTERS.items():
             family = CounterMetricFamily(f"servoscope_{key}", words, labels=["asset"])
             for name, (position, _) in followed.items():

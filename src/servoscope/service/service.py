@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -35,6 +35,7 @@ from servoscope.service.writer import StoreWriter
 
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
 MAX_PAUSE_S = 0.05
+LEAST_TURN_S = 0.25  # blocks that came within a turn are followed together, which costs a fraction of one by one
 HOUSEKEEPING_EVERY_S = 1.0
 PROGNOSIS_RETRY_S = 60.0  # after one that failed
 
@@ -58,7 +59,7 @@ class Service:
         self._receptions = {name: ReceptionLog(heard_before=asset.heard) for name, asset in self.assets.items()}
         self._housekeeping = Housekeeping(self)
         self._next_commit = self._next_housekeeping = 0.0
-        self._stopping = False
+        self._stopping = self._is_behind = False  # _is_behind: whether the last turn left blocks for the next
         self._reload_from: Path | None = None
         self.layers = components.groups.layers
         self.last_turn = time.monotonic()  # a service that hangs is not alive
@@ -88,8 +89,8 @@ class Service:
             return f"the store is unavailable, {self.writer.waiting} blocks wait"
         return ""
 
-    def run(self) -> None:
-        """Run.
+    def run(self, announce: Callable[[], None] = lambda: None) -> None:
+        """Run; `announce` is called when assets that begin anew have their new states in the store.
 
         Raises StoreUnavailableError if at the end the store does not take what is left; the sources return it again.
         """
@@ -98,8 +99,10 @@ class Service:
         self.writer.add(self.config.name, [audit_row("started", document)])
         self._add_restarts(self._components)
         self.dispatcher.start()
-        notify_systemd("READY=1", self._systemd_status)
         try:
+            self._commit()
+            announce()
+            notify_systemd("READY=1", self._systemd_status)
             while not self._stopping and not self._ended:
                 if self._reload_from is not None:
                     path, self._reload_from = self._reload_from, None
@@ -167,9 +170,12 @@ class Service:
         now = self.last_turn
         if self.writer.free:
             self._listening_s += min(now - before, 2.0 * MAX_PAUSE_S)
+        self._is_behind = False
         for source in self.sources.values():
             self.layers.enter("assemble")
-            self._process_blocks(source, source.poll(min(MAX_BLOCKS_PER_POLL, self.writer.free)))
+            blocks = source.poll(min(MAX_BLOCKS_PER_POLL, self.writer.free))
+            self._is_behind |= len(blocks) == MAX_BLOCKS_PER_POLL
+            self._process_blocks(source, blocks)
         self._run_diagnoses(ended=self._exhausted)
         self.layers.enter("other")
         if now >= self._next_housekeeping:
@@ -352,9 +358,13 @@ class Service:
     @property
     def _pause_s(self) -> float:
         """How long to sleep before the next turn [s]."""
-        nexts = (source.next_block_s for source in self.sources.values())  # none: a worker that lost its last asset
-        due = min(nexts, default=math.inf) if self.writer.free else math.inf
-        return min(due, MAX_PAUSE_S, max(0.0, self._next_commit - time.monotonic()))
+        now = time.monotonic()
+        # what is measured now is gathered for a while, unless each block is to be stored soon, or a turn was full
+        gather_s = min(LEAST_TURN_S, 0.5 * self.config.service.commit_every_s) if not self._is_behind else 0.0
+        rest_s = max(0.0, self.last_turn + gather_s - now)
+        nexts = (max(one.next_block_s, rest_s * (one.clock_rate == 1.0)) for one in self.sources.values())
+        due = min(nexts, default=math.inf) if self.writer.free else math.inf  # none: a worker that lost its last asset
+        return min(due, max(MAX_PAUSE_S, rest_s), max(0.0, self._next_commit - now))
 
     def _commit_all(self) -> None:
         """Commit what is in hand; raises StoreUnavailableError if the store does not take it in time."""

@@ -66,6 +66,7 @@ class _Worker:
         self, config: ServiceFile, path: Path, number: int, anew: Iterable[str], files: Collection[int]
     ) -> None:
         self.number, self._path, self._anew, self._address = number, path, list(anew), ""
+        self._reload_due = self.has_begun = False  # has_begun: whether it follows its assets
         self.supervisor = ProcessSupervisor(
             f"worker {number}",
             self._command,
@@ -76,17 +77,23 @@ class _Worker:
         )
 
     def _command(self) -> list[str]:
-        anew, self._anew = self._anew, []  # once: started again, it goes on
-        return [
-            "run",
-            str(self._path),
-            "--worker",
-            str(self.number),
-            *(part for one in anew for part in ("--anew", one)),
-        ]
+        self._address, self.has_begun = "", False
+        anew = [part for one in self._anew for part in ("--anew", one)]
+        return ["run", str(self._path), "--worker", str(self.number), *anew]
 
     def _take_address(self, line: str) -> None:
-        self._address = line
+        self._address, self.has_begun = line.removeprefix("-"), bool(line)
+        if line:
+            self._anew = []  # their new states are stored: started again, it goes on
+            if self._reload_due:
+                self.reload()
+
+    def reload(self) -> None:
+        """Let it read the service file again; while it starts a signal would end it, and waits."""
+        self._reload_due = True
+        if self.has_begun:
+            self._reload_due = False
+            self.supervisor.send_signal(signal.SIGHUP)
 
     def ask(self, path: str) -> bytes:
         """Return its answer; raises OSError where it has none."""
@@ -174,8 +181,8 @@ class WorkerPool:
         check_restarted(self.restarted, [*self.config.assets, *names])
         check_service_file(self.config)
 
-    def run(self) -> None:
-        """Run until it is stopped, or all workers have nothing left to do."""
+    def run(self, announce: Callable[[], None] = lambda: None) -> None:
+        """Run until it is stopped, or all workers have nothing left to do; `announce` is called when all have begun."""
         settings = self.config.store
         store = Store.open(settings.url, self.config.folder, write=True, network=settings.rules)
         try:
@@ -183,11 +190,14 @@ class WorkerPool:
             store.acquire_lock(())
             files = () if store.lock_file is None else (store.lock_file,)
             self._start(files)
-            next_look = time.monotonic() + STALL_S
-            notify_systemd("READY=1", f"STATUS={len(self.config.assets)} assets, {len(self._workers)} workers")
+            next_look, is_announced = time.monotonic() + STALL_S, False
             while not self._stopping.wait(LOOK_EVERY_S) and not all(one.supervisor.done for one in self._workers):
                 self.last_turn = time.monotonic()
                 notify_systemd("WATCHDOG=1")
+                if not is_announced and all(one.has_begun or one.supervisor.done for one in self._workers):
+                    is_announced = True
+                    announce()
+                    notify_systemd("READY=1", self._systemd_status)
                 if self.last_turn >= next_look:
                     next_look = self.last_turn + STALL_S / 3.0
                     self._end_hung()
@@ -201,6 +211,10 @@ class WorkerPool:
                 one.supervisor.stop()
         finally:
             store.close()
+
+    @property
+    def _systemd_status(self) -> str:
+        return f"STATUS={len(self.config.assets)} assets, {len(self._workers)} workers"
 
     def _start(self, files: Sequence[int]) -> None:
         """Start a worker for each shard that has assets and none yet."""
@@ -236,6 +250,6 @@ class WorkerPool:
             return
         self.config = config
         for one in self._workers:
-            one.supervisor.send_signal(signal.SIGHUP)
+            one.reload()
         self._start(files)
-        notify_systemd("READY=1", f"STATUS={len(config.assets)} assets, {len(self._workers)} workers")
+        notify_systemd("READY=1", self._systemd_status)

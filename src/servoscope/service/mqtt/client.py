@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import socket
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +20,8 @@ from servoscope.service.network import TlsSettings
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
+
+    from servoscope.service.mqtt.paho_clients import BulkClient, ReceivedMessage
 
 
 PLAIN_PORT, TLS_PORT = 1883, 8883
@@ -43,6 +45,11 @@ class BrokerSettings(TlsSettings):
     def address(self) -> tuple[str, int]:
         """Host and port."""
         return self.host, self.port or (TLS_PORT if self.tls else PLAIN_PORT)
+
+    def checked_address(self) -> tuple[str, int]:
+        """Return the address to connect to; raises OSError if there is none that may be reached."""
+        host, port = self.address
+        return self.rules.resolve(host, port), port
 
 
 class SessionSettings(BrokerSettings):
@@ -104,26 +111,35 @@ class BrokerConnection:
         return self._reason or render(message("service.trouble.connecting"))
 
 
-def create_mqtt_client(settings: BrokerSettings, folder: Path, client_id: str, *, manual_ack: bool = False) -> Client:
+def create_mqtt_client(settings: BrokerSettings, folder: Path, client_id: str) -> Client:
     """Return a client of MQTT 5, not yet connected; paths are relative to `folder`.
 
-    An empty `client_id` lets the broker choose one. With `manual_ack` messages are acknowledged by ``ack``, not when
-    they come. Raises ConfigError if a file cannot be used, or paho-mqtt is missing.
+    An empty `client_id` lets the broker choose one. Raises ConfigError if a file cannot be used, or paho-mqtt is
+    missing.
     """
+    client: Client = _paho_clients().CheckedClient(settings.checked_address, client_id)
+    _set_up(client, settings, folder)
+    return client
+
+
+def create_bulk_client(
+    settings: BrokerSettings, folder: Path, client_id: str, on_received: Callable[[ReceivedMessage], None]
+) -> BulkClient:
+    """Return a client as `create_mqtt_client` does, for many messages, which are acknowledged when we say so."""
+    client: BulkClient = _paho_clients().BulkClient(settings.checked_address, client_id, on_received)
+    _set_up(client, settings, folder)
+    return client
+
+
+def _paho_clients() -> Any:
     try:
-        from paho.mqtt.client import Client, MQTTv5
-        from paho.mqtt.enums import CallbackAPIVersion
+        from servoscope.service.mqtt import paho_clients
     except ModuleNotFoundError:
         raise ConfigError("paho-mqtt is missing, pip install 'servoscope[mqtt]'") from None
+    return paho_clients
 
-    class CheckedMqttClient(Client):
-        """Connects to an address that was checked, and not to a name that may mean another one by then."""
 
-        def _create_socket_connection(self) -> socket.socket:
-            host, port = settings.address
-            return socket.create_connection((settings.rules.resolve(host, port), port), self.connect_timeout)
-
-    client = CheckedMqttClient(CallbackAPIVersion.VERSION2, client_id, protocol=MQTTv5, manual_ack=manual_ack)
+def _set_up(client: Client, settings: BrokerSettings, folder: Path) -> None:
     client.reconnect_delay_set(1, MAX_RECONNECT_DELAY_S)
     client.max_inflight_messages_set(1000)  # the broker's own limit, which it states on connecting, may be lower
     if settings.user is not None:
@@ -132,4 +148,3 @@ def create_mqtt_client(settings: BrokerSettings, folder: Path, client_id: str, *
         client.tls_set_context(settings.create_tls_context(folder, settings.host))
     elif settings.has_certificates:
         raise ConfigError(f"{settings.host}: certificates are given, but not tls = true")
-    return client

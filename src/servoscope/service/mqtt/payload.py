@@ -24,7 +24,7 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +38,7 @@ HEADER = struct.Struct("<4sBBHII")
 BODY_HEADER = struct.Struct("<QQQdd")
 FLAG_RETAINED, FLAG_TIMES, FLAG_BINARY32 = 1, 2, 4
 MAX_COUNT = 2**63 - 1  # what a database can count
+COUNTS = ("stream", "sequence", "oldest")
 MAX_TIME_S = 253402300800.0  # s: the year 10000, from which on calendars end
 JSON_KEYS = {"version", "stream", "sequence", "oldest", "t", "t0", "dt", "r", "u", "y", "covariates"}
 
@@ -130,6 +131,11 @@ def _json_decoder() -> Any:
     return msgspec.json.Decoder(msgspec.defstruct("JsonBlock", fields, forbid_unknown_fields=True))
 
 
+@lru_cache(maxsize=16)
+def _packer(numbers: int) -> struct.Struct:
+    return struct.Struct(f"={numbers}d")
+
+
 def _decode_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> DecodedBlock:
     import msgspec
 
@@ -143,7 +149,11 @@ def _decode_json(asset: str, message: bytes, received_at: float, covariates: Seq
         return _decode_loose_json(asset, message, received_at, ())  # which takes more, or says what is wrong
     if found.version != VERSION or found.t is None or len(lengths) > 1:
         return _decode_loose_json(asset, message, received_at, ())
-    signals = np.array(columns, dtype=np.float64)  # None becomes NaN
+    signals = np.empty((4, len(found.t)))
+    try:  # in half of the time that np.array takes
+        _packer(signals.size).pack_into(signals.data, 0, *found.t, *found.r, *found.u, *found.y)
+    except (struct.error, OverflowError):
+        signals = np.array(columns, dtype=np.float64)  # None becomes NaN
     return _build_block(asset, found.stream, found.sequence, found.oldest, signals, received_at)
 
 
@@ -236,9 +246,10 @@ def _build_block(
     t = signals[0]
     if not t.size:
         raise MessageError("empty", "no samples")
-    for name, value in (("stream", stream), ("sequence", sequence), ("oldest", oldest or 0)):
-        if not 0 <= value <= MAX_COUNT:
-            raise MessageError("out of range", f"{name}: must lie between 0 and 2^63 - 1")
+    counts = stream, sequence, oldest or 0
+    if min(counts) < 0 or max(counts) > MAX_COUNT:
+        name = next(name for name, n in zip(COUNTS, counts, strict=True) if not 0 <= n <= MAX_COUNT)
+        raise MessageError("out of range", f"{name}: must lie between 0 and 2^63 - 1")
     if not (t.min() >= 0.0 and t.max() < MAX_TIME_S):  # NaN is neither
         raise MessageError("times", "a time stamp is missing, or outside of the years 1970 to 9999")
     block = Block.from_signals(asset, sequence, signals, received_at, stream, oldest is not None)

@@ -20,13 +20,13 @@ from servoscope.service.mapping.collector import MessageCollector, MessageSource
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import encode_rebirth
 from servoscope.service.mqtt import topics
-from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_mqtt_client
+from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_bulk_client
 from servoscope.service.mqtt.payload import DecodedBlock, decode_block
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
 
 if TYPE_CHECKING:
-    from paho.mqtt.client import MQTTMessage
+    from servoscope.service.mqtt.paho_clients import ReceivedMessage
 
 
 POLL_S = 0.02
@@ -86,11 +86,10 @@ class MqttSource(BlockSource):
         super().__init__()
         self._covariates = covariates or {}
         self.settings, self._assets = settings, assets
-        self._client = create_mqtt_client(settings, folder, settings.client or client, manual_ack=True)
+        self._client = create_bulk_client(settings, folder, settings.client or client, self._on_message)
         self._broker = BrokerConnection(settings, settings.client or client)
         self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
         self._client.on_connect_fail = lambda *_: self._broker.handle_failure()
-        self._client.on_message = self._on_message
         self._lock = threading.Lock()  # held while a message is acknowledged: never one of another connection
         self._connection = 0
         self._waiting: dict[tuple[Any, ...], tuple[Block, _AckHandle]] = {}
@@ -148,11 +147,11 @@ class MqttSource(BlockSource):
         """What is wrong with the connection, in words; empty: nothing."""
         return self._broker.trouble
 
-    def _on_message(self, _client: Any, _data: Any, message: MQTTMessage) -> None:
+    def _on_message(self, message: ReceivedMessage) -> None:
         """Queue a message, in the client's thread."""
         self._receive(message, _AckHandle(message.mid, message.qos, self._connection, None))
 
-    def _receive(self, message: MQTTMessage, handle: _AckHandle) -> None:
+    def _receive(self, message: ReceivedMessage, handle: _AckHandle) -> None:
         try:
             asset = topics.parse_asset(message.topic)
             if asset not in self._assets:  # an earlier service file had it, and the broker has kept that
@@ -161,7 +160,7 @@ class MqttSource(BlockSource):
             if len(message.payload) > self.settings.largest:
                 raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
             start = time.thread_time()
-            decoded = decode_block(asset, bytes(message.payload), time.monotonic(), self._covariates.get(asset, ()))
+            decoded = decode_block(asset, message.payload, time.monotonic(), self._covariates.get(asset, ()))
             self._thread_s = time.thread_time()
             self._decode_s += self._thread_s - start
             self._check_order(decoded)
@@ -246,7 +245,7 @@ class PlantSource(MessageSource, MqttSource):
     def _topic_filters(self) -> list[str]:
         return self._collector.mapping.topic_filters(everyone=self.settings.is_visit)
 
-    def _receive(self, message: MQTTMessage, handle: _AckHandle) -> None:
+    def _receive(self, message: ReceivedMessage, handle: _AckHandle) -> None:
         mapping, acknowledge = self._collector.mapping, partial(self._ack, handle)
         try:
             if len(message.payload) > self.settings.largest:
@@ -258,7 +257,7 @@ class PlantSource(MessageSource, MqttSource):
             acknowledge()
             return
         start = time.thread_time()
-        self._collector.add(message.topic, bytes(message.payload), acknowledge, old=message.retain)
+        self._collector.add(message.topic, message.payload, acknowledge, old=message.retain)
         self._thread_s = time.thread_time()
         self._decode_s += self._thread_s - start
         if mapping.missing_births:

@@ -45,6 +45,8 @@ class Block:
 
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
+        if "signals" in vars(self) and self.t.size and math.isfinite(first := self.t.item(0)):
+            return first  # rows of one array: nearly all blocks
         shape = self.t.shape
         known = np.flatnonzero(np.isfinite(self.t)) if len(shape) == 1 else np.zeros(0, dtype=np.intp)
         same = shape == self.r.shape == self.u.shape == self.y.shape

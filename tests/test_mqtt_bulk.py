@@ -1,0 +1,86 @@
+"""Messages that are read in bulk: the same as one by one, wherever the network cuts them, and as many acknowledged."""
+
+from __future__ import annotations
+
+import random
+import socket
+import threading
+import time
+from pathlib import Path
+
+from servoscope.service.mqtt.client import BrokerSettings, create_bulk_client
+from servoscope.service.mqtt.paho_clients import ReceivedMessage
+
+CONNACK = bytes([0x20, 3, 0, 0, 0])
+
+
+def length(n: int) -> bytes:
+    """Return a length as MQTT writes it (MQTT 5.0, OASIS 2019, 1.5.5)."""
+    return bytes([n]) if n < 128 else bytes([n % 128 | 128]) + length(n // 128)
+
+
+def publish(one: ReceivedMessage, properties: bytes = b"") -> bytes:
+    """Return the packet of a message (3.3)."""
+    topic = one.topic.encode()
+    number = one.mid.to_bytes(2, "big") if one.qos else b""
+    body = len(topic).to_bytes(2, "big") + topic + number + length(len(properties)) + properties + one.payload
+    return bytes([0x30 | one.qos << 1 | one.retain]) + length(len(body)) + body
+
+
+def acknowledged(received: bytes) -> list[int]:
+    """Return which messages the client's packets acknowledge, in their order; they are all short."""
+    found = []
+    while received:
+        if received[0] == 0x40:
+            found.append(int.from_bytes(received[2:4], "big"))
+        received = received[2 + received[1] :]
+    return found
+
+
+def serve(server: socket.socket, pieces: list[bytes], received: bytearray) -> None:
+    """Be a broker that sends these pieces, and keeps what follows the client's first packet."""
+    connection = server.accept()[0]
+    with connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.recv(4096)
+        connection.sendall(CONNACK)
+        for piece in pieces:
+            connection.sendall(piece)
+            if len(piece) < 20:
+                time.sleep(0.001)  # the next one comes by itself
+        while data := connection.recv(4096):
+            received += data
+
+
+def test_messages_in_pieces_of_any_size_are_those_that_were_sent() -> None:
+    chance, sent, packets = random.Random(1), list[ReceivedMessage](), []
+    for mid in range(1, 400):
+        payload = chance.randbytes(chance.choice([0, 1, 100, 127, 128, 9000, 300_000 if mid % 100 == 0 else 50]))
+        one = ReceivedMessage(f"hall/é{mid % 7}", payload, chance.choice([1, 1, 1, 0]), mid, chance.random() < 0.2)
+        sent.append(one if one.qos else one._replace(mid=0))
+        # a content type, which is a property; or the answer to a ping between two messages
+        packets.append(publish(one, b"\x03\0\x04text" if mid % 11 == 0 else b""))
+        packets += [b"\xd0\0"] if mid % 13 == 0 else []
+    stream, pieces = b"".join(packets), list[bytes]()
+    while stream:
+        n = chance.choice([1, 3, 1000, 20_000, 500_000])
+        pieces.append(stream[:n])
+        stream = stream[n:]
+    came, received = list[ReceivedMessage](), bytearray()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = threading.Thread(target=serve, args=(server, pieces, received))
+        broker.start()
+        settings = BrokerSettings(host="127.0.0.1", port=server.getsockname()[1])
+        client = create_bulk_client(settings, Path(), "reader", came.append)
+        client.connect_async(*settings.address)
+        client.loop_start()
+        deadline = time.monotonic() + 60.0
+        while len(came) < len(sent) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        for one in came:
+            client.ack(one.mid, one.qos)
+        client.disconnect()  # not before they are acknowledged
+        client.loop_stop()
+        broker.join(60.0)
+    assert came == sent
+    assert acknowledged(bytes(received)) == [one.mid for one in sent if one.qos]
