@@ -4,8 +4,9 @@ python benchmarks/covariates.py [--count 100] [--live] [--json]
 
 Oil that warms thins by 4 % per kelvin, which leakage and friction of a linear actuator follow: a minute from 30 to 38
 degC on, by 5 to 30 K with a time constant of a minute. A motor axis carries a load that adds 10 % of its inertia per
-unit. Worn recordings leak 10 % more, or have half as much friction again, from their middle on. Beside it, what is
-learned from the same healthy recordings without the covariate: with a warm-up that the coefficients tell, with their
+unit; it creeps and sticks between its moves, and its loop file leaves these rests out, as `servoscope inspect` asks.
+Worn recordings leak 10 % more, or have half as much friction again, from their middle on. Beside it, what is learned
+from the same healthy recordings without the covariate: with a warm-up that the coefficients tell, with their
 scatter, and from one state; of the latter two the monitor's alarms are counted. And three simple detectors that learned
 from the same recordings. With --live the same recordings are followed as streams instead, by a monitor that sees no
 later sample.
@@ -32,6 +33,7 @@ RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
 RISES = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)  # K, of the healthy recordings
 LOADS = (1.0, 3.0, 5.0)
 WINDOW_S, CUTOFF_HZ = 10.0, 10.0  # of the simple detectors
+SHORT_RESTS = {"update_when": "moving", "rest_speed": 0.004}  # what `servoscope inspect` asks for on the axis
 NEAR = 0.03  # relative error of a size that counts as right
 Draw = Callable[[np.random.Generator, bool], ss.Recording]
 
@@ -89,7 +91,7 @@ def scenes() -> Iterator[Scene]:
 
     yield Scene("oil that warms", rig, warm, same, heat, 1.1)
     yield Scene("oil at one temperature", rig, warm, same, hold, 1.1)
-    axis = with_covariate(ss.Loop.from_dict(AXIS), "load")
+    axis = with_covariate(ss.Loop.from_dict({**AXIS, "monitor": SHORT_RESTS}), "load")
 
     def move(rng: np.random.Generator, worn: bool) -> ss.Recording:
         return carry(axis, int(rng.integers(1000, 2**31)), rng.uniform(1.0, 5.0), worn)

@@ -23,7 +23,7 @@ from servoscope.detection.feature_model import (
     spans_in_a_row,
 )
 from servoscope.detection.feature_monitor import hold, smallest_in_a_row
-from servoscope.detection.homogeneity import leave_one_out, scatter
+from servoscope.detection.homogeneity import leave_one_out, scatter, scatter_of_others
 from servoscope.diagnosis.follower import Follower, FollowerState
 from servoscope.estimation.window_features import FeatureLayout, Window, WindowFeatures
 from servoscope.learning.features import choose_layout, learn_features
@@ -231,8 +231,11 @@ class TestLimits:
         C = np.tile(1e-4 * np.eye(n), (m, 1, 1))
         mean = apart.mean(axis=0)
         paths = [(np.tile(x - mean, (5, 1)), np.tile(1e-4 * np.eye(n), (5, 1, 1))) for x in apart]
-        factor, ratios = leave_one_out(paths, apart, C, 1e-6 * np.eye(n), limit=20.0)
+        settled = [np.zeros((1, n, n))] * m
+        told = scatter_of_others(apart, C, settled)
+        factor, ratios = leave_one_out(paths, apart, told, 1e-6 * np.eye(n), limit=20.0)
         others = np.delete(np.arange(m), 4)
+        assert np.array_equal(told[4], scatter(apart[others], C[others]))
         d = apart[4] - apart[others].mean(axis=0)
 
         def slow(f: float) -> float:
@@ -241,7 +244,7 @@ class TestLimits:
 
         assert ratios[4] == pytest.approx(slow(1.0)) and ratios[4] > 1.0 and ratios[others].max() < 1.0
         assert slow(factor) <= 1.0 < slow(factor / 1.3)
-        assert leave_one_out(paths[:3], apart[:3], C[:3], np.eye(n), 20.0)[0] == 1.0  # three have no scatter
+        assert leave_one_out(paths[:3], apart[:3], told[:3], np.eye(n), 20.0)[0] == 1.0  # three have no scatter
 
 
 class TestLearning:

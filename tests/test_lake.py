@@ -20,6 +20,7 @@ import lakes
 from commands import one_line, run
 from servoscope import fleet
 from servoscope.core.errors import OutputError, RecordingError
+from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.fleet import Plan, day_monitor, read
 from servoscope.fleet.day_monitor import DayMonitor, DayState, RowHistory
@@ -221,6 +222,20 @@ def test_the_command_runs_a_fleet(done: tuple[Plan, fleet.Fleet], lake: Path) ->
     assert json.loads(run(*words, "--json").out)["assets"][0]["asset"] == lakes.ILL
     assert run("fleet", lake, "-o", plan.output).code == 2
     one_line(run(*words[:3], plan.output, "--baselines", plan.output), "belongs to a run with another baselines")
+
+
+def test_new_machines_start_from_like_ones_and_not_from_themselves(lake: Path, tmp_path: Path) -> None:
+    """Six machines are known, one of them by the name of an asset of the lake: it has five like ones, others six."""
+    known = tmp_path / "known"
+    known.mkdir()
+    for asset, name in enumerate(("P0", *(f"old-{i}" for i in range(5))), 10):
+        learn_baseline(lakes.loop(), [lakes.recorded(asset, 0, 15.0)]).save(known / f"{name}.json")
+    words = ("fleet", lake, "-o", tmp_path / "out", "--jobs", 1, "--population", known)
+    assert run(*words, "--loop", lakes.LOOP).code == 0
+    notes = {name: str(Baseline.load(tmp_path / f"out/baselines/{name}.json").notes) for name in ("P0", "P1")}
+    assert "5 like machines" in notes["P0"] and "6 like machines" in notes["P1"]
+    assert "--population goes with --loop" in run(*words, "--baselines", known).err
+    one_line(run(*words[:-2], "--loop", lakes.LOOP), "belongs to a run with another population")
 
 
 def test_following_knows_its_default_window_everywhere() -> None:

@@ -13,7 +13,7 @@ import pytest
 import servoscope as ss
 from commands import one_line, run
 from servoscope.core.errors import BaselineError, NotEnoughError
-from servoscope.detection.homogeneity import describe_outliers, find_outliers, scatter
+from servoscope.detection.homogeneity import cover_transients, describe_outliers, find_outliers, scatter
 from servoscope.signals import writers
 from servoscope.simulation import FaultEvent, reference, simulate
 
@@ -92,6 +92,28 @@ def test_two_recordings_of_one_plant_promise_no_less_than_one(plain: ss.Baseline
     two = ss.learn(LOOP, [record(1), record(33)])
     for few, many in zip(plain.promises, two.promises, strict=True):
         assert few.change is not None and many.change is not None and many.change < 1.1 * few.change
+
+
+def test_recordings_that_scatter_have_no_sequential_test_which_takes_the_plant_for_constant(plain: ss.Baseline) -> None:
+    """A further recording of that scatter raises no alarm, from the first evaluation on."""
+    learned = ss.learn(LOOP, [record(1), record(2, 1.004)])
+    assert plain.members and not learned.members
+    monitor = ss.Monitor(learned)
+    for leak in (0.997, 1.007):
+        further = record(34, leak)
+        assert not monitor.run(monitor.init(), further.r, further.u, further.y)[1].exceeded.any(), leak
+
+
+def test_scatter_covers_what_it_does_while_the_start_is_not_forgotten() -> None:
+    """By brute force: theta_hat of further machines, which start where the mean of the others is."""
+    rng, between = np.random.default_rng(2), np.diag([1.0, 0.01])
+    Psi = np.array([np.eye(2), [[0.5, 2.0], [3.0, 0.5]], np.zeros((2, 2))])  # what is left of the start, by evaluation
+    off = rng.standard_normal((20_000, 2)) * np.sqrt(np.diag(between))
+    spread = np.array([((np.eye(2) - left) @ off.T).var(axis=1) for left in Psi])
+    covered = cover_transients(between, [Psi[:2], Psi[2:]])
+    assert np.diag(covered) == pytest.approx(spread.max(axis=0), rel=0.05)
+    assert covered[1, 1] > 500.0 * between[1, 1]  # what is known badly moves by far more than it scatters
+    assert not cover_transients(np.zeros((2, 2)), [Psi]).any()
 
 
 def test_points_round_trip_through_one_file(points: ss.Baseline, plain: ss.Baseline, tmp_path: Path) -> None:

@@ -252,6 +252,14 @@ def test_a_baseline_is_learned_saved_used_and_deleted(client: httpx.Client, fold
     assert {row["id"] for row in client.get("/baselines").json()["baselines"]} == {"service:press", "mine"}
     refs = [one["ref"] for one in client.get("/loops").json()["loops"]]
     assert {"example": "reference-rig"} in refs and {"baseline": "mine"} in refs
+    for name in "abcd":  # with the first one five machines, as like as can be
+        client.post("/baselines", json={"name": name, "learning": job["result"]["learning"]})
+    asked = {"loop": loop, "recordings": [{"upload": healthy}], "population": ["mine", *"abcd"]}
+    like = finished(client, client.post("/learnings", json=asked))
+    assert "5 like machines" in str(like["result"]["summary"]["notes"]), like["problem"]
+    assert client.post("/learnings", json=asked | {"population": ["nobody"]}).status_code == 404
+    for name in "abcd":
+        assert client.delete(f"/baselines/{name}").status_code == 204
     assert client.delete("/baselines/service:press").status_code == 409
     assert client.delete("/baselines/mine").status_code == 204
     done = [one["what"] for one in client.get("/audit").json()["entries"]]

@@ -126,6 +126,15 @@ def test_a_real_axis_is_learned_and_then_healthy(open_page: Open, shared_data: P
     expect(page.get_by_role("heading", name="What was learned")).to_be_visible(timeout=LONG_MS)
     shot(page, "learn", full_page=True)
     fits(page, 1440, 800, 390)
+    for i in range(5):
+        page.get_by_label("Save as").fill(f"emps-{i}")
+        page.get_by_role("button", name="Save").click()
+        expect(page.get_by_text(f"Saved as emps-{i}:")).to_be_visible()
+    page.get_by_text("A new machine among like ones").click()
+    for i in range(5):
+        page.get_by_label(f"Use emps-{i}").check()
+    page.get_by_role("button", name="Learn").click()
+    expect(page.get_by_text("learned with 5 like machines as a prior")).to_be_visible(timeout=LONG_MS)
     page.get_by_label("Save as").fill("emps")
     page.get_by_role("button", name="Save").click()
     page.get_by_role("link", name="diagnose a recording with it").click()

@@ -34,6 +34,10 @@ def fleet(
         str, typer.Option(metavar="KEY", help="One baseline per asset, or per group of this key.")
     ] = "asset",
     healthy_days: Annotated[int, typer.Option(metavar="N", min=1, help="Days to learn from, the first ones.")] = 1,
+    population: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="BASELINE", help="Baseline of a like machine, folder or pattern of them; repeatable."),
+    ] = None,
     groups: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="Table of groups: asset, supply, site, ...")
     ] = None,
@@ -72,12 +76,15 @@ def fleet(
     """Learn and diagnose a whole fleet from its recordings: who is ill, what is common, what changed."""
     if (loop is None) == (baselines is None):
         raise typer.BadParameter("give --loop to learn baselines, or --baselines, and not both")
+    if population and loop is None:
+        raise typer.BadParameter("--population goes with --loop: baselines that exist are taken as they are")
     keys = tuple(part.strip() for part in partition.split(","))
     if len(keys) != 2 or not all(keys):
         raise typer.BadParameter(f"--partition {partition!r}: write two names, as in asset,day")
 
+    alike = tuple(arguments.expand_baselines(population or []))
     options = _FleetOptions(
-        lake, output, loop, baselines, baseline_by, healthy_days, groups, (keys[0], keys[1]), columns, window
+        lake, output, loop, baselines, baseline_by, healthy_days, groups, (keys[0], keys[1]), columns, window, alike
     )
     if stream:
         result = _run_stream(
@@ -117,6 +124,7 @@ class _FleetOptions(NamedTuple):
     partition: tuple[str, str]
     columns: str | None
     window: float
+    population: tuple[Path, ...]
 
 
 def _run_batch(options: _FleetOptions, engine: EngineName, jobs: int | None, master: str | None) -> Fleet:
@@ -139,6 +147,7 @@ def _run_batch(options: _FleetOptions, engine: EngineName, jobs: int | None, mas
         healthy=options.healthy,
         columns=arguments.parse_mapping(options.columns, settings.columns if settings is not None else None),
         window_s=options.window,
+        population=options.population,
     )
     if engine is EngineName.spark:
         from servoscope.fleet.spark import session, spark

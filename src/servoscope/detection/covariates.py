@@ -52,6 +52,12 @@ class CovariateModel(BaseModel):
         """The middle of the learned range, shape (k,)."""
         return np.asarray(0.5 * (np.array(self.low) + np.array(self.high)))
 
+    @cached_property
+    def _known(self) -> tuple[FloatArray, FloatArray]:
+        """The learned range and what is next to it, shapes (k,)."""
+        edge = EDGE * (np.array(self.high) - np.array(self.low))
+        return np.asarray(self.low - edge), np.asarray(self.high + edge)
+
     def basis(self, c: FloatArray) -> FloatArray:
         """Return the powers of covariates (..., k), shape (..., p)."""
         x = (c - self.origin) / (0.5 * (np.array(self.high) - np.array(self.low)))
@@ -71,8 +77,8 @@ class CovariateModel(BaseModel):
         return np.asarray(np.einsum("...p,piqj,...q->...ij", G, C, G) * size[..., :, None] * size[..., None, :])
 
     def clip(self, c: FloatArray) -> FloatArray:
-        """Return covariates (..., k) held within the learned range."""
-        return np.asarray(np.clip(c, self.low, self.high))
+        """Return covariates (..., k) held where something is known: within the learned range, or next to it."""
+        return np.asarray(np.clip(c, *self._known))
 
     def values(self, channels: Mapping[str, FloatArray]) -> FloatArray:
         """Return the covariates among the channels of a block, shape (N, k); NaN where one is missing."""
@@ -96,8 +102,8 @@ class CovariateModel(BaseModel):
 
     def is_inside(self, c: FloatArray) -> BoolArray:
         """Return whether all covariates (..., k) are within the learned range, or next to it."""
-        edge = EDGE * (np.array(self.high) - np.array(self.low))
-        return np.asarray(((c >= self.low - edge) & (c <= self.high + edge)).all(axis=-1))
+        low, high = self._known
+        return np.asarray(((c >= low) & (c <= high)).all(axis=-1))
 
     def describe_outside(self, c: FloatArray) -> Message | None:
         """Return that covariates (N, k) leave the learned range; None where they do not."""

@@ -101,10 +101,23 @@ def scatter(apart: FloatArray, covariances: FloatArray) -> FloatArray:
     A further recording scatters like Student's t around the mean of m, with the variance (m - 1)/(m - 3); fewer than
     four recordings get the factor of four. A variance of two or three values is mostly chance, opens directions that
     noise leaves narrow, and would let two recordings of one plant promise less than one of them. It counts only where
-    noise does not explain it: Cochran's (1954) Q, the weighted squares of the distances to the weighted mean, is
-    chi-square with (m - 1) n degrees of freedom then. Four and more always count: real machines scatter.
+    noise does not explain it (`scatter_probability`). Four and more always count: real machines scatter.
 
     The arguments are those of `find_outliers`.
+    """
+    m, n = apart.shape
+    if m < 2 or (m < ENOUGH and scatter_probability(apart, covariances) > SCATTER_BY_CHANCE):
+        return np.zeros((n, n))
+    own = np.mean([np.diag(c) for c in covariances], axis=0)
+    beyond = np.maximum(apart.var(axis=0, ddof=1) - own, 0.0)
+    return np.diag(beyond * prediction_factor(m))
+
+
+def scatter_probability(apart: FloatArray, covariances: FloatArray) -> float:
+    """Return the probability with which noise alone makes recordings differ by as much as these do; 1 of one.
+
+    Cochran's (1954) Q, the weighted squares of the distances to the weighted mean, is chi-square with (m - 1) n degrees
+    of freedom then. The arguments are those of `find_outliers`.
     """
     from scipy import special
 
@@ -112,11 +125,7 @@ def scatter(apart: FloatArray, covariances: FloatArray) -> FloatArray:
     x, C, W = _standardise(apart, covariances)
     mean = np.linalg.solve(W.sum(axis=0), np.einsum("jab,jb->a", W, x))
     Q = float(t2_statistic(x, np.broadcast_to(mean, x.shape), C).sum())
-    if m < 2 or (m < ENOUGH and special.chdtrc((m - 1) * n, Q) > SCATTER_BY_CHANCE):
-        return np.zeros((n, n))
-    own = np.mean([np.diag(c) for c in covariances], axis=0)
-    beyond = np.maximum(apart.var(axis=0, ddof=1) - own, 0.0)
-    return np.diag(beyond * prediction_factor(m))
+    return float(special.chdtrc((m - 1) * n, Q)) if m > 1 else 1.0
 
 
 def between_covariance(apart: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -136,9 +145,17 @@ def cover_transients(between: FloatArray, shares: Sequence[FloatArray]) -> Float
     With Psi of the start left, an actuator that is off by d moves the estimate by (I - Psi) d, and what is known badly
     then moves by far more than d. `shares`: Psi of each recording, shape (K, n, n).
     """
-    left = np.eye(len(between)) - np.concatenate(shares)
-    most = np.einsum("kij,jl,kil->ki", left, between, left).max(axis=0, initial=0.0)
-    return between + np.diag(np.maximum(most - np.diag(between), 0.0))
+    most = np.diag(between).copy()
+    for Psi in shares if between.any() else ():
+        taken = np.eye(len(between)) - Psi
+        most = np.maximum(most, np.einsum("kij,jl,kil->ki", taken, between, taken).max(axis=0, initial=0.0))
+    return between + np.diag(most - np.diag(between))
+
+
+def scatter_of_others(apart: FloatArray, covariances: FloatArray, shares: Sequence[FloatArray]) -> list[FloatArray]:
+    """Return for each recording the scatter (n, n) that the others tell, as `scatter` and `cover_transients` do."""
+    others = [[j for j in range(len(apart)) if j != i] for i in range(len(apart))]
+    return [cover_transients(scatter(apart[j], covariances[j]), [shares[k] for k in j]) for j in others]
 
 
 def prediction_factor(m: int) -> float:
@@ -149,10 +166,9 @@ def prediction_factor(m: int) -> float:
 def leave_one_out(
     paths: Sequence[tuple[FloatArray, FloatArray]],
     apart: FloatArray,
-    covariances: FloatArray,
+    spreads: Sequence[FloatArray],
     common: FloatArray,
     limit: float,
-    between: FloatArray | None = None,
 ) -> tuple[float, FloatArray]:
     """Judge each of m >= 4 healthy recordings by what the others teach; return the scatter's factor, and the ratios.
 
@@ -161,15 +177,13 @@ def leave_one_out(
     can so only raise the covariance that their own scatter has contradicted.
 
     `paths`: theta_hat less what is expected of a healthy loop, shape (K, n), and its covariance (K, n, n), of each
-    recording; `apart`, `covariances`: as in `find_outliers`; `common`: what theta is known to without scatter, (n, n);
-    `between`: covariance of the scatter (n, n) where others than these recordings tell it.
+    recording; `apart`: as in `find_outliers`; `spreads`: covariance of the scatter (n, n) that the others of each tell;
+    `common`: what theta is known to without scatter, (n, n).
     """
     m = len(apart)
     if m < ENOUGH:
         return 1.0, np.zeros(0)
-    others = [np.delete(np.arange(m), i) for i in range(m)]
-    shifts = [apart[j].mean(axis=0) - apart.mean(axis=0) for j in others]
-    spreads = [scatter(apart[j], covariances[j]) if between is None else between for j in others]
+    shifts = [np.delete(apart, i, axis=0).mean(axis=0) - apart.mean(axis=0) for i in range(m)]
     ratios = np.zeros(m)
     factors = np.ones(m)
     for i, (d, S) in enumerate(paths):

@@ -51,6 +51,8 @@ class Plan:
         Seconds of each healthy day that are learned from, at most.
     prior
         What is assumed of faults and common causes in advance.
+    population
+        Baselines of like machines: a prior for those that are learned. A machine's own, by its name, is left out.
     """
 
     lake: Lake
@@ -63,6 +65,7 @@ class Plan:
     window_s: float = WINDOW
     learn_s: float = 600.0
     prior: Prior = PRIOR
+    population: tuple[Path, ...] = ()
 
     def baseline_name(self, item: AssetDay) -> str:
         """Return the asset or group whose baseline an item is compared with.
@@ -78,6 +81,7 @@ class Plan:
 
     def provenance(self) -> dict[str, Any]:
         """Return what all results depend on."""
+        like = {"population": [str(file) for file in self.population]} if self.population else {}
         return {
             "loop": self.loop.hash() if self.loop is not None else None,
             "baselines": str(self.baselines) if self.baselines is not None else None,
@@ -86,6 +90,7 @@ class Plan:
             "columns": self.columns.model_dump() if self.columns is not None else None,
             "window_s": self.window_s,
             "learn_s": self.learn_s if self.baselines is None else None,
+            **like,
         }
 
 
@@ -147,7 +152,8 @@ def _learn_baselines(
         some = list(islice(days, plan.healthy))
         healthy.setdefault(names[some[0].key], []).extend(some)
     missing = [name for name, file in _existing(files).items() if file is None]
-    tasks = [LearnTask(name, tuple(healthy[name]), loop, files[name], plan.learn_s) for name in missing]
+    alike = tuple(str(file) for file in plan.population)
+    tasks = [LearnTask(name, tuple(healthy[name]), loop, files[name], plan.learn_s, alike) for name in missing]
     errors: dict[str, str] = {}
     progress("learning", len(files) - len(tasks), len(files))
     for done, (_, result) in enumerate(engine(tasks), start=len(files) - len(tasks) + 1):

@@ -58,6 +58,7 @@ class LearnTask:
     loop: Loop  # settings, with the columns
     output: str  # the baseline's file
     max_s: float  # seconds of each item that are used
+    population: tuple[str, ...] = ()  # files of the baselines of like machines
 
     @property
     def key(self) -> str:
@@ -78,7 +79,9 @@ class LearnTask:
         try:
             if not recordings:
                 raise NotEnoughError("; ".join(f"{name}: {reason}" for name, reason in unused.items()))
-            learn(self.loop, recordings).save(self.output)
+            # what this machine was itself would count twice
+            others = [file for file in self.population if Path(file).name != Path(self.output).name]
+            learn(self.loop, recordings, population=others).save(self.output)
         except Exception as error:
             return {"name": self.name, "error": error_text(error), "unused": unused}
         return {"name": self.name, "error": None, "unused": unused}

@@ -141,7 +141,8 @@ def at_origin(
     referred = []
     for rec, g in zip(recordings, regressions, strict=True):
         path = CovariatePath.of(model, theta, rec.channels, 1.0)
-        shift = model.theta(theta, model.clip(path.values)) - theta
+        # the curve is not continued to confirm itself: what lies beyond its stretches counts as scatter
+        shift = model.theta(theta, np.clip(path.values, model.low, model.high)) - theta
         referred.append(replace(g, eta=g.eta - np.einsum("ki,ki->k", g.phi, shift)))
     return referred
 

@@ -215,12 +215,11 @@ def _assemble_baseline(
     covariates: CovariateModel | None = None,
     population: Population | None = None,
 ) -> Baseline:
-    calibration = CalibrationFactors()
+    calibration, m = CalibrationFactors(), len(recordings)
     theta_covariance, deviations_between = fit.covariance, fit.each
     error = np.diag((loop.monitor.model_error * fit.rms_eta / fit.tuning.scale) ** 2)
     theta, noise, model_theta, loudest = fit.tuning.theta, None, np.zeros(0), None
-    ratios: dict[str, float] = {}
-    ratios_std: dict[str, float] = {}
+    ratios, ratios_std = dict[str, float](), dict[str, float]()
     ratios_covariance = np.zeros((0, 0))
     hypotheses: tuple[CusumHypothesis, ...] = ()
     expectations: list[Expectation] = []
@@ -271,14 +270,15 @@ def _assemble_baseline(
                     healthy = describe_healthy_plant(expectations, regressions, fit, *shared)
             ratios, ratios_std, model_theta = healthy.ratios, healthy.std(), healthy.theta
             plant = loop.plant.scaled(ratios)
-            deviations_between = fit.each - np.array(
-                [e.batch_estimate(plant) for e in expectations]
-            )  # each reference has its own bias
+            # each reference has its own bias
+            deviations_between = fit.each - np.array([e.batch_estimate(plant) for e in expectations])
             ratios_covariance = healthy.covariance
             if healthy.misfit <= special.chdtri(pipeline.bank.n, UNLIKELY):
                 # the physics hold: what they say is known better than the coefficients one by one
                 theta, theta_covariance = model_theta, healthy.theta_covariance
-                sequential = population is None or population.sequential
+                by_chance = homogeneity.scatter_probability(deviations_between, fit.each_covariance)
+                # it takes the parameters for constant: where they scatter, healthy recordings would be alarms
+                sequential = by_chance > homogeneity.SCATTER_BY_CHANCE and (population is None or population.sequential)
                 if loudest and not loop.monitor.model_error and covariates is None and sequential:
                     progress("rehearsal")
                     calibration, hypotheses, warnings = design_sequential_test(
@@ -293,7 +293,6 @@ def _assemble_baseline(
         notes += warnings
         if axis is not None:  # scatter between recordings; a change within one is told from its own past
             error += np.diag(axis.scatter(pipeline.bank.names) ** 2)
-    m = len(recordings)
     between = homogeneity.scatter(deviations_between, fit.each_covariance)
     own_scatter = homogeneity.between_covariance(deviations_between, fit.each_covariance)
     if population is not None:
@@ -330,10 +329,11 @@ def _assemble_baseline(
     ]
     deviations = [e.theta - mean for e, mean in zip(estimates, expected, strict=True)]
     paths = [(d[e.updates > 0], e.S[e.updates > 0]) for d, e in zip(deviations, estimates, strict=True)]
-    told = None if population is None else homogeneity.cover_transients(between, [e.Psi for e in estimates])
-    between = between if told is None else told
-    common = theta_covariance + error
-    factor, left_out = homogeneity.leave_one_out(paths, deviations_between, fit.each_covariance, common, limit, told)
+    shares = [e.Psi for e in estimates]
+    between = homogeneity.cover_transients(between, shares)
+    others = homogeneity.scatter_of_others(deviations_between, fit.each_covariance, shares)
+    told = others if population is None else [between] * m
+    factor, left_out = homogeneity.leave_one_out(paths, deviations_between, told, theta_covariance + error, limit)
     covariance = theta_covariance + factor * between + error
     notes += noise_notes(pipeline, fit, estimates, can_simulate(loop))
     excess, suggestion = baseline_misfit(estimates, deviations, covariance, fit)

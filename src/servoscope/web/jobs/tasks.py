@@ -159,6 +159,7 @@ def learn_baseline(
     loop: requests.LoopRef,
     uploads: Sequence[str],
     earlier: str | None,
+    alike: Sequence[str],
     out: str,
 ) -> JsonObject:
     """Learn a baseline from healthy recordings into the folder `out`, and inspect each of them."""
@@ -181,6 +182,7 @@ def learn_baseline(
         progress,
         compare=Baseline.load(earlier) if earlier is not None else None,
         accept_change=request.accept_change,
+        population=alike,
     )
     baseline.save(Path(out) / "baseline.json")
     return {"summary": plain_values.replace_nan(plain_values.baseline_summary(baseline)), "recordings": rows}

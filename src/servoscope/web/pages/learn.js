@@ -8,13 +8,19 @@ import { mark, prose } from "./marks.js";
 import { dropzone, earlier, mapping, preview } from "./uploads.js";
 import { change, count, DASH, duration, general, moment, number, plain, withStd } from "./words.js";
 
+const FEWEST = 5; // like machines, of which something in common is known
 const KINDS = { usable: "healthy", "usable with care": "care", "not usable": "stop" };
 
 export async function show(main, { session, signal, values }) {
   const saved = h("div", {});
   const work = h("div", { class: "steps" });
   main.replaceChildren(h("div", { class: "head" }, h("h1", {}, "Learn a baseline")), work, section("Baselines", null, saved));
-  const refresh = async () => saved.replaceChildren(baselines((await get("/baselines", signal)).baselines));
+  const [like, machines] = [new Set(), h("div", {})];
+  const refresh = async () => {
+    const all = (await get("/baselines", signal)).baselines;
+    saved.replaceChildren(baselines(all));
+    machines.replaceChildren(all.length < FEWEST ? "" : likes(all, like));
+  };
   await refresh();
   if (!mayChange(session.role, "engineer")) {
     work.replaceChildren(h("p", { class: "note" }, "Learning a baseline is for engineers; these are known."));
@@ -69,7 +75,7 @@ export async function show(main, { session, signal, values }) {
   learn.addEventListener("click", () =>
     during(learn, said, async (step) => {
       const recordings = used().map((each) => ({ upload: each.upload.id, ...(each.point.value.trim() && { point: each.point.value.trim() }) }));
-      const found = await job("/learnings", { loop: loop.read(), recordings, columns: mapped.read() }, { signal, step });
+      const found = await job("/learnings", { loop: loop.read(), recordings, columns: mapped.read(), population: [...like] }, { signal, step });
       for (const one of found.recordings) judged(chosen.find((each) => each.upload.id === one.upload), one.inspection);
       result.replaceChildren(learned(found, refresh));
       result.scrollIntoView({ block: "start" });
@@ -77,7 +83,7 @@ export async function show(main, { session, signal, values }) {
   );
   work.append(
     section("Loop", ["What is known of it: sampling, plant, controller. A baseline has it inside. Without a loop file ", h("a", { href: "/begin" }, "begin with a log"), "."], loop.element),
-    section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, h("div", { class: "actions" }, learn, look, said)),
+    section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, machines, h("div", { class: "actions" }, learn, look, said)),
     result,
   );
   for (const id of values.getAll("upload")) await get(`/uploads/${part(id)}`, signal).then(add, () => {}); // those that are still there
@@ -129,6 +135,17 @@ function told(summary) {
       values.length > 0 && h("div", { class: "half" }, h("h3", {}, "Coefficients, in units of u per derivative of y [s]"), table("Learned coefficients", ["Name", "*Value", "*Standard deviation"], values)),
     ),
     (summary.notes ?? []).length > 0 && h("ul", { class: "why" }, summary.notes.map((words) => h("li", {}, prose(typeof words === "string" ? words : (words.message ?? ""))))),
+  );
+}
+
+function likes(all, chosen) {
+  const box = (one) => h("input", { type: "checkbox", checked: chosen.has(one.id), "aria-label": `Use ${one.name}`, onchange: (event) => chosen[event.target.checked ? "add" : "delete"](one.id) });
+  return h(
+    "details",
+    {},
+    h("summary", {}, "A new machine among like ones"),
+    h("p", { class: "note" }, "Choose the baselines of five or more like machines: what they have in common need not be learned again, and its own recordings make it sharper."),
+    table("Like machines", ["Use", "Name", "Loop"], all.map((one) => [box(one), one.name, one.loop])),
   );
 }
 

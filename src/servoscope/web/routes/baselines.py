@@ -180,16 +180,19 @@ async def start_learning(context: ContextDep, who: Engineer, request: LearningRe
     uploads = [one.upload for one in request.recordings]
     paths = await asyncio.to_thread(context.storage.upload_paths, uploads)
     loop = await asyncio.to_thread(resolve_loop, context, request.loop)
-    earlier = None
-    if request.compare is not None:
-        earlier = str((await asyncio.to_thread(find_baseline, context, request.compare)).path)
+
+    async def file(baseline: str) -> str:
+        return str((await asyncio.to_thread(find_baseline, context, baseline)).path)
+
+    earlier = await file(request.compare) if request.compare is not None else None
+    alike = [await file(baseline) for baseline in request.population]
     id_, out = await asyncio.to_thread(context.storage.create, "learnings")
 
     def finish(result: responses.JsonObject) -> responses.JsonObject:
         context.storage.publish(responses.LearningRow(id=id_, who=who.user, uploads=uploads))
         return {"learning": id_, **result}
 
-    arguments = request, loop, paths, earlier, str(out)
+    arguments = request, loop, paths, earlier, alike, str(out)
     discard = partial(context.storage.remove, "learnings", id_)
     return context.jobs.submit(Job("learning", who.user, "learn_baseline", arguments, out, finish, discard))
 

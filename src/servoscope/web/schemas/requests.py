@@ -216,6 +216,7 @@ class LearningRequest(ApiRequest):
     where: RowConditions = Field(default_factory=dict)
     compare: Id | None = None
     accept_change: bool = False
+    population: Annotated[list[Id], Field(max_length=200)] = Field(default_factory=list)  # baselines of like machines
 
 
 class BaselineRequest(ApiRequest):
