@@ -188,14 +188,8 @@ def _with_warnings(diagnosis: Diagnosis, more: Sequence[DiagnosisWarning]) -> Di
 
 def _first_alarm_time(exam: Examination) -> float:
     alarms = np.flatnonzero(exam.apparent_alarm)
-    changed = _changed_at(exam)
+    changed = exam.features_changed_s
     return min(float(exam.t(alarms[0])) if alarms.size else np.inf, np.inf if changed is None else changed)
-
-
-def _changed_at(exam: Examination) -> float | None:
-    """Return the end of the span with which the features left their limit [s]; None where they did not."""
-    span = exam.features.changed if exam.features is not None else None
-    return None if span is None else float(exam.recording.t[span.end - 1])
 
 
 def largest_statistic_ratio(exam: Examination) -> float:
@@ -236,7 +230,7 @@ def diagnose_examination(
     elif changed is not None:
         unknown = (Candidate(name=UNKNOWN, probability=1.0),)
         doubts = []
-        intervals = (FaultInterval(detected_at_s=_changed_at(exam), probability=1.0, candidates=unknown),)
+        intervals = (FaultInterval(detected_at_s=exam.features_changed_s, probability=1.0, candidates=unknown),)
     else:
         detectable = detectable_sizes(exam)
         doubts = power_warnings(exam, detectable)
@@ -354,8 +348,7 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
     at = exam.evaluations - 1 if exam.alarm[-1] else first + int(np.argmax(exam.statistic[first:]))
     progress("onset")
     if (change := exam.change) is not None:
-        ends = (change.onset,) * 3 if change.vibration is None else change.vibration.onset
-        low, likely, high = (float(exam.recording.t[k]) for k in ends)
+        low, likely, high = (float(exam.recording.t[k]) for k in change.onset_interval)
         return RecordingAlarm(change.detected, at, Onset(low, likely, high, change.onset))
     onset = estimate_onset(
         exam.pipeline,

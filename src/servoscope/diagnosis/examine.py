@@ -146,6 +146,12 @@ class Examination:
     def _of_coefficients(self) -> tuple[Statistic, ...]:
         return detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready)
 
+    @property
+    def features_changed_s(self) -> float | None:
+        """End of the span with which the features left their limit [s]; None where they did not."""
+        span = self.features.changed if self.features is not None else None
+        return None if span is None else float(self.recording.t[span.end - 1])
+
     @cached_property
     def apparent_alarm(self) -> npt.NDArray[np.bool_]:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""

@@ -34,6 +34,11 @@ class AxisChange:
     detected: int  # when what had been measured by then was enough to tell it
     vibration: AxisVibration | None = None  # where not a coefficient changed; its onsets are samples of the recording
 
+    @property
+    def onset_interval(self) -> tuple[int, int, int]:
+        """Lower end, most likely and upper end of the onset; of a coefficient all are one, until the refit."""
+        return (self.onset,) * 3 if self.vibration is None else self.vibration.onset
+
 
 def find_axis_change(baseline: Baseline, recording: Recording) -> AxisChange | None:
     """Return the first change of an axis within a recording, None where there is none.
