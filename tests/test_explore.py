@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import servoscope as ss
 from commands import run
 from servoscope.cli.explore import plant_table, replace_plant
 from servoscope.core.errors import NotEnoughError
+from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.axis_structures import explore_structures
 from servoscope.simulation import simulate
 
@@ -51,6 +53,16 @@ def test_one_recording_orders_nothing() -> None:
     loop, made = recordings(plant, 1)
     with pytest.raises(NotEnoughError, match="two or more"):
         explore_structures(loop, made)
+
+
+def test_a_recording_at_rest_is_named() -> None:
+    plant = {"terms": ["viscous"], "coefficients": {"inertia": 2.0, "viscous_friction": 3.0}}
+    loop, made = recordings(plant, 2)
+    still = simulate(loop, np.zeros(1500), noise_u_std=0.2, noise_y_std=1e-5, seed=9)[0]
+    with pytest.raises(NotEnoughError, match="standing: it moves in 0 samples only"):
+        explore_structures(loop, [*made, replace(still, name="standing")])
+    with pytest.raises(NotEnoughError, match="standing: it moves in 0 samples only"):
+        fit_axis(loop, [*made, replace(still, name="standing")])
 
 
 def test_only_the_section_of_the_plant_is_replaced() -> None:

@@ -13,7 +13,14 @@ import pytest
 import servoscope as ss
 from commands import one_line, run
 from servoscope.core.errors import BaselineError, NotEnoughError
-from servoscope.detection.homogeneity import cover_transients, describe_outliers, find_outliers, scatter
+from servoscope.detection.homogeneity import (
+    cover_transients,
+    describe_outliers,
+    find_outliers,
+    leave_one_out,
+    scatter,
+    scatter_of_others,
+)
 from servoscope.signals import writers
 from servoscope.simulation import FaultEvent, reference, simulate
 
@@ -92,6 +99,20 @@ def test_two_recordings_of_one_plant_promise_no_less_than_one(plain: ss.Baseline
     two = ss.learn(LOOP, [record(1), record(33)])
     for few, many in zip(plain.promises, two.promises, strict=True):
         assert few.change is not None and many.change is not None and many.change < 1.1 * few.change
+
+
+def test_one_that_differs_where_the_others_agree_hides_no_fault() -> None:
+    """Three recordings of one plant scatter by chance alone: no multiple of that reaches the fourth."""
+    n, S = 2, np.eye(2)
+    apart = np.array([[0.5, -0.4], [-0.6, 0.3], [0.2, 0.1], [9.0, 0.0]])
+    C = np.tile(S, (4, 1, 1))
+    paths = [((x - apart.mean(axis=0))[None], S[None]) for x in apart]
+    told = scatter_of_others(apart, C, [np.zeros((1, n, n))] * 4)
+    factor, ratios = leave_one_out(paths, apart, told, 0.25 * S, limit=20.0)
+    assert not told[3].any() and ratios[3] > 1.0 and factor == 1.0
+    # the scatter of all four lets such a recording pass
+    deviation = (apart - apart.mean(axis=0))[3]
+    assert deviation @ np.linalg.solve(1.25 * S + scatter(apart, C), deviation) < 20.0
 
 
 def test_recordings_that_scatter_have_no_sequential_test_which_takes_the_plant_for_constant(plain: ss.Baseline) -> None:

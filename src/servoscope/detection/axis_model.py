@@ -31,6 +31,8 @@ class AxisModel(BaseModel):
     # what twice the log-likelihood ratio of a change within a recording has to exceed, where healthy ones exceed what
     # chance explains; 0 where they do not
     change_limit: float = 0.0
+    # the same for the squared t statistic of a vibration that begins within a recording
+    vibration_limit: float = 0.0
 
     def scatter(self, names: Sequence[str]) -> FloatArray:
         """Return the standard deviations of coefficients between recordings, shape (len(names),)."""

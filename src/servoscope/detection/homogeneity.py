@@ -14,7 +14,7 @@ from servoscope.detection.chi2_test import t2_statistic
 BY_CHANCE = 1e-3  # probability with which recordings of one plant may be called different
 SCATTER_BY_CHANCE = 0.01  # probability of such scatter by noise alone, below which few recordings are believed
 WIDENING = 1.25  # factor by which the scatter's variance is raised at a time
-MOST_WIDENED = 1e3  # and at most in all
+MOST_WIDENED = 1e3  # and at most in all; what this does not help is left
 ENOUGH = 4  # recordings whose scatter is believed in any case
 
 
@@ -174,7 +174,8 @@ def leave_one_out(
 
     The factor, at least 1, is by how much the scatter between recordings has to be larger so that none of them would
     have been called faulty; the ratios, shape (m,), are their largest T^2 over its limit before that. More recordings
-    can so only raise the covariance that their own scatter has contradicted.
+    can so only raise the covariance that their own scatter has contradicted. Where the others do not scatter in the
+    direction in which one differs, no factor helps, and the scatter of all of them, that one included, stays as it is.
 
     `paths`: theta_hat less what is expected of a healthy loop, shape (K, n), and its covariance (K, n, n), of each
     recording; `apart`: as in `find_outliers`; `spreads`: covariance of the scatter (n, n) that the others of each tell;
@@ -198,4 +199,6 @@ def leave_one_out(
         ratios[i] = worst(1.0)
         while worst(factors[i]) > 1.0 and factors[i] < MOST_WIDENED:
             factors[i] *= WIDENING
+        if worst(factors[i]) > 1.0:  # the others agree where this one differs: widened, their scatter hides all faults
+            factors[i] = 1.0
     return float(factors.max()), ratios

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.detection.axis_model import AxisModel
 from servoscope.detection.feature_model import score_limit
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals, axis_stride
 from servoscope.estimation.tuning import sum_covariance
-from servoscope.isolation.ml.axis_scan import largest_change, scan_limit
+from servoscope.isolation.ml.axis_scan import NEAR, largest_changes, scan_limit
+from servoscope.isolation.ml.axis_vibration import BANDS
 from servoscope.isolation.ml.axis_window import LONG_RUN_S, axis_signals
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
@@ -28,8 +30,8 @@ ADDED_SHARE = 0.05  # of the force (rms), by which the constant one may differ b
 SEEN = 3.0  # standard deviations from which a coefficient is seen
 COMBINED = 30  # steps in which coefficients and their scatter agree
 FALSE_ALARMS = 1.0 / 200.0  # share of healthy recordings that change within themselves beyond a learned limit
-NEAR = 1.5  # times as far as the furthest, a further healthy recording may well come
 LEAST_GAIN = 1.0  # of a likelihood ratio whose logarithm counts
+FEWEST_PER_COLUMN = 10  # samples in motion
 STEPS = 250  # of the search for the noise
 
 
@@ -70,6 +72,17 @@ def rest_speed(signals: Sequence[AxisSignals]) -> float:
     """Return the speed below which an axis counts as resting."""
     speed = np.concatenate([one.speed for one in signals])
     return REST_SHARE * float(np.sqrt(np.mean(speed**2)))
+
+
+def check_motion(recordings: Sequence[Recording], signals: Sequence[AxisSignals], slow: float, columns: int) -> None:
+    """Raise NotEnoughError where a recording moves too little for some columns of a regression."""
+    fewest = FEWEST_PER_COLUMN * columns
+    for recording, one in zip(recordings, signals, strict=True):
+        if (usable := int(one.moving(slow, 0).sum())) < fewest:
+            raise NotEnoughError(
+                f"{recording.name}: it moves in {usable} samples only, of at least {fewest}: leave it out, or record a "
+                "livelier motion"
+            )
 
 
 def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise:
@@ -127,12 +140,14 @@ def fit_recording(problem: AxisRegression, noise: AxisNoise, slow: float) -> Axi
 def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | None, list[Message]]:
     """Learn a healthy axis; None, with a note, where u does not show its inertia.
 
-    A friction that the recordings do not show stays as they have it, and has no faults in the refit.
+    A friction that the recordings do not show stays as they have it, and has no faults in the refit. Raises
+    NotEnoughError with a recording that hardly moves.
     """
     plant, stride = loop.plant, axis_stride(loop.sample_rate)
     assert isinstance(plant, AxisPlant)
     signals = [axis_signals(loop, one, stride) for one in recordings]
     slow = rest_speed(signals)
+    check_motion(recordings, signals, slow, 1 + len(plant.columns))
     problems = [AxisRegression.of(plant, one) for one in signals]
     noise = fit_axis_noise(problems, slow)
     fits = [fit_recording(one, noise, slow) for one in problems]
@@ -171,15 +186,19 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
         drift_std=ADDED_SHARE * force,
         unseen=dict(zip(of_unseen, off[unseen].tolist(), strict=True)),
     )
-    own = [largest_change(loop, model, one) for one in recordings]
-    usual, most = scan_limit(len(model.visible_faults(plant.faults))), max(own)
-    if NEAR * most <= usual:
-        return model, notes
-    # friction does what the terms do not know, and chance alone is no longer what a change has to exceed
-    limit = max(score_limit([max(one, LEAST_GAIN) for one in own], FALSE_ALARMS), usual)
-    name = recordings[own.index(most)].name
-    notes.append(message("learning.axis_own_change", name=name, times=limit / usual))
-    return model.model_copy(update={"change_limit": limit}), notes
+    changes, shaken = zip(*(largest_changes(loop, model, one) for one in recordings), strict=True)
+    limits = {}
+    for key, key_message, own, usual in (
+        ("change_limit", "learning.axis_own_change", changes, scan_limit(len(model.visible_faults(plant.faults)))),
+        ("vibration_limit", "learning.axis_own_vibration", shaken, scan_limit(BANDS)),
+    ):
+        most = max(own)
+        # the machine does what the terms do not know, and chance alone is no longer what a change has to exceed
+        limit = score_limit([max(one, LEAST_GAIN) for one in own], FALSE_ALARMS) if NEAR * most > usual else 0.0
+        if limit > usual:
+            limits[key] = limit
+            notes.append(message(key_message, name=recordings[own.index(most)].name, times=limit / usual))
+    return model.model_copy(update=limits), notes
 
 
 def combine_fits(fits: Sequence[AxisFit], n: int) -> tuple[FloatArray, FloatArray]:

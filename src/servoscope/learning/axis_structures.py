@@ -13,7 +13,14 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError, NotEnoughError
 from servoscope.estimation.axis_filter import AxisSignals, axis_stride
 from servoscope.isolation.ml.axis_window import axis_signals
-from servoscope.learning.axis_fit import AxisRegression, combine_fits, fit_axis_noise, fit_recording, rest_speed
+from servoscope.learning.axis_fit import (
+    AxisRegression,
+    check_motion,
+    combine_fits,
+    fit_axis_noise,
+    fit_recording,
+    rest_speed,
+)
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.models.plants.axis import AxisPlant
@@ -51,7 +58,8 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
     coefficients is supported, and its coefficients are what `learn` would find. Structures with a negative inertia or
     friction are left out. A fit to one recording alone does not order structures.
 
-    Raises NotEnoughError with fewer than two recordings, LoopError where the plant is no axis.
+    Raises NotEnoughError with fewer than two recordings or with one that hardly moves, LoopError where the plant is no
+    axis.
     """
     if len(recordings) < 2:
         raise NotEnoughError("structures are compared between recordings: give two or more")
@@ -64,6 +72,7 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
     half = 0.5 * max(float(np.ptp(one.y)) for one in signals)
     plants = list(_candidates(loop.plant, speed, half))
     richest = max(plants, key=lambda plant: len(plant.columns))
+    check_motion(recordings, signals, slow, 1 + len(richest.columns))
     # what many terms take up of a short recording is no smaller noise
     usual = "viscous", "coulomb", *(("gravity",) if _may_swing(loop.plant, half) else ())
     ordinary = next(plant for plant in plants if plant.terms == usual)

@@ -10,7 +10,7 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.axis_model import AxisModel
 from servoscope.detection.baseline import Baseline
-from servoscope.isolation.ml.axis_vibration import BANDS, AxisVibration, find_vibration
+from servoscope.isolation.ml.axis_vibration import BANDS, LEAST, AxisVibration, find_vibration
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.onset import ChangeCosts
@@ -24,6 +24,7 @@ FALSE_ALARMS = 1e-4  # share of healthy recordings that are called changed
 TRIM = 0.05  # of a stretch at both ends, in which no onset is looked for
 ONSETS = 400  # that are tried
 MOST = 40_000  # samples of a stretch
+NEAR = 1.5  # times as far as the furthest, a further healthy recording may well come
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,10 @@ def find_axis_change(baseline: Baseline, recording: Recording) -> AxisChange | N
     assert model is not None
     faults = model.visible_faults(baseline.plant.faults)
     limit = max(scan_limit(len(faults)), model.change_limit)
+    enough = max(scan_limit(BANDS), model.change_limit, model.vibration_limit)
     for window in _stretches(baseline.loop, model, recording):
         found = _likeliest_change(window, faults)
-        change = (
-            None if found is None else _named_change(window, found, limit, max(model.change_limit, scan_limit(BANDS)))
-        )
+        change = None if found is None else _named_change(window, found, limit, enough)
         if change is not None:
             return change
     return None
@@ -73,12 +73,22 @@ def _named_change(window: AxisWindow, found: _ChangeFit, limit: float, enough: f
     return AxisChange(at, window.first_sample + window.stride * told, within)
 
 
-def largest_change(loop: Loop, model: AxisModel, recording: Recording) -> float:
-    """Return twice the log-likelihood ratio of the likeliest change within a healthy recording, 0 at rest."""
+def largest_changes(loop: Loop, model: AxisModel, recording: Recording) -> tuple[float, float]:
+    """Return how much speaks for a change within a healthy recording: of a coefficient, and of its vibration.
+
+    The first is twice the log-likelihood ratio of the likeliest change, the second the squared t statistic of the
+    loudest band; 0 at rest, and where no band is nearly as loud as a fault.
+    """
     assert isinstance(loop.plant, AxisPlant)
     faults = model.visible_faults(loop.plant.faults)
-    found = [_likeliest_change(window, faults) for window in _stretches(loop, model, recording)]
-    return max((one.gain for one in found if one is not None), default=0.0)
+    gains, shaken = [0.0], [0.0]
+    for window in _stretches(loop, model, recording):
+        found = _likeliest_change(window, faults)
+        if found is not None:
+            gains.append(found.gain)
+            vibration = find_vibration(window, found.healthy.residual, scan_limit(BANDS) / NEAR, LEAST / NEAR)
+            shaken.append(0.0 if vibration is None else vibration.statistic)
+    return max(gains), max(shaken)
 
 
 def scan_limit(faults: int, false_alarms: float = FALSE_ALARMS) -> float:

@@ -34,6 +34,7 @@ class AxisVibration:
     interval: tuple[float, float]  # 95 %
     onset: tuple[int, int, int]  # samples of the window: lower end, most likely, upper end of the 95 % interval
     detected: int
+    statistic: float  # squared t
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +78,13 @@ class _BandEnergies:
         return size, np.sqrt(left / (count - motion.shape[1] - 1) / length), left
 
 
-def find_vibration(window: AxisWindow, residual: FloatArray, limit: float) -> AxisVibration | None:
+def find_vibration(
+    window: AxisWindow, residual: FloatArray, limit: float, least: float = LEAST
+) -> AxisVibration | None:
     """Return since when a band of the innovations is louder than the motion explains, None where none is.
 
-    `residual`: of the healthy axis, shape (N + m,); `limit`: of the squared t statistic of the best onset and band.
+    `residual`: of the healthy axis, shape (N + m,); `limit`: of the squared t statistic of the best onset and band;
+    `least`: of the ratio of amplitudes.
     """
     e = residual[: window.samples]
     blocks = _BandEnergies.of(window, e)
@@ -93,7 +97,7 @@ def find_vibration(window: AxisWindow, residual: FloatArray, limit: float) -> Ax
     begin = blocks.begin[EDGE + int(k)]
     size, std = float(sizes[k, band]), float(stds[k, band])
     ratio, low, high = (float(np.exp(0.5 * (size + way * std))) for way in (0.0, -1.96, 1.96))
-    if ratio < LEAST or t[k, band] ** 2 <= limit or _is_noise(window, e, int(begin)):
+    if ratio < least or t[k, band] ** 2 <= limit or _is_noise(window, e, int(begin)):
         return None
     told = next(n for n in range(FEWEST, count + 1) if n == count or _largest(blocks, n) ** 2 > limit)
     likelihood = (left[:, band] / left[:, band].min()) ** (-0.5 * count)
@@ -102,7 +106,7 @@ def find_vibration(window: AxisWindow, residual: FloatArray, limit: float) -> Ax
     # a change may come anywhere within a block
     onset = (max(first - blocks.size, 0), int(begin), min(last + blocks.size, window.samples - 1))
     detected = max(int(blocks.begin[told - 1]) + blocks.size - 1, int(begin))
-    return AxisVibration(ratio, (low, high), onset, detected)
+    return AxisVibration(ratio, (low, high), onset, detected, float(t[k, band] ** 2))
 
 
 def _largest(blocks: _BandEnergies, count: int) -> float:
