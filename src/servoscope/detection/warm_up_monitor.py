@@ -84,6 +84,7 @@ class WarmUpMonitor(CovariateMonitor):
         """Return the state before the first sample: nothing is known of the warmth."""
         state = np.zeros(self.size)
         parts = self._parts(state)
+        parts.average[:] = self.average.start()  # once: with it come the coefficients to start from
         parts.filters[:] = RegressionRunner(self._pipeline).state
         self._forget(parts)
         return state
@@ -91,7 +92,6 @@ class WarmUpMonitor(CovariateMonitor):
     def _forget(self, parts: _Parts) -> None:
         """Know nothing of warmth and machine, as at the start: what was believed cannot be."""
         parts.x[:], parts.P[:] = (0.5, 0.5, 0.0, 0.0), np.diag([PRIOR_STD**2] * 3 + [0.0])
-        parts.average[:] = self.average.start()
         self._begin(parts)
 
     def _begin(self, parts: _Parts) -> None:
