@@ -121,6 +121,30 @@ def test_a_covariate_in_messages_of_its_own_belongs_to_the_next_sample() -> None
     assert second.covariates[0, 3] == 53.0 and not rejections.take()
 
 
+def test_a_thermometer_beside_a_machine_that_is_off_keeps_no_messages_open() -> None:
+    """A broker sends no more than `in_flight` before it hears of the first: nor would it, once the machine runs."""
+    collector, rejections = line(**FIELDS)
+    told: list[int] = []
+    for k in range(1000):
+        told += [send(collector, {"t": BEGAN + k, "T": k})]  # lists, into which the acknowledgements come
+    assert sum(not one for one in told) <= 500
+    for k in range(30):
+        send(collector, {"t": BEGAN + 1000.0 + 0.01 * k, "r": k, "u": -k, "y": 2 * k})
+    first, *_ = collector.poll(10)
+    np.testing.assert_array_equal(first.covariates, [[99.9, *[math.nan] * 9]])
+    assert not rejections.take()
+
+
+def test_a_thermometer_whose_clock_is_set_back_is_believed() -> None:
+    one = Resampler(1, 0.1, hold_s=math.inf, covariates=1)
+    one.restart(0.0)
+    for t, value in ((BEGAN, 40.0), (BEGAN - 3600.0, 50.0), (BEGAN - 3599.0, 51.0)):
+        one.add(0, t, value)
+        one.add(1, t, value)
+        made = one.take_samples(-math.inf, t + 0.05)
+        assert made.values[:, -1].tolist() == [value, value]
+
+
 def collect(source: BlockSource, blocks: int) -> list[Block]:
     found: list[Block] = []
     until(lambda: (found.extend(source.poll(100)), len(found) >= blocks)[1], 60.0)
@@ -281,5 +305,7 @@ def test_rows_keep_their_channels_packed_sorted_and_joined() -> None:
         assert again.t_us.tolist() == [1, 2, 3] and again.y.tolist() == [7.0, 8.0, 6.0]
         assert set(again.channels) == set(one.channels)
         assert len(Rows.concatenate([Rows.empty(), one, one[:0], one])) == 6
+    without = Rows.concatenate([replace(rows, channels={}), rows])  # a file has the column, and another one has not
+    np.testing.assert_array_equal(without.channels["oil_temperature"], [*[math.nan] * 3, 30.0, 10.0, math.nan])
     assert len(replace(rows, channels={}).pack()) == 96  # as earlier versions wrote them
     np.testing.assert_array_equal(Rows.unpack(rows.pack()).channels["oil_temperature"], [30.0, 10.0, math.nan])

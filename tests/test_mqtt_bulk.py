@@ -8,8 +8,15 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from brokers import until
 from servoscope.service.mqtt.client import BrokerSettings, create_bulk_client
 from servoscope.service.mqtt.paho_clients import ReceivedMessage
+from servoscope.service.mqtt.payload import encode_binary
+from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
+from servoscope.service.sources.block import Block
 
 CONNACK = bytes([0x20, 3, 0, 0, 0])
 
@@ -50,6 +57,29 @@ def serve(server: socket.socket, pieces: list[bytes], received: bytearray) -> No
                 time.sleep(0.001)  # the next one comes by itself
         while data := connection.recv(4096):
             received += data
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+@pytest.mark.parametrize("topic", [b"", b"\xff\xfe"])
+def test_topics_that_are_none_do_not_make_a_source_deaf(topic: bytes, qos: int) -> None:
+    """An exception in its thread would end the client, and nobody would hear of it."""
+    block = Block("press", 0, np.array([1e9]), *np.ones((3, 1)))
+    number = bytes([0, 1]) if qos else b""
+    body = len(topic).to_bytes(2, "big") + topic + number + b"\x03\x23\0\x01"  # an alias, which we have not allowed
+    strange = bytes([0x30 | qos << 1]) + length(len(body)) + body
+    good = publish(ReceivedMessage("servoscope/v1/data/press", encode_binary(block), 1, 2, False))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = threading.Thread(target=serve, args=(server, [strange, good], bytearray()), daemon=True)
+        broker.start()
+        settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=server.getsockname()[1])
+        source = MqttSource(settings, frozenset(["press"]), Path(), "reader")
+        source.open({})
+        until(lambda: source.next_block_s == 0.0, 20.0)
+        (found,) = source.poll(10)
+        source.close()
+        broker.join(60.0)
+    assert found.y.tolist() == [1.0]
+    assert [one.kind for one in source.rejections.take()] == ["unknown asset"]
 
 
 def test_messages_in_pieces_of_any_size_are_those_that_were_sent() -> None:

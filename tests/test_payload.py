@@ -108,6 +108,11 @@ def test_any_acknowledgement(message: bytes) -> None:
     assert min(stream, sequence) >= -1
 
 
+def test_a_damaged_byte_in_a_name_is_told_as_what_it_is() -> None:
+    with pytest.raises(MessageError, match="no JSON"):
+        payload.decode_block("press", b'{"version": 1, "s\xfatream": 0}')
+
+
 def test_what_is_announced_takes_no_memory() -> None:
     head = payload.HEADER.pack(payload.MAGIC, 1, 0, 0, 2**32 - 1, 0) + payload.BODY_HEADER.pack(0, 0, 0, T0, 0.01)
     tracemalloc.start()

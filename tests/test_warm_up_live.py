@@ -84,6 +84,20 @@ def test_states_are_the_same_however_samples_are_cut_and_gaps_forget_the_warmth_
     assert len(state) < 600  # numbers
 
 
+@pytest.mark.parametrize(("signal", "value"), [("y", 10.0), ("y", 1e9), ("u", 100.0)])
+def test_a_sample_that_was_read_wrongly_is_forgotten(baseline: ss.Baseline, signal: str, value: float) -> None:
+    """As losses it would warm the machine beyond all measure, and as a regressor outweigh all others."""
+    made, monitor = minutes(71, 33.0, 18.0), ss.Monitor(baseline)
+    read = {"r": made.r, "u": made.u.copy(), "y": made.y.copy()}
+    read[signal][3000] = value
+    with np.errstate(over="ignore", invalid="ignore"):
+        state, trace = monitor.run(monitor.init(), *read.values(), made.restart)
+    late = trace.t > 120.0
+    assert trace.ready[late].all() and not trace.exceeded[late].any()
+    _, clean, _ = follow(baseline, made)
+    assert abs(monitor.covariate_history(state)[NAME][1][-1] - clean[NAME]) < 0.02
+
+
 def test_the_last_minutes_are_compared_with_what_the_monitor_knows(baseline: ss.Baseline) -> None:
     """Alone, minutes behind the onset of a leak are those of a machine at another temperature."""
     made = minutes(73, 33.0, 18.0, LEAK)

@@ -52,6 +52,7 @@ class CovariateMonitor:
         An average is NaN before the first value, and where the newest value is too old.
         """
         found = {name: np.asarray(channel, dtype=np.float64) for name, channel in channels.items()}
+        found = {name: np.where(np.isfinite(channel), channel, np.nan) for name, channel in found.items()}
         if (missing := next((name for name in self.model.names if name not in found), None)) is not None:
             raise RecordingError(str(message("covariate.missing", covariate=missing)))
         if any(found[name].shape != (samples,) for name in self.model.names):

@@ -27,6 +27,8 @@ SHORTEST = 2  # blocks that a jump has to last
 SETTLED = 0.1  # standard deviation of w below which it is known
 DRIFT = 0.03  # of the learned range by which the surroundings drift within a time constant
 ROUNDS = 4  # of Gauss and Newton
+MOST_LOSSES = 100.0  # times the usual ones that a block may have; more is a sample that was read wrongly
+FAR = 10.0  # learned ranges: no machine is warmer than that
 POINTS, PER_CONSTANT = 32, 8.0  # of the course that is kept, and how many of them lie within a time constant
 LOOK = np.array([1.0, 0.0, 0.0, 1.0])  # what a block sees of x
 
@@ -82,12 +84,15 @@ class WarmUpMonitor(CovariateMonitor):
         """Return the state before the first sample: nothing is known of the warmth."""
         state = np.zeros(self.size)
         parts = self._parts(state)
-        parts.x[:2] = 0.5
-        parts.P[:3, :3] = PRIOR_STD**2 * np.eye(3)
-        parts.average[:] = self.average.start()
+        parts.average[:] = self.average.start()  # once: with it come the coefficients to start from
         parts.filters[:] = RegressionRunner(self._pipeline).state
-        self._begin(parts)
+        self._forget(parts)
         return state
+
+    def _forget(self, parts: _Parts) -> None:
+        """Know nothing of warmth and machine, as at the start: what was believed cannot be."""
+        parts.x[:], parts.P[:] = (0.5, 0.5, 0.0, 0.0), np.diag([PRIOR_STD**2] * 3 + [0.0])
+        self._begin(parts)
 
     def _begin(self, parts: _Parts) -> None:
         """Begin anew behind a gap, of which nobody knows how long it was: the warmth is unknown, the rest is kept."""
@@ -137,7 +142,7 @@ class WarmUpMonitor(CovariateMonitor):
         n, sums = self._n, parts.sums
         A, b, (loss, count) = sums[: n * n].reshape(n, n), sums[n * n : -2], sums[-2:]
         measured = self._measure(parts, A, b)
-        F = self._transition(parts, float(loss), float(count))
+        F, known = self._transition(float(loss), float(count))
         if measured is not None:
             self._update(parts, *measured)
         parts.head[2] += 1.0
@@ -146,21 +151,23 @@ class WarmUpMonitor(CovariateMonitor):
             parts.course[-1] = parts.x[0], np.sqrt(parts.P[0, 0])
             parts.head[2] = 0.0
         keep, drift = self._keep, DRIFT**2 * self._seconds / self._warm_up.time_constant_s
-        known = count >= 0.5 * self._block
         parts.x[:] = F @ parts.x
         parts.P[:] = F @ parts.P @ F.T
         parts.P[0, 0] += 0.0 if known else (0.5 * (1.0 - keep) * parts.x[2]) ** 2  # it may have run, or stood still
         parts.P[1, 1] += drift
         parts.onsets[:, :4] = parts.onsets[:, :4] @ F.T
         parts.head[0], parts.sums[:] = 0.0, 0.0
+        if not (abs(parts.x[0]) < FAR and np.isfinite(parts.P).all()):
+            self._forget(parts)
 
-    def _transition(self, parts: _Parts, loss: float, count: float) -> FloatArray:
-        """Return what leads x to the next block, with the losses of this one, or half of the usual ones."""
-        known, power = count >= 0.5 * self._block, self._warm_up.power
+    def _transition(self, loss: float, count: float) -> tuple[FloatArray, bool]:
+        """Return what leads x to the next block, with the losses of this one if known, or half of the usual ones."""
+        power = self._warm_up.power
+        known = count >= 0.5 * self._block and (not power or abs(loss) <= MOST_LOSSES * power * count)
         p = 0.0 if not power else loss / count / power if known else 0.5
         F = np.eye(4)
         F[0, :3] = self._keep, 1.0 - self._keep, (1.0 - self._keep) * p
-        return F
+        return F, known
 
     def _measure(self, parts: _Parts, A: FloatArray, b: FloatArray) -> tuple[float, float] | None:
         """Return w + j as a block shows it, and its variance; None where the block shows nothing."""

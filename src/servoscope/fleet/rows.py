@@ -73,7 +73,12 @@ class Rows:
         if not parts:
             return cls.empty()
         t_us, r, u, y = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t_us", "r", "u", "y"))
-        channels = {name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels}
+        names = dict.fromkeys(name for part in parts for name in part.channels)
+        # a file that lacks the column of a covariate has no value of it
+        channels = {
+            name: np.concatenate([part.channels.get(name, np.full(len(part), np.nan)) for part in parts])
+            for name in names
+        }
         return cls(t_us, r, u, y, channels)
 
     def pack(self) -> bytes:

@@ -68,7 +68,8 @@ class _AssetStream:
         self.ready = deque[tuple[Block, list[Receipt]]]()
         self._seen: dict[int, None] = {}
         self.trouble: AssetTrouble | None = None
-        self.heard_at, self.values, self._from = -math.inf, 0, math.nan  # heard_at: by the monotonic clock [s]
+        # heard_at: when r, u or y came last, by the monotonic clock [s]
+        self.heard_at, self.values, self._from = time.monotonic(), 0, math.nan
         self._newest, self._complete, self.is_flushed = [-math.inf] * len(SIGNALS), False, True
 
     def restart(self) -> None:
@@ -95,8 +96,11 @@ class _AssetStream:
             self.assembler.rates[place].add(t, value)
             if place < len(SIGNALS):
                 newest[place], sampled = max(newest[place], t), True
-        self.values += len(values)
-        self._complete, self.is_flushed = complete if sampled else self._complete, False
+        self.values, self.is_flushed = self.values + len(values), False
+        if sampled:
+            self._complete, self.heard_at = complete, time.monotonic()
+            if self.trouble is not None and self.trouble.state == "silent":
+                self.trouble = None
         if math.isnan(self._from):
             self._from = values[0].t
         if abs(values[-1].t - self._from) >= self._span_s or self.values >= len(SIGNALS) * MAX_VALUES:
@@ -110,6 +114,8 @@ class _AssetStream:
         if not (self._complete or short):  # others may still come for what one signal has reached
             settled = max(min(self._newest), last - max(LAG_S, self._span_s))
         assembler.collect(-math.inf, settled)
+        if short:  # a machine that is off makes no samples, while its thermometer goes on: no message waits for them
+            assembler.resampler.take_covariates()
         if self.trouble is None or self.trouble.state == "slow":
             words = [assembler.describe_slow(k, interval_ms) for k, interval_ms in assembler.slow_ms.items()]
             self.trouble = AssetTrouble("slow", ", ".join(words)) if words else None
@@ -198,9 +204,6 @@ class MessageCollector:
                 self._rejections.add(name, "repeated", "the same message once more")
                 stream.collect(short=False)
                 continue
-            if stream.trouble is not None and stream.trouble.state == "silent":
-                stream.trouble = None
-            stream.heard_at = time.monotonic()
             stream.add(values, found.complete)
         self._count()
 
@@ -216,7 +219,7 @@ class MessageCollector:
         self.waiting = sum(len(one.ready) for one in self._streams.values())
 
     def _flush(self, heard_before: float) -> None:
-        """Make blocks, however short, of assets of which nothing has come since then, by the monotonic clock [s]."""
+        """Make blocks, however short, of assets without r, u and y since then, by the monotonic clock [s]."""
         for stream in self._streams.values():
             if stream.heard_at < heard_before and not stream.is_flushed:
                 stream.collect(short=True)

@@ -56,7 +56,8 @@ class BulkClient(CheckedClient):
         self._piece, self._at = b"", 0  # what the socket gave last, and how far it was read
         self._acks, self._acks_lock = list[bytes](), threading.Lock()
         self.on_message = lambda _client, _data, one: on_received(
-            ReceivedMessage(one.topic, bytes(one.payload), one.qos, one.mid, one.retain)
+            # not `one.topic`, which raises where it is no UTF-8, and so ends paho's thread
+            ReceivedMessage(one._topic.decode("utf-8", "replace"), bytes(one.payload), one.qos, one.mid, one.retain)
         )
 
     def ack(self, mid: int, qos: int) -> MQTTErrorCode:

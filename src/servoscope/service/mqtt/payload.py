@@ -145,7 +145,7 @@ def _decode_json(asset: str, message: bytes, received_at: float, covariates: Seq
         found = _json_decoder().decode(message)
         columns = [found.t, found.r, found.u, found.y]
         lengths = {len(column) for column in columns if column is not None}
-    except (msgspec.MsgspecError, RecursionError):
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return _decode_loose_json(asset, message, received_at, ())  # which takes more, or says what is wrong
     if found.version != VERSION or found.t is None or len(lengths) > 1:
         return _decode_loose_json(asset, message, received_at, ())

@@ -155,7 +155,8 @@ class MqttSource(BlockSource):
         try:
             asset = topics.parse_asset(message.topic)
             if asset not in self._assets:  # an earlier service file had it, and the broker has kept that
-                self._client.unsubscribe(message.topic)
+                if message.topic:  # without, an alias stands for it, which we have not allowed
+                    self._client.unsubscribe(message.topic)
                 raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
             if len(message.payload) > self.settings.largest:
                 raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")

@@ -129,8 +129,18 @@ class Resampler:
         values = np.array([held for _, held in samples]).reshape(-1, self._values.size).T
         return ResampledSignals(np.array([t for t, _ in samples]), values, gaps)
 
+    def take_covariates(self) -> None:
+        """Take the covariates that wait for a sample: the next one has the newest of them."""
+        waiting, self._pending = sorted(self._pending), []
+        for one in waiting:
+            if one[2] < self._signals:
+                self._pending.append(one)  # in order, which makes a heap
+            else:
+                self._take_covariate(one[0], *one[2:])
+
     def _take_covariate(self, t: float, signal: int, value: float) -> None:
-        if t >= self._value_t[signal] or not self._known[signal]:
+        is_set_back = self._hold_s == math.inf and t < self._value_t[signal] - CLOCK_STEP_S
+        if t >= self._value_t[signal] or is_set_back or not self._known[signal]:
             self._values[signal], self._value_t[signal] = value, t
             self._known[signal] = self._new[signal] = True
 
