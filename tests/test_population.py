@@ -69,6 +69,16 @@ class TestNormalPrior:
 
 
 class TestPopulation:
+    def test_few_of_its_own_kind_are_refused(self) -> None:
+        """One in a thousand, however few are known; the limit of chi-squared refuses 55 of these 1000."""
+        rng, mixed = np.random.default_rng(5), np.array([[1.0, 0.6, 0.2], [0.0, 0.5, 0.3], [0.0, 0.0, 0.2]])
+        nothing, names, refused = np.zeros((3, 3)), ("a", "b", "c"), 0
+        for _ in range(1000):
+            x = rng.normal(size=(9, 3)) @ mixed
+            prior = NormalPrior.from_machines(names, x[:8], np.broadcast_to(1e-9 * np.eye(3), (8, 3, 3)))
+            refused += not Population(8, prior, None, nothing, 0.0, False).describe(x[8], nothing)[0]
+        assert refused <= 4
+
     def test_a_new_machine_is_known_better(self, known: dict[str, ss.Baseline]) -> None:
         loop, own = ss.Loop.from_dict(UNKNOWN), [record(500, 50, seconds=12.0)]
         alone, like = ss.learn(loop, own), ss.learn(loop, own, population=known)

@@ -121,11 +121,17 @@ class Population:
         return _without_negative(S, np.sqrt(np.diag(self.scatter)))
 
     def describe(self, theta: FloatArray, covariance: FloatArray) -> tuple[bool, Message]:
-        """Return whether a machine is one of the population, and a note that says so."""
+        """Return whether a machine is one of the population, and a note that says so.
+
+        The squared distance of a further draw from k of them is Hotelling's T^2 (Anderson, 2003, section 5.3.5), in
+        units of a covariance that `NormalPrior.from_machines` has widened already.
+        """
         from scipy import special
 
-        n = len(theta)
-        distance, limit = self.theta.distance(theta, covariance), float(special.chdtri(n, UNLIKELY))
+        n, k = len(theta), self.machines
+        left = max(k - n, 1)
+        distance = self.theta.distance(theta, covariance)
+        limit = n * (k - 3.0) / left * float(special.fdtri(n, left, 1.0 - UNLIKELY))
         if distance <= limit:
             return True, message("learning.population", machines=self.machines)
         off = (theta - self.theta.mean) / np.sqrt(np.diag(self.theta.covariance + covariance))

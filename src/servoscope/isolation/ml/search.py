@@ -34,6 +34,7 @@ MAX_WINDOW_SAMPLES = 40_000  # samples in a window
 PAIRS = 0.02  # probability that two faults come at once, before anything is known
 OUTSIDE = 0.01  # and that it is a parameter outside the list of faults
 LOOKS = 4  # for the onset, each with the sizes that fit the one before
+FAR = 100.0  # variances by which a fit at another onset is worse if that onset is none
 WORTH_A_LOOK = 1.0  # of the sum of squares that a look gained, for another one
 HOPELESS = 10.0  # of what noise leaves unexplained at most, from which a pair is not followed to its onset
 SHARP = 20  # samples of an onset's interval, up to which the step is loud
@@ -155,7 +156,8 @@ class _HypothesisSearch:
         self.settled = True
         best = self._update_noise_variance(everything)
         if self.window.coloured:
-            found = replace(self._onset(best), profile=found.profile)
+            settled, onset = self._onset(best), found.profile.onset
+            found = replace(settled, profile=found.profile, low=min(settled.low, onset), high=max(settled.high, onset))
         return self._weigh(everything, found)
 
     def _sharpen_onset(
@@ -301,7 +303,13 @@ class _HypothesisSearch:
         return found * self.window.inflation(fitted.jacobian, fitted.residual, len(fitted.x))
 
     def _onset(self, fitted: HypothesisFit, drifts: bool = True) -> OnsetEstimate:
-        return onset_posterior(self.window, fitted, self.latest, self.noise_variance, drifts)
+        found = onset_posterior(self.window, fitted, self.latest, self.noise_variance, drifts)
+        begin = fitted.profile.onset
+        if not self.window.follows or abs(found.profile.onset - begin) <= SHARP:
+            return found
+        # a size that is large, and healthy parameters that follow, are not linear so far from where they were fitted
+        is_worse = self._refit_at(fitted, found.profile).cost > fitted.cost + FAR * self.noise_variance
+        return OnsetEstimate(fitted.profile, begin, begin, found.size_std) if is_worse else found
 
     def _weigh(self, fitted: Sequence[HypothesisFit], found: OnsetEstimate) -> RefitResult:
         window, n = self.window, len(self.faults)
