@@ -105,6 +105,14 @@ def with_covariate(loop: ss.Loop, name: str) -> ss.Loop:
     return loop.model_copy(update={"columns": loop.columns.model_copy(update={"covariates": {name: name}})})
 
 
+def judged_scenes(count: int) -> Iterator[tuple[Scene, ss.Loop, list[ss.Recording]]]:
+    """Yield each scene, its loop without the covariate, and `count` healthy recordings before as many worn ones."""
+    for scene in scenes():
+        plain = scene.loop.model_copy(update={"columns": ss.Loop.from_dict(AXIS).columns})
+        rng = np.random.default_rng(4)
+        yield scene, plain, [scene.draw(rng, worn) for worn in (False, True) for _ in range(count)]
+
+
 def learn_covariates(scene: Scene, plain: ss.Loop) -> dict[str, ss.Baseline]:
     """Return what is learned with the covariate, and where it warms without."""
     learned = {"the covariate": ss.learn(scene.loop, scene.healthy)}
@@ -118,10 +126,7 @@ def learn_covariates(scene: Scene, plain: ss.Loop) -> dict[str, ss.Baseline]:
 def live_rows(count: int) -> list[tuple[str, ...]]:
     """Follow healthy and worn recordings of each machine as streams: alarms, and how long after the onset."""
     found = []
-    for scene in scenes():
-        plain = scene.loop.model_copy(update={"columns": ss.Loop.from_dict(AXIS).columns})
-        rng = np.random.default_rng(4)
-        recordings = [scene.draw(rng, worn) for worn in (False, True) for _ in range(count)]
+    for scene, plain, recordings in judged_scenes(count):
         for name, baseline in learn_covariates(scene, plain).items():
             monitor, first = ss.Monitor(baseline), []
             for one in recordings:
@@ -139,10 +144,7 @@ def live_rows(count: int) -> list[tuple[str, ...]]:
 def rows(count: int) -> list[tuple[str, ...]]:
     """Judge healthy and worn recordings of each machine by three baselines."""
     found = []
-    for scene in scenes():
-        plain = scene.loop.model_copy(update={"columns": ss.Loop.from_dict(AXIS).columns})
-        rng = np.random.default_rng(4)
-        recordings = [scene.draw(rng, worn) for worn in (False, True) for _ in range(count)]
+    for scene, plain, recordings in judged_scenes(count):
         for name, baseline in learn_covariates(scene, plain).items():
             said = [ss.diagnose(baseline, one) for one in recordings]
             alarms = [one.verdict == "fault" for one in said]

@@ -170,6 +170,13 @@ def test_kafka_carries_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.concatenate([one.covariates[0] for one in blocks[:2]]), 40.0 + 0.1 * np.arange(20))
 
 
+def received(settings: OpcuaSourceSettings, nodes: OpcuaNodes, count: int) -> list[Block]:
+    """Return the first blocks of an asset whose loop names one covariate, oil."""
+    source = OpcuaSource(settings, source_assets(nodes, RATE, ("oil",)), Path())
+    source.open({})
+    return collect(source, count)
+
+
 @pytest.mark.parametrize("kind", ["array", "single"])
 def test_opcua_carries_them(kind: str) -> None:
     plant = Plant("nothing")
@@ -181,9 +188,7 @@ def test_opcua_carries_them(kind: str) -> None:
     settings = OpcuaSourceSettings.model_validate({"kind": "opcua", "url": url, "block": 0.25})
     assert settings.carries("oil", nodes) and settings.carries("load", nodes) == (kind == "array")
     try:
-        source = OpcuaSource(settings, source_assets(nodes, RATE, ("oil",)), Path())
-        source.open({})
-        blocks = collect(source, 8)
+        blocks = received(settings, nodes, 8)
     finally:
         plant.close()
     t, _, _, y, oil = np.concatenate([block.signals for block in blocks], axis=1)
@@ -198,9 +203,7 @@ def test_another_stack_carries_them() -> None:
         {"kind": "opcua", "url": f"opc.tcp://127.0.0.1:{plant.port}/plant", "block": 0.5}
     )
     try:
-        source = OpcuaSource(settings, source_assets(nodes, RATE, ("oil",)), Path())
-        source.open({})
-        blocks = collect(source, 6)
+        blocks = received(settings, nodes, 6)
     finally:
         plant.kill()
     _, _, u, _, oil = np.concatenate([block.signals for block in blocks], axis=1)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import message
 from servoscope.detection.baseline import Baseline
@@ -45,17 +45,22 @@ class CovariateMonitor:
         return np.concatenate([self.average.start(), np.zeros(len(self.model.names))])
 
     def run(
-        self, state: FloatArray, channels: Mapping[str, npt.ArrayLike], samples: int
+        self,
+        state: FloatArray,
+        signals: tuple[FloatArray, FloatArray, FloatArray],
+        restart: BoolArray,
+        channels: Mapping[str, npt.ArrayLike],
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the averages (N, k), and once, as soon as all are known, the coefficients (n,) to start from.
+        """Feed r, u, y and channels of a block, shape (N,) each; return the averages (N, k); changes the state.
 
-        An average is NaN before the first value, and where the newest value is too old.
+        Once, as soon as all are known, the coefficients (n,) to start from come too. An average is NaN before the first
+        value, and where the newest value is too old.
         """
         found = {name: np.asarray(channel, dtype=np.float64) for name, channel in channels.items()}
         found = {name: np.where(np.isfinite(channel), channel, np.nan) for name, channel in found.items()}
         if (missing := next((name for name in self.model.names if name not in found), None)) is not None:
             raise RecordingError(str(message("covariate.missing", covariate=missing)))
-        if any(found[name].shape != (samples,) for name in self.model.names):
+        if any(found[name].shape != signals[0].shape for name in self.model.names):
             raise RecordingError("covariates must have the shape of r")
         of_average, age = np.split(state, [self.average.size])
         began, values = not np.isnan(of_average).any(), self.model.values(found)
@@ -97,13 +102,11 @@ class CovariateMonitor:
         averages, std = np.split(averages, [len(self.model.names)], axis=1)
         known = np.isfinite(averages).all(axis=1) & self.model.is_inside(averages)
         c = np.where(known[:, None], self.model.clip(averages), self.model.origin)
-        more = self.model.theta_covariance(self._theta, c)
+        theta, more = self.model.theta(self._theta, c), self.model.theta_covariance(self._theta, c)
         if std.size:
-            off = self.model.theta(self._theta, c + np.where(known[:, None], std, 0.0)) - self.model.theta(
-                self._theta, c
-            )
+            off = self.model.theta(self._theta, c + np.where(known[:, None], std, 0.0)) - theta
             more = more + off[:, :, None] * off[:, None, :]
-        expected = trace.expected + self.model.theta(self._theta, c) - self._theta
+        expected = trace.expected + theta - self._theta
         C, healthy, ready = trace.covariance + more, trace.ifrf_expected, trace.ready & known
         return replace(
             trace,

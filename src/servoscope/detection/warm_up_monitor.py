@@ -10,9 +10,10 @@ unlikely enough by chance.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.detection.baseline import Baseline
@@ -101,12 +102,17 @@ class WarmUpMonitor(CovariateMonitor):
         parts.P[0, 0] = PRIOR_STD**2
         parts.course[:] = np.nan
 
-    def follow(
-        self, state: FloatArray, signals: tuple[FloatArray, FloatArray, FloatArray], restart: BoolArray
+    def run(
+        self,
+        state: FloatArray,
+        signals: tuple[FloatArray, FloatArray, FloatArray],
+        restart: BoolArray,
+        channels: Mapping[str, npt.ArrayLike],
     ) -> tuple[FloatArray, FloatArray | None]:
         """Feed r, u and y of a block, shape (N,) each; return averages of w and standard deviations, shape (N, 2).
 
-        They are NaN until the warmth is known. Once, as soon as it is, the coefficients (n,) to start from come too.
+        No channel has them. They are NaN until the warmth is known. Once, as soon as it is, the coefficients (n,) to
+        start from come too.
         """
         parts, (r, u, y), start = self._parts(state), signals, None
         g = RegressionRunner(self._pipeline, parts.filters).advance(r, u, y, restart)
@@ -209,10 +215,6 @@ class WarmUpMonitor(CovariateMonitor):
             x += towards * score[best] / information[best]
             P[:] = P + np.outer(towards, towards) / information[best]
             onsets[:] = 0.0
-
-    def run(self, state: FloatArray, channels: Mapping[str, Any], samples: int) -> tuple[FloatArray, FloatArray | None]:
-        """Nobody has logged it: see `follow`."""
-        raise NotImplementedError
 
     def latest(self, state: FloatArray) -> FloatArray:
         """Return the average of w in a state, and its standard deviation, shape (2,)."""

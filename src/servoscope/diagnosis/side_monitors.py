@@ -89,10 +89,8 @@ class SideMonitors:
             features = np.array([span.value for span in spans]), ends, before
         if self.motion is not None:
             motion = self.motion.run(of_motion, r, u, y, restart)
-        if isinstance(self.covariates, WarmUpMonitor):
-            averages, start = self.covariates.follow(of_covariates, (r, u, y), restart)
-        elif self.covariates is not None:
-            averages, start = self.covariates.run(of_covariates, channels, len(r))
+        if self.covariates is not None:
+            averages, start = self.covariates.run(of_covariates, (r, u, y), restart, channels)
         return SideValues(features, averages, start, motion)
 
     def latest(self, state: FloatArray) -> SideValues:

@@ -13,6 +13,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.isolation.ml.axis_window import AxisWindow
+from servoscope.isolation.posterior import INTERVAL
 
 BLOCK_S = 1.0
 BANDS = 5  # octaves below half the sample rate
@@ -23,7 +24,6 @@ MOVED = 0.25  # share of a block's samples that have to count
 LAGS = 8  # samples of the autocovariance by which a vibration is told from noise
 TINY = 1e-9  # of squares left; a simulation without noise leaves none
 NOISY = 0.3  # of what was added, that louder noise leaves unexplained at least where it is none
-INTERVAL = 0.025, 0.975
 
 
 @dataclass(frozen=True)

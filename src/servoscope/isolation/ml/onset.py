@@ -10,6 +10,7 @@ import numpy as np
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.isolation.ml.hypothesis import HypothesisFit
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
+from servoscope.isolation.posterior import INTERVAL
 
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
 SHORTEST_S = 0.2  # of a drift that is not called a step
@@ -20,7 +21,6 @@ PER_DURATION = 4  # onsets that are tried within the duration of a drift
 CLOSER = 3  # times closer together they are in each further look
 LOOKS = 5
 NEGLIGIBLE = 1e-4  # of the largest posterior, that a further look may leave out
-INTERVAL = 0.025, 0.975
 ALIKE = 7.35  # of the cost: what the true onset reaches in 95 % of the cases (Hansen, 2000, table 1)
 
 

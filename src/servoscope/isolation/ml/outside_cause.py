@@ -9,11 +9,12 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.isolation.ml.hypothesis import IN_REACH, HypothesisFit, refit_jointly
-from servoscope.isolation.ml.onset import ALIKE, INTERVAL, NEGLIGIBLE, OnsetEstimate, onset_posterior
+from servoscope.isolation.ml.onset import ALIKE, NEGLIGIBLE, OnsetEstimate, onset_posterior
 from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes_at, parameter_cause, parameter_causes
 from servoscope.isolation.ml.search import LOOKS, RefitResult
 from servoscope.isolation.ml.timeline import INCONSTANT, bridge_height
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
+from servoscope.isolation.posterior import INTERVAL
 
 AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
 NEARLY_ALL = 0.95  # of what the healthy plant does not explain

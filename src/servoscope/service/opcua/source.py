@@ -170,7 +170,7 @@ class OpcuaSource(BlockSource):
             nodes, rate, wanted = asset.address, asset.loop.sample_rate, asset.covariates
             at, common = resume.get(name, ResumePosition(-1, math.nan)), (self._enqueue, self.rejections)
             if nodes.block is not None:
-                self._subscriptions.append(ArraySubscription(name, [nodes.block], at, *common, len(wanted)))
+                self._subscriptions.append(ArraySubscription(name, [nodes.block], at, *common, wanted))
             else:
                 signals = [*nodes.signals, *(nodes.covariates[one] for one in wanted)]
                 size = max(1, round(self.settings.block * rate))

@@ -36,7 +36,7 @@ MAX_EXACT_INT = 2.0**53  # beyond, a binary64 cannot count
 
 
 class _Subscription(ABC):
-    """Nodes of one asset; `emit` takes its blocks, `rejections` what could not be used."""
+    """Nodes of one asset; `emit` takes its blocks, `rejections` what is of no use; `covariates` by name."""
 
     value_s = MIN_BLOCK_S  # time between two values of a node, at least
 
@@ -47,8 +47,9 @@ class _Subscription(ABC):
         resume: ResumePosition,
         emit: Callable[[Block], None],
         rejections: RejectionCounter,
+        covariates: tuple[str, ...] = (),
     ) -> None:
-        self.asset, self.nodes = asset, nodes
+        self.asset, self.nodes, self._covariates = asset, nodes, covariates
         self._sequence, self._last_t = resume.sequence, resume.last_t
         self._emit, self._rejections = emit, rejections
         self.trouble: AssetTrouble | None = None  # why there are no samples although the server is there
@@ -89,18 +90,6 @@ class ArraySubscription(_Subscription):
 
     sampling_ms = 0.0  # as fast as the server can
 
-    def __init__(
-        self,
-        asset: str,
-        nodes: Sequence[str],
-        resume: ResumePosition,
-        emit: Callable[[Block], None],
-        rejections: RejectionCounter,
-        covariates: int = 0,
-    ) -> None:
-        super().__init__(asset, nodes, resume, emit, rejections)
-        self._covariates = covariates
-
     async def read_missed(self, client: Any, now: float) -> None:
         """Read the blocks that were missed."""
         if not math.isnan(self._last_t):
@@ -110,7 +99,7 @@ class ArraySubscription(_Subscription):
     def add_value(self, node: int, value: Any) -> None:
         """Take a block, unless history or a new subscription repeats it."""
         try:
-            block = parse_block(self.asset, value, self._covariates)
+            block = parse_block(self.asset, value, len(self._covariates))
         except MessageError as error:
             self._rejections.add(self.asset, error.kind, str(error))
             return
@@ -133,7 +122,7 @@ class ScalarSubscription(_Subscription):
         size: int,
         covariates: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(asset, nodes, resume, emit, rejections)
+        super().__init__(asset, nodes, resume, emit, rejections, covariates)
         self.value_s, self.sampling_ms = 1.0 / rate, 1000.0 / rate
         self._assembler = BlockAssembler(asset, resume, rejections, rate, size, covariates=covariates)
         self._read_until = [-math.inf] * len(nodes)  # the last time that was read from the history of each node
