@@ -13,6 +13,7 @@ from servoscope.models.loop import Loop
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
+from servoscope.service.store import Store
 from servoscope.signals import Recording, writers
 from servoscope.simulation import FaultEvent, reference, simulate
 
@@ -91,10 +92,22 @@ def hall(folder: Path, name: str, *, speed: float = 0.0, store: str = "", more: 
 
 
 def asked(config: Path, query: str) -> list[Any]:
-    """Return what a query finds in the SQLite store of a service file."""
+    """Return what a query finds in the SQLite store of a service file; its `recent` has all recent samples."""
     found = ServiceFile.load(config)
-    connection = sqlite3.connect(found.folder / found.store.url, timeout=10.0)
+    path = found.folder / found.store.url
+    connection = sqlite3.connect(path, timeout=10.0)
     try:
+        if " recent" in query:
+            connection.execute("CREATE TEMP TABLE recent (asset, sequence, samples)")  # in front of the stored one
+            connection.executemany("INSERT INTO recent VALUES (?, ?, ?)", recent_rows(str(path)))
         return connection.execute(query).fetchall()
     finally:
         connection.close()
+
+
+def recent_rows(url: str) -> list[Any]:
+    """Return all recent samples of a store, block by block."""
+    store = Store.open(url, lock_timeout_s=10.0)
+    blocks = sorted(store.recent_samples_of(store.checkpoint_times()))
+    store.close()
+    return [(asset, *block) for asset, of_asset in blocks for block in of_asset]

@@ -24,7 +24,7 @@ from servoscope.service.store.series import read_notes
 
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
 # What each released version of the tables left behind; a new version brings its own.
-STORES = {1: "history.sqlite.gz", 2: "history-2.sqlite.gz"}
+STORES = {1: "history.sqlite.gz", 2: "history-2.sqlite.gz", 3: "history-3.sqlite.gz"}
 
 
 def old_store(folder: Path, version: int) -> Path:

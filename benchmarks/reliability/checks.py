@@ -12,7 +12,7 @@ from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
 from servoscope.service.store import Store
-from servoscope.service.store.tables import diagnoses, recent, residuals, transitions
+from servoscope.service.store.tables import diagnoses, residuals, transitions
 
 __all__ = ["Found", "check"]
 
@@ -98,8 +98,7 @@ def numbers_of(table: sa.Table, asset: str) -> sa.Select[tuple[int]]:
 def results(store: Store, asset: str) -> list[object]:
     """Return all that is stored of an asset."""
     found: list[object] = [
-        store.fetch(sa.select(table).where(table.c.asset == asset).order_by(*table.primary_key))
-        for table in (*NUMBERED, recent)
+        store.fetch(sa.select(table).where(table.c.asset == asset).order_by(*table.primary_key)) for table in NUMBERED
     ]
     row = store.checkpoints([asset])[asset]
-    return [*found, row["sequence"], bytes(row["state"]), row["status"]]
+    return [*found, store.recent_samples(asset), row["sequence"], bytes(row["state"]), row["status"]]

@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 from servoscope.core.errors import BaselineError, ConfigError, LoopError
@@ -69,6 +70,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
         elif config.name in rows:
             notifier.resume(rows[config.name]["state"])
         groups = AssetGroups(assets)
+        store.take_over(config.name, assets)
         resume_assets(groups, assets, store, rows, restarted)
         for name, source in sources.items():
             source.open(resume_positions(config, name, assets))
@@ -99,8 +101,9 @@ def resume_assets(
     Raises StateError if a saved state cannot be used.
     """
     uncounted = list[Block]()
-    for name, asset in assets.items():
-        blocks = [Block.unpack(name, *one) for one in store.recent_samples(name)] if name in rows else []
+    stored = store.recent_samples_of([name for name in assets if name in rows])
+    for name, samples in chain(stored, ((name, []) for name in assets if name not in rows)):
+        asset, blocks = assets[name], [Block.unpack(name, *one) for one in samples]
         if name in restarted and name in rows:
             position = StreamPosition(**rows[name]["status"]["counted"])
             for block in blocks[bisect.bisect_left(blocks, position.blocks, key=lambda one: one.sequence) :]:

@@ -71,6 +71,7 @@ def reload_components(
             if unpack_state(row["state"], name).baseline != new[name].baseline.hash
         )
         groups = AssetGroups(assets, running.groups.layers)
+        store.take_over(config.name, new)
         resume_assets(groups, new, store, resumed, anew)
         notifier = Notifier(config.name, config.alarms, config.actions)
         notifier.resume(running.notifier.checkpoint()["state"])

@@ -14,6 +14,7 @@ from servoscope.service.asset import Asset
 from servoscope.service.checkpoint import AssetState, pack_state
 from servoscope.service.records import TableRow
 from servoscope.service.store import Batch, Store
+from servoscope.service.store.bundles import SampleBlock
 
 MIN_RETRY_S, MAX_RETRY_S = 0.1, 2.0  # between two attempts at a store that is unavailable
 MIN_CHECKPOINTS = 32  # that a commit writes at least, if there are so many
@@ -25,6 +26,7 @@ class PendingCommit:
     """A batch, and the blocks that are to be acknowledged when it is stored."""
 
     batch: Batch = field(default_factory=Batch)
+    samples: list[SampleBlock] = field(default_factory=list)
     blocks: Counter[str] = field(default_factory=Counter)  # how many of each asset
     completion_times: list[float] = field(default_factory=list)  # of these blocks, by the monotonic clock [s]
 
@@ -49,7 +51,7 @@ class StoreWriter:
 
     def __init__(self, store: Store, owner: str, capacity: int) -> None:
         self._store, self._owner, self.capacity = store, owner, capacity
-        self._number = store.last_commit(owner)
+        self._number, self._bundles = store.last_commit(owner), store.bundle_index(owner)
         self._gathered = PendingCommit()
         self._sealed: PendingCommit | None = None  # on its way: nothing is added to it any more
         self._checkpoints: dict[str, _Checkpoint] = {}
@@ -77,7 +79,8 @@ class StoreWriter:
     @property
     def empty(self) -> bool:
         """Whether nothing waits."""
-        return self._sealed is None and self._gathered.batch.empty and not self._checkpoints
+        gathered = self._gathered
+        return self._sealed is None and gathered.batch.empty and not gathered.samples and not self._checkpoints
 
     @property
     def batch(self) -> Batch:
@@ -87,9 +90,16 @@ class StoreWriter:
     def add(self, owner: str, rows: Iterable[TableRow]) -> None:
         """Take rows of an asset, or of the service."""
         for table, values in rows:
+            if table == "recent":
+                self.add_block(owner, values["sequence"], values["samples"])
+                continue
             # only the audit says when it was written: all else is the same for every run over the same samples
             at = {"at": time.time()} if table == "audit" else {}
             self._gathered.batch.rows[table].append({"asset": owner, **at, **values})
+
+    def add_block(self, asset: str, sequence: int, samples: bytes) -> None:
+        """Take a block of an asset, packed, under the store's number."""
+        self._gathered.samples.append((asset, sequence, samples))
 
     def set_checkpoint(self, asset: Asset, completed_at: float | None = None, *, can_wait: bool = False) -> None:
         """Take the state of an asset, after a block that had been complete at `completed_at`, if there was one.
@@ -147,4 +157,6 @@ class StoreWriter:
             row = {"asset": name, "sequence": state.position.sequence, "state": pack_state(state)}
             batch.checkpoints[name] = {**row, "status": asset.status(state).to_json(), "at": time.time()}
         self._urgent = set()
+        batch.bundles = self._bundles.advance(self._gathered.samples, batch.first_needed)
+        self._gathered.samples = []
         return self._gathered

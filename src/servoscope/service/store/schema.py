@@ -9,7 +9,7 @@ import sqlalchemy as sa
 
 from servoscope.core.errors import EmptyStoreError, StoreError
 from servoscope.service.store.rows import Row, fault_rows
-from servoscope.service.store.tables import METADATA, diagnoses, meta, sizes
+from servoscope.service.store.tables import METADATA, bundles, diagnoses, meta, needed, sizes
 
 
 def _fill_sizes(connection: sa.Connection) -> None:
@@ -23,10 +23,18 @@ def _fill_sizes(connection: sa.Connection) -> None:
         connection.execute(sizes.insert(), list(found.values()))
 
 
+def _add_bundles(connection: sa.Connection) -> None:
+    """Make the tables of samples in bundles; those that are there keep rows of their own until they are too old."""
+    bundles.create(connection)
+    needed.create(connection)
+
+
 Migration = Callable[[sa.Connection], None]
 FIRST_VERSION = 1
-MIGRATIONS: list[Migration] = [_fill_sizes]  # the first leads from 1 to 2; a step that was released is never changed
+# the first leads from 1 to 2; a step that was released is never changed
+MIGRATIONS: list[Migration] = [_fill_sizes, _add_bundles]
 SIZES_FROM = 2  # version with sizes over time
+BUNDLES_FROM = 3  # version with samples in bundles
 READABLE_FROM = 1  # oldest version that is read as it is: what came later are further tables
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
@@ -17,6 +17,14 @@ from sqlalchemy.engine import URL
 from servoscope.core.errors import EmptyStoreError, StoreError, StoreUnavailableError
 from servoscope.service.network import NetworkSettings
 from servoscope.service.store import engine, schema, tables
+from servoscope.service.store.bundles import (
+    BundleChanges,
+    BundleIndex,
+    dissolve_rows_of_others,
+    read_index,
+    read_samples,
+    write_bundles,
+)
 from servoscope.service.store.rows import (
     NOTE,
     CheckpointRow,
@@ -27,7 +35,7 @@ from servoscope.service.store.rows import (
     Row,
 )
 
-RECENT_COLUMNS = tuple(column.name for column in tables.recent.c)
+Result = TypeVar("Result")
 OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
 
 
@@ -37,6 +45,7 @@ class Batch:
 
     rows: dict[str, list[Row]] = field(default_factory=lambda: defaultdict(list))  # new rows by the name of their table
     checkpoints: dict[str, Row] = field(default_factory=dict)  # the newest per asset: only that is written
+    bundles: BundleChanges = field(default_factory=lambda: BundleChanges([], [], []))  # of the newest samples
     first_needed: dict[str, int] = field(default_factory=dict)  # per asset, of the sequences of its recent samples
     outcomes: dict[int, Row] = field(default_factory=dict)  # changes of rows of the commands, by id
     deliveries: dict[str, Row] = field(default_factory=dict)  # changes of rows of the outbox, by key
@@ -44,29 +53,27 @@ class Batch:
     @property
     def empty(self) -> bool:
         """Whether there is nothing to write."""
-        return not (any(self.rows.values()) or self.checkpoints or self.outcomes or self.deliveries)
+        changes = self.checkpoints or self.outcomes or self.deliveries or any(self.bundles)
+        return not (any(self.rows.values()) or changes)
 
     def write(self, connection: sa.Connection, owner: str, commit: int) -> None:
         """Write it in the connection's transaction, as commit number `commit` of its owner."""
         _upsert(connection, tables.meta, [{"key": commit_key(owner), "value": commit}])
         for name, rows in self.rows.items():
-            if name == tables.recent.name:  # after an outage most of them are old by now
-                rows = [row for row in rows if row["sequence"] >= self.first_needed.get(row["asset"], row["sequence"])]
             if name == tables.sizes.name and rows:  # a clock that was set back may come to the same time again
                 _upsert(connection, tables.sizes, rows)
-            elif name == tables.recent.name and rows:  # nearly all rows, which need no conversion
-                marks = ", ".join(["?" if connection.dialect.name == "sqlite" else "%s"] * len(RECENT_COLUMNS))
-                insert = f"INSERT INTO {name} ({', '.join(RECENT_COLUMNS)}) VALUES ({marks})"
-                connection.exec_driver_sql(insert, [tuple(row[key] for key in RECENT_COLUMNS) for row in rows])
             elif rows:
                 connection.execute(tables.METADATA.tables[name].insert(), rows)
         if self.checkpoints:
             _upsert(connection, tables.checkpoints, list(self.checkpoints.values()))
         of: sa.BindParameter[Any] = sa.bindparam("of")
         if self.first_needed:
+            first: list[Row] = [{"asset": asset, "sequence": sequence} for asset, sequence in self.first_needed.items()]
+            _upsert(connection, tables.needed, first)
             below: sa.BindParameter[int] = sa.bindparam("below")
             old = tables.recent.delete().where((tables.recent.c.asset == of) & (tables.recent.c.sequence < below))
-            connection.execute(old, [{"of": asset, "below": first} for asset, first in self.first_needed.items()])
+            connection.execute(old, [{"of": row["asset"], "below": row["sequence"]} for row in first])
+        write_bundles(connection, owner, self.bundles)
         for key, changes in ((tables.commands.c.id, self.outcomes), (tables.outbox.c.key, self.deliveries)):
             if changes:
                 rows = [{"of": each, **row} for each, row in changes.items()]
@@ -138,11 +145,14 @@ class Store:
         Two processes that begin with an empty file lock each other out for a moment, and a reader may see the file
         before its tables. SQLite does not wait there, as one of them would wait for the other for ever.
         """
+        self.version = self._retry(end, lambda connection: schema.create_or_migrate(connection, self.name, write=write))
+
+    def _retry(self, end: float, work: Callable[[sa.Connection], Result]) -> Result:
+        """Return what some work in a transaction does, tried until `end`, monotonic [s]."""
         while True:
             try:
                 with self._transaction() as connection:
-                    self.version = schema.create_or_migrate(connection, self.name, write=write)
-                return
+                    return work(connection)
             except (StoreUnavailableError, EmptyStoreError):
                 if time.monotonic() >= end:
                     raise
@@ -262,11 +272,26 @@ class Store:
         with self._transaction() as connection:
             connection.execute(tables.audit.insert(), row)
 
-    def recent_samples(self, asset: str) -> list[tuple[int, bytes]]:
-        """Return an asset's recent samples: sequence and packed block, in order."""
-        table = tables.recent
-        query = sa.select(table).where(table.c.asset == asset).order_by(table.c.sequence)
-        return [(row["sequence"], row["samples"]) for row in self.fetch(query)]
+    def recent_samples(self, asset: str, newest: int | None = None) -> list[tuple[int, bytes]]:
+        """Return an asset's recent samples, or so many of the newest ones: sequence and packed block, in order."""
+        return dict(self.recent_samples_of([asset], newest))[asset]
+
+    def recent_samples_of(
+        self, assets: Iterable[str], newest: int | None = None
+    ) -> Iterator[tuple[str, list[tuple[int, bytes]]]]:
+        """Yield each of many assets, in any order, and its recent samples."""
+        with self.snapshot() as connection:
+            yield from read_samples(connection, assets, newest, in_bundles=self.version >= schema.BUNDLES_FROM)
+
+    def bundle_index(self, owner: str) -> BundleIndex:
+        """Return which rows hold the samples of an owner's assets."""
+        with self._transaction() as connection:
+            return read_index(connection, owner)
+
+    def take_over(self, owner: str, assets: Collection[str]) -> None:
+        """Let an owner have the samples of assets that another one has followed before."""
+        end = time.monotonic() + OPENING_S  # another worker may write to the same file meanwhile
+        self._retry(end, lambda connection: dissolve_rows_of_others(connection, owner, assets))
 
     def due_deliveries(self, now: float, limit: int, service: str, busy: Collection[str] = ()) -> list[OutboxRow]:
         """Return up to `limit` rows of a service's outbox whose next attempt is due, the oldest first.

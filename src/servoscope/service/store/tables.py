@@ -40,23 +40,40 @@ checkpoints = sa.Table(  # the state from which `run` continues each asset, and 
     sa.Column("status", sa.JSON, nullable=False),
     sa.Column("at", sa.Double, nullable=False),
 )
-recent = sa.Table(  # the last minutes of samples, block by block: those of a full diagnosis
+# The last minutes of samples: those of a full diagnosis. `bundles.py` reads and writes them.
+bundles = sa.Table(  # the blocks of a commit, those of the assets of a bundle in one row
+    "bundles",
+    METADATA,
+    sa.Column("bundle", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("owner", sa.Text, primary_key=True),  # the service that follows its assets
+    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("contents", sa.Text, nullable=False),  # JSON: whose blocks, which, how long
+    sa.Column("samples", sa.LargeBinary, nullable=False),
+)
+recent = sa.Table(  # blocks with a row of their own: of older versions, and what a bundle's row would be kept for
     "recent",
     METADATA,
     sa.Column("asset", sa.Text, primary_key=True),
     sa.Column("sequence", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("samples", sa.LargeBinary, nullable=False),
 )
+needed = sa.Table(  # the first block that an asset's checkpoint needs; earlier ones may still be there
+    "needed",
+    METADATA,
+    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("sequence", sa.BigInteger, nullable=False),
+)
 # All of it is new every few minutes. Noise does not compress; and dead rows are vacuumed by their number: a share of
 # the table's rows would grow with it, and its statistics are lost in a crash.
-for statement in (
-    "ALTER TABLE recent ALTER COLUMN samples SET STORAGE EXTERNAL",
-    "ALTER TABLE recent SET (autovacuum_vacuum_scale_factor = 0, autovacuum_vacuum_threshold = 1000,"
-    " autovacuum_vacuum_cost_delay = 0, toast.autovacuum_vacuum_scale_factor = 0,"
-    " toast.autovacuum_vacuum_threshold = 10000, toast.autovacuum_vacuum_cost_delay = 0)",
-):
-    on_postgresql = sa.DDL(statement).execute_if(dialect="postgresql")  # type: ignore[no-untyped-call]
-    sa.event.listen(recent, "after_create", on_postgresql)
+for _table in (bundles, recent):
+    for _statement in (
+        f"ALTER TABLE {_table.name} ALTER COLUMN samples SET STORAGE EXTERNAL",
+        f"ALTER TABLE {_table.name} SET (autovacuum_vacuum_scale_factor = 0, autovacuum_vacuum_threshold = 1000,"
+        " autovacuum_vacuum_cost_delay = 0, toast.autovacuum_vacuum_scale_factor = 0,"
+        " toast.autovacuum_vacuum_threshold = 10000, toast.autovacuum_vacuum_cost_delay = 0)",
+    ):
+        on_postgresql = sa.DDL(_statement).execute_if(dialect="postgresql")  # type: ignore[no-untyped-call]
+        sa.event.listen(_table, "after_create", on_postgresql)
 residuals = _numbered_table(
     "residuals",
     sa.Column("statistic", sa.Double, nullable=False),  # the largest since the row before, over its limit

@@ -193,20 +193,14 @@ def get_signals(context: ContextDep, asset: str, query: Annotated[SignalQuery, Q
 
 def _read_blocks(store: Store, asset: str, seconds: float, until: float | None) -> tuple[int | None, list[Block]]:
     """Return the sequence of the newest block that the store keeps, and the blocks from so long before a time on."""
-    table = tables.recent
-    newest = sa.select(sa.func.max(table.c.sequence)).where(table.c.asset == asset)
-    sequence: int | None = next(iter(store.fetch(newest)[0].values()))
-    query = sa.select(table).where(table.c.asset == asset).order_by(table.c.sequence.desc())
-    blocks: list[Block] = []
-    limit = FIRST_BLOCKS
-    while sequence is not None:
-        rows = store.fetch(query.limit(limit))
-        blocks = [Block.unpack(asset, row["sequence"], row["samples"]) for row in reversed(rows)]
-        end = blocks[-1].t[-1] if until is None else until
-        if end - blocks[0].t[0] >= seconds or len(rows) < limit:
-            break
+    blocks, limit = list[Block](), FIRST_BLOCKS
+    while True:
+        rows = store.recent_samples(asset, limit)
+        blocks = [Block.unpack(asset, *row) for row in rows]
+        end = (blocks[-1].t[-1] if until is None else until) if blocks else 0.0
+        if len(rows) < limit or end - blocks[0].t[0] >= seconds:
+            return (rows[-1][0] if rows else None), blocks
         limit *= 4
-    return sequence, blocks
 
 
 @router.get("/assets/{asset}/alarms")

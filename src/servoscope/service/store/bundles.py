@@ -1,0 +1,263 @@
+"""The last minutes of samples: a commit writes the blocks of many assets as one row, in a fraction of the time.
+
+A row is deleted when nobody needs a block of it. Where few of its blocks are still needed after a while, of an asset
+that has fallen silent for example, these go on as rows of their own: one asset does not hold the blocks of all others.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections import defaultdict, deque
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+import sqlalchemy as sa
+
+from servoscope.core.arrays import FloatArray
+from servoscope.service.store import tables
+from servoscope.service.store.rows import Row
+
+BUNDLES = 64  # that all assets are shared out among: whoever reads one asset reads the rows of its bundle
+PATIENCE = 80  # commits: two rounds of checkpoints, after which a row that is needed in part is no longer waited for
+RATE_DIGITS = 2  # of the rate of time stamps [Hz]
+
+
+SampleBlock = tuple[str, int, bytes]  # an asset, a sequence, and its packed samples as `Block.pack` returns them
+# what a bundle's row tells of one of its blocks: asset, sequence, bytes in the row, and whether it is without its time
+# stamps, which follow from the first one and the rate
+BundlePart = tuple[str, int, int, bool]
+
+
+class BundleKey(NamedTuple):
+    """Which row of an owner."""
+
+    bundle: int
+    number: int
+
+
+class BundleChanges(NamedTuple):
+    """What a commit does to the rows of its owner."""
+
+    new: list[Row]
+    unneeded: list[BundleKey]
+    sparse: list[BundleKey]  # few of their blocks are still needed, and these go on as rows of their own
+
+
+def bundle_number(asset: str) -> int:
+    """Return the bundle that an asset is in, always and in every store."""
+    return zlib.crc32(asset.encode()) % BUNDLES
+
+
+class BundleIndex:
+    """Which rows of an owner hold blocks that are still needed; `rows`: bundle, number and contents of those stored."""
+
+    def __init__(self, rows: Iterable[tuple[int, int, str]]) -> None:
+        self._number = 0  # of the newest row
+        self._counts: dict[BundleKey, list[int]] = {}  # how many blocks of a row are needed, and how many there are
+        self._held: dict[str, deque[tuple[int, BundleKey]]] = {}  # of each asset, sequences and where they are
+        self._bundles: dict[str, int] = {}
+        self._sparse: dict[BundleKey, int] = {}  # the newest row when at most half of a row was needed any more
+        for bundle, number, contents in sorted(rows, key=lambda row: row[1]):
+            self._hold(BundleKey(bundle, number), _read_contents(contents))
+            self._number = max(self._number, number)
+
+    def advance(self, blocks: Sequence[SampleBlock], first_needed: Mapping[str, int]) -> BundleChanges:
+        """Return what changes with further blocks, and when assets need those from a sequence on only."""
+        changes, counts = BundleChanges([], [], []), self._counts
+        self._number += 1
+        for asset, first in first_needed.items():
+            held = self._held.get(asset)
+            while held and held[0][0] < first:
+                _, key = held.popleft()
+                if (left := counts.get(key)) is None:
+                    continue  # its blocks are rows of their own
+                left[0] -= 1
+                if not left[0]:
+                    del counts[key]
+                    self._sparse.pop(key, None)
+                    changes.unneeded.append(key)
+                elif 2 * left[0] <= left[1]:
+                    self._sparse.setdefault(key, self._number)
+        while self._sparse and next(iter(self._sparse.values())) <= self._number - PATIENCE:
+            key = next(iter(self._sparse))
+            del self._sparse[key], counts[key]
+            changes.sparse.append(key)
+        # after an outage most of them are old by now
+        wanted = [one for one in blocks if one[1] >= first_needed.get(one[0], one[1])]
+        bundles: defaultdict[int, tuple[list[BundlePart], list[bytes]]] = defaultdict(lambda: ([], []))
+        for (asset, sequence, _), (stored, regular) in zip(
+            wanted, leave_out_times([one[2] for one in wanted]), strict=True
+        ):
+            bundle = self._bundles.get(asset)
+            if bundle is None:
+                bundle = self._bundles[asset] = bundle_number(asset)
+            parts, samples = bundles[bundle]
+            parts.append((asset, sequence, len(stored), regular))
+            samples.append(stored)
+        for bundle, (parts, samples) in bundles.items():
+            self._hold(BundleKey(bundle, self._number), parts)
+            contents = _write_contents(parts)
+            row = {"bundle": bundle, "number": self._number, "contents": contents, "samples": b"".join(samples)}
+            changes.new.append(row)
+        return changes
+
+    def _hold(self, key: BundleKey, parts: Sequence[BundlePart]) -> None:
+        self._counts[key] = [len(parts), len(parts)]
+        for asset, sequence, *_ in parts:
+            held = self._held.get(asset)
+            if held is None:
+                held = self._held[asset] = deque()
+            held.append((sequence, key))
+
+
+def leave_out_times(blocks: Sequence[bytes]) -> list[tuple[bytes, bool]]:
+    """Return packed blocks, and whether they are without time stamps: where these are t_0 + k / rate to the last bit.
+
+    Such a block begins with t_0 and the rate, and `restore_times` returns what it was.
+    """
+    found = [(one, False) for one in blocks]
+    alike: defaultdict[tuple[int, bytes], list[int]] = defaultdict(list)
+    for i, one in enumerate(blocks):
+        alike[len(one), one[-1:] if len(one) % 8 == 1 else b""].append(i)
+    for (length, tail), places in alike.items():
+        rows = 4 + tail[0] if tail else 4  # t, r, u, y and the covariates
+        n = length // 8 // rows
+        if n < 2 or 8 * rows * n + len(tail) != length:
+            continue
+        numbers = np.frombuffer(b"".join([blocks[i][: 8 * rows * n] for i in places]), dtype="<f8").reshape(-1, rows, n)
+        t, first = numbers[:, 0], numbers[:, 0, :1]
+        with np.errstate(all="ignore"):  # what is no time is kept as it is
+            rate = np.round((n - 1) / (t[:, -1:] - first), RATE_DIGITS)
+            regular = ((first + np.arange(n) / rate).view(np.int64) == t.view(np.int64)).all(axis=1)
+        short = np.concatenate([first, rate, numbers[:, 1:].reshape(len(places), -1)], axis=1)
+        for i, one_short, is_regular in zip(places, short, regular.tolist(), strict=True):
+            if is_regular:
+                found[i] = one_short.tobytes() + tail, True
+    return found
+
+
+def restore_times(stored: bytes) -> bytes:
+    """Return the packed block that `leave_out_times` made shorter."""
+    tail = stored[-1:] if len(stored) % 8 == 1 else b""
+    (first, rate), signals = np.frombuffer(stored[:16], dtype="<f8"), stored[16 : len(stored) - len(tail)]
+    n = len(signals) // 8 // (3 + tail[0] if tail else 3)
+    t: FloatArray = first + np.arange(n) / rate
+    return t.astype("<f8").tobytes() + signals + tail
+
+
+def _write_contents(parts: Sequence[BundlePart]) -> str:
+    import msgspec
+
+    return msgspec.json.encode(parts).decode()
+
+
+def _read_contents(contents: str) -> list[BundlePart]:
+    import msgspec
+
+    return msgspec.json.decode(contents, type=list[BundlePart])
+
+
+def read_index(connection: sa.Connection, owner: str) -> BundleIndex:
+    """Return which rows an owner has."""
+    rows = sa.select(*_columns("bundle", "number", "contents")).where(tables.bundles.c.owner == owner)
+    return BundleIndex((bundle, number, contents) for bundle, number, contents in connection.execute(rows))
+
+
+def read_samples(
+    connection: sa.Connection, assets: Iterable[str], newest: int | None = None, *, in_bundles: bool = True
+) -> Iterator[tuple[str, list[tuple[int, bytes]]]]:
+    """Yield each asset, in any order, and its blocks that are needed, in theirs: sequence and packed samples.
+
+    `newest`: only so many of them; `in_bundles`: False in stores of before version 3, where each has a row of its own.
+    """
+    of_bundle: defaultdict[int, list[str]] = defaultdict(list)
+    for asset in assets:
+        of_bundle[bundle_number(asset)].append(asset)
+    for bundle, names in of_bundle.items():
+        found: dict[str, list[tuple[int, bytes]]] = {name: [] for name in names}
+        alone = connection.execute(sa.select(tables.recent).where(tables.recent.c.asset.in_(names)))
+        first = dict.fromkeys(names, 0)
+        contents: dict[tuple[str, int], list[BundlePart]] = {}
+        if in_bundles:
+            first |= _first_needed(connection, names)
+            rows = sa.select(*_columns("owner", "number", "contents")).where(tables.bundles.c.bundle == bundle)
+            contents = {(of, number): _read_contents(text) for of, number, text in connection.execute(rows)}
+        for asset, sequence, samples in alone:
+            found[asset].append((sequence, samples))
+        if newest is not None:
+            sequences = {name: [sequence for sequence, _ in found[name]] for name in names}
+            for asset, sequence, *_ in chain.from_iterable(contents.values()):
+                if asset in sequences:
+                    sequences[asset].append(sequence)
+            first |= {name: max([first[name], *sorted(have)[-newest:][:1]]) for name, have in sequences.items()}
+        for (owner, number), parts in contents.items():
+            if any(sequence >= first.get(asset, math.inf) for asset, sequence, *_ in parts):
+                for asset, sequence, samples in _read_row(connection, owner, BundleKey(bundle, number)):
+                    if asset in found:
+                        found[asset].append((sequence, samples))
+        for name, blocks in found.items():
+            yield name, sorted(one for one in blocks if one[0] >= first[name])
+
+
+def _first_needed(connection: sa.Connection, assets: Iterable[str]) -> dict[str, int]:
+    rows = connection.execute(sa.select(tables.needed).where(tables.needed.c.asset.in_(set(assets))))
+    return {row.asset: row.sequence for row in rows}
+
+
+def _columns(*names: str) -> list[sa.Column[Any]]:
+    return [tables.bundles.c[name] for name in names]
+
+
+def _is_row(owner: str, bundle: Any, number: Any) -> sa.ColumnElement[bool]:
+    columns = tables.bundles.c
+    return sa.and_(columns.bundle == bundle, columns.owner == owner, columns.number == number)
+
+
+def _read_row(connection: sa.Connection, owner: str, key: BundleKey, *, lock: bool = False) -> list[SampleBlock]:
+    """Return the blocks of a row, none if there is no such row any more."""
+    query = sa.select(*_columns("contents", "samples")).where(_is_row(owner, *key))
+    row = connection.execute(query.with_for_update() if lock else query).first()
+    found, at = list[SampleBlock](), 0
+    contents, whole = ("[]", b"") if row is None else row
+    for asset, sequence, size, regular in _read_contents(contents):
+        stored = whole[at : at + size]
+        found.append((asset, sequence, restore_times(stored) if regular else stored))
+        at += size
+    return found
+
+
+def write_bundles(connection: sa.Connection, owner: str, changes: BundleChanges) -> None:
+    """Write what a commit changes, in its transaction."""
+    for key in changes.sparse:
+        dissolve_row(connection, owner, key)
+    if changes.unneeded:
+        unneeded = _is_row(owner, sa.bindparam("of_bundle"), sa.bindparam("of_number"))
+        keys = [{"of_bundle": key.bundle, "of_number": key.number} for key in changes.unneeded]
+        connection.execute(tables.bundles.delete().where(unneeded), keys)
+    if changes.new:
+        connection.execute(tables.bundles.insert(), [{"owner": owner, **row} for row in changes.new])
+
+
+def dissolve_row(connection: sa.Connection, owner: str, key: BundleKey) -> None:
+    """Replace a row by rows of their own for those of its blocks that are still needed."""
+    blocks = _read_row(connection, owner, key, lock=True)
+    first = _first_needed(connection, (asset for asset, *_ in blocks))
+    kept = [
+        {"asset": asset, "sequence": sequence, "samples": samples}
+        for asset, sequence, samples in blocks
+        if sequence >= first.get(asset, 0)
+    ]
+    connection.execute(tables.bundles.delete().where(_is_row(owner, *key)))
+    if kept:
+        connection.execute(tables.recent.insert(), kept)
+
+
+def dissolve_rows_of_others(connection: sa.Connection, owner: str, assets: Collection[str]) -> None:
+    """Dissolve the rows of other owners with blocks of these assets: `owner` follows them now."""
+    others = sa.select(*_columns("bundle", "owner", "number", "contents")).where(tables.bundles.c.owner != owner)
+    for bundle, of, number, contents in connection.execute(others).all():
+        if any(asset in assets for asset, *_ in _read_contents(contents)):
+            dissolve_row(connection, of, BundleKey(bundle, number))
