@@ -1,14 +1,17 @@
-"""What a sample costs on its way through the service: over MQTT, JSON, blocks of a second; by layer.
+"""What a sample costs on its way through the service: over MQTT, blocks of a second; by layer.
 
-    python benchmarks/service.py [--assets 1000] [--rate 100] [--blocks 60] [--speed 0] [--workers 1] [--postgres]
+    python benchmarks/service.py [--assets 1000] [--rate 100] [--blocks 60 or --seconds 60] [--speed 0]
+                                 [--format binary] [--workers 1] [--postgres]
     python benchmarks/service.py --overview [--json]
 
-`--speed 1` sends in true time and shows the latency; 0 sends as fast as broker and service take it. Broker, sender and
-PostgreSQL run on the same cores, and are reported apart. `--overview` runs several cases.
+`--speed 1` sends in true time, evenly, and shows the latency; 0 sends as fast as the service takes it, never more than
+`AHEAD` blocks of each asset ahead. Broker, sender and PostgreSQL run on the same cores, and are reported apart.
+`--overview` runs several cases.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import socket
@@ -16,28 +19,25 @@ import subprocess
 import sys
 import tempfile
 import time
-import tomllib
 import urllib.request
 from collections import Counter
 from importlib.resources import files
 from pathlib import Path
-from threading import Thread
 from typing import NamedTuple
 
 import numpy as np
+from block_sender import GROUPS, OFFSET_S, Feed, SenderReport, send_blocks
 from reliability.servers import Mosquitto, Postgres, mosquitto, programs
 from tables import Table, parser, show
 
 import servoscope as ss
 from servoscope.diagnosis.monitor import Monitor
-from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
-from servoscope.service.mqtt.payload import encode_json
-from servoscope.service.mqtt.topics import data_topic
-from servoscope.service.sources.block import Block
 from servoscope.simulation import reference, simulate
 
 RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
 START_S = 300.0  # in which a service begins
+SILENT_S = 30.0  # without a block that is counted: the rest is lost
+AHEAD = 20  # blocks of each asset that are sent and not yet counted, where they are sent as fast as they are taken
 WARM_BLOCKS = 10  # of each asset, before anything is counted: filters, first verdicts, memory
 TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
@@ -51,12 +51,19 @@ class Case(NamedTuple):
     speed: float = 1.0  # over true time; 0: as fast as they are taken
     workers: int = 1
     postgres: bool = False
+    binary: bool = False
 
     @property
     def words(self) -> str:
         """How the table calls it."""
         store, workers = "PostgreSQL" if self.postgres else "SQLite", f", {self.workers} workers" * (self.workers > 1)
-        return f"{self.assets} at {self.rate:g} Hz, {store}{workers}" + ", as fast as they are taken" * (not self.speed)
+        more = ", binary" * self.binary + ", as fast as they are taken" * (not self.speed)
+        return f"{self.assets} at {self.rate:g} Hz, {store}{workers}{more}"
+
+    @property
+    def feed_seconds(self) -> int:
+        """How long the recording has to be: no asset ever begins anew, which would be an alarm."""
+        return WARM_BLOCKS + self.blocks + GROUPS * OFFSET_S
 
 
 OVERVIEW = (
@@ -67,54 +74,25 @@ OVERVIEW = (
 
 
 def make_hall(folder: Path, case: Case, port: int, listen: int, store: str) -> tuple[Monitor, ss.Recording]:
-    """Write baseline and service file; return a monitor of the baseline and a healthy recording."""
+    """Write baseline and service file; return a monitor of the baseline and a healthy recording, long enough."""
+    # what is sent as fast as possible is taken and decoded when it is processed, not all at the beginning
+    in_flight = 65535 if case.speed else min(65535, 2 * case.assets)
     loop = ss.Loop.from_dict(ss.Loop.load(RIG).to_dict() | {"sample_rate": case.rate})
-    recordings = [simulate(loop, reference("multisine", 120.0, loop.sample_rate), seed=seed)[0] for seed in range(3)]
+    seconds = 120.0, 120.0, float(case.feed_seconds)
+    references = [reference("multisine", duration, loop.sample_rate) for duration in seconds]
+    recordings = [simulate(loop, r, seed=seed)[0] for seed, r in enumerate(references)]
     baseline = ss.learn(loop, recordings[:2])
     baseline.save(folder / "baseline.json")
     lines = [
         f'name = "hall"\n[service]\nlisten = "127.0.0.1:{listen}"\nworkers = {case.workers}\nlog = "error"',
+        f"buffer = {max(10_000, 4 * case.assets)}",
         f'[store]\nurl = "{store}"',
         '[sources.line]\nkind = "mqtt"',
-        f'host = "127.0.0.1"\nport = {port}\nin_flight = 65535',
+        f'host = "127.0.0.1"\nport = {port}\nin_flight = {in_flight}',
         *(f'[assets.axis{i:05d}]\nbaseline = "baseline.json"\nsource = "line"' for i in range(case.assets)),
     ]
-    text = "\n".join(lines) + "\n"
-    tomllib.loads(text)
-    (folder / "hall.toml").write_text(text, encoding="utf-8")
+    (folder / "hall.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return Monitor(baseline), recordings[2]
-
-
-class Sender:
-    """Sends the same recording for all assets, block by block."""
-
-    def __init__(self, port: int, assets: int, recording: ss.Recording, blocks: int) -> None:
-        self._client = create_mqtt_client(BrokerSettings(host="127.0.0.1", port=port), Path(), "sender")
-        self._client.max_inflight_messages_set(2000)
-        self._client.connect("127.0.0.1", port)
-        self._client.loop_start()
-        self._assets, self._blocks, self._began = assets, blocks, 0.0
-        self._recording, self._n = recording, round(recording.sample_rate)  # samples of a block of a second
-
-    def send(self, speed: float) -> None:
-        """Send all blocks, at so many times the true speed; 0: as they are taken."""
-        start = time.monotonic()
-        self._began = time.time() - (0.0 if speed else self._blocks)
-        for k in range(self._blocks):
-            rows = np.arange(k * self._n, (k + 1) * self._n) % self._recording.samples
-            t = self._began + k + np.arange(self._n) / self._n
-            signals = (getattr(self._recording, name)[rows] for name in "ruy")
-            message = encode_json(Block("", k, t, *signals))
-            for i in range(self._assets):
-                if speed:
-                    due = start + (k + (i + 1) / self._assets) / speed
-                    time.sleep(max(0.0, due - time.monotonic()) if i % 50 == 0 else 0.0)
-                sent = self._client.publish(data_topic("servoscope", f"axis{i:05d}"), message, qos=1)
-                if not speed and i % 1000 == 999:
-                    sent.wait_for_publish(600.0)
-        sent.wait_for_publish(600.0)
-        self._client.disconnect()  # the next sender has the same name
-        self._client.loop_stop()
 
 
 def scrape(port: int) -> Counter[str]:
@@ -151,6 +129,19 @@ def processor_time(pid: int) -> float:
     return found
 
 
+def largest_memory(pid: int) -> float:
+    """Return the most memory that a process and those that it has started have held, added up [GB]."""
+    found = 0
+    for file in Path("/proc").glob("[0-9]*/status"):
+        try:
+            fields = dict(line.split(":", 1) for line in file.read_text(encoding="utf-8").splitlines())
+        except OSError:
+            continue
+        if pid in (int(fields["Pid"]), int(fields["PPid"])):
+            found += int(fields["VmHWM"].split()[0])
+    return found / 2**20
+
+
 def quantile(before: Counter[str], after: Counter[str], share: float) -> float:
     """Return a quantile of the latencies between two scrapes: the upper end of its bin [s]."""
     edges = sorted(
@@ -161,16 +152,60 @@ def quantile(before: Counter[str], after: Counter[str], share: float) -> float:
     return next(edge for edge, count in edges if count >= share * edges[-1][1])
 
 
-def wait_for_blocks(port: int, blocks: float, seconds: float = 600.0, *, stored: bool = True) -> Counter[str]:
-    """Wait until so many blocks are counted, and `stored`."""
-    deadline = time.monotonic() + seconds
+class Feeder:
+    """The sender, a process of its own, and what it has reported."""
+
+    def __init__(self, feed: Feed, recording: ss.Recording) -> None:
+        context, signals = multiprocessing.get_context("spawn"), np.stack([recording.r, recording.u, recording.y])
+        self._feed, (self._pipe, theirs) = feed, context.Pipe()
+        self._process = context.Process(target=send_blocks, args=(feed, signals, theirs), daemon=True)
+        self.report, self.latest_s = SenderReport(0, 0, 0, 0, 0.0), 0.0
+        self._process.start()
+
+    @property
+    def pid(self) -> int:
+        """Its process, while it runs."""
+        return self._process.pid or 0
+
+    @property
+    def is_paced(self) -> bool:
+        """Whether it keeps to a speed, and does not wait for what is counted."""
+        return bool(self._feed.speed)
+
+    def follow(self, counted: float = 0.0) -> SenderReport:
+        """Tell how many blocks are counted; return what it has reported last."""
+        self._pipe.send(int(counted))
+        while self._pipe.poll():
+            self.report = self._pipe.recv()
+            self.latest_s = max(self.latest_s, self.report.late_s)
+        if not self._process.is_alive():
+            raise SystemExit("the sender has ended early")
+        if sys.stderr.isatty():
+            of = self._feed.assets * self._feed.blocks
+            print(f"\r{self.report.sent} of {of} blocks sent, {counted:.0f} counted ", end="", file=sys.stderr)
+        return self.report
+
+    def stop(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.join()
+
+
+def wait_for_blocks(port: int, feeder: Feeder, blocks: int, *, stored: bool) -> Counter[str]:
+    """Wait until so many blocks are counted, and `stored` or lost; return the metrics then."""
+    best, since = -1.0, time.monotonic()
     while True:
+        # each look makes the service list the metrics of all assets: none before it can say what we want to know
+        while feeder.follow(max(0.0, best)).sent < (blocks if feeder.is_paced else 1):
+            time.sleep(0.2)
         found = scrape(port)
-        if found["servoscope_blocks_total"] >= blocks and (found["servoscope_buffered_blocks"] == 0.0 or not stored):
+        counted = found["servoscope_blocks_total"]
+        if counted > best:
+            best, since = counted, time.monotonic()
+        done = counted >= blocks and not (stored and found["servoscope_buffered_blocks"])
+        if done or time.monotonic() > since + SILENT_S:
             return found
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"{found['servoscope_blocks_total']:.0f} of {blocks:.0f} blocks came")
-        time.sleep(2.0)  # each look makes the service list the metrics of all assets
+        time.sleep(1.0 if feeder.is_paced else 2.0)
 
 
 def kernel_time(monitor: Monitor, recording: ss.Recording) -> float:
@@ -192,7 +227,8 @@ def measure(case: Case) -> tuple[Table, tuple[str, ...]]:
     assets, server = case.assets, Postgres.temporary(server_programs) if server_programs is not None else None
     with tempfile.TemporaryDirectory() as name, socket.socket() as free:
         folder = Path(name)
-        more = ("allow_anonymous true", "max_inflight_messages 65535", "max_queued_messages 0", "max_queued_bytes 0")
+        # a broker that wrote all that waits to its disk every second would be what is measured
+        more = "allow_anonymous true", "max_inflight_messages 65535", "max_queued_messages 0", "autosave_interval 1800"
         broker = Mosquitto(folder, program, *more)
         free.bind(("127.0.0.1", 0))
         listen = int(free.getsockname()[1])
@@ -201,31 +237,34 @@ def measure(case: Case) -> tuple[Table, tuple[str, ...]]:
         broker.start()
         if server is not None:
             server.start()
+        feeder, starting = None, time.monotonic()
         service = subprocess.Popen([sys.executable, "-m", "servoscope", "run", str(folder / "hall.toml")])
         try:
-            deadline = time.monotonic() + START_S
             while not is_connected(listen):
-                if time.monotonic() > deadline:
-                    raise TimeoutError("the service does not begin")
+                if service.poll() is not None or time.monotonic() > starting + START_S:
+                    raise SystemExit("the service does not begin")
                 time.sleep(0.5)
+            start_s = time.monotonic() - starting
             time.sleep(2.0)  # until the broker knows what each worker wants: earlier blocks are not for it
             # without a pause between those that warm up and those that count: silence would be an alarm of each asset
-            given = broker.port, assets, recording, WARM_BLOCKS + case.blocks
-            sender = Thread(target=Sender(*given).send, args=(case.speed,))
-            sender.start()
-            before, used = wait_for_blocks(listen, assets * WARM_BLOCKS, stored=False), processor_time(service.pid)
-            broker_used, own, begin = processor_time(broker.pid), time.process_time(), time.monotonic()
-            sender.join()
-            after = wait_for_blocks(listen, assets * (WARM_BLOCKS + case.blocks))
-            seconds, used = time.monotonic() - begin, processor_time(service.pid) - used
-            broker_used, own = processor_time(broker.pid) - broker_used, time.process_time() - own
-            kernel = kernel_time(monitor, recording)
+            blocks = WARM_BLOCKS + case.blocks
+            feeder = Feeder(Feed(broker.port, assets, blocks, case.speed, case.rate, case.binary, AHEAD), recording)
+            pids = service.pid, broker.pid, feeder.pid
+            before, begin = wait_for_blocks(listen, feeder, assets * WARM_BLOCKS, stored=False), time.monotonic()
+            spent = [processor_time(pid) for pid in pids]
+            after = wait_for_blocks(listen, feeder, assets * blocks, stored=True)
+            seconds, report = time.monotonic() - begin, feeder.report
+            used, broker_used, own = (processor_time(pid) - earlier for pid, earlier in zip(pids, spent, strict=True))
+            kernel, memory = kernel_time(monitor, recording), largest_memory(service.pid)
         finally:
+            if feeder is not None:
+                feeder.stop()
             service.send_signal(signal.SIGTERM)
             service.wait(120)
             broker.stop()
             if server is not None:
                 server.remove()
+    counted = after["servoscope_blocks_total"]
     samples = after["servoscope_samples_total"] - before["servoscope_samples_total"]
     if not samples:
         raise SystemExit("all blocks came before the first look: more --blocks are needed")
@@ -242,14 +281,20 @@ def measure(case: Case) -> tuple[Table, tuple[str, ...]]:
     ]
     cells = [(words, f"{1e6 * spent / samples:.3f} us", f"{spent / samples / kernel:.1f}") for words, spent in rows]
     cells.append(("one log's kernel, in the same minute", f"{1e6 * kernel:.3f} us", "1"))
-    load, blocks = f"{os.getloadavg()[0]:.1f}", samples / case.rate / assets
-    late = tuple(f"{quantile(before, after, share):g} s" for share in (0.5, 0.99))
+    load = f"{os.getloadavg()[0]:.1f}"
+    p50, p99, p999, largest = (f"{quantile(before, after, share):g} s" for share in (0.5, 0.99, 0.999, 1.0))
     note = (
-        f"{case.words}: blocks of a second as JSON, {blocks:.0f} of each after those that warm up, in {seconds:.0f} s; "
-        f"latency p50 and p99 {late[0]} and {late[1]} at most. Load of the machine at the end: {load}."
+        f"{case.words}: blocks of a second, {samples / case.rate / assets:.0f} of each after those that warm up, in "
+        f"{seconds:.0f} s; ready after {start_s:.0f} s, {memory:.1f} GB at most. Sent {report.sent} blocks"
+        + f", the last ones of a second up to {feeder.latest_s:.1f} s late"
+        * bool(case.speed)
+        + f"; not acknowledged by the broker {report.sent - report.acknowledged + report.refused}, not counted "
+        f"{report.sent - counted:.0f}, not stored {after['servoscope_buffered_blocks']:.0f}; alarms "
+        f"{after['servoscope_alarms']:.0f}. Latency p50, p99, p99.9 and largest: {p50}, {p99}, {p999}, {largest} at "
+        f"most. Load of the machine at the end: {load}."
     )
     per_sample = (f"{1e6 * spent / samples:.2f}" for spent in (used - receive, used))
-    row = case.words, *per_sample, f"{used / samples / kernel:.0f}", *late, load
+    row = case.words, *per_sample, f"{used / samples / kernel:.0f}", p50, p99, load
     return Table("A sample through the service", note, ("layer", "time", "over the kernel"), tuple(cells)), row
 
 
@@ -257,15 +302,17 @@ if __name__ == "__main__":
     command = parser(__doc__)
     command.add_argument("--assets", type=int, default=1000)
     command.add_argument("--rate", type=float, default=100.0, help="of samples [Hz]")
-    command.add_argument("--blocks", type=int, default=60, help="of each asset")
+    command.add_argument("--blocks", "--seconds", type=int, default=60, help="of each asset, a second each")
     command.add_argument("--speed", type=float, default=0.0, help="over true time; 0: as fast as they are taken")
     command.add_argument("--workers", type=int, default=1)
     command.add_argument("--postgres", action="store_true", help="the store is a PostgreSQL server")
+    command.add_argument("--format", choices=("json", "binary"), default="json", help="of the messages")
     command.add_argument("--overview", action="store_true", help="several cases")
     given = command.parse_args()
     cases = OVERVIEW
     if not given.overview:
-        cases = (Case(given.assets, given.rate, given.blocks, given.speed, given.workers, given.postgres),)
+        how = given.workers, given.postgres, given.format == "binary"
+        cases = (Case(given.assets, given.rate, given.blocks, given.speed, *how),)
     measured = [measure(one) for one in cases]
     columns = ("assets", "without the client, us", "service, us", "over the kernel", "p50", "p99", "load")
     note = "Processor time of the service per sample; latency from the last sample of a block to its results stored."
