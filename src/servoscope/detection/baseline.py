@@ -20,7 +20,7 @@ from servoscope.detection.axis_model import AxisModel
 from servoscope.detection.baseline_parts import BaselineMemory, BaselineSource, DetectableChange, ExactPredictorFit
 from servoscope.detection.covariates import CovariateModel
 from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, sure_level, worst_case_hypotheses
-from servoscope.detection.expectation import NO_REFERENCE, Expectation, BaselineRun
+from servoscope.detection.expectation import NO_REFERENCE, BaselineRun, Expectation
 from servoscope.detection.feature_model import FeatureModel
 from servoscope.detection.learned_fault import LearnedFault
 from servoscope.detection.motion import MotionRange

@@ -24,8 +24,8 @@ from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
 from servoscope.detection.covariates import CovariatePath
 from servoscope.detection.expectation import (
-    Expectation,
     BaselineRun,
+    Expectation,
     ReferencePath,
     reference_path,
     residual_noise_model,
