@@ -8,6 +8,7 @@ import os
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import IO, Any
 
 import numpy as np
@@ -18,6 +19,18 @@ from servoscope.core.errors import OutputError
 CHUNK_ROWS = 1 << 16  # rows that are worked on at a time: a handful of columns of them fit into a core's cache
 SAMPLE_ROWS = 1 << 20  # rows that are enough to estimate a scale
 SPILL_BYTES = 1 << 24  # bytes from which an array is kept in a file
+
+
+class _SameThread(Executor):
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future = Future[Any]()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def second_thread(rows: int) -> Executor:
+    """Return what works beside this thread, task by task; for one chunk this thread itself: starting another costs."""
+    return ThreadPoolExecutor(1) if rows > CHUNK_ROWS else _SameThread()
 
 
 def empty(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:

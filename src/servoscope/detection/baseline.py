@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from functools import cached_property
@@ -18,20 +17,20 @@ from servoscope.core.files import atomic_write
 from servoscope.core.messages import MessageText
 from servoscope.core.short_repr import ShortRepr
 from servoscope.detection.axis_model import AxisModel
-from servoscope.detection.baseline_parts import BaselineModel, BaselineSource, DetectableChange, ExactPredictorFit
+from servoscope.detection.baseline_parts import BaselineMemory, BaselineSource, DetectableChange, ExactPredictorFit
 from servoscope.detection.covariates import CovariateModel
-from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, worst_case_hypotheses
-from servoscope.detection.expectation import Expectation
+from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, sure_level, worst_case_hypotheses
+from servoscope.detection.expectation import NO_REFERENCE, BaselineRun, Expectation
 from servoscope.detection.feature_model import FeatureModel
 from servoscope.detection.learned_fault import LearnedFault
 from servoscope.detection.motion import MotionRange
 from servoscope.detection.plant_fit import match_ratios
 from servoscope.detection.sensors import SensorModel
-from servoscope.detection.threshold_calibration import SEQUENTIAL, CalibrationFactors, t2_threshold
+from servoscope.detection.threshold_calibration import CalibrationFactors, t2_threshold
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.instrument import InstrumentTuning
 from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
-from servoscope.estimation.pipeline import Pipeline, Tuning
+from servoscope.estimation.pipeline import EstimationRunner, Pipeline, Tuning
 from servoscope.estimation.two_stage import StageOneTuning
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
@@ -47,7 +46,7 @@ Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
 
 
-class Baseline(ShortRepr, BaselineModel):
+class Baseline(ShortRepr, BaselineMemory):
     """What a healthy loop looks like to the monitor; everything that `diagnose` needs.
 
     Parameters
@@ -274,7 +273,21 @@ class Baseline(ShortRepr, BaselineModel):
 
     def pipeline(self) -> Pipeline:
         """Return the loop's chain of constant matrices."""
+        return self._pipeline
+
+    @cached_property
+    def _pipeline(self) -> Pipeline:
         return Pipeline.of(self.loop, self.stage_one, self.still_speed, self.instrument)
+
+    @cached_property
+    def baseline_run(self) -> BaselineRun:
+        """What runs over each recording; computed once, for a service examines thousands of windows an hour."""
+        pipeline, tuning, mean = self.pipeline(), self.tuning, None
+        if self.noise is not None:
+            expected = Expectation(pipeline, tuning, self.noise, NO_REFERENCE)
+            mean = expected.propagator(np.array(self.model_theta), self.plant)
+        estimates = EstimationRunner(pipeline, tuning, self.cusum_constants(pipeline))
+        return BaselineRun(estimates, mean, sure_level(self.members, self.rehearsed.sequential_budget(self.loop)))
 
     def cusum_constants(
         self, pipeline: Pipeline, under: Expectation | None = None, growth: float = 1.0
@@ -287,8 +300,7 @@ class Baseline(ShortRepr, BaselineModel):
         if self.loudest is None or not self.members:
             return None
         noise = self.loudest.times(np.sqrt(growth))
-        budget = SEQUENTIAL * self.loop.monitor.false_alarms_per_year / self.rehearsed.cusum
-        heard = self.members
+        budget, heard = self.rehearsed.sequential_budget(self.loop), self.members
         if under is not None:
             heard = worst_case_hypotheses(under, self.plant, self.loudest, np.array(self.ratios_covariance), heard)
         return build_cusum_constants(pipeline, self.plant, noise, np.array(self.scale), heard, budget)
@@ -314,15 +326,12 @@ class Baseline(ShortRepr, BaselineModel):
         budget = monitor.false_alarms_per_year / assets
         loop = self.loop.model_copy(update={"monitor": monitor.model_copy(update={"false_alarms_per_year": budget})})
         features = self.features.shared(budget) if self.features is not None else None
-        limit = t2_threshold(
-            loop, len(self.names), self.dof, self.rehearsed, bool(self.members), features=features is not None
-        )
+        tests = bool(self.members), features is not None
+        limit = t2_threshold(loop, len(self.names), self.dof, self.rehearsed, *tests)
         others = tuple(other.shared(assets) for other in self.others)
-        changed = self.model_copy(
+        return self.model_copy(
             update={"loop_settings": loop.to_dict(), "limit": limit, "features": features, "others": others}
         )
-        vars(changed).pop("loop", None)  # a copy takes along what was computed from the old settings
-        return changed
 
     def covariance_array(self) -> FloatArray:
         """Return `covariance` as an array (n, n)."""
@@ -389,11 +398,3 @@ class Baseline(ShortRepr, BaselineModel):
         except LoopError as error:
             raise BaselineError(f"{path}: damaged baseline, {error}; learn it again") from None
         return baseline
-
-
-def digest(loop: Loop, arrays: list[FloatArray]) -> str:
-    """Return a hash of a loop and of all samples that were learned from: 16 hexadecimal digits."""
-    h = hashlib.sha256(loop.hash().encode())
-    for array in arrays:
-        h.update(np.ascontiguousarray(array).tobytes())
-    return h.hexdigest()[:16]

@@ -28,6 +28,7 @@ RANK_TOLERANCE = 1e-9  # of the largest singular value: smaller ones are roundin
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
 FEWEST = 500  # updates with less of which a reference says nothing
 LONGEST = 60.0  # s of a healthy recording by which the test is designed
+ROUNDING = 1e-6  # of a level, by which limits that stand in its weights may change it
 HARDEST = 1.3  # a limit raised by more than this for the baseline's own uncertainty is not worth having
 
 
@@ -53,6 +54,18 @@ class CusumHypothesis:
             return np.inf
         h = 2.0 * level / (1.0 + float(np.sqrt(1.0 - 8.0 * self.drift * level)))
         return h if h <= HARDEST * level else np.inf
+
+
+def sure_level(members: Sequence[CusumHypothesis], false_alarms_per_year: float) -> float:
+    """Return up to which level of the test none alarms whose limits were fitted to another reference.
+
+    Fitted limits are those of larger rates and drifts, hence higher; but where others fall away, the whole budget may
+    be that of one.
+    """
+    limits = [member.limit(false_alarms_per_year / max(len(members), 1)) for member in members]
+    kept = [member for member, limit in zip(members, limits, strict=True) if np.isfinite(limit)]
+    alone = [m.limit(false_alarms_per_year) / m.limit(false_alarms_per_year / len(kept)) for m in kept]
+    return (1.0 - ROUNDING) * min(alone, default=1.0)
 
 
 def choose_cusum_hypotheses(

@@ -8,10 +8,11 @@ moments. So the biases of the regression are in the expectation, and cancel from
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from servoscope.estimation.noise_model import (
     arma_from_white_noise,
     colour_error,
 )
-from servoscope.estimation.pipeline import Pipeline, Regression, RegressionRunner, Tuning
+from servoscope.estimation.pipeline import EstimationRunner, Pipeline, Regression, RegressionRunner, Tuning
 from servoscope.models.lti import LinearSystem, autocovariances, solve_scaled
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
@@ -52,6 +53,9 @@ class ReferencePath(NamedTuple):
     def at_recorded(self, x: FloatArray) -> FloatArray:
         """Return the recorded samples of a signal on the gapless clock."""
         return x if len(self.recorded_index) == len(x) else x[self.recorded_index]
+
+
+NO_REFERENCE = ReferencePath(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.bool_))
 
 
 def reference_path(recording: Recording, before: tuple[float, float] | None = None) -> ReferencePath:
@@ -214,9 +218,16 @@ class NoiseFreeRegression:
 
     def __init__(self, pipeline: Pipeline, plant: Plant, faulty: Plant | None = None, onset: int = 0) -> None:
         self.plants, onsets = plant_sequence(plant, faulty, onset)
-        self._onsets = np.array(onsets)
+        self._onsets, self._pipeline = np.array(onsets), pipeline
         self._simulation, self._regressing = LoopSimulation(pipeline.loop, self.plants), RegressionRunner(pipeline)
         self._samples = 0
+
+    def again(self) -> Self:
+        """Return one at the first sample, whose constants are these."""
+        other = copy.copy(self)
+        other._simulation, other._regressing = self._simulation.again(), RegressionRunner(self._pipeline)
+        other._samples = 0
+        return other
 
     def advance(self, reference: ReferencePath) -> tuple[Regression, IntArray]:
         """Return the regression of the next piece of a reference, and which plant each sample (N,) had."""
@@ -249,7 +260,14 @@ class MeanPropagator:
         self._undisturbed = NoiseFreeRegression(self._pipeline, plant, faulty, onset)
         moments = [expectation.moments(each) for each in self._undisturbed.plants]
         self._moments = np.array([m.c for m in moments]), np.array([m.S for m in moments])
-        self._theta, self._samples = np.array(start, dtype=np.float64), 0
+        self._start = np.array(start, dtype=np.float64)
+        self._theta, self._samples = self._start.copy(), 0
+
+    def again(self) -> Self:
+        """Return one at the first sample, whose constants are these."""
+        other = copy.copy(self)
+        other._undisturbed, other._theta, other._samples = self._undisturbed.again(), self._start.copy(), 0
+        return other
 
     def advance(self, reference: ReferencePath) -> FloatArray:
         """Return the mean at the evaluations of the next piece of a reference, shape (K, n)."""
@@ -263,6 +281,15 @@ class MeanPropagator:
         room = np.empty((2, len(P_d)))
         mean_path(g.eta, g.phi, g.z, g.ok, which, *self._moments, P_d, R, self._theta, number, every, room, path)
         return path
+
+
+class BaselineRun(NamedTuple):
+    """What runs over each recording of one baseline, at the first sample: go on with `again` of each."""
+
+    estimates: EstimationRunner  # with the sequential test as the baseline has it
+    mean: MeanPropagator | None  # None where the loop cannot be simulated
+    # of the test's level, up to which the same test with limits fitted to whatever reference raises no alarm either
+    sure_level: float
 
 
 def plant_sequence(plant: Plant, faulty: Plant | None, onset: int) -> tuple[list[Plant], list[int]]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from itertools import groupby
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.detection.feature_model import FeatureModel, SpanFeatures, SpanSums
-from servoscope.estimation.window_features import WindowFeatures
+from servoscope.estimation.window_features import Window, WindowFeatures, WindowLanes
 
 
 class SpanScore(NamedTuple):
@@ -30,20 +32,23 @@ class FeatureMonitor:
 
     def __init__(self, model: FeatureModel) -> None:
         self.model = model
-        self._windows = WindowFeatures(model.layout)
-        self._head = model.in_a_row + SpanSums.size_of(model.layout)
-        self.size = self._head + self._windows.size
+        self.windows = WindowFeatures(model.layout)
+        self.head = model.in_a_row + SpanSums.size_of(model.layout)  # numbers of the state before the window that runs
+        self.size = self.head + self.windows.size
 
     def start(self) -> FloatArray:
         """Return the state before the first sample, shape (size,)."""
-        return np.concatenate([np.zeros(self._head), self._windows.start()])
+        return np.concatenate([np.zeros(self.head), self.windows.start()])
 
     def run(
         self, state: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
     ) -> list[SpanScore]:
         """Feed a block of samples, each of shape (N,), and return the spans that ended in it."""
+        return self.score(state, self.windows.run(state[self.head :], r, u, y, restart))
+
+    def score(self, state: FloatArray, windows: Iterable[Window]) -> list[SpanScore]:
+        """Add windows to the span that runs, and return the spans that ended with one of them."""
         sums, scores, found = self._span(state), state[: self.model.in_a_row], []
-        windows = self._windows.run(state[self._head :], r, u, y, restart)
         for end, ended in groupby(windows, key=lambda window: window.end):
             for window in ended:
                 sums.add(window)
@@ -71,7 +76,50 @@ class FeatureMonitor:
         return float(state[: self.model.in_a_row].min())
 
     def _span(self, state: FloatArray) -> SpanSums:
-        return SpanSums(self.model.layout, state[self.model.in_a_row : self._head])
+        return SpanSums(self.model.layout, state[self.model.in_a_row : self.head])
+
+
+class FeatureValues(NamedTuple):
+    """What the features of several assets say in a block: the value before it, and those of the spans that ended."""
+
+    before: FloatArray  # shape (assets,); 0 where an asset has no features
+    spans: list[tuple[int, int, float]]  # asset, last sample since its start, and value, asset by asset in their order
+
+    def at(self, samples: IntArray) -> FloatArray:
+        """Return the value that holds at each of some samples, shape (assets, K)."""
+        held = np.repeat(self.before[:, None], samples.size, axis=1)
+        for asset, end, value in self.spans:
+            held[asset, int(np.searchsorted(samples, end)) :] = value
+        return held
+
+
+class FeatureLanes:
+    """Scores the spans of several assets together; their states begin at a column of their rows."""
+
+    def __init__(self, assets: Sequence[FeatureMonitor | None], column: int) -> None:
+        """`assets`: None for one without features."""
+        self._assets, self._column = tuple(assets), column
+        heads = np.array([0 if one is None else one.head for one in assets])
+        self._windows = WindowLanes([None if one is None else one.windows for one in assets], column + heads)
+        in_a_row = np.array([0 if one is None else one.model.in_a_row for one in assets])
+        self._others = np.arange(in_a_row.max()) >= in_a_row[:, None]  # what of the first numbers is no score
+
+    def values(self, rows: FloatArray) -> FloatArray:
+        """Return `FeatureMonitor.value` of each asset, shape (assets,); 0 where it has no features."""
+        scores = rows[:, self._column : self._column + self._others.shape[1]]
+        smallest = np.where(self._others, np.inf, scores).min(axis=1)
+        return np.asarray(np.where(self._others.all(axis=1), 0.0, smallest))
+
+    def run(self, rows: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> FeatureValues:
+        """Feed a block of samples, each of shape (assets, N); the rows are changed in place."""
+        before, spans = self.values(rows), []
+        ended = groupby(self._windows.run(rows, r, u, y, restart), key=itemgetter(0))
+        for asset, windows in ended:
+            one = self._assets[asset]
+            assert one is not None
+            found = one.score(rows[asset, self._column : self._column + one.size], (window for _, window in windows))
+            spans += [(asset, span.end - 1, span.value) for span in found]
+        return FeatureValues(before, spans)
 
 
 def smallest_in_a_row(ratios: FloatArray, length: int) -> FloatArray:

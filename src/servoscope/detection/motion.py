@@ -15,9 +15,7 @@ from pydantic import BaseModel, ConfigDict
 
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.pipeline import Pipeline, RegressionRunner, Tuning
-from servoscope.models.plants.polynomial import PolynomialPlant
 from servoscope.signals import Recording
 
 __all__ = ["QUANTITIES", "MotionRange", "RecordedMotion", "learn_motion"]
@@ -123,15 +121,19 @@ def motion_columns(
     motion = [
         runner.advance(x, x, x, restart).phi for runner, x in zip(kinematics, (r - origin, y - origin), strict=True)
     ]
-    products = (g.phi[:, :, None] * g.phi[:, None, :]).reshape(len(r), -1)
-    used = g.ok[:, None]
-    return np.where(used, np.column_stack([np.ones_like(r), *(x**2 for x in motion), products]), 0.0)
+    n, edges = g.phi.shape[1], np.cumsum([1, *(x.shape[1] for x in motion)])
+    columns = np.empty((len(r), edges[-1] + n * n))
+    columns[:, 0] = 1.0
+    for x, begin, end in zip(motion, edges, edges[1:], strict=False):
+        np.square(x, out=columns[:, begin:end])
+    np.multiply(g.phi[:, :, None], g.phi[:, None, :], out=columns[:, edges[-1] :].reshape(len(r), n, n))
+    columns[~g.ok] = 0.0
+    return columns
 
 
 def motion_pipelines(pipeline: Pipeline) -> tuple[Pipeline, ...]:
     """Return what forms the plant's regressors, and the kinematics of r and of y."""
-    plain = _kinematics(pipeline)
-    return pipeline, *(plain for _ in range(SIGNALS))
+    return pipeline, *(pipeline.kinematics for _ in range(SIGNALS))
 
 
 def mean_quantities(means: FloatArray) -> FloatArray:
@@ -196,16 +198,3 @@ def learn_motion(pipeline: Pipeline, recordings: Sequence[Recording]) -> MotionR
 
 def _nested(x: FloatArray) -> Ranges:
     return tuple(tuple(tuple(map(float, row)) for row in window) for window in x)
-
-
-def _kinematics(pipeline: Pipeline) -> Pipeline:
-    """Return what forms position, speed and acceleration of a signal behind a filter with the loop's cutoff."""
-    loop = pipeline.loop
-    plain = {"structure": "svf", "cutoff": filter_cutoff(loop), "estimator": "akf", "two_stage": "none"}
-    update = {
-        "plant": PolynomialPlant(order=2, stiffness=True),
-        "monitor": loop.monitor.model_copy(update=plain),
-        "input_deadzone": None,
-        "delay": 0.0,
-    }
-    return Pipeline.of(loop.model_copy(update=update))

@@ -42,6 +42,10 @@ class CalibrationFactors:
     statistic: float = 1.0
     cusum: float = 1.0
 
+    def sequential_budget(self, loop: Loop) -> float:
+        """Return how many false alarms per year of a loop theory may expect of the CUSUMs."""
+        return SEQUENTIAL * loop.monitor.false_alarms_per_year / self.cusum
+
 
 def t2_threshold(
     loop: Loop, n: int, dof: float, calibration: CalibrationFactors, sequential: bool, features: bool = False

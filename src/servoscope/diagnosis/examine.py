@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -23,7 +23,13 @@ from servoscope.detection import cusum_design
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
 from servoscope.detection.covariates import CovariatePath
-from servoscope.detection.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
+from servoscope.detection.expectation import (
+    BaselineRun,
+    Expectation,
+    ReferencePath,
+    reference_path,
+    residual_noise_model,
+)
 from servoscope.detection.motion import RecordedMotion
 from servoscope.detection.trace import UNSEEN, Statistic, any_exceeded, detection_statistics
 from servoscope.detection.warm_up import follow_warm_up
@@ -64,8 +70,11 @@ class Examination:
     replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
 
     @classmethod
-    def from_recording(cls, baseline: Baseline, recording: Recording) -> Examination:
+    def from_recording(cls, baseline: Baseline, recording: Recording, *, quick: bool = False) -> Examination:
         """Run the recursion over the recording and compare it with what a healthy loop would show.
+
+        `quick`: whether the level of the sequential test may be held against the baseline's own limits where neither
+        these nor those for the recording's reference, which take several times as long as all the rest, raise an alarm.
 
         Raises RecordingError if the recording's sample rate is not the loop's.
         """
@@ -75,18 +84,19 @@ class Examination:
                 f"{recording.name}: sampled at {recording.sample_rate:g} Hz, the baseline's loop at "
                 f"{loop.sample_rate:g} Hz: learn a baseline at this rate"
             )
-        along = None
+        along, pipeline = None, baseline.pipeline()
         if (model := baseline.covariates) is not None:
-            memory = baseline.pipeline().memory_samples
+            memory = pipeline.memory_samples
             theta = np.array(baseline.theta)
             if model.warm_up is None:
                 along = CovariatePath.of(model, theta, recording.channels, memory)
             else:
-                along = follow_warm_up(baseline.pipeline(), model, theta, recording, memory)
+                along = follow_warm_up(pipeline, model, theta, recording, memory)
             place = ", ".join(filter(None, [baseline.point, along.place]))
             baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
             baseline = baseline.model_copy(update={"point": place})
-        exam = _run_recursion(baseline, recording, baseline.pipeline(), along)
+        exam = _run_quickly(baseline, recording) if quick and along is None else None
+        exam = exam or _run_recursion(baseline, recording, pipeline, along)
         skipped = _skipped_share(exam.estimates)
         replaced = _has_failed_instrument(exam)
         if replaced or skipped > MAX_SKIPPED_SHARE:
@@ -274,19 +284,34 @@ def _reference_piece(recording: Recording, rows: slice, first: int) -> Reference
     return reference_path(recording.rows(rows), ahead)
 
 
+def _run_quickly(baseline: Baseline, recording: Recording) -> Examination | None:
+    """Return what `_run_recursion` does, with the baseline's own limits; None where others might raise an alarm."""
+    run = baseline.baseline_run
+    exam = _run_recursion(baseline, recording, baseline.pipeline(), run=run)
+    quiet = exam.estimates.level.max(initial=0.0) < run.sure_level
+    return exam if quiet and exam.statistic.max(initial=0.0) <= baseline.limit else None
+
+
 def _run_recursion(
     baseline: Baseline,
     recording: Recording,
     pipeline: Pipeline,
     along: CovariatePath | None = None,
     growth: float = 1.0,
+    run: BaselineRun | None = None,
 ) -> Examination:
-    """Read a recording once: the estimates, and in a second thread what a healthy loop would show."""
-    tuning, C, noise, walk = baseline.tuning, baseline.covariance_array(), None, None
-    if baseline.noise is None:
+    """Read a recording once: the estimates, and in a second thread what a healthy loop would show.
+
+    `run`: with the baseline's own sequential test; None: with limits for the recording's reference.
+    """
+    tuning, C, noise, walk, watch = baseline.tuning, baseline.covariance_array(), None, None, None
+    if baseline.noise is not None:
+        noise = baseline.noise.times(np.sqrt(growth))
+    if run is not None:
+        walk = None if run.mean is None else run.mean.again()
+    elif noise is None:
         watch = baseline.cusum_constants(pipeline)
     else:
-        noise = baseline.noise.times(np.sqrt(growth))
         beginning = recording.rows(slice(0, round(cusum_design.design_duration_s(pipeline) * recording.sample_rate)))
         expectation = Expectation(pipeline, tuning, noise, reference_path(beginning))
         watch = baseline.cusum_constants(pipeline, expectation, growth)
@@ -299,7 +324,8 @@ def _run_recursion(
             walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.model_theta))
         )
 
-    estimating = EstimationRunner(pipeline, tuning if along is None else replace(tuning, theta=along.start), watch)
+    started = tuning if along is None else replace(tuning, theta=along.start)
+    estimating = EstimationRunner(pipeline, started, watch) if run is None else run.estimates.again()
     columns = defaultdict[str, outofcore.GrowableArray](outofcore.GrowableArray)
 
     def keep(e: Estimates, path: Future[FloatArray]) -> None:
@@ -311,7 +337,7 @@ def _run_recursion(
         for name, piece in {**vars(e), "expected": expected, "statistic": T2}.items():
             columns[name].append(piece)
 
-    with ThreadPoolExecutor(1) as second:  # one thread, so that its tasks run in order
+    with outofcore.second_thread(recording.samples) as second:  # one thread, so that its tasks run in order
         kept: Future[None] | None = None
         for rows in outofcore.iter_chunks(0, recording.samples):
             path = second.submit(healthy, rows)

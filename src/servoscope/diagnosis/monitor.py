@@ -16,7 +16,7 @@ from servoscope.detection.baseline import Baseline
 from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key, deduplicate
-from servoscope.diagnosis.side_monitors import SideLanes, SideValues, stack_features
+from servoscope.diagnosis.side_monitors import SideLanes, SideValues
 from servoscope.estimation.frequency_response import FrequencyResponse
 
 if TYPE_CHECKING:
@@ -266,11 +266,14 @@ class Monitor:
         new, outs = rows.copy(), []
         for assets, recursion in self._groups:
             part = slice(self._prefix_size, self._prefix_size + recursion.size)
-            own = np.ascontiguousarray(rows[assets, part])
+            who: Any = assets if len(self._groups) > 1 else slice(None)  # which copies nothing
+            own = np.ascontiguousarray(rows[who, part])
             index = recursion.rows(own, signals[0].shape[1])
-            r, u, y = (signal[assets] for signal in signals)
-            new[assets, part], out = recursion.run(own, r, u, y, None if flags is None else flags[assets])
+            r, u, y = (signal[who] for signal in signals)
+            new[who, part], out = recursion.run(own, r, u, y, None if flags is None else flags[who])
             outs.append(out)
+        if len(outs) == 1:
+            return new, outs[0], index
         together = np.empty((len(rows), *outs[0].shape[1:]), dtype=outs[0].dtype)
         for (assets, _), out in zip(self._groups, outs, strict=True):
             together[assets] = out
@@ -313,17 +316,15 @@ class Monitor:
         signals: list[npt.NDArray[Any]],
         gaps: npt.NDArray[np.bool_],
         channels: Mapping[str, npt.ArrayLike],
-    ) -> list[SideValues]:
+    ) -> SideValues:
         """Return what is seen beside the recursions; changes its state, and starts theta where covariates say so."""
         found = self._sides.run(rows, signals, gaps, channels)
-        if not found:
-            return found
-        if found[0].averages is not None:  # of one asset
-            signals[0] = np.where(np.isnan(found[0].averages).any(axis=1), np.nan, signals[0])
-        if found[0].start is not None:
+        if found.averages is not None:  # of one asset
+            signals[0] = np.where(np.isnan(found.averages).any(axis=1), np.nan, signals[0])
+        if found.start is not None:
             ((_, recursion),), constants = self._groups, self._constants_of[0].constants
             theta = rows[0, self._prefix_size :][recursion.slices["theta"]]
-            theta[:] = np.linalg.solve(constants.basis, found[0].start - constants.origin)
+            theta[:] = np.linalg.solve(constants.basis, found.start - constants.origin)
         return found
 
     def latest(self, state: FloatArray) -> Trace:
@@ -350,10 +351,10 @@ class Monitor:
         out: npt.NDArray[Any],
         index: npt.NDArray[np.int64],
         first: int,
-        beside: Sequence[SideValues],
+        beside: SideValues,
     ) -> Trace:
         """Return complete evaluations, shape (assets, K, row), as a trace; the block begins at sample `first`."""
-        motion = beside[0].motion if beside else None
+        motion, features = beside.motion, None if beside.features is None else beside.features.at(index)
         n, f = len(self._constants_of[0].expected_theta), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)
         shape = out.shape[:2]
         H = out[..., 4 + n + n * n :].reshape(*shape, len(f), 6)
@@ -381,11 +382,11 @@ class Monitor:
             threshold=threshold,
             ifrf=FrequencyResponse(f, *response),
             ifrf_expected=expected,
-            features=stack_features(beside, index) if self.fleet or not beside else beside[0].features_at(index),
+            features=features if features is None or self.fleet else features[0],
             motion=None if motion is None else motion.excess,
             **columns,
         )
-        return self._sides.first.compare(trace, beside[0], index - first) if beside else trace
+        return self._sides.first.compare(trace, beside, index - first)
 
 
 def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:

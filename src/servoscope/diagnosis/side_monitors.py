@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
-from servoscope.detection.feature_monitor import FeatureMonitor, hold
+from servoscope.detection.feature_monitor import FeatureLanes, FeatureMonitor, FeatureValues
 from servoscope.detection.motion_monitor import MotionEvidence, MotionMonitor
 from servoscope.detection.trace import Trace
 from servoscope.detection.warm_up_monitor import WarmUpMonitor
@@ -22,14 +23,10 @@ from servoscope.estimation.pipeline import Pipeline
 class SideValues(NamedTuple):
     """What they say of a block."""
 
-    features: tuple[FloatArray, npt.NDArray[np.int64], float] | None  # values, samples at which each is there, before
-    averages: FloatArray | None  # of the covariates at each sample, shape (N, k)
-    start: FloatArray | None  # coefficients to start from, as soon as the covariates are known
-    motion: MotionEvidence | None
-
-    def features_at(self, index: npt.NDArray[np.int64]) -> FloatArray | None:
-        """Return what the features say at some samples, counted since the start."""
-        return None if self.features is None else hold(*self.features[:2], index, self.features[2])
+    features: FeatureValues | None  # of all assets; the others are there for one asset only
+    averages: FloatArray | None = None  # of the covariates at each sample, shape (N, k)
+    start: FloatArray | None = None  # coefficients to start from, as soon as the covariates are known
+    motion: MotionEvidence | None = None
 
 
 class SideMonitors:
@@ -77,28 +74,28 @@ class SideMonitors:
         return np.split(state, np.cumsum(sizes)[:-1])
 
     def run(
-        self, state: FloatArray, signals: Sequence[npt.NDArray[Any]], restart: BoolArray, channels: Mapping[str, Any]
+        self,
+        state: FloatArray,
+        signals: Sequence[FloatArray],
+        restart: BoolArray,
+        channels: Mapping[str, Any],
+        features: FeatureValues | None,
     ) -> SideValues:
-        """Feed r, u and y of a block, shape (N,) each; the state is changed in place."""
-        r, u, y = (np.asarray(signal, dtype=np.float64) for signal in signals)
-        of_features, of_covariates, of_motion = self._split(state)
-        features, averages, start, motion = None, None, None, None
-        if self.features is not None:
-            before, spans = self.features.value(of_features), self.features.run(of_features, r, u, y, restart)
-            ends = np.array([span.end - 1 for span in spans], np.int64)
-            features = np.array([span.value for span in spans]), ends, before
+        """Feed r, u and y of a block, shape (N,) each, to all but the features; the state is changed in place."""
+        r, u, y = signals
+        _, of_covariates, of_motion = self._split(state)
+        averages, start, motion = None, None, None
         if self.motion is not None:
             motion = self.motion.run(of_motion, r, u, y, restart)
         if self.covariates is not None:
             averages, start = self.covariates.run(of_covariates, (r, u, y), restart, channels)
         return SideValues(features, averages, start, motion)
 
-    def latest(self, state: FloatArray) -> SideValues:
+    def latest(self, state: FloatArray, features: FeatureValues | None) -> SideValues:
         """Return what holds at the last sample of a state, as of a block of one sample."""
-        of_features, of_covariates, of_motion = self._split(state)
-        none = np.zeros(0)
+        _, of_covariates, of_motion = self._split(state)
         return SideValues(
-            None if self.features is None else (none, none.astype(np.int64), self.features.value(of_features)),
+            features,
             None if self.covariates is None else self.covariates.latest(of_covariates)[None],
             None,
             None if self.motion is None else self.motion.latest(of_motion),
@@ -116,10 +113,15 @@ class SideMonitors:
 
 
 class SideLanes:
-    """Those of several assets, one after the other, in the rows of their states from `column` on."""
+    """Those of several assets, in the rows of their states from `column` on; only features follow more than one."""
 
     def __init__(self, lanes: Sequence[SideMonitors], column: int) -> None:
-        self._lanes, self._column, self.first = lanes, column, lanes[0]
+        self._lanes, self._column, self.first = tuple(lanes), column, lanes[0]
+
+    @cached_property
+    def _features(self) -> FeatureLanes | None:
+        features = [one.features for one in self._lanes]
+        return None if all(one is None for one in features) else FeatureLanes(features, self._column)
 
     @property
     def size(self) -> int:
@@ -130,15 +132,10 @@ class SideLanes:
         """Return those of some assets."""
         return SideLanes([self._lanes[asset] for asset in assets.tolist()], self._column)
 
-    def _states(self, rows: FloatArray) -> list[FloatArray]:
-        """Return the part of each row that is theirs; none where all of them are empty."""
-        ends = [self._column + one.size for one in self._lanes] if rows.shape[1] > self._column else []
-        return [row[self._column : end] for row, end in zip(rows, ends, strict=False)]
-
     def start(self, rows: FloatArray) -> None:
         """Write the states before the first sample, shape (assets, ...)."""
-        for state, one in zip(self._states(rows), self._lanes, strict=False):
-            state[:] = one.start()
+        for row, one in zip(rows, self._lanes, strict=True):
+            row[self._column : self._column + one.size] = one.start()
 
     def run(
         self,
@@ -146,21 +143,23 @@ class SideLanes:
         signals: Sequence[npt.NDArray[Any]],
         restart: BoolArray,
         channels: Mapping[str, Any],
-    ) -> list[SideValues]:
+    ) -> SideValues:
         """Feed r, u and y of a block, shape (assets, N) each; the states are changed in place."""
-        return [
-            one.run(state, [signal[i] for signal in signals], restart[i], channels)
-            for i, (one, state) in enumerate(zip(self._lanes, self._states(rows), strict=False))
-        ]
+        features = None
+        if self._features is None and len(self._lanes) > 1:
+            return SideValues(None)
+        r, u, y = (np.asarray(signal, dtype=np.float64) for signal in signals)
+        if self._features is not None:
+            features = self._features.run(rows, r, u, y, restart)
+        if len(self._lanes) > 1:
+            return SideValues(features)
+        return self.first.run(self._own(rows), (r[0], u[0], y[0]), restart[0], channels, features)
 
-    def latest(self, rows: FloatArray) -> list[SideValues]:
+    def latest(self, rows: FloatArray) -> SideValues:
         """Return what holds at the last sample of each state."""
-        return [one.latest(state) for one, state in zip(self._lanes, self._states(rows), strict=False)]
+        features = None if self._features is None else FeatureValues(self._features.values(rows), [])
+        return SideValues(features) if len(self._lanes) > 1 else self.first.latest(self._own(rows), features)
 
-
-def stack_features(values: Sequence[SideValues], index: npt.NDArray[np.int64]) -> FloatArray | None:
-    """Return what the features of each asset say, shape (assets, K), 0 without features; None: none has."""
-    found = [one.features_at(index) for one in values]
-    if all(one is None for one in found):
-        return None
-    return np.array([np.zeros(index.size) if one is None else one for one in found])
+    def _own(self, rows: FloatArray) -> FloatArray:
+        """Return the state of the one asset."""
+        return rows[0, self._column : self._column + self.first.size]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ from servoscope.estimation.two_stage import StageOneRunner, StageOneTuning
 from servoscope.estimation.valve import ValveLaw, integer_delay
 from servoscope.models.lti import LinearSystem
 from servoscope.models.plants import EXTRA_COLUMNS
+from servoscope.models.plants.polynomial import PolynomialPlant
 from servoscope.signals import Recording
 
 if TYPE_CHECKING:
@@ -235,6 +237,19 @@ class Pipeline:
         return self.valve.run(self.valve.start(), u, y, restart)
 
     @cached_property
+    def kinematics(self) -> Pipeline:
+        """What forms position, speed and acceleration of a signal behind a filter with the loop's cutoff."""
+        loop = self.loop
+        plain = {"structure": "svf", "cutoff": filter_bank.filter_cutoff(loop), "estimator": "akf", "two_stage": "none"}
+        update = {
+            "plant": PolynomialPlant(order=2, stiffness=True),
+            "monitor": loop.monitor.model_copy(update=plain),
+            "input_deadzone": None,
+            "delay": 0.0,
+        }
+        return Pipeline.of(loop.model_copy(update=update))
+
+    @cached_property
     def _plain(self) -> Recursion:
         """The recursion that only forms regressors; cached, for signatures need it many times."""
         from servoscope.estimation.recursion import Recursion
@@ -307,6 +322,12 @@ class EstimationRunner:
         self._constants = pipeline.constants(tuning, watch)
         self._recursion = Recursion([self._constants])
         self._state = self._recursion.start()
+
+    def again(self) -> Self:
+        """Return one at the first sample, whose constants are these."""
+        other = copy.copy(self)
+        other._ahead, other._state = _InputStage(self._pipeline), self._recursion.start()
+        return other
 
     def advance(self, block: Recording) -> Estimates:
         """Return the estimates of the next block; their samples count from the first block on."""

@@ -10,21 +10,27 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.core.jit import where
 
 MOTIONS = ("forward", "backward", "rest")
 SIGNALS = ("u", "e")
 MAX_PHYSICAL = 1e100  # as in the recursion: no physical signal, and it would stay in the filters for ever
 SPEED_TIME = 0.02  # s: time constant behind the speed of the reference
+SMALLEST = np.finfo(np.float64).tiny
 FEWEST = 3  # samples of a motion from which a window speaks for it
+VECTOR_WIDTH = 8  # numbers in a vector
 HEADER = 8  # numbers of the state before those of the filters; see `_accumulate`
 ROW_HEADER = 3  # numbers of a row before the sums: sample, level, span
+
+
+_pass_bands: Any = None  # filled in where the kernel is compiled
 
 
 class FeatureLayout(BaseModel):
@@ -85,19 +91,6 @@ class Window(NamedTuple):
     motion: FloatArray  # shares of the three motions, logarithms of the rms speed forward and backward, shape (5,)
 
 
-class _Constants(NamedTuple):
-    window: int
-    levels: int
-    span: int
-    settling: int
-    rest: float
-    rate: float
-    smoothing: float
-    edges: FloatArray  # in samples
-    b: FloatArray  # of the band-pass filters, shape (bands,)
-    a: FloatArray  # shape (bands, 2)
-
-
 def _bands(layout: FeatureLayout) -> tuple[FloatArray, FloatArray]:
     """Return second-order band-passes bw s/(s^2 + bw s + w0^2) by the bilinear transform, prewarped at their edges.
 
@@ -116,20 +109,15 @@ class WindowFeatures:
         self.layout = layout
         b, a = _bands(layout)
         smoothing = 1.0 - np.exp(-1.0 / (SPEED_TIME * layout.sample_rate))
-        self._constants = _Constants(
-            window=layout.window,
-            levels=layout.levels,
-            span=layout.span,
-            settling=layout.settling,
-            rest=layout.rest_speed,
-            rate=layout.sample_rate,
-            smoothing=float(smoothing),
-            edges=np.array(layout.edges_s, dtype=np.float64) * layout.sample_rate,
-            b=np.ascontiguousarray(b),
-            a=np.ascontiguousarray(a),
-        )
+        edges = np.array(layout.edges_s, dtype=np.float64) * layout.sample_rate
+        counts = [layout.window, layout.levels, layout.span, layout.settling, edges.size, b.size]
+        numbers = [layout.rest_speed, layout.sample_rate, float(smoothing)]
+        self.constants = np.concatenate([counts, numbers, edges, b, a[:, 0], a[:, 1]])  # as `_accumulate` takes them
+        bins, powers = 3 * layout.bins, 3 * layout.bins + 2 * len(MOTIONS) * layout.bands
+        self._parts = slice(layout.bins), slice(layout.bins, bins), slice(bins, powers), slice(powers, None)
+        self._floors = np.array(layout.floors)[:, None, None]
+        self._fewest_heard = max(FEWEST, layout.sample_rate / layout.bands_hz[0] / 4.0)
         self.size = HEADER + 8 * layout.bands + layout.levels * (1 + layout.sums)
-        self._run = _compile()
 
     def start(self) -> FloatArray:
         """Return the state before the first sample, shape (size,)."""
@@ -139,122 +127,179 @@ class WindowFeatures:
         self, state: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
     ) -> Iterator[Window]:
         """Feed a block of samples, each of shape (N,); NaN in any of the three is a gap, which ends a window early."""
-        out = np.empty((self._constants.levels * (len(r) // self._constants.window + 1), ROW_HEADER + self.layout.sums))
-        for row in out[: self._run(self._constants, state, r, u, y, restart, out)]:
-            end, level, span = (int(x) for x in row[:ROW_HEADER])
-            yield Window(end, level, span, *self._features(row[ROW_HEADER:]))
+        lane = WindowLanes([self], np.zeros(1, dtype=np.int64))
+        for _, window in lane.run(state[None], r[None], u[None], y[None], restart[None]):
+            yield window
+
+    def window(self, row: FloatArray) -> Window:
+        """Return the window of a row that `_accumulate` has written."""
+        end, level, span = (int(x) for x in row[:ROW_HEADER])
+        return Window(end, level, span, *self._features(row[ROW_HEADER : ROW_HEADER + self.layout.sums]))
 
     def _features(self, sums: FloatArray) -> tuple[FloatArray, FloatArray]:
-        layout, motions = self.layout, len(MOTIONS)
-        counts, levels, powers, speeds = np.split(
-            sums, np.cumsum([layout.bins, 2 * layout.bins, 2 * motions * layout.bands])
-        )
+        motions = len(MOTIONS)
+        counts, levels, powers, speeds = (sums[part] for part in self._parts)
         with np.errstate(divide="ignore", invalid="ignore"):
             means = np.where(counts >= FEWEST, levels.reshape(2, -1) / counts, np.nan)
             of_motion = counts.reshape(motions, -1).sum(axis=1)
-            power = powers.reshape(2, motions, layout.bands) / of_motion[:, None]
-            power = np.maximum(power, np.array(layout.floors)[:, None, None])
-            heard = of_motion >= max(FEWEST, layout.sample_rate / layout.bands_hz[0] / 4.0)
+            power = np.maximum(powers.reshape(2, motions, -1) / of_motion[:, None], self._floors)
+            heard = of_motion >= self._fewest_heard
             logs = np.where(heard[:, None], 0.5 * np.log(power), np.nan)
-            speed = 0.5 * np.log(np.maximum(speeds[:2] / of_motion[:2], np.finfo(float).tiny))
+            speed = 0.5 * np.log(np.maximum(speeds[:2] / of_motion[:2], SMALLEST))
         motion = np.concatenate([of_motion / of_motion.sum(), np.where(of_motion[:2] >= FEWEST, speed, np.nan)])
         return np.concatenate([means.ravel(), logs.ravel()]), motion
 
 
+class WindowLanes:
+    """Cuts the signals of several assets into windows, each by its own layout, to the same bits as alone."""
+
+    def __init__(self, assets: Sequence[WindowFeatures | None], begins: IntArray) -> None:
+        """`begins`: where in its row the state of each asset begins, shape (assets,); None: it has no windows."""
+        self._assets, self._begins = tuple(assets), begins
+        known = [one for one in assets if one is not None]
+        self._table = np.zeros((len(assets), max(one.constants.size for one in known)))
+        for row, one in zip(self._table, assets, strict=True):
+            if one is not None:
+                row[: one.constants.size] = one.constants
+        self._shortest = min(one.layout.window for one in known)
+        self._levels, self._sums = (max(getattr(one.layout, name) for one in known) for name in ("levels", "sums"))
+
+    def run(
+        self, rows: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
+    ) -> Iterator[tuple[int, Window]]:
+        """Feed a block, each of shape (assets, N); change the rows; yield asset and window, asset by asset."""
+        most = len(rows) * self._levels * (r.shape[1] // self._shortest + 1)
+        out, lane = np.empty((most, ROW_HEADER + self._sums)), np.empty(most, dtype=np.int64)
+        found = _compile()(self._table, rows, self._begins, r, u, y, restart, out, lane)
+        for asset, row in zip(lane[:found].tolist(), out, strict=False):
+            if (one := self._assets[asset]) is not None:
+                yield asset, one.window(row)
+
+
 def _accumulate(
-    c: _Constants, s: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray, out: FloatArray
+    table: FloatArray,
+    states: FloatArray,
+    begins: IntArray,
+    R: FloatArray,
+    U: FloatArray,
+    Y: FloatArray,
+    restarts: BoolArray,
+    out: FloatArray,
+    lane: IntArray,
 ) -> int:
-    # state: armed, sample, samples of the window, windows of the span, span, reference before, speed, time since the
-    # motion began (positive) with its sign in the motion; then filters and first values, then sums level by level
-    bands, edges = len(c.b), len(c.edges)
-    bins = 3 * (edges + 1)
-    sums = 3 * bins + 3 * (2 * bands + 1)
-    filters = s[HEADER : HEADER + 8 * bands]
-    rows = 0
-    for k in range(len(r)):
-        s[1] += 1.0
-        if not (abs(r[k]) < MAX_PHYSICAL and abs(u[k]) < MAX_PHYSICAL and abs(y[k]) < MAX_PHYSICAL):
-            s[0] = 0.0
+    # a row of constants: window, levels, span, settling, number of edges, number of bands, speed of rest, rate,
+    # smoothing; then edges [samples], b and both a of the band-pass filters
+    # a state: armed, sample, samples of the window, windows of the span, span, reference before, speed, 4 times the
+    # samples since the motion began plus the motion; then filters, then sums level by level
+    rows, lanes = 0, (2 * int(table[:, 5].max()) + VECTOR_WIDTH - 1) // VECTOR_WIDTH * VECTOR_WIDTH
+    weights, filters, square, x = np.zeros((4, lanes)), np.zeros((4, lanes)), np.zeros((4, lanes)), np.zeros((2, lanes))
+    for asset in range(len(table)):
+        c, s = table[asset], states[asset, begins[asset] :]
+        r, u, y, restart = R[asset], U[asset], Y[asset], restarts[asset]
+        window, levels, span, settling, edges, bands = c[0], int(c[1]), c[2], c[3], int(c[4]), int(c[5])
+        if bands == 0:
             continue
-        if restart[k] or s[0] == 0.0:
-            s[0], s[2], s[5], s[6], s[7] = 1.0, 0.0, r[k], 0.0, 0.0
-            # a band-pass has forgotten a constant: it starts where a signal has always been what it is now
-            for band in range(bands):
-                for j in range(2):
-                    value = u[k] if j == 0 else r[k] - y[k]
-                    at = 4 * (2 * band + j)
-                    filters[at] = -c.b[band] * value
-                    filters[at + 1] = -c.b[band] * value
-                    filters[at + 2] = 0.0
-                    filters[at + 3] = 0.0
-            s[HEADER + 8 * bands :] = 0.0
-        s[6] += c.smoothing * ((r[k] - s[5]) * c.rate - s[6])
-        s[5] = r[k]
-        motion = 2
-        if s[6] > c.rest:
-            motion = 0
-        elif s[6] < -c.rest:
-            motion = 1
-        # time since the motion began, and the motion itself, in one number: 4 (samples) + motion
-        if int(s[7]) % 4 == motion:
-            s[7] += 4.0
-        else:
-            s[7] = float(motion)
-        since = s[7] // 4.0
-        place = motion * (edges + 1)
-        for edge in range(edges):
-            if since >= c.edges[edge]:
-                place += 1
-        settled = s[1] > c.settling
-        begin = HEADER + 8 * bands
-        for j in range(2):
-            value = u[k] if j == 0 else r[k] - y[k]
-            if settled:
-                s[begin + 1 + (1 + j) * bins + place] += value
-            for band in range(bands):
-                at = 4 * (2 * band + j)
-                passed = value
-                for _ in range(2):
-                    before, passed = passed, c.b[band] * passed + filters[at]
-                    filters[at] = filters[at + 1] - c.a[band, 0] * passed
-                    filters[at + 1] = -c.b[band] * before - c.a[band, 1] * passed
-                    at += 2
-                if settled:
-                    s[begin + 1 + 3 * bins + (3 * j + motion) * bands + band] += passed * passed
-        if not settled:
-            continue
-        s[begin + 1 + place] += 1.0
-        s[begin + 1 + 3 * bins + 6 * bands + motion] += s[6] * s[6]
-        s[2] += 1.0
-        if s[2] < c.window:
-            continue
-        s[2] = 0.0
-        s[3] += 1.0
-        for level in range(c.levels):
-            at = begin + level * (1 + sums)
-            if level:
-                for i in range(sums):
-                    s[at + 1 + i] += s[begin + 1 + i]
-            s[at] += 1.0
-            if s[at] >= 2**level:
-                out[rows, 0], out[rows, 1], out[rows, 2] = s[1], level, s[4]
-                for i in range(sums):
-                    out[rows, ROW_HEADER + i] = s[at + 1 + i]
-                rows += 1
+        rest, rate, smoothing = c[6], c[7], c[8]
+        bins, begin = 3 * (edges + 1), HEADER + 8 * bands
+        sums, powers = 3 * bins + 3 * (2 * bands + 1), begin + 1 + 3 * bins
+        for i in range(2 * bands):
+            j, band = i // bands, i % bands
+            weights[3, i] = 1.0 - j
+            for row in range(3):
+                weights[row, i] = c[9 + edges + row * bands + band]
+                square[row, i] = s[powers + (3 * j + row) * bands + band]
+            for row in range(4):
+                filters[row, i] = s[HEADER + 4 * (2 * band + j) + row]
+        armed, sample, speed, before, moving = s[0], s[1], s[6], s[5], int(s[7])
+        for k in range(len(r)):
+            sample += 1.0
+            if not (abs(r[k]) < MAX_PHYSICAL and abs(u[k]) < MAX_PHYSICAL and abs(y[k]) < MAX_PHYSICAL):
+                armed = 0.0
+                continue
+            if restart[k] or armed == 0.0:
+                armed, before, speed, moving, s[2] = 1.0, r[k], 0.0, 0, 0.0
+                # a band-pass has forgotten a constant: it starts where a signal has always been what it is now
+                for i in range(2 * bands):
+                    filters[0, i] = filters[1, i] = -weights[0, i] * (u[k] if i < bands else r[k] - y[k])
+                    filters[2, i] = filters[3, i] = 0.0
+                square[:] = 0.0
+                s[begin : begin + levels * (1 + sums)] = 0.0
+            speed += smoothing * ((r[k] - before) * rate - speed)
+            before = r[k]
+            motion = 2
+            if speed > rest:
+                motion = 0
+            elif speed < -rest:
+                motion = 1
+            moving = moving + 4 if moving & 3 == motion else motion
+            since, place = float(moving >> 2), motion * (edges + 1)
+            for edge in range(edges):
+                if since >= c[9 + edge]:
+                    place += 1
+            settled = sample > settling
+            for i in range(0, 2 * bands, VECTOR_WIDTH):
+                x[0, i], x[1, i] = u[k], r[k] - y[k]
+                _pass_bands(i, weights, filters, x, square, motion if settled else 3)
+            if not settled:
+                continue
+            s[begin + 1 + bins + place] += u[k]
+            s[begin + 1 + 2 * bins + place] += r[k] - y[k]
+            s[begin + 1 + place] += 1.0
+            s[powers + 6 * bands + motion] += speed * speed
+            s[2] += 1.0
+            if s[2] < window:
+                continue
+            s[2] = 0.0
+            s[3] += 1.0
+            for i in range(2 * bands):
+                for row in range(3):
+                    s[powers + (3 * (i // bands) + row) * bands + i % bands] = square[row, i]
+            square[:] = 0.0
+            for level in range(levels):
+                at = begin + level * (1 + sums)
                 if level:
-                    for i in range(sums + 1):
-                        s[at + i] = 0.0
-        for i in range(sums + 1):
-            s[begin + i] = 0.0
-        if s[3] >= c.span:
-            s[3] = 0.0
-            s[4] += 1.0
-            s[begin:] = 0.0
+                    for i in range(sums):
+                        s[at + 1 + i] += s[begin + 1 + i]
+                s[at] += 1.0
+                if s[at] >= 2**level:
+                    lane[rows], out[rows, 0], out[rows, 1], out[rows, 2] = asset, sample, level, s[4]
+                    for i in range(sums):
+                        out[rows, ROW_HEADER + i] = s[at + 1 + i]
+                    rows += 1
+                    if level:
+                        for i in range(sums + 1):
+                            s[at + i] = 0.0
+            for i in range(sums + 1):
+                s[begin + i] = 0.0
+            if s[3] >= span:
+                s[3] = 0.0
+                s[4] += 1.0
+                s[begin : begin + levels * (1 + sums)] = 0.0
+        for i in range(2 * bands):
+            for row in range(3):
+                s[powers + (3 * (i // bands) + row) * bands + i % bands] = square[row, i]
+            for row in range(4):
+                s[HEADER + 4 * (2 * (i % bands) + i // bands) + row] = filters[row, i]
+        s[0], s[1], s[5], s[6], s[7] = armed, sample, before, speed, moving
     return rows
+
+
+def pass_bands(weights: Any, filters: Any, x: Any, square: Any, row: Any) -> None:
+    """Pass u or e, x of shape (2, 1), twice through the band-pass of each lane; add its square to a row."""
+    b, a, a_last = weights[0], weights[1], weights[2]
+    value = where(weights[3] > 0.0, x[0], x[1])
+    first = b * value + filters[0]
+    filters[0] = filters[1] - a * first
+    filters[1] = -b * value - a_last * first
+    passed = b * first + filters[2]
+    filters[2] = filters[3] - a * passed
+    filters[3] = -b * first - a_last * passed
+    square[row] = square[row] + passed * passed
 
 
 @functools.cache
 def _compile() -> Callable[..., int]:
-    from servoscope.core.jit import kernel  # late: it imports Numba
+    from servoscope.core.jit import kernel, specialise, trace_function  # late: they import Numba
 
-    return kernel(_accumulate)
+    part = trace_function(pass_bands, VECTOR_WIDTH, "x")
+    return kernel(specialise(_accumulate, {"_pass_bands": part}))

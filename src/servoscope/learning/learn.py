@@ -13,8 +13,8 @@ from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.detection import homogeneity
 from servoscope.detection.axis_model import AxisModel
-from servoscope.detection.baseline import Baseline, digest
-from servoscope.detection.baseline_parts import BaselineSource
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.baseline_parts import BaselineSource, digest
 from servoscope.detection.covariates import CovariateModel, CovariatePath
 from servoscope.detection.cusum_design import CusumHypothesis
 from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system

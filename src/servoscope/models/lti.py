@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -189,10 +190,16 @@ def state_variable_filter(cutoff: float, order: int) -> StateSpace:
 
 def settling_samples(cutoff: float, order: int, dt: float, rest: float = 1e-3) -> int:
     """Count the samples after which a step's transient in a state-variable filter is below `rest`."""
+    return math.ceil(_settling_time(order, rest) / (2.0 * math.pi * cutoff * dt))
+
+
+@functools.cache
+def _settling_time(order: int, rest: float) -> float:
+    """Return the same in time constants of the filter."""
     x = 0.0
     while sum(x**j / math.factorial(j) for j in range(order)) * math.exp(-x) > rest:
         x += 0.01
-    return math.ceil(x / (2.0 * math.pi * cutoff * dt))
+    return x
 
 
 def solve_scaled(A: FloatArray, b: FloatArray) -> FloatArray:

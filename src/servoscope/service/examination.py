@@ -89,7 +89,8 @@ def examine_blocks(
 
     try:
         recording, start = blocks_to_recording(baseline, name, blocks)
-        exam = Examination.from_recording(baseline.model_copy(update={"features": None}), recording)
+        exam = Examination.from_recording(baseline, recording, quick=True)
+        exam = replace(exam, baseline=exam.baseline.model_copy(update={"features": None}))
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
     if exam.along is not None and (outside := exam.along.outside) is not None:

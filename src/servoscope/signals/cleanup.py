@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -200,7 +199,7 @@ def _find_spikes(
     r: FloatArray, u: FloatArray, y: FloatArray, run: Int32Array, labels: tuple[str, str, str]
 ) -> tuple[IndexArray, list[str]]:
     """Return the rows with a spike in any signal, and the labels of these signals."""
-    with ThreadPoolExecutor(1) as pool:
+    with outofcore.second_thread(y.size) as pool:
         y_search = pool.submit(find_spikes, y, run, share=SPIKE_SHARES["y"])
         in_r, in_u = _find_input_spikes(r, u, run)
     found = in_r, in_u, y_search.result()

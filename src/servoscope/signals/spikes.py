@@ -20,6 +20,7 @@ NEIGHBOURS = 20  # samples on either side that define what is normal
 STEP_SHARE = 0.02  # of the reference's range: smaller steps do not make u kick
 REACTION_SAMPLES = 3  # samples in which u may kick after a step of r
 PASSES = 30
+FEW = 500  # samples that are enough to guess two levels
 CHUNK_PLACES = 512  # that are looked at together: each of them brings the pages around it into memory
 _NO_ROWS = np.empty(0, dtype=np.intp)
 
@@ -43,6 +44,8 @@ def find_spikes(
     samples may jump, for example u where the reference steps.
     """
     spikes = _NO_ROWS
+    if _is_smooth(x, share):
+        return spikes
     for _ in range(PASSES):  # spikes hide others: range and neighbours are taken again without those found
         z, runs = outofcore.drop_rows(x, spikes), outofcore.drop_rows(run, spikes)
         before = spikes - np.arange(spikes.size)
@@ -74,6 +77,20 @@ def follows_reference_step(r: FloatArray, run: npt.NDArray[np.int32], rows: Inde
     return kicked
 
 
+def _is_smooth(x: FloatArray, share: float) -> bool:
+    """Return whether no step is as high as a spike must be: most signals, told in a tenth of the search's time.
+
+    More than 1 % of the samples lie beyond either of two levels, so the range of the search is no smaller than their
+    distance. At the edge of a run, `MAX_WIDTH` such steps are less than an enormous spike.
+    """
+    if not 0 < x.size <= outofcore.CHUNK_ROWS:
+        return False
+    low, high = np.quantile(x[:: max(1, x.size // FEW)], [0.05, 0.95])
+    enough = 0.01 * x.size + 1.0
+    beyond = min(int(np.count_nonzero(x <= low)), int(np.count_nonzero(x >= high)))
+    return bool(low < high and beyond > enough and np.abs(np.diff(x)).max(initial=0.0) <= share * (high - low))
+
+
 def _range(x: FloatArray) -> tuple[float, float]:
     each = [(float(x[rows].min()), float(x[rows].max())) for rows in outofcore.iter_chunks(0, x.size, x)]
     return min(low for low, _ in each), max(high for _, high in each)
@@ -101,13 +118,18 @@ def _find_spikes_once(
     modest, enormous = max(share * span, QUANTUM_FACTOR * quantum), WIDE_SPIKE_FACTOR * span
     least = min(modest, enormous) if span > 0.0 else modest
     # a spike is entered by a high step, or stands where a run starts
-    entered = outofcore.find_rows(
-        lambda rows: (np.abs(_differences(z, rows)) > least) | (run[rows] != _previous(run, rows)), z, run, first=1
-    )
-    entered = np.append(0, entered)
+    highest = 0.0
+
+    def enters(rows: slice) -> BoolArray:
+        nonlocal highest
+        steps = np.abs(_differences(z, rows))
+        highest = max(highest, float(steps.max()))
+        return np.asarray((steps > least) | (run[rows] != _previous(run, rows)))
+
+    entered = np.append(0, outofcore.find_rows(enters, z, run, first=1))
     for width in range(1, MAX_WIDTH + 1):
-        if width > MAX_NORMAL_WIDTH and span == 0.0:
-            break
+        if width > MAX_NORMAL_WIDTH and (span == 0.0 or highest <= enormous):
+            break  # one that is wide is entered, or left where it stands at an edge, by an enormous step
         smallest = modest if width <= MAX_NORMAL_WIDTH else enormous
         start, height = _find_excursions(z, run, entered, width, smallest, enormous if span > 0.0 else np.inf)
         # The spike itself takes two steps of its surroundings; a quartile does not notice.

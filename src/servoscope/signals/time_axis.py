@@ -145,8 +145,18 @@ def _check_direction(t: FloatArray, begins: IndexArray, name: str) -> tuple[floa
             f"{name}: {repeated} of {count + 1} time stamps repeat the one before:"
             " the clock is too coarse, log finer time stamps or leave the time column out"
         )
-    steps = _sample_steps(t, begins)
-    return float(np.median(steps[steps > 0.0])), back
+    return _typical_step(_sample_steps(t, begins)), back
+
+
+def _typical_step(steps: FloatArray) -> float:
+    """Return the median of the steps forward; or, where all are alike, their mean, which is as good and sooner known.
+
+    What is a gap or a repeat beside it is none beside the median either, and the other way round.
+    """
+    mean = float(steps.mean()) if steps.size else 0.0
+    if steps.size and steps.min() > 0.9 * mean and steps.max() < 1.1 * mean:
+        return mean
+    return float(np.median(steps[steps > 0.0]))
 
 
 def _sample_steps(t: FloatArray, begins: IndexArray) -> FloatArray:
@@ -191,8 +201,8 @@ def _measure_rate(
     some = some[some > 0.0]
     if some.size == 0:
         raise RecordingError(f"{name}: time does not advance, choose another time column")
-    typical = float(np.median(some))
-    typical = float(np.median(some[some > REPEAT_STEP * typical]))
+    typical = _typical_step(some)
+    typical = _typical_step(some[some > REPEAT_STEP * typical])
     total, count = 0.0, 0
     for rows in outofcore.iter_chunks(0, t.size, t):
         steps = _steps_within_runs(t, begins, rows)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -132,14 +133,20 @@ class LoopSimulation:
             self._kernel = lambda which, *signals: linear_kernels.run_axis(motion, which, settings, *signals)
         else:
             A, b_next, b_now, b_late, c = (np.stack([each[i] for each in discrete]) for i in range(5))
-            states, room = c.shape[1], np.zeros(c.shape[1])
+            states = c.shape[1]
             self._kernel = lambda which, *signals: linear_kernels.run_linear(
-                A, b_next, b_now, b_late, c, room, which, settings, *signals
+                A, b_next, b_now, b_late, c, np.zeros(c.shape[1]), which, settings, *signals
             )
         self._state, self._past_input = (
             np.zeros(linear_kernels.HEADER_SIZE + states),
             np.zeros(settings.delay_samples + 2),
         )
+
+    def again(self) -> Self:
+        """Return one at rest, whose constants are these."""
+        other = copy.copy(self)
+        other._state, other._past_input = np.zeros_like(self._state), np.zeros_like(self._past_input)
+        return other
 
     def run(
         self, which: npt.NDArray[np.int64], r: FloatArray, n_u: FloatArray | None = None, n_y: FloatArray | None = None

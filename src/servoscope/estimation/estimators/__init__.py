@@ -22,6 +22,7 @@ Another package adds estimators by entry points in the group ``servoscope.estima
 
 from __future__ import annotations
 
+import functools
 import importlib
 import pkgutil
 from collections.abc import Mapping
@@ -50,6 +51,7 @@ def estimator_names() -> list[str]:
     return sorted({*_own_names(), *(entry.name for entry in metadata.entry_points(group=GROUP))})
 
 
+@functools.cache
 def _own_names() -> list[str]:
     return [module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__)]
 

@@ -1,0 +1,146 @@
+"""Examinations of a service: whatever is spared on the way to them, they say what a full one says, bit for bit."""
+
+from __future__ import annotations
+
+import functools
+import pickle
+
+import numpy as np
+import pytest
+
+import halls
+from servoscope.core.messages import message
+from servoscope.detection.baseline import Baseline
+from servoscope.detection.cusum_design import sure_level, worst_case_hypotheses
+from servoscope.detection.expectation import Expectation, reference_path
+from servoscope.diagnosis.diagnose import diagnose_examination
+from servoscope.diagnosis.examine import Examination
+from servoscope.learning.learn import learn_baseline
+from servoscope.models.loop import Loop
+from servoscope.service.examination import StoredDiagnosis, blocks_to_recording, examine_blocks
+from servoscope.service.sources.block import Block
+from servoscope.signals import Recording, spikes
+from servoscope.simulation import FaultEvent, reference, simulate
+
+START = 1767225600.0
+YEAR = 365.25 * 86400.0
+
+
+def blocks_of(recording: Recording) -> list[Block]:
+    """A recording as a service keeps it, in blocks of a second."""
+    rows = np.stack([START + recording.t, recording.r, recording.u, recording.y])
+    return [Block.from_signals("a", k, part) for k, part in enumerate(np.split(rows, recording.samples // 100, axis=1))]
+
+
+@functools.cache
+def rig() -> Baseline:
+    loop = Loop.load(halls.LOOP)
+    return learn_baseline(loop, [simulate(loop, reference("multisine", 60.0, loop.sample_rate), seed=9)[0]])
+
+
+def window(seed: int, kind: str = "multisine", *faults: FaultEvent) -> list[Block]:
+    loop = Loop.load(halls.LOOP)
+    return blocks_of(simulate(loop, reference(kind, 30.0, loop.sample_rate), seed=seed, faults=faults)[0])
+
+
+def slowly(baseline: Baseline, blocks: list[Block]) -> StoredDiagnosis | None:
+    """What a healthy window is stored as, the obvious way: everything computed anew; None where there is an alarm."""
+    anew = Baseline.model_validate(baseline.model_dump(by_alias=True))
+    exam = Examination.from_recording(anew, blocks_to_recording(anew, "a", blocks)[0])
+    if exam.alarm.any():
+        return None
+    found = diagnose_examination(exam)[0]
+    return StoredDiagnosis(verdict=found.verdict, headline=found.headline, document=found.model_dump(mode="json"))
+
+
+def with_budget(per_year: float) -> Baseline:
+    """The rig's baseline, whose sequential test may raise so many false alarms."""
+    loop = rig().loop
+    monitor = loop.monitor.model_copy(update={"false_alarms_per_year": per_year})
+    return rig().model_copy(
+        update={"loop_settings": loop.model_copy(update={"monitor": monitor}).to_dict(), "limit": 1e6}
+    )
+
+
+def test_what_is_stored_is_that_of_a_full_examination() -> None:
+    baseline = rig()
+    for blocks in (window(1), window(2, "trapezoid"), window(3, "profile")):
+        stored = examine_blocks(baseline, "a", blocks)
+        assert stored == slowly(baseline, blocks)
+        assert stored.verdict == "healthy"
+        assert examine_blocks(baseline, "a", blocks) == stored  # nothing of a window stays in what is kept
+    leak = window(4, "multisine", FaultEvent.parse("C_ie=1.2@10"))
+    assert slowly(baseline, leak) is None
+    assert examine_blocks(baseline, "a", leak).verdict == "fault"
+
+
+def test_limits_that_matter_are_those_of_the_reference() -> None:
+    """With thousands of false alarms a day the level is between both limits again and again."""
+    judged, close = set[str](), 0
+    for per_year in (20.0 * YEAR / 30.0, 2.0 * YEAR / 30.0, 0.1 * YEAR / 30.0):
+        baseline = with_budget(per_year)
+        for seed in range(3):
+            blocks = window(seed, ("multisine", "trapezoid", "profile")[seed])
+            stored, slow = examine_blocks(baseline, "a", blocks), slowly(baseline, blocks)
+            judged.add(stored.verdict)
+            if slow is None:
+                assert stored.verdict == "fault" or stored.headline == message("service.examination.recovering")
+            else:
+                assert stored == slow
+            own = baseline.baseline_run.estimates.again().advance(blocks_to_recording(baseline, "a", blocks)[0])
+            close += slow is not None and own.level.max() >= baseline.baseline_run.sure_level
+    assert close and len(judged) > 1  # otherwise this has shown nothing
+
+
+@pytest.mark.parametrize("per_year", [1.0, 1e3, 1e5])
+def test_no_reference_makes_limits_lower_than_the_sure_level(per_year: float) -> None:
+    baseline = rig()
+    loop, members = baseline.loop, baseline.members
+    sure = sure_level(members, per_year)
+    assert 0.2 < sure < 1.0
+    kept = [member for member in members if np.isfinite(member.limit(per_year / len(members)))]
+    own = {id(member): member.limit(per_year / len(kept)) for member in kept}
+    for kind in ("multisine", "trapezoid", "profile"):
+        record, _ = simulate(loop, reference(kind, 30.0, loop.sample_rate), seed=1)
+        assert baseline.noise is not None and baseline.loudest is not None
+        expectation = Expectation(baseline.pipeline(), baseline.tuning, baseline.noise, reference_path(record))
+        covariance = np.array(baseline.ratios_covariance)
+        fitted = worst_case_hypotheses(expectation, baseline.plant, baseline.loudest, covariance, members)
+        heard = [one for one in zip(fitted, members, strict=True) if np.isfinite(one[0].limit(per_year / len(fitted)))]
+        for after, before in heard:
+            assert after.limit(per_year / len(heard)) >= sure * own[id(before)]
+
+
+def test_a_copy_takes_along_what_holds_for_it_only() -> None:
+    baseline = Baseline.model_validate(rig().model_dump(by_alias=True))
+    pipeline, run = baseline.pipeline(), baseline.baseline_run
+    bare = baseline.model_copy(update={"features": None, "point": "cold"})
+    assert bare.pipeline() is pipeline and bare.baseline_run is run
+    moved = baseline.model_copy(update={"theta": tuple(1.1 * x for x in baseline.theta)})
+    assert moved.pipeline() is pipeline and moved.baseline_run is not run
+    settings = baseline.loop.to_dict()
+    other = baseline.model_copy(update={"loop_settings": settings | {"delay": 0.01}})
+    assert other.loop.delay == 0.01 and other.pipeline() is not pipeline
+    assert pickle.loads(pickle.dumps(baseline)).pipeline().every == pipeline.every
+
+
+def test_a_smooth_signal_is_known_to_have_no_spikes(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, run = np.random.default_rng(0), np.zeros(3000, dtype=np.int32)
+    run[1500:] = 1
+    t = np.arange(3000) / 100.0
+    made = [
+        scale * np.sin(2.0 * np.pi * f * t) + level * rng.normal(size=t.size)
+        for scale, f, level in [(1.0, 0.3, 0.0), (1.0, 0.5, 0.01), (0.0, 1.0, 1.0), (1e-9, 7.0, 1e-11), (5.0, 0.2, 0.3)]
+    ]
+    for x in made.copy():
+        for at, width in ((700, 1), (1499, 2), (1500, 3), (0, 2), (2999, 1), (2000, 6)):
+            for height in (0.3, 3.0, 100.0):
+                spiky = x.copy()
+                spiky[at : at + width] += height * np.ptp(x)
+                made.append(spiky)
+    smooth = [spikes._is_smooth(x, 0.1) for x in made]
+    found = [spikes.find_spikes(x, run, share=0.1) for x in made]
+    assert any(smooth) and any(rows.size for rows in found)
+    monkeypatch.setattr(spikes, "_is_smooth", lambda x, share: False)
+    for x, rows in zip(made, found, strict=True):
+        np.testing.assert_array_equal(rows, spikes.find_spikes(x, run, share=0.1))
