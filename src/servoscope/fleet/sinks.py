@@ -14,7 +14,7 @@ from servoscope.fleet.common_cause import PRIOR, Prior
 from servoscope.fleet.partition import DAY_US
 from servoscope.fleet.report import write_fleet_report
 from servoscope.fleet.rows import MICRO, required_columns
-from servoscope.fleet.streaming import SCHEMA
+from servoscope.fleet.stream_shard import SCHEMA
 from servoscope.fleet.summary import Fleet, summarise_fleet
 from servoscope.models.loop import Columns
 
