@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections import Counter as TotalCounter
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import ConfigError
 from servoscope.service.asset import Asset
 from servoscope.service.checkpoint import evolve
@@ -71,11 +71,11 @@ class ServiceMetrics:
         self._rejections = counter("refused", "Messages that could not be used", ["source", "asset", "kind"])
         self.registry.register(self)  # calls `collect`
 
-    def record_commit(self, latencies: Sequence[float], seconds: float) -> None:
-        """Count a commit."""
+    def record_commit(self, latencies: FloatArray, seconds: float) -> None:
+        """Count a commit of blocks with these latencies [s], shape (N,), which took so long [s]."""
         self._commits.observe(seconds)
         places = np.bincount(np.searchsorted(BUCKETS_S, latencies), minlength=len(BUCKETS_S) + 1)
-        self._latencies = self._latencies[0] + places, self._latencies[1] + math.fsum(latencies)
+        self._latencies = self._latencies[0] + places, self._latencies[1] + float(latencies.sum())
 
     def record_rejection(self, source: str, one: Rejection) -> None:
         """Count messages that could not be used."""

@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 
+import numpy as np
+
 from servoscope import __version__
 from servoscope.core.errors import ServoscopeError, StoreUnavailableError
 from servoscope.core.messages import message, render
@@ -328,17 +330,18 @@ class Service:
             document = {"from": unavailable_since, "seconds": seconds}
             self.writer.add(self.config.name, [audit_row("store was unavailable", document)])
         self.layers.enter("publish")
+        statuses = {name: row["status"] for name, row in stored.batch.checkpoints.items()}
         for publisher in self._publishers.values():
-            publisher.publish({name: row["status"] for name, row in stored.batch.checkpoints.items()})
+            publisher.publish(statuses)
         self.dispatcher.wake()
         now = time.monotonic()
         for name, blocks in stored.blocks.items():
             self.sources[self.assets[name].source].acknowledge(name, blocks)
         self.layers.enter("other")
-        latencies = [now - completed for completed in stored.completion_times]
+        latencies = now - np.array(stored.completion_times)
         self.metrics.record_commit(latencies, now - start)
-        latest = round(max(latencies, default=0.0), 4)
-        log("debug", "commit", blocks=len(latencies), seconds=round(now - start, 4), latest=latest)
+        latest = round(float(latencies.max(initial=0.0)), 4)
+        log("debug", "commit", blocks=latencies.size, seconds=round(now - start, 4), latest=latest)
 
     @property
     def _exhausted(self) -> bool:

@@ -17,7 +17,7 @@ from servoscope.service.store import Batch, Store
 from servoscope.service.store.bundles import SampleBlock
 
 MIN_RETRY_S, MAX_RETRY_S = 0.1, 2.0  # between two attempts at a store that is unavailable
-MIN_CHECKPOINTS = 32  # that a commit writes at least, if there are so many
+MIN_CHECKPOINTS = 16  # that a commit writes at least, if there are so many
 CHECKPOINT_SHARE = 40  # beyond, each commit writes one of so many that can wait
 
 

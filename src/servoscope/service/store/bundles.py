@@ -29,13 +29,7 @@ SampleBlock = tuple[str, int, bytes]  # an asset, a sequence, and its packed sam
 # what a bundle's row tells of one of its blocks: asset, sequence, bytes in the row, and whether it is without its time
 # stamps, which follow from the first one and the rate
 BundlePart = tuple[str, int, int, bool]
-
-
-class BundleKey(NamedTuple):
-    """Which row of an owner."""
-
-    bundle: int
-    number: int
+BundleKey = tuple[int, int]  # which row of an owner: bundle and number; plain, as the garbage collector skips these
 
 
 class BundleChanges(NamedTuple):
@@ -61,7 +55,7 @@ class BundleIndex:
         self._bundles: dict[str, int] = {}
         self._sparse: dict[BundleKey, int] = {}  # the newest row when at most half of a row was needed any more
         for bundle, number, contents in sorted(rows, key=lambda row: row[1]):
-            self._hold(BundleKey(bundle, number), _read_contents(contents))
+            self._hold((bundle, number), _read_contents(contents))
             self._number = max(self._number, number)
 
     def advance(self, blocks: Sequence[SampleBlock], first_needed: Mapping[str, int]) -> BundleChanges:
@@ -98,7 +92,7 @@ class BundleIndex:
             parts.append((asset, sequence, len(stored), regular))
             samples.append(stored)
         for bundle, (parts, samples) in bundles.items():
-            self._hold(BundleKey(bundle, self._number), parts)
+            self._hold((bundle, self._number), parts)
             contents = _write_contents(parts)
             row = {"bundle": bundle, "number": self._number, "contents": contents, "samples": b"".join(samples)}
             changes.new.append(row)
@@ -195,7 +189,7 @@ def read_samples(
             first |= {name: max([first[name], *sorted(have)[-newest:][:1]]) for name, have in sequences.items()}
         for (owner, number), parts in contents.items():
             if any(sequence >= first.get(asset, math.inf) for asset, sequence, *_ in parts):
-                for asset, sequence, samples in _read_row(connection, owner, BundleKey(bundle, number)):
+                for asset, sequence, samples in _read_row(connection, owner, (bundle, number)):
                     if asset in found:
                         found[asset].append((sequence, samples))
         for name, blocks in found.items():
@@ -235,7 +229,7 @@ def write_bundles(connection: sa.Connection, owner: str, changes: BundleChanges)
         dissolve_row(connection, owner, key)
     if changes.unneeded:
         unneeded = _is_row(owner, sa.bindparam("of_bundle"), sa.bindparam("of_number"))
-        keys = [{"of_bundle": key.bundle, "of_number": key.number} for key in changes.unneeded]
+        keys = [{"of_bundle": bundle, "of_number": number} for bundle, number in changes.unneeded]
         connection.execute(tables.bundles.delete().where(unneeded), keys)
     if changes.new:
         connection.execute(tables.bundles.insert(), [{"owner": owner, **row} for row in changes.new])
@@ -260,4 +254,4 @@ def dissolve_rows_of_others(connection: sa.Connection, owner: str, assets: Colle
     others = sa.select(*_columns("bundle", "owner", "number", "contents")).where(tables.bundles.c.owner != owner)
     for bundle, of, number, contents in connection.execute(others).all():
         if any(asset in assets for asset, *_ in _read_contents(contents)):
-            dissolve_row(connection, of, BundleKey(bundle, number))
+            dissolve_row(connection, of, (bundle, number))

@@ -33,6 +33,13 @@ HINTS = {  # what to do, where SQLite does not say it
     sqlite3.SQLITE_CANTOPEN: ", its folder must be one that servoscope may write to",
     sqlite3.SQLITE_READONLY: ", file and folder must be ones that servoscope may write to",
 }
+LARGE_WRITES = (  # samples come and go by megabytes: together these take less than half the processor time
+    "page_size = 16384",  # of a new file
+    "wal_autocheckpoint = 4000",
+    "journal_size_limit = 67108864",
+    "cache_size = -32768",  # a commit of ten thousand assets fits in
+    "secure_delete = OFF",  # Debian's SQLite overwrites with zeros what is deleted
+)
 UNCHANGED = {"mode": "ro", "immutable": "1", "uri": "true"}
 LOCK_RELEASE_S = 2.0  # s: after which a killed process has released its lock
 
@@ -125,10 +132,8 @@ def _resolve_host(network: NetworkSettings, arguments: dict[str, Any]) -> None:
 
 
 def _set_up_sqlite(connection: sqlite3.Connection, _: object) -> None:
-    # readers never wait for the writer; FULL, because what has been acknowledged must survive a power cut. Samples are
-    # written in large pieces: pages of 16 KiB, of a new file, and a log of up to 64 MiB take half the processor time
-    sizes = "page_size = 16384", "journal_size_limit = 67108864", "wal_autocheckpoint = 4000"
-    for pragma in (*sizes, "journal_mode = WAL", "synchronous = FULL"):
+    # readers never wait for the writer; FULL, because what has been acknowledged must survive a power cut
+    for pragma in (*LARGE_WRITES, "journal_mode = WAL", "synchronous = FULL"):
         connection.execute(f"PRAGMA {pragma}")
     connection.isolation_level = None
 
