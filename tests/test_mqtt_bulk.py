@@ -6,6 +6,7 @@ import random
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 from brokers import until
 from servoscope.service.mqtt.client import BrokerSettings, create_bulk_client
-from servoscope.service.mqtt.paho_clients import ReceivedMessage
+from servoscope.service.mqtt.paho_clients import GATHER_S, ReceivedMessage
 from servoscope.service.mqtt.payload import encode_binary
 from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
 from servoscope.service.sources.block import Block
@@ -44,8 +45,10 @@ def acknowledged(received: bytes) -> list[int]:
     return found
 
 
-def serve(server: socket.socket, pieces: list[bytes], received: bytearray) -> None:
-    """Be a broker that sends these pieces, and keeps what follows the client's first packet."""
+def serve(
+    server: socket.socket, pieces: list[bytes], received: bytearray, ends: Callable[[], bool] | None = None
+) -> None:
+    """Be a broker that sends these pieces, and keeps what follows the client's first packet; or goes when it `ends`."""
     connection = server.accept()[0]
     with connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -55,6 +58,9 @@ def serve(server: socket.socket, pieces: list[bytes], received: bytearray) -> No
             connection.sendall(piece)
             if len(piece) < 20:
                 time.sleep(0.001)  # the next one comes by itself
+        if ends is not None:
+            until(ends, 60.0)
+            return
         while data := connection.recv(4096):
             received += data
 
@@ -74,8 +80,7 @@ def test_topics_that_are_none_do_not_make_a_source_deaf(topic: bytes, qos: int) 
         settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=server.getsockname()[1])
         source = MqttSource(settings, frozenset(["press"]), Path(), "reader")
         source.open({})
-        until(lambda: source.next_block_s == 0.0, 20.0)
-        (found,) = source.poll(10)
+        (found,) = until(lambda: source.poll(10), 20.0)
         source.close()
         broker.join(60.0)
     assert found.y.tolist() == [1.0]
@@ -114,3 +119,43 @@ def test_messages_in_pieces_of_any_size_are_those_that_were_sent() -> None:
         broker.join(60.0)
     assert came == sent
     assert acknowledged(bytes(received)) == [one.mid for one in sent if one.qos]
+
+
+def test_what_is_sent_again_takes_the_place_of_its_earlier_copy() -> None:
+    """A service that cannot store for a while holds no message twice, however often the connection is lost."""
+    payloads = [encode_binary(Block("press", k, np.array([1e9 + k]), *np.ones((3, 1)))) for k in range(3)]
+    topic, received = "servoscope/v1/data/press", bytearray()
+    connections = [((1, 0), (2, 1)), ((11, 0), (12, 1), (13, 2))]  # in each: numbers of messages, and which they are
+
+    def send(server: socket.socket) -> None:
+        for sent, ends in zip(connections, (lambda: len(source._waiting) == 2, None), strict=True):
+            packets = [publish(ReceivedMessage(topic, payloads[k], 1, mid, False)) for mid, k in sent]
+            serve(server, packets, received, ends)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=server.getsockname()[1])
+        source = MqttSource(settings, frozenset(["press"]), Path(), "reader")
+        broker = threading.Thread(target=send, args=(server,))
+        broker.start()
+        source.open({})
+        until(lambda: len(source._waiting) == 3, 60.0)
+        assert [one.sequence for one in source.poll(10)] == [0, 1, 2]
+        source.acknowledge("press", 3)
+        source.close()
+        broker.join(60.0)
+    assert acknowledged(bytes(received)) == [11, 12, 13]
+
+
+def test_the_socket_is_left_alone_until_a_share_of_its_buffer_is_full() -> None:
+    """Otherwise a broker that sends faster than that in a pause would wait for us."""
+    client = create_bulk_client(BrokerSettings(host="127.0.0.1"), Path(), "reader", lambda one: None)
+    with socket.socket() as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**17)
+        room = one.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) / 4
+        client._sock, client._read_at = one, time.monotonic() - 1e6  # so long that the moments of the test are nothing
+        assert client._gathering_time(0) == 0.0
+        assert client._gathering_time(1000) == GATHER_S
+        for speed in (1e6, 1e8):  # bytes per second
+            assert speed * client._gathering_time(round(speed * 1e6)) == pytest.approx(
+                min(speed * GATHER_S, room), 1e-3
+            )

@@ -23,6 +23,7 @@ from servoscope.service.store.series import thin_sizes
 from servoscope.service.writer import StoreWriter
 
 RETENTION_EVERY_S = 3600.0
+ASSETS_AT_ONCE = 20  # whose sizes are thinned at one look
 REJECTIONS_EVERY_S = 60.0  # between two audit rows about a flood of bad messages
 
 
@@ -58,7 +59,9 @@ class Housekeeping:
         self._executed: set[int] = set()  # commands whose outcome is not yet stored
         self._rejections = RejectionCounter()
         self._next_retention = self._next_rejections = 0.0
-        self._thinned: dict[str, float] = {}  # by asset, until when on its clock its sizes are thinned
+        # by asset, until when on its clock its sizes are thinned, and until when they are to be
+        self._thinned: dict[str, float] = {}
+        self._to_thin: dict[str, float] = {}
 
     def run_due(self) -> None:
         """Do what is due."""
@@ -69,6 +72,7 @@ class Housekeeping:
             if self._service.writer.unavailable_since is None:
                 self._execute_commands()
                 self._delete_old_rows()
+                self._thin_sizes()
         except StoreUnavailableError as error:
             log("debug", "store unavailable", why=str(error))  # the next commit reports it as an error
 
@@ -149,7 +153,13 @@ class Housekeeping:
         deleted = delete_old_rows(store, service.config.store, service.config.name, clocks, service.clock.now())
         for table, count in deleted.items():
             log("info", f"old {table} deleted", rows=count)
-        thinned = sum(thin_sizes(store, name, t, self._thinned.get(name)) for name, t in clocks.items())
-        self._thinned = clocks
+        self._to_thin |= clocks
+
+    def _thin_sizes(self) -> None:
+        """Thin the sizes of some assets: those of all of them at once would keep blocks waiting."""
+        thinned = 0
+        for name in list(self._to_thin)[:ASSETS_AT_ONCE]:
+            thinned += thin_sizes(self._service.store, name, self._to_thin[name], self._thinned.get(name))
+            self._thinned[name] = self._to_thin.pop(name)
         if thinned:
             log("info", "old sizes thinned", rows=thinned)

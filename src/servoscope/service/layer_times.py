@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Literal, get_args
 
-Layer = Literal["assemble", "quality", "kernel", "judge", "store", "publish", "other"]
+Layer = Literal["decode", "assemble", "quality", "kernel", "judge", "store", "publish", "other"]
 
 
 class LayerTimes:

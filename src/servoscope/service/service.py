@@ -174,8 +174,9 @@ class Service:
             self._listening_s += min(now - before, 2.0 * MAX_PAUSE_S)
         self._is_behind = False
         for source in self.sources.values():
-            self.layers.enter("assemble")
+            self.layers.enter("decode")
             blocks = source.poll(min(MAX_BLOCKS_PER_POLL, self.writer.free))
+            self.layers.enter("assemble")
             self._is_behind |= len(blocks) == MAX_BLOCKS_PER_POLL
             self._process_blocks(source, blocks)
         self._run_diagnoses(ended=self._exhausted)

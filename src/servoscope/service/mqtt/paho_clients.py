@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
@@ -14,6 +15,8 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 READ_BYTES = 2**18  # most bytes that are taken from the socket at once
 READS = 16  # after so many, what waits to be written has its turn
+GATHER_S = 0.05  # most time between two looks at the socket: waking for each message costs three times as much
+GATHER_SHARE = 0.25  # of the socket's buffer, beyond which nothing is waited for: the broker must never wait for us
 PUBLISH, PUBACK, TYPE_BITS = 0x30, 0x40, 0xF0  # types of packets
 QOS_1, QOS_BITS, RETAIN = 0x02, 0x06, 0x01  # bits of a PUBLISH beside its type
 ACK = struct.Struct(">BBH")  # type, bytes that follow, number of the message
@@ -43,9 +46,17 @@ class ReceivedMessage(NamedTuple):
 class BulkClient(CheckedClient):
     """Hands each message to `on_received`, in their order; they are acknowledged by `ack`.
 
-    paho asks the socket four times for each message, and wakes its thread for each acknowledgement. Here the socket is
-    read in large pieces, and the whole messages in them are taken apart at once (MQTT 5.0, OASIS 2019, 3.3). All else,
-    the connection, TLS, pings and every other packet, stays with paho.
+    paho asks the socket four times for each message, and wakes its thread for each message and each acknowledgement.
+    Here the socket is left alone for a moment after it was read, then read in large pieces, and the whole messages in
+    them are taken apart at once (MQTT 5.0, OASIS 2019, 3.3). All else, the connection, TLS, pings and every other
+    packet, stays with paho.
+
+    Attributes
+    ----------
+    empty_at
+        When the socket was last seen without a message, monotonic [s]: what is read now came after that.
+    thread_s
+        Processor time of the client's thread so far [s].
     """
 
     def __init__(
@@ -55,6 +66,8 @@ class BulkClient(CheckedClient):
         self._on_received = on_received
         self._piece, self._at = b"", 0  # what the socket gave last, and how far it was read
         self._acks, self._acks_lock = list[bytes](), threading.Lock()
+        self._read_at, self._gather_s = 0.0, 0.0  # when the socket was read, and how long it is left alone from then on
+        self._is_empty, self.empty_at, self.thread_s = True, 0.0, 0.0
         self.on_message = lambda _client, _data, one: on_received(
             # not `one.topic`, which raises where it is no UTF-8, and so ends paho's thread
             ReceivedMessage(one._topic.decode("utf-8", "replace"), bytes(one.payload), one.qos, one.mid, one.retain)
@@ -113,16 +126,24 @@ class BulkClient(CheckedClient):
 
     def loop_read(self, max_packets: int = 1) -> MQTTErrorCode:
         """Read what has come: nothing of it is left when paho waits for the socket again."""
+        now = time.monotonic()  # paho's thread comes here as soon as there is something
+        wait_s = self._read_at + self._gather_s - now
+        if self._is_empty:
+            self.empty_at = self._read_at if wait_s > 0.0 else now
+        time.sleep(max(0.0, wait_s))
+        received, self._gather_s, self._is_empty = 0, 0.0, False
         for _ in range(READS):
             if not self._is_unread:
                 try:
                     is_connected = self._fill()
                 except BlockingIOError:
+                    self._gather_s, self._is_empty = self._gathering_time(received), True
                     break
                 except OSError:
                     is_connected = False
                 if not is_connected:
                     return self._loop_rc_handle(MQTTErrorCode.MQTT_ERR_CONN_LOST)
+                received += len(self._piece)
             while self._is_unread:
                 if not self._in_packet["command"]:
                     self._take_messages()
@@ -130,7 +151,15 @@ class BulkClient(CheckedClient):
                     code = super().loop_read()
                     if code or self._sock is None:
                         return code
+        self._read_at, self.thread_s = time.monotonic(), time.thread_time()
         return MQTTErrorCode.MQTT_ERR_SUCCESS
+
+    def _gathering_time(self, received: int) -> float:
+        """Return how long the socket may be left alone after so many bytes came since it was read before [s]."""
+        if not isinstance(self._sock, socket.socket) or not received:
+            return 0.0
+        room = GATHER_SHARE * self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)  # the kernel lets it grow
+        return min(GATHER_S, (time.monotonic() - self._read_at) * room / received)
 
     def _take_messages(self) -> None:
         """Take the whole messages of quality 1, without properties, that come next."""

@@ -7,8 +7,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -68,7 +68,21 @@ class _AckHandle(NamedTuple):
     mid: int
     qos: int
     connection: int
-    position: tuple[int, int] | None
+    position: tuple[int, int] | None = None
+
+
+@dataclass(slots=True)
+class _Arrival:
+    """A message that waits to be decoded, and when it came at the earliest, monotonic [s]."""
+
+    message: ReceivedMessage
+    connection: int
+    came_at: float
+
+    @property
+    def key(self) -> tuple[str, bytes]:
+        """What it is known by when it is sent again."""
+        return self.message.topic, self.message.payload
 
 
 class MqttSource(BlockSource):
@@ -92,11 +106,12 @@ class MqttSource(BlockSource):
         self._client.on_connect_fail = lambda *_: self._broker.handle_failure()
         self._lock = threading.Lock()  # held while a message is acknowledged: never one of another connection
         self._connection = 0
-        self._waiting: dict[tuple[Any, ...], tuple[Block, _AckHandle]] = {}
+        # decoded where they are processed: a thread that decodes each as it comes does so with cold caches
+        self._waiting = deque[_Arrival]()
+        self._waiting_again: dict[tuple[str, bytes], _Arrival] = {}  # those of earlier connections
         self._unacknowledged: dict[str, deque[_AckHandle]] = {name: deque() for name in assets}
         self._newest: dict[str, tuple[int, int]] = {}  # stream and sequence of the newest block that was received
         self._acknowledged: dict[str, tuple[int, int]] = {}
-        self._thread_s = self._decode_s = 0.0
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as the broker is there."""
@@ -115,6 +130,7 @@ class MqttSource(BlockSource):
     def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         with self._lock:
             self._connection += 1
+            self._waiting_again = {one.key: one for one in self._waiting}
         if not self._broker.handle_connect(reason):
             return
         # also where the broker has the session: that of a killed process may have an old subscription
@@ -135,7 +151,7 @@ class MqttSource(BlockSource):
     @property
     def layer_seconds(self) -> Mapping[str, float]:
         """Processor time of the client's thread, as it was at the last message [s]."""
-        return {"receive": self._thread_s - self._decode_s, "decode": self._decode_s}
+        return {"receive": self._client.thread_s}
 
     @property
     def connected(self) -> bool:  # type: ignore[override]  # others set it
@@ -149,37 +165,42 @@ class MqttSource(BlockSource):
 
     def _on_message(self, message: ReceivedMessage) -> None:
         """Queue a message, in the client's thread."""
-        self._receive(message, _AckHandle(message.mid, message.qos, self._connection, None))
-
-    def _receive(self, message: ReceivedMessage, handle: _AckHandle) -> None:
-        try:
+        if not message.qos and len(self._waiting) >= self.settings.in_flight:
             asset = topics.parse_asset(message.topic)
+            reason = "sent without acknowledgement, faster than it can be processed"
+            self.rejections.add(asset if asset in self._assets else "", "overflow", reason)
+            return
+        one = _Arrival(message, self._connection, self._client.empty_at)
+        if self._waiting_again:
+            with self._lock:
+                # sent again in a new connection, it replaces its earlier copy: the queue does not grow by it
+                if (earlier := self._waiting_again.pop(one.key, None)) is not None:
+                    earlier.message, earlier.connection = message, one.connection
+                    return
+        self._waiting.append(one)
+
+    def _decode(self, one: _Arrival) -> tuple[Block, _AckHandle] | None:
+        """Return the block of a message; None: it is rejected, and acknowledged."""
+        message, handle = one.message, _AckHandle(one.message.mid, one.message.qos, one.connection)
+        asset = topics.parse_asset(message.topic)
+        try:
             if asset not in self._assets:  # an earlier service file had it, and the broker has kept that
-                if message.topic:  # without, an alias stands for it, which we have not allowed
+                # empty: an alias stands for it, which we have not allowed; too long: made up
+                if 0 < len(message.topic) < 1000:
                     self._client.unsubscribe(message.topic)
                 raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
             if len(message.payload) > self.settings.largest:
                 raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
-            start = time.thread_time()
-            decoded = decode_block(asset, message.payload, time.monotonic(), self._covariates.get(asset, ()))
-            self._thread_s = time.thread_time()
-            self._decode_s += self._thread_s - start
+            decoded = decode_block(asset, message.payload, one.came_at, self._covariates.get(asset, ()))
             self._check_order(decoded)
-            if not message.qos and len(self._waiting) >= self.settings.in_flight:
-                raise MessageError("overflow", "sent without acknowledgement, faster than it can be processed")
         except MessageError as error:
             self.rejections.add("" if error.kind == "unknown asset" else asset, error.kind, str(error))
             self._ack(handle)
-            return
+            return None
         block = decoded.block
         position = block.stream, block.sequence
         self._newest[asset] = max(position, self._newest.get(asset, position))
-        with self._lock:
-            # sent again in a new connection, it replaces its earlier copy: the queue does not grow by it
-            key: tuple[Any, ...] = asset, *position, float(block.t[0])
-            if key in self._waiting and self._waiting[key][1].connection == handle.connection:
-                key = *key, handle.mid  # sent twice
-            self._waiting[key] = block, handle._replace(position=position if block.retained else None)
+        return block, handle._replace(position=position) if block.retained else handle
 
     def _check_order(self, decoded: DecodedBlock) -> None:
         """Reject a block that comes before an earlier one which its sender retains, and will send again."""
@@ -193,10 +214,17 @@ class MqttSource(BlockSource):
     def poll(self, limit: int) -> list[Block]:
         """Return blocks in the order in which they came."""
         with self._lock:
-            found = [self._waiting.pop(key) for key in list(islice(self._waiting, limit))]
-        for block, handle in found:
-            self._unacknowledged[block.asset].append(handle)
-        return [block for block, _ in found]
+            arrivals = [self._waiting.popleft() for _ in range(min(limit, len(self._waiting)))]
+            if self._waiting_again:
+                for one in arrivals:
+                    self._waiting_again.pop(one.key, None)
+        found = []
+        for one in arrivals:
+            if (decoded := self._decode(one)) is not None:
+                block, handle = decoded
+                self._unacknowledged[block.asset].append(handle)
+                found.append(block)
+        return found
 
     def acknowledge(self, asset: str, blocks: int) -> None:
         """Acknowledge to the broker, and to a sender that retains its blocks, that they are stored."""
@@ -236,6 +264,7 @@ class PlantSource(MessageSource, MqttSource):
         super().__init__(settings, frozenset(assets), folder, client)
         assert settings.payload is not None, "what is sent is blocks"
         self._collector = MessageCollector(settings.payload, assets, self.rejections, settings.in_flight)
+        self._decode_s = 0.0
         self._asked: dict[tuple[str, str], float] = {}  # by node, when it was asked for its births, monotonic [s]
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
@@ -246,8 +275,15 @@ class PlantSource(MessageSource, MqttSource):
     def _topic_filters(self) -> list[str]:
         return self._collector.mapping.topic_filters(everyone=self.settings.is_visit)
 
-    def _receive(self, message: ReceivedMessage, handle: _AckHandle) -> None:
-        mapping, acknowledge = self._collector.mapping, partial(self._ack, handle)
+    @property
+    def layer_seconds(self) -> Mapping[str, float]:
+        """Processor time of the client's thread, which decodes, as it was at the last message [s]."""
+        return {"receive": self._client.thread_s - self._decode_s, "decode": self._decode_s}
+
+    def _on_message(self, message: ReceivedMessage) -> None:
+        """Take a message, in the client's thread."""
+        mapping = self._collector.mapping
+        acknowledge = partial(self._ack, _AckHandle(message.mid, message.qos, self._connection))
         try:
             if len(message.payload) > self.settings.largest:
                 raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
@@ -259,8 +295,7 @@ class PlantSource(MessageSource, MqttSource):
             return
         start = time.thread_time()
         self._collector.add(message.topic, message.payload, acknowledge, old=message.retain)
-        self._thread_s = time.thread_time()
-        self._decode_s += self._thread_s - start
+        self._decode_s += time.thread_time() - start
         if mapping.missing_births:
             self._ask_for_births()
 

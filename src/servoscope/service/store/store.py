@@ -306,12 +306,13 @@ class Store:
 
     def delete_before(self, table: str, before: Mapping[str, float]) -> int:
         """Delete rows of a table that are older, by the asset's own clock; return how many."""
-        chosen, count = tables.METADATA.tables[table], 0
+        if not before:
+            return 0
+        chosen = tables.METADATA.tables[table]
+        old = (chosen.c.asset == sa.bindparam("of_asset")) & (chosen.c.t < sa.bindparam("before"))
+        of_assets = [{"of_asset": asset, "before": t} for asset, t in before.items()]
         with self._transaction() as connection:
-            for asset, t in before.items():
-                old = (chosen.c.asset == asset) & (chosen.c.t < t)
-                count += connection.execute(chosen.delete().where(old)).rowcount
-        return count
+            return connection.execute(chosen.delete().where(old), of_assets).rowcount
 
     def delete_events(self, service: str, assets: Sequence[str], before: float) -> dict[str, int]:
         """Delete audit, executed commands and finished deliveries of a service that are older [UTC s]; notes stay.
