@@ -33,6 +33,7 @@ from servoscope.signals import Recording
 from servoscope.simulation.closed_loop import LoopSimulation
 
 COLOURED = 0.1  # autocorrelation, and error of the variance, that a whitening may leave
+REMEMBERED = 4  # models of noise per loop: a recording asks for the same again and again
 LONGEST_FILL = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
 
 
@@ -96,12 +97,22 @@ def residual_system(pipeline: Pipeline, plant: Plant) -> LinearSystem:
 
 
 def residual_noise_model(pipeline: Pipeline, plant: Plant, noise: WhiteNoise) -> ArmaNoise:
-    """Return the model of v for white noise in the closed loop with a plant.
+    """Return the model of v for white noise in the closed loop with a plant; the newest ones are remembered.
 
     The colour is that of the filters and the power exact, as long as that is nearly white noise behind the whitening:
     between samples the output that answers to the noise does not run in straight lines either, which takes a few per
     cent from it. Where a resonance makes more of that, the model is the one of the whole closed loop.
     """
+    known, key = pipeline.noise_models, (plant.model_dump_json(), noise)
+    model = known.get(key)
+    if model is None:
+        if len(known) >= REMEMBERED:
+            known.clear()
+        known[key] = model = _make_noise_model(pipeline, plant, noise)
+    return model
+
+
+def _make_noise_model(pipeline: Pipeline, plant: Plant, noise: WhiteNoise) -> ArmaNoise:
     model = arma_from_white_noise(pipeline.bank, nominal_theta(pipeline.loop, plant), noise, pipeline.stride)
     system = residual_system(pipeline, plant).input(np.diag([noise.u_std, noise.y_std]))
     power = float(autocovariances(system, 0)[0, 0, 0])

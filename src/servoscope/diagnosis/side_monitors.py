@@ -146,7 +146,7 @@ class SideLanes:
     ) -> SideValues:
         """Feed r, u and y of a block, shape (assets, N) each; the states are changed in place."""
         features = None
-        if self._features is None and len(self._lanes) > 1:
+        if self._features is None and (len(self._lanes) > 1 or not self.first.size):
             return SideValues(None)
         r, u, y = (np.asarray(signal, dtype=np.float64) for signal in signals)
         if self._features is not None:

@@ -15,7 +15,7 @@ from servoscope.core.errors import LoopError
 from servoscope.estimation import filter_bank
 from servoscope.estimation.filter_bank import FilterBank
 from servoscope.estimation.instrument import InstrumentTuning, instrument_model
-from servoscope.estimation.noise_model import ArmaNoise
+from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
 from servoscope.estimation.two_stage import StageOneRunner, StageOneTuning
 from servoscope.estimation.valve import ValveLaw, integer_delay
 from servoscope.models.lti import LinearSystem
@@ -248,6 +248,11 @@ class Pipeline:
             "delay": 0.0,
         }
         return Pipeline.of(loop.model_copy(update=update))
+
+    @cached_property
+    def noise_models(self) -> dict[tuple[str, WhiteNoise], ArmaNoise]:
+        """Models of v by plant (as JSON) and noise; see `servoscope.detection.expectation.residual_noise_model`."""
+        return {}
 
     @cached_property
     def _plain(self) -> Recursion:

@@ -36,6 +36,9 @@ MIN_PARALLEL_SAMPLES = 200_000  # samples from which a second core pays
 PARTS_PER_CORE = 12  # taken in turn, so that a core that is held up leaves its share to the others
 
 
+_SPECS: dict[KernelSpec, KernelSpec] = {}
+
+
 class EvaluationConstants(NamedTuple):
     """Constants of complete evaluations; `response` holds Re and Im of E(f).
 
@@ -337,9 +340,10 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
         row=5 + n + 2 * n * n if start else 4 + n + n * n + 6 * frequencies,
         floats=to["end"],
     )
-    return KernelSpec(
+    spec = KernelSpec(
         first.estimator, sizes, tuple(to.items()), tuple((*at.items(), ("tail", at["end"]))), bank, shadow
     )
+    return _SPECS.setdefault(spec, spec)  # ten kilobytes that all loops of one structure share
 
 
 def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:

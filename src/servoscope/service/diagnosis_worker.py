@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 from servoscope.core.workers import Worker, WorkerError
@@ -20,6 +20,7 @@ from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
 from servoscope.service.store.series import last_renewal, query_sizes
 
+LATEST_BASELINES = 64  # that the process keeps parsed: a hall may have one for each of thousands of assets
 MAX_ATTEMPTS = 2  # of a diagnosis that takes its process down with it
 TASK = "servoscope.service.diagnosis_worker:diagnose_packed_blocks"
 PROGNOSIS_TASK = "servoscope.service.outlook:prognose_in_worker"
@@ -87,6 +88,6 @@ def diagnose_packed_blocks(
     return diagnose_blocks(_parse_baseline(baseline), name, blocks).model_dump(mode="json")
 
 
-@cache
+@lru_cache(LATEST_BASELINES)
 def _parse_baseline(text: str) -> Baseline:
     return Baseline.model_validate(json.loads(text))

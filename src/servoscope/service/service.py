@@ -233,6 +233,8 @@ class Service:
             asset = self.assets[name]
             if asset.state is None or not asset.state.pending_diagnoses:
                 del self._awaiting[name]
+            elif all((name, one) in self._diagnosis_jobs for one in asset.state.pending_diagnoses):
+                continue  # hundreds may wait for their turn: their samples need not be gathered again meanwhile
             for window, blocks in asset.due_diagnoses(ended=ended):
                 if (name, window) not in self._diagnosis_jobs:
                     self._diagnosis_jobs[name, window] = self._diagnosis_worker.submit(asset.baseline, name, blocks)
