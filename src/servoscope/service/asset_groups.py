@@ -42,9 +42,10 @@ class _Fleet(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Of an asset in its fleet: which of the fleet's baselines is its own, and its row among the states."""
+    """Of an asset in a fleet: the fleet's number, which of its baselines is its own, and its row among the states."""
 
-    kind: Hashable
+    asset: Asset
+    fleet: int
     baseline: int
     row: int
 
@@ -63,14 +64,15 @@ class AssetGroups:
         members: dict[Hashable, list[str]] = defaultdict(list)
         for name, asset in assets.items():
             members[kinds[id(asset.monitor)]].append(name)
-        self._fleets, self._places = dict[Hashable, _Fleet](), dict[str, _Place]()  # of assets that have company
+        self._fleets, self._places = list[_Fleet](), dict[str, _Place]()  # of assets that have company
         for key, own in monitors.items():
             if len(names := members[key]) > 1:
                 size = len(assets[names[0]].monitor.init())
-                self._fleets[key] = _Fleet(Monitor.join(list(own.values())), AssetStates(len(names), size))
                 baselines = {each: i for i, each in enumerate(own)}
                 for row, name in enumerate(names):
-                    self._places[name] = _Place(key, baselines[id(assets[name].monitor)], row)
+                    asset = assets[name]
+                    self._places[name] = _Place(asset, len(self._fleets), baselines[id(asset.monitor)], row)
+                self._fleets.append(_Fleet(Monitor.join(list(own.values())), AssetStates(len(names), size)))
 
     def process(self, blocks: Iterable[Block], latest: float = np.inf) -> Iterator[BlockResult | QuietBlocks]:
         """Process blocks of any assets, those of one asset in their order; yield what they have led to.
@@ -90,7 +92,7 @@ class AssetGroups:
             yield from self._process_round(turn.values(), latest)
 
     def _process_round(self, turn: Iterable[Block], latest: float) -> Iterator[BlockResult | QuietBlocks]:
-        together: dict[tuple[Hashable, tuple[int, ...]], list[Block]] = defaultdict(list)
+        together: dict[tuple[int, tuple[int, ...]], list[Block]] = defaultdict(list)
         alone = list[Block]()
         for block in turn:
             place = self._places.get(block.asset)
@@ -99,13 +101,13 @@ class AssetGroups:
             except ServoscopeError as error:  # one asset's trouble must not stop the others
                 yield BlockResult(block, error)
                 continue
-            if place is None or not self._assets[block.asset].heard:
+            if place is None or not place.asset.heard:
                 alone.append(block)
             else:
-                together[place.kind, block.signals.shape].append(block)
-        for (kind, shape), blocks in together.items():
+                together[place.fleet, block.signals.shape].append(block)
+        for (fleet, shape), blocks in together.items():
             signals = np.concatenate([one.signals for one in blocks]).reshape(len(blocks), *shape)
-            yield from self._process_together(self._fleets[kind], blocks, signals, latest, alone)
+            yield from self._process_together(self._fleets[fleet], blocks, signals, latest, alone)
         for block in alone:
             yield BlockResult(block, self._process_alone(block, latest))
 
@@ -129,10 +131,11 @@ class AssetGroups:
         """Process blocks of one shape, with these `signals`; those that must go `alone` are added there."""
         self.layers.enter("assemble")
         states, t = fleet.states, signals[:, 0]
-        rows = np.array([self._places[one.asset].row for one in blocks])
+        places = [self._places[one.asset] for one in blocks]
+        rows = np.array([one.row for one in places])
         for i in np.flatnonzero(~states.columns["is_here"][rows]).tolist():
-            self._assets[blocks[i].asset].move_state(states, int(rows[i]))
-        lanes = self._assets[blocks[0].asset].lanes
+            places[i].asset.move_state(states, places[i].row)
+        lanes = places[0].asset.lanes
         follows = states.are_next(rows, [one.sequence for one in blocks], [one.stream for one in blocks])
         follows &= lanes.are_regular(t, states.columns["last_t"][rows]) & ~(t[:, -1] > latest)
         phases = fleet.monitor.phase(states.monitor[rows])
