@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import functools
 import sqlite3
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from servoscope.detection.baseline import Baseline
 from servoscope.learning.learn import nominal_baseline
 from servoscope.models.loop import Loop
+from servoscope.service.asset_groups import BlockResult, QuietBlocks
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
+from servoscope.service.records import StepResult, TableRow
 from servoscope.service.service import Service
 from servoscope.service.store import Store
 from servoscope.signals import Recording, writers
@@ -89,6 +92,17 @@ def hall(folder: Path, name: str, *, speed: float = 0.0, store: str = "", more: 
     path = folder / f"{name}.toml"
     path.write_text("\n".join(line.strip() for line in text.splitlines()), encoding="utf-8")
     return path
+
+
+def block_rows(processed: Iterable[BlockResult | QuietBlocks]) -> Iterator[tuple[str, list[TableRow]]]:
+    """Yield the rows to which each block has led, with its asset; a quiet block leads to its samples alone."""
+    for one in processed:
+        if isinstance(one, QuietBlocks):
+            for asset, number, packed in zip(one.assets, one.numbers, one.packed, strict=True):
+                yield asset.name, [TableRow("recent", {"sequence": number, "samples": packed})]
+        else:
+            assert isinstance(one.result, StepResult), one.result
+            yield one.block.asset, one.result.rows
 
 
 def asked(config: Path, query: str) -> list[Any]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+import halls
 import servoscope as ss
 from servoscope.detection.chi2_test import t2_statistic
 from servoscope.detection.feature_model import (
@@ -28,7 +29,7 @@ from servoscope.diagnosis.follower import Follower, FollowerState
 from servoscope.estimation.window_features import FeatureLayout, Window, WindowFeatures
 from servoscope.learning.features import choose_layout, learn_features
 from servoscope.service.asset import Asset
-from servoscope.service.asset_groups import AssetGroups, BlockOffer
+from servoscope.service.asset_groups import AssetGroups
 from servoscope.service.checkpoint import pack_state
 from servoscope.service.examination import examine_blocks
 from servoscope.service.sources.block import Block
@@ -354,8 +355,8 @@ class TestStreams:
                 Block(name, k // 50, BEGAN + x.t[rows], x.r[rows], x.u[rows], x.y[rows]) for name, x in recs.items()
             ]
             expected = [alone[one.asset].process(one).rows for one in blocks]
-            found = [result.rows for _, result in groups.process([BlockOffer(one, np.inf) for one in blocks])]
-            assert found == expected
+            found = dict(halls.block_rows(groups.process(blocks)))
+            assert [found[one.asset] for one in blocks] == expected
         for name, asset in alone.items():
             assert asset.state is not None and together[name].state is not None
             assert pack_state(asset.state) == pack_state(together[name].state)

@@ -14,17 +14,19 @@ import pytest
 
 import halls
 from halls import RESULTS, asked, hall
+from servoscope.core.errors import AlarmError
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.learning.learn import nominal_baseline
 from servoscope.models.loop import Loop
 from servoscope.service import service as service_module
 from servoscope.service import writer
-from servoscope.service.alarms import AlarmSettings
+from servoscope.service.alarms import AlarmSettings, LifecycleEvent, OperatorCommand
 from servoscope.service.asset import Asset, AssetPolicy
-from servoscope.service.asset_groups import AssetGroups, BlockOffer
+from servoscope.service.asset_groups import AssetGroups, BlockResult
 from servoscope.service.build import build_components
-from servoscope.service.checkpoint import pack_state
+from servoscope.service.checkpoint import pack_state, unpack_state
 from servoscope.service.config import DiagnosisSettings, ServiceFile
+from servoscope.service.reception import FOLLOWED, Reception
 from servoscope.service.records import StepResult
 from servoscope.service.service import Service
 from servoscope.service.sources.block import Block
@@ -82,10 +84,88 @@ def test_assets_of_one_structure_go_together_to_the_bits_that_each_has_alone(mon
     assert any(row.table == "transitions" for row in expected["asset1"])  # its leak is alarmed
     while any(waiting.values()):
         turn = [blocks.pop(0) for blocks in waiting.values() for _ in range(min(chance.randrange(4), len(blocks)))]
-        for block, result in groups.process([BlockOffer(one, np.inf) for one in turn]):
-            assert isinstance(result, StepResult)
-            found.setdefault(block.asset, []).extend(result.rows)
+        for name, rows in halls.block_rows(groups.process(turn)):
+            found.setdefault(name, []).extend(rows)
     assert found == expected
+    for name, asset in alone.items():
+        other = together[name]
+        assert asset.state is not None and other.state is not None
+        assert pack_state(other.state) == pack_state(asset.state), name
+        assert other.status(other.state) == asset.status(asset.state)
+
+
+def disturb(blocks: list[Block], chance: random.Random) -> list[Block]:
+    """Return the blocks of an asset with what may happen to them on their way."""
+    found = list[Block]()
+    for one in blocks:
+        way = chance.choices(["sound", "lost", "twice", "late", "early", "turned", "torn", "still"], [150] + [1] * 7)[0]
+        if way == "turned":
+            one = replace(one, **{name: getattr(one, name)[::-1] for name in "truy"})
+        elif way == "torn":
+            one = replace(one, y=np.where(np.arange(one.t.size) % 7 == 3, np.nan, one.y))
+        elif way == "still":
+            one = replace(one, y=np.zeros(one.t.size), u=np.zeros(one.t.size))
+        early = [replace(one, t=one.t + 3600.0), one]
+        more = {"lost": [], "twice": [one, one], "late": [one, *found[-2:-1]], "early": early}
+        found += more.get(way, [one])
+    return found
+
+
+def interfere(asset: Asset, kind: str) -> StepResult:
+    """Do what is done to an asset between two blocks."""
+    if kind == "silence":
+        return asset.advance_time(20.0)
+    if kind == "shelve":
+        try:
+            return asset.execute("fault", OperatorCommand(LifecycleEvent.SHELVE, "ann", until=asset.t + 5.0))
+        except AlarmError:  # it is shelved
+            pass
+    if kind == "slow":
+        asset.reception = Reception("slow", "u comes too slowly")
+    return StepResult([], [])
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_whatever_happens_to_some_assets_all_come_to_what_they_come_to_alone(
+    monitors: list[Monitor], seed: int
+) -> None:
+    chance, alone, together = random.Random(seed), assets(monitors), assets(monitors)
+    groups, latest, quiet, behind = AssetGroups(together), BEGAN + 100.0, 0, 0
+    waiting = {name: disturb(blocks, chance) for name, blocks in streams().items()}
+    expected, found = ({name: list[Any]() for name in alone} for _ in range(2))
+    saved = dict[str, bytes]()
+    while any(waiting.values()):
+        turn = [blocks.pop(0) for blocks in waiting.values() for _ in range(min(chance.randrange(3), len(blocks)))]
+        for one in turn:
+            expected[one.asset] += alone[one.asset].process(one, latest).rows
+            alone[one.asset].reception = FOLLOWED
+        changed = set()
+        for result in groups.process(turn, latest):
+            for name, rows in halls.block_rows([result]):
+                found[name] += rows
+            if isinstance(result, BlockResult):
+                assert isinstance(result.result, StepResult)
+                changed |= set() if result.result.repeatable else {result.block.asset}
+                together[result.block.asset].reception = FOLLOWED
+            else:
+                quiet += len(result.blocks)
+        name, kind = chance.choice(list(together)), chance.choice(["silence", "shelve", "slow", *["nothing"] * 20])
+        if together[name].heard and kind != "nothing":
+            expected[name] += interfere(alone[name], kind).rows
+            found[name] += interfere(together[name], kind).rows
+            changed.add(name)
+        saved |= {each: pack_state(state) for each in changed if (state := together[each].state) is not None}
+        if chance.random() < 0.3 and name in saved:  # killed: it goes on from its checkpoint and what came since
+            killed, reception = together[name], together[name].reception
+            together[name] = Asset(name, killed.baseline, killed.monitor, POLICY)
+            stored = [Block.unpack(name, *one.values.values()) for one in found[name] if one.table == "recent"]
+            groups = AssetGroups(together)
+            left = together[name].resume(unpack_state(saved[name], name), stored[-80:])
+            behind += len(left)
+            assert all([row.table for row in rows] == ["recent"] for _, rows in halls.block_rows(groups.process(left)))
+            together[name].reception = reception
+    assert found == expected
+    assert quiet > 100 and behind > 5
     for name, asset in alone.items():
         other = together[name]
         assert asset.state is not None and other.state is not None

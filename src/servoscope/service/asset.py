@@ -4,32 +4,24 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from servoscope.core.errors import AlarmError, StateError
+from servoscope.core.errors import StateError
 from servoscope.core.messages import message, render
-from servoscope.core.settings_errors import suggest_name
 from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.prognosis.forecast import Prognosis
-from servoscope.service.alarms import (
-    AlarmSettings,
-    AlarmStandstill,
-    AlarmTransition,
-    OperatorCommand,
-    advance_alarms,
-    initial_alarm_state,
-    next_event_time,
-    step_alarm,
-)
-from servoscope.service.asset_status import AssetStatus, asset_metadata, asset_snapshot, asset_status
-from servoscope.service.block_lanes import BlockLanes, LaneInput, LaneOutput
+from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCommand
+from servoscope.service.asset_alarms import AssetAlarms
+from servoscope.service.asset_states import AssetStates, RestPeriod, StateHolder
+from servoscope.service.asset_status import AssetStatus, asset_metadata, asset_status
+from servoscope.service.block_lanes import BlockLanes, LaneOutput
 from servoscope.service.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.examination import StoredDiagnosis, carry_covariates, examine_blocks
@@ -40,12 +32,13 @@ from servoscope.service.examination_schedule import (
     examination_phase,
     fault_names,
     is_at_rest,
+    rest_period,
     schedule_full_diagnosis,
     update_examination,
 )
-from servoscope.service.outlook import AssetLimits, Outlook, PrognosisSettings, outlook_word, single_fault
+from servoscope.service.outlook import AssetLimits, Outlook, PrognosisSettings, single_fault
 from servoscope.service.recent_blocks import RecentBlocks
-from servoscope.service.reception import FOLLOWED
+from servoscope.service.reception import FOLLOWED, Reception
 from servoscope.service.records import BlockRefusal, StepResult, TableRow, transition_row
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.continuity import BlockContinuity, check_continuity
@@ -65,7 +58,14 @@ class AssetPolicy:
     limits: AssetLimits = field(default_factory=dict)
 
 
-class Asset:
+class NextBlock(NamedTuple):
+    """A block that is to be followed, and how it follows what was counted."""
+
+    block: Block
+    continuity: BlockContinuity = BlockContinuity(0, anew=False)
+
+
+class Asset(StateHolder):
     """Follows one asset.
 
     `baseline`: of one operating point; `monitor`: of this baseline, shared by all assets that have it; `group`: what
@@ -75,23 +75,38 @@ class Asset:
     def __init__(
         self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "", source: str = ""
     ) -> None:
+        super().__init__()
         self.name, self.baseline, self.policy, self.source = name, baseline, policy, source
         self.monitor, self._rate, self._phase = monitor, baseline.loop.sample_rate, examination_phase(name)
         self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
         self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s, source)
         self._limits = policy.quality.limits(self._rate)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
-        alarms, limited = policy.alarms.asset_alarms, bool(policy.limits)
-        self._definitions = {key: one for key, one in alarms.items() if limited or one.source != "outlook"}
-        self._window = RecentBlocks(policy.diagnosis.window_s, self._rate)
-        self._accepted: tuple[Block, BlockContinuity] | None = None
-        self._settled: AlarmStandstill | None = None
-        self._by_numbers = any(one.source in ("statistic", "level") for one in self._definitions.values())
+        self._alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
+        self._window = RecentBlocks(name, policy.diagnosis.window_s, self._rate)
         self._result = StepResult([], [])
-        self.state: AssetState | None = None
-        self.reception = FOLLOWED
-        # is_repeatable: whether the last block leads from the state before it to that after it, and to nothing else
-        self.is_repeatable = self._ticked = False  # _ticked: whether silence has changed the state since then
+        self._reception = FOLLOWED
+        self._ticked = False  # whether silence has changed the state since the last block
+
+    def move_state(self, states: AssetStates, row: int) -> None:
+        """Let the state be a row of `states`, until it is taken or another one is set."""
+        state = self.take_state()
+        since, until = rest_period(state.examination)
+        from_s, to_s = self._alarms.standstill(state, self.reception)
+        undisturbed = self.reception == FOLLOWED and not self._ticked
+        rest = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
+        self._move_to(states.put(row, state, rest if undisturbed else rest._replace(until=-math.inf)))
+
+    @property
+    def reception(self) -> Reception:
+        """How its samples come in."""
+        return self._reception
+
+    @reception.setter
+    def reception(self, reception: Reception) -> None:
+        if reception is not self._reception and self._state is not None:
+            self.take_state()  # what its next block leads to is no longer what it was
+        self._reception = reception
 
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
@@ -111,11 +126,11 @@ class Asset:
                 f"{self.baseline.hash}): run --anew {self.name} begins with a new state, behind the samples counted"
             )
         t = state.position.t
-        alarms = {name: state.alarms.get(name) or initial_alarm_state(self.name, name, t) for name in self._definitions}
+        alarms = self._alarms.begin(self.name, t, state.alarms)
         self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
         position, blocks = state.position, list(stored)
         counted = [one for one in blocks if one.sequence < position.blocks]
-        self._window = RecentBlocks(self.policy.diagnosis.window_s, self._rate, counted)
+        self._window = RecentBlocks(self.name, self.policy.diagnosis.window_s, self._rate, counted)
         ahead = position.sequence - position.blocks + 1  # of the sender's numbers; all are of one stream
         return [
             replace(one, sequence=one.sequence + ahead, stream=position.stream)
@@ -125,8 +140,8 @@ class Asset:
 
     def begin(self, position: StreamPosition) -> None:
         """Begin with a new state, before the first sample or behind those that were counted."""
-        self._settled = None
         before = {} if self.heard or self.state is None else self.state.alarms_now
+        standing = {name: one for name, one in before.items() if one.sequence}
         due = position.t + self.policy.diagnosis.window_s * (1.0 + self._phase)
         self.state = AssetState(
             asset=self.name,
@@ -136,18 +151,8 @@ class Asset:
             quality=quality.init_state(),
             examination=ExaminationState(due=due, since=position.t),
             # those that stand since before the first block go on
-            alarms={
-                name: one
-                if (one := before.get(name)) and one.sequence
-                else initial_alarm_state(self.name, name, position.t)
-                for name in self._definitions
-            },
+            alarms=self._alarms.begin(self.name, position.t, standing),
         )
-
-    @property
-    def heard(self) -> bool:
-        """Whether a block of it was ever counted."""
-        return self.state is not None and self.state.position.blocks > 0
 
     def expect(self, now: float) -> None:
         """Wait for the first block from `now` [UTC s] on: an asset that was never heard has a state too."""
@@ -155,7 +160,7 @@ class Asset:
 
     def status(self, state: AssetState) -> AssetStatus:
         """Return what users see of a state."""
-        return asset_status(state, self._definitions, self._metadata, self.reception)
+        return asset_status(state, self._alarms.definitions, self._metadata, self.reception)
 
     @property
     def first_needed_sequence(self) -> int:
@@ -169,45 +174,50 @@ class Asset:
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
         accepted = self.accept(block, latest)
-        if isinstance(accepted, StepResult):
-            return accepted
-        return self.conclude(self.lanes.follow(self.monitor, accepted))
+        return accepted if isinstance(accepted, StepResult) else self.conclude(accepted, self.follow(accepted))
 
-    def accept(self, block: Block, latest: float = math.inf) -> LaneInput | StepResult:
+    def accept(self, block: Block, latest: float = math.inf) -> NextBlock | StepResult:
         """Begin to process a block, as `process` does: return what is to be followed and concluded, or no effect."""
-        self.is_repeatable = False
         start, credible = block.start_time(), block.until(latest)
         if credible is None:
             return self._leave_out(block, "future", ahead_s=start - latest)
         block, start = credible, start if credible is block else credible.start_time()
-        continuity = check_continuity(self._current.position if self.heard else None, block, latest)
+        continuity = check_continuity(self.take_state().position if self.heard else None, block, latest)
         if not self.heard:
-            rows = self.state.position.rows if self.state is not None else 0
+            rows = self._state.position.rows if self._state is not None else 0
             self.begin(StreamPosition(start, start, stream=block.stream, rows=rows))
-        position, self._result = self._current.position, StepResult([], [])
         if continuity is None:
+            position = self._current.position
             # its sender sends it again by design, or it is one of the last minutes
             if block.retained or self._window.begins_with(block.t[0]):
                 self.state = replace(self._current, position=replace(position, repeated=position.repeated + 1))
-                return self._result
+                return StepResult([], [])
             return self._leave_out(block, "late", behind_s=position.t - start)
-        self._accepted = block, continuity
-        return LaneInput(self._current, block.signals, continuity.is_broken)
+        return NextBlock(block, continuity)
 
-    def conclude(self, followed: LaneOutput) -> StepResult:
-        """Take what the accepted block has led to."""
-        assert self._accepted is not None, "accept comes first"
-        (block, continuity), self._accepted = self._accepted, None
-        examination, alarms = self._current.examination, self._current.alarms
-        self._count(block, continuity, followed)
+    def follow(self, accepted: NextBlock) -> LaneOutput:
+        """Follow an accepted block alone."""
+        block, continuity = accepted
+        return self.lanes.follow(self.monitor, self._current, block.signals, restart=continuity.is_broken)
+
+    def conclude(self, accepted: NextBlock, followed: LaneOutput) -> StepResult:
+        """Take what an accepted block has led to."""
+        before, self._result = self.take_state(), StepResult([], [])
+        self._count(*accepted, followed)
         self._examine()
         self._advance_alarms(self._current.position.t)
         self._window.trim(self._current.position.t, self._current.pending_diagnoses)
-        nothing_else = len(self._result.rows) == 1 and self._current.alarms is alarms
-        undisturbed = self.reception == FOLLOWED and not self._ticked
-        self.is_repeatable = nothing_else and undisturbed and self._current.examination is examination
+        after, undisturbed = self._current, self.reception == FOLLOWED and not self._ticked
         self._ticked = False
-        return self._result
+        nothing_else = after.alarms is before.alarms and after.examination is before.examination
+        return self._result._replace(repeatable=nothing_else and undisturbed and len(self._result.rows) == 1)
+
+    def keep(self, sequence: int, block: Block, packed: bytes) -> None:
+        """Keep the samples of a quiet block, stored under this number, whose state is there."""
+        assert self._state is not None
+        last = block.t.item(-1)
+        self._window.append(sequence, block.t.item(0), last, block.t.size, packed)
+        self._window.trim(last, self._state.pending_diagnoses)
 
     def _leave_out(self, block: Block, kind: Literal["late", "future"], **seconds: float) -> StepResult:
         """Count a block that is left out for its time stamps; its place in its stream has passed."""
@@ -242,24 +252,28 @@ class Asset:
 
         Raises AlarmError if there is no such alarm, or the command has no meaning in its state.
         """
-        if self.state is None or alarm not in self._definitions:
-            raise AlarmError(f"{self.name}: has no alarm {alarm!r}, {suggest_name(alarm, self._definitions)}")
-        alarms = self.state.alarms_now
-        self._result, before, self._settled = StepResult([], []), alarms[alarm], None
-        t = max(before.at, self.state.position.t)
-        after, transitions = step_alarm(self._definitions[alarm], before, command, t)
-        self.state = replace(self.state, alarms={**alarms, alarm: after}, alarms_at=None)
+        self._result = StepResult([], [])
+        self.state, transitions = self._alarms.execute(self._current, alarm, command)
         self._add_transitions(transitions)
         return self._result
 
-    def due_diagnoses(self, *, ended: bool = False) -> list[tuple[PendingDiagnosis, Sequence[Block]]]:
-        """Return the full diagnoses whose windows are complete, or end here, with their samples."""
-        if self.state is None:
+    def due_diagnoses(
+        self, *, ended: bool = False, started: Container[tuple[str, PendingDiagnosis]] = ()
+    ) -> list[tuple[PendingDiagnosis, Sequence[Block]]]:
+        """Return the full diagnoses whose windows are complete, or end here, with their samples.
+
+        `started`: asset and window of those that are not asked for again.
+        """
+        if self._state is None or not self._state.pending_diagnoses:
             return []
-        t, after_s, pending = self.state.position.t, self._schedule.after, self.state.pending_diagnoses
+        t, after_s, pending = self.t, self._schedule.after, self._state.pending_diagnoses
         # complete, or never to be because the clock was set back
         ready = [window for window in pending if ended or not window.until - after_s <= t < window.until]
-        return [(window, self._carry_covariates(self._window.within(window))) for window in ready]
+        return [
+            (window, self._carry_covariates(self._window.within(window)))
+            for window in ready
+            if (self.name, window) not in started
+        ]
 
     def _carry_covariates(self, blocks: Sequence[Block]) -> Sequence[Block]:
         state = self._current
@@ -298,8 +312,7 @@ class Asset:
 
     @property
     def _current(self) -> AssetState:
-        assert self.state is not None, "begin or resume comes first"
-        return self.state
+        return self.take_state()
 
     def _next_row_number(self) -> int:
         position = self._current.position
@@ -316,7 +329,7 @@ class Asset:
         """Keep a block and the state after it."""
         state, position, packed = self._current, self._current.position, block.pack()
         # stored under a number of our own, because the sender's may begin anew
-        self._window.append(block if block.sequence == position.blocks else evolve(block, sequence=position.blocks))
+        self._window.append(position.blocks, block.t.item(0), block.t.item(-1), block.t.size, packed)
         self._result.rows.append(TableRow("recent", {"sequence": position.blocks, "samples": packed}))
         if continuity.is_broken:
             self._result.rows.append(continuity.audit_row(position, block))
@@ -377,24 +390,10 @@ class Asset:
 
     def _advance_alarms(self, t: float) -> None:
         """Update the alarms at time `t` [UTC s]."""
-        state = self._current
-        findings, settled = tuple(quality.active_findings(state.quality)), self._settled
-        word = outlook_word(state.outlook, state.examination.faults, t, self.policy.prognosis.ahead_s)
-        known = state.examination, findings, self.reception, word
-        if settled is not None and settled.known == known:
-            at = settled.at if state.alarms_at is None else state.alarms_at
-            if at <= t < settled.until:
-                self.state = evolve(state, alarms_at=t)
-                return
-        snapshot = asset_snapshot(state, findings, self.reception, word)
-        alarms, transitions = advance_alarms(self._definitions, state.alarms_now, snapshot, t)
-        self.state = replace(state, alarms=alarms, alarms_at=None)
-        # after transitions a second step may do more, because alarms suppress each other
-        still = not transitions and not self._by_numbers
-        self._settled = AlarmStandstill(known, t, next_event_time(self._definitions, alarms)) if still else None
+        self.state, transitions = self._alarms.advance(self._current, self.reception, t)
         self._add_transitions(transitions)
 
     def _add_transitions(self, transitions: Sequence[AlarmTransition]) -> None:
         self._result.transitions.extend(transitions)
         for one in transitions:
-            self._add_row("transitions", **transition_row(one, self._definitions[one.alarm]))
+            self._add_row("transitions", **transition_row(one, self._alarms.definitions[one.alarm]))

@@ -5,7 +5,6 @@ Both ways lead to the same bits, so that nothing depends on which assets happen 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,17 +15,9 @@ from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.checkpoint import AssetState
 from servoscope.service.layer_times import LayerTimes
-from servoscope.service.residual_history import HistoryState, LatestEvaluation, evaluation_status, update_history
+from servoscope.service.residual_history import HistoryState, LatestEvaluation, update_history
 from servoscope.signals import quality
 from servoscope.signals.timebase import Timebase
-
-
-class LaneInput(NamedTuple):
-    """A block that is to be followed, with the state before it."""
-
-    state: AssetState
-    signals: FloatArray  # t, r, u, y and covariates, shape (4 + k, N)
-    restart: bool  # whether samples before it are missing
 
 
 class LaneOutput(NamedTuple):
@@ -41,6 +32,49 @@ class LaneOutput(NamedTuple):
     evaluation: LatestEvaluation | None  # None: the block has none
 
 
+class LaneEvaluations:
+    """The evaluations of a block of each of several assets, at `times` [UTC s], shape (assets, K), K > 0.
+
+    What is judged of them, of each asset: `exceeded`, whether the last one is above a limit; `peaks`, of the whole
+    block, shape (3, assets); `t`, time of the last one [UTC s]; `periods` of the history in which the first and the
+    last one lie, shape (2, assets).
+    """
+
+    def __init__(self, trace: Trace, times: FloatArray, every_s: float) -> None:
+        self._trace, self._times, self._every_s = trace, times, every_s
+        self.exceeded, self.peaks, self.t = trace.exceeded[:, -1], _peaks(trace), times[:, -1]
+        self.periods = np.floor(times[:, [0, -1]].T / every_s)
+
+    def latest(self, lane: int) -> LatestEvaluation:
+        """Return the newest one of an asset."""
+        excess, level, _ = self.peaks[:, lane].tolist()
+        return LatestEvaluation.from_trace(self._trace, float(self.t[lane]), (excess, level), lane)
+
+    def update_history(self, lane: int, state: HistoryState) -> tuple[HistoryState, list[dict[str, Any]]]:
+        """Add those of an asset to its history, as `residual_history.update_history` does."""
+        return update_history(state, self._trace.lane(lane), self._times[lane], self._every_s)
+
+
+class LanesOutput(NamedTuple):
+    """What a block of each of several assets has led to."""
+
+    monitor: FloatArray  # shape (assets, size)
+    quality: FloatArray  # shape (assets, size)
+    t: FloatArray  # time of the last sample, shape (assets,) [UTC s]
+    size: int  # samples of each block
+    evaluations: LaneEvaluations | None  # None: the blocks have none
+
+    def lane(self, lane: int, state: AssetState) -> LaneOutput:
+        """Return that of one asset, with the state before it."""
+        history, rows, latest = state.history, list[dict[str, Any]](), None
+        if self.evaluations is not None:
+            history, rows = self.evaluations.update_history(lane, history)
+            latest = self.evaluations.latest(lane)
+        # copies: an asset that falls silent must not hold the arrays of all others
+        new, seen = self.monitor[lane].copy(), self.quality[lane].copy()
+        return LaneOutput(new, seen, state.samples + self.size, float(self.t[lane]), history, rows, latest)
+
+
 class BlockLanes:
     """Follows blocks of assets that have one sample rate and the same limits of data quality."""
 
@@ -48,12 +82,14 @@ class BlockLanes:
         self._rate, self._limits, self._residual_every_s = rate, limits, residual_every_s
         self._timebase = Timebase(1.0 / rate)
 
-    def follow(self, monitor: Monitor, accepted: LaneInput) -> LaneOutput:
-        """Follow a block of one asset, in whatever order its samples are."""
-        state, block, _ = accepted
+    def follow(self, monitor: Monitor, state: AssetState, block: FloatArray, *, restart: bool) -> LaneOutput:
+        """Follow a block of one asset, in whatever order its samples are.
+
+        `block`: t, r, u, y and covariates, shape (4 + k, N); `restart`: whether samples before it are missing.
+        """
         last = np.nan if state.last_t is None else state.last_t
         order = self._timebase.order_block(block[0], last)
-        order.restart[:1] |= accepted.restart
+        order.restart[:1] |= restart
         t, signals = block[0, order.rows], block[1:, order.rows]
         r, u, y, *covariates = np.where(np.isfinite(signals), signals, np.nan)
         channels = dict(zip(monitor.baselines[0].logged_covariates, covariates, strict=False))
@@ -61,76 +97,49 @@ class BlockLanes:
         checked, _ = quality.check_block(self._limits, state.quality, *block[:4, order.order])
         last_t = order.t if np.isfinite(order.t) else None
         checked, _ = quality.tick(self._limits, checked, state.position.t if last_t is None else last_t)
-        times = t[self._evaluated_samples(trace, state)]
+        times = t[self._evaluated_samples(trace, state.samples)]
         history, rows = update_history(state.history, trace, times, self._residual_every_s)
         evaluation = None
         if times.size:
             excess, level, _ = _peaks(trace).tolist()
-            features = None if trace.features is None else float(trace.features[-1])
-            exceeded = bool(trace.exceeded[-1])
-            evaluation = LatestEvaluation(exceeded, (excess, level), features, float(times[-1]), _writer(trace, times))
+            evaluation = LatestEvaluation.from_trace(trace, float(times[-1]), (excess, level))
         return LaneOutput(new, checked, state.samples + len(t), last_t, history, rows, evaluation)
 
-    def are_regular(self, blocks: Sequence[LaneInput], signals: FloatArray) -> BoolArray:
-        """Tell which of some blocks of one length need no sorting, and no second look at what came before them.
+    def are_regular(self, t: FloatArray, last: FloatArray) -> BoolArray:
+        """Tell which of some blocks, with times `t` (blocks, N), need no sorting, nor a second look at what was `last`.
 
-        `signals`: theirs, shape (blocks, 4, N).
+        `last`: time of the last sample before each, shape (blocks,), NaN: there was none [UTC s].
         """
-        last = np.array([np.nan if one.state.last_t is None else one.state.last_t for one in blocks])
-        follows = ~np.array([one.restart for one in blocks], dtype=np.bool_)
-        return np.logical_and(self._timebase.is_regular(signals[:, 0], last), follows)
+        return self._timebase.is_regular(t, last)
 
     def follow_lanes(
-        self, fleet: Monitor, blocks: Sequence[LaneInput], signals: FloatArray, layers: LayerTimes
-    ) -> list[LaneOutput]:
+        self,
+        fleet: Monitor,
+        before: tuple[FloatArray, FloatArray],
+        samples: int,
+        signals: FloatArray,
+        layers: LayerTimes,
+    ) -> LanesOutput:
         """Follow regular blocks of the assets of a fleet, of one length and one phase, side by side.
 
-        `signals`: theirs, shape (blocks, 4, N).
+        `before`: states of monitor and data quality, shape (blocks, ...) each; `samples`: that the monitor of the first
+        asset has processed; `signals`: of the blocks, shape (blocks, 4 + k, N).
         """
-        layers.enter("assemble")
-        states = [one.state for one in blocks]
-        t, given = signals[:, 0], signals[:, 1:]
-        used = np.where(np.isfinite(given), given, np.nan)
-        before = np.array([one.monitor for one in states])
+        t, given = signals[:, 0], signals[:, 1:4]
+        known = np.isfinite(given)
+        used = given if known.all() else np.where(known, given, np.nan)
         layers.enter("kernel")
-        monitors, trace = fleet.run(before, used[:, 0], used[:, 1], used[:, 2])
+        monitors, trace = fleet.run(before[0], used[:, 0], used[:, 1], used[:, 2])
         layers.enter("quality")
-        checked = quality.check_lanes(self._limits, np.array([one.quality for one in states]), t, given)
+        checked = quality.check_lanes(self._limits, before[1], t, given)
         layers.enter("judge")
-        times = t[:, self._evaluated_samples(trace, states[0])]
-        last_t, size = t[:, -1].tolist(), t.shape[1]
-        if not times.shape[1]:
-            return [
-                LaneOutput(monitors[i].copy(), checked[i].copy(), one.samples + size, at, one.history, [], None)
-                for i, (one, at) in enumerate(zip(states, last_t, strict=True))
-            ]
-        columns = zip(
-            states,
-            last_t,
-            times[:, -1].tolist(),
-            trace.exceeded[:, -1].tolist(),
-            _peaks(trace).T.tolist(),
-            np.floor(times[:, [0, -1]] / self._residual_every_s).tolist(),
-            strict=True,
-        )
-        found = []
-        for i, (state, at, evaluated, exceeded, (excess, level, known), (first, last)) in enumerate(columns):
-            history, rows = state.history, list[dict[str, Any]]()
-            if first == history.period == last:
-                if known > history.excess or level > history.level:
-                    history = HistoryState(history.period, max(history.excess, known), max(history.level, level))
-            else:
-                history, rows = update_history(history, trace.lane(i), times[i], self._residual_every_s)
-            features = None if trace.features is None else float(trace.features[i, -1])
-            evaluation = LatestEvaluation(exceeded, (excess, level), features, evaluated, _writer(trace, times, i))
-            # copies: an asset that falls silent must not hold the arrays of all others
-            new, seen = monitors[i].copy(), checked[i].copy()
-            found.append(LaneOutput(new, seen, state.samples + size, at, history, rows, evaluation))
-        return found
+        times = t[:, self._evaluated_samples(trace, samples)]
+        evaluations = LaneEvaluations(trace, times, self._residual_every_s) if times.shape[1] else None
+        return LanesOutput(monitors, checked, t[:, -1].copy(), t.shape[1], evaluations)
 
-    def _evaluated_samples(self, trace: Trace, state: AssetState) -> npt.NDArray[np.int64]:
-        """Return at which of a block's samples the evaluations are."""
-        return np.rint(trace.t * self._rate).astype(np.int64) - state.samples
+    def _evaluated_samples(self, trace: Trace, samples: int) -> npt.NDArray[np.int64]:
+        """Return at which of a block's samples the evaluations are; `samples` were processed before it."""
+        return np.rint(trace.t * self._rate).astype(np.int64) - samples
 
 
 def _peaks(trace: Trace) -> FloatArray:
@@ -141,10 +150,3 @@ def _peaks(trace: Trace) -> FloatArray:
     excess = np.nan_to_num(trace.statistic / trace.threshold)
     known = np.where(trace.ready, excess, 0.0)
     return np.array([excess.max(axis=-1), trace.level.max(axis=-1), known.max(axis=-1, initial=0.0)])
-
-
-def _writer(trace: Trace, times: FloatArray, lane: int | None = None) -> Callable[[], Any]:
-    """Return what writes an evaluation down when somebody asks for it."""
-    if lane is None:
-        return lambda: evaluation_status(trace, float(times[-1]))
-    return lambda: evaluation_status(trace.lane(lane), float(times[lane, -1]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import math
 import shutil
 import time
 from collections import deque
@@ -21,7 +20,7 @@ from servoscope.models.loop import Loop
 from servoscope.service.actions import CommandSettings, WebhookSettings, load_secret
 from servoscope.service.actions.settings import Sink
 from servoscope.service.asset import Asset, AssetPolicy
-from servoscope.service.asset_groups import AssetGroups, BlockOffer
+from servoscope.service.asset_groups import AssetGroups
 from servoscope.service.checkpoint import StreamPosition, unpack_state
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
@@ -115,7 +114,7 @@ def resume_assets(
             asset.expect(time.time())
             asset.reception = UNHEARD
     # their checkpoints waited; all that they lead to is the state after them
-    deque(groups.process(BlockOffer(block, math.inf) for block in uncounted), maxlen=0)
+    deque(groups.process(uncounted), maxlen=0)
 
 
 def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, BlockSource]]:

@@ -63,10 +63,17 @@ def examination_phase(asset: str) -> float:
     return zlib.crc32(asset.encode()) / 2.0**32
 
 
+def rest_period(state: ExaminationState) -> tuple[float, float]:
+    """Return from when and until when [UTC s] `update_examination` changes nothing if the recursion agrees."""
+    if state.doubts:
+        return math.inf, -math.inf
+    return -math.inf if state.examined is None else state.examined, state.due
+
+
 def is_at_rest(state: ExaminationState, t: float, exceeded: bool) -> bool:
     """Return whether `update_examination` changes nothing at time `t` [UTC s]: nearly always."""
-    agrees = exceeded == (state.verdict == "fault") and not state.doubts
-    return agrees and t < state.due and (state.examined is None or t >= state.examined)
+    since, until = rest_period(state)
+    return since <= t < until and exceeded == (state.verdict == "fault")
 
 
 def update_examination(

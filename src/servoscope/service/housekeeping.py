@@ -81,7 +81,7 @@ class Housekeeping:
         writer, notifier, now = self._service.writer, self._service.notifier, self._service.clock.now()
         result = notifier.check_service(writer.fill_ratio, self._service.troubles, now)
         self._handle_own(result, now)
-        clocks = [one.state.position.t for one in self._service.assets.values() if one.state is not None and one.heard]
+        clocks = [one.t for one in self._service.assets.values() if one.heard]
         writer.add(notifier.name, notifier.advance_time(max(clocks, default=0.0), now))
 
     def _handle_own(self, result: StepResult, now: float) -> None:
@@ -149,7 +149,7 @@ class Housekeeping:
             return
         self._next_retention = now + RETENTION_EVERY_S
         service, store = self._service, self._service.store
-        clocks = {name: one.state.position.t for name, one in service.assets.items() if one.state is not None}
+        clocks = {name: one.t for name, one in service.assets.items() if one.has_state}
         deleted = delete_old_rows(store, service.config.store, service.config.name, clocks, service.clock.now())
         for table, count in deleted.items():
             log("info", f"old {table} deleted", rows=count)

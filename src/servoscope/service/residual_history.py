@@ -77,6 +77,19 @@ class LatestEvaluation:
         self._write = write
 
     @classmethod
+    def from_trace(
+        cls, trace: Trace, t: float, peaks: tuple[float, float], lane: int | None = None
+    ) -> LatestEvaluation:
+        """Return the last evaluation of a block, at `t` [UTC s]; `lane`: of which asset, of a fleet's trace."""
+        own = () if lane is None else (lane,)
+        features = None if trace.features is None else float(trace.features[*own, -1])
+
+        def write() -> EvaluationStatus:
+            return evaluation_status(trace if lane is None else trace.lane(lane), t)
+
+        return cls(bool(trace.exceeded[*own, -1]), peaks, features, t, write)
+
+    @classmethod
     def from_status(cls, status: EvaluationStatus) -> LatestEvaluation:
         """Return the evaluation that a checkpoint has written down."""
         return cls(status.exceeded, status.peaks, status.features, status.t, lambda: status)

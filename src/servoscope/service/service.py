@@ -16,7 +16,7 @@ from servoscope.core.messages import message, render
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.asset import Asset
-from servoscope.service.asset_groups import BlockOffer
+from servoscope.service.asset_groups import QuietBlocks
 from servoscope.service.build import ServiceComponents
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile
@@ -196,7 +196,11 @@ class Service:
     def _process_blocks(self, source: BlockSource, blocks: Sequence[Block]) -> None:
         # recordings are dated as they like
         latest = self.clock.latest() + self.config.service.ahead_s if source.clock_rate == 1.0 else math.inf
-        for block, result in self._groups.process([BlockOffer(block, latest) for block in blocks]):
+        for found in self._groups.process(blocks, latest):
+            if isinstance(found, QuietBlocks):
+                self._store_quiet(found)
+                continue
+            block, result = found
             asset = self.assets[block.asset]
             if asset.state is not None and asset.state.pending_diagnoses:
                 self._awaiting[asset.name] = None
@@ -211,7 +215,13 @@ class Service:
             else:
                 source.rejections.add(block.asset, *result.refusal)
             self.handle_result(asset, result)
-            self.writer.set_checkpoint(asset, block.completed_at, can_wait=asset.is_repeatable)
+            self.writer.set_checkpoint(asset, block.completed_at, can_wait=result.repeatable)
+
+    def _store_quiet(self, found: QuietBlocks) -> None:
+        for asset, number, packed in zip(found.assets, found.numbers, found.packed, strict=True):
+            self.writer.add_block(asset.name, number, packed)
+            self._receptions[asset.name].hear(self._listening_s)
+        self.writer.set_checkpoints(found.assets, [one.completed_at for one in found.blocks])
 
     def handle_result(self, asset: Asset, result: StepResult) -> None:
         """Store and announce what a step of an asset has led to."""
@@ -233,11 +243,8 @@ class Service:
             asset = self.assets[name]
             if asset.state is None or not asset.state.pending_diagnoses:
                 del self._awaiting[name]
-            elif all((name, one) in self._diagnosis_jobs for one in asset.state.pending_diagnoses):
-                continue  # hundreds may wait for their turn: their samples need not be gathered again meanwhile
-            for window, blocks in asset.due_diagnoses(ended=ended):
-                if (name, window) not in self._diagnosis_jobs:
-                    self._diagnosis_jobs[name, window] = self._diagnosis_worker.submit(asset.baseline, name, blocks)
+            for window, blocks in asset.due_diagnoses(ended=ended, started=self._diagnosis_jobs):
+                self._diagnosis_jobs[name, window] = self._diagnosis_worker.submit(asset.baseline, name, blocks)
         for name, window in [key for key, job in self._diagnosis_jobs.items() if job.done()]:
             asset, diagnosis = self.assets[name], self._diagnosis_jobs.pop((name, window)).result()
             log("info", "diagnosis", asset=name, verdict=diagnosis.verdict, summary=diagnosis.summary)

@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 from servoscope.core.errors import StoreUnavailableError
 from servoscope.service.asset import Asset
-from servoscope.service.checkpoint import AssetState, pack_state
+from servoscope.service.checkpoint import pack_state
 from servoscope.service.records import TableRow
 from servoscope.service.store import Batch, Store
 from servoscope.service.store.bundles import SampleBlock
@@ -31,14 +31,6 @@ class PendingCommit:
     completion_times: list[float] = field(default_factory=list)  # of these blocks, by the monotonic clock [s]
 
 
-class _Checkpoint(NamedTuple):
-    """A state that is to be written, and the number of the first block that is needed with it."""
-
-    asset: Asset
-    state: AssetState
-    first_needed: int
-
-
 class StoreWriter:
     """Gathers what is to be written about up to `capacity` blocks, and writes each batch exactly once.
 
@@ -54,7 +46,7 @@ class StoreWriter:
         self._number, self._bundles = store.last_commit(owner), store.bundle_index(owner)
         self._gathered = PendingCommit()
         self._sealed: PendingCommit | None = None  # on its way: nothing is added to it any more
-        self._checkpoints: dict[str, _Checkpoint] = {}
+        self._checkpoints: dict[str, Asset] = {}  # whose states are to be written as they are then
         self._urgent: set[str] = set()  # assets whose checkpoint cannot wait
         self._in_doubt = False
         self._retry_s = self._retry_at = 0.0
@@ -109,12 +101,18 @@ class StoreWriter:
         if completed_at is not None:
             self._gathered.blocks[asset.name] += 1
             self._gathered.completion_times.append(completed_at)
-        if asset.state is None:
+        if not asset.has_state:
             return
-        # packed when it is written: of many blocks, only the last counts
-        self._checkpoints[asset.name] = _Checkpoint(asset, asset.state, asset.first_needed_sequence)
+        self._checkpoints[asset.name] = asset
         if not can_wait:
             self._urgent.add(asset.name)
+
+    def set_checkpoints(self, assets: Iterable[Asset], completed_at: Iterable[float]) -> None:
+        """Take the states of assets after a block of each, as `set_checkpoint` does; they can wait."""
+        own = {asset.name: asset for asset in assets}
+        self._gathered.blocks.update(own.keys())
+        self._gathered.completion_times.extend(completed_at)
+        self._checkpoints.update(own)
 
     def finish(self) -> None:
         """Let no checkpoint wait any longer: nothing follows."""
@@ -153,7 +151,8 @@ class StoreWriter:
         batch, count = self._gathered.batch, max(MIN_CHECKPOINTS, len(self._checkpoints) // CHECKPOINT_SHARE)
         waiting = (name for name in self._checkpoints if name not in self._urgent)  # the oldest first
         for name in [*self._urgent, *islice(waiting, count)]:
-            asset, state, batch.first_needed[name] = self._checkpoints.pop(name)
+            asset = self._checkpoints.pop(name)
+            state, batch.first_needed[name] = asset.take_state(), asset.first_needed_sequence
             row = {"asset": name, "sequence": state.position.sequence, "state": pack_state(state)}
             batch.checkpoints[name] = {**row, "status": asset.status(state).to_json(), "at": time.time()}
         self._urgent = set()

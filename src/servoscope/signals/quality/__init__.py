@@ -9,6 +9,7 @@ verdict = limit_verdict(verdict, active_findings(state))              # never he
 
 from servoscope.signals.quality.findings import KINDS, QualityFinding, describe_findings, limit_verdict
 from servoscope.signals.quality.monitor import (
+    ACTIVE,
     active_findings,
     check_block,
     check_lanes,
@@ -19,6 +20,7 @@ from servoscope.signals.quality.monitor import (
 from servoscope.signals.quality.settings import QualityLimits, QualitySettings
 
 __all__ = [
+    "ACTIVE",
     "KINDS",
     "QualityFinding",
     "QualityLimits",

@@ -163,4 +163,5 @@ STATE_DTYPE = np.dtype(
     ]
 )
 STATE_SIZE = STATE_DTYPE.itemsize // 8
+# where in a state the flags are
 ACTIVE = slice((_begin := STATE_DTYPE.fields["active"][1] // 8), _begin + len(KINDS))  # type: ignore[index]

@@ -1,0 +1,206 @@
+"""The states of assets that are followed together, as arrays: most blocks change nothing but a row of them.
+
+Such a block is quiet: it follows the one before it, no examination, alarm or row of the store comes from it, and the
+state after it is a row of numbers. All that a quiet block does not change stays in the record that the asset has.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import BoolArray, IndexArray
+from servoscope.service.block_lanes import LaneEvaluations, LanesOutput
+from servoscope.service.checkpoint import AssetState, evolve
+from servoscope.service.residual_history import HistoryState
+from servoscope.service.store.rows import SIZE_EVERY_S
+from servoscope.signals import quality
+
+COLUMNS = np.dtype(
+    [
+        ("is_here", np.bool_),  # whether the asset's state is this row
+        # of its position
+        ("t", np.float64),
+        ("sequence", np.int64),
+        ("stream", np.int64),
+        ("blocks", np.int64),
+        ("counted", np.int64),
+        ("digest", np.int64),
+        # of what was followed: times are NaN where there is none
+        ("samples", np.int64),
+        ("last_t", np.float64),
+        ("evaluated", np.float64),
+        ("exceeded", np.bool_),
+        ("period", np.float64),
+        ("excess", np.float64),
+        ("level", np.float64),
+        ("alarms_at", np.float64),
+        ("lane", np.int64),
+        # the rest that it is in
+        ("is_fault", np.bool_),
+        ("since", np.float64),
+        ("until", np.float64),
+    ]
+)
+
+
+class RestPeriod(NamedTuple):
+    """From when and until when [UTC s] an asset is at rest while the recursion says that there is a fault, or none."""
+
+    is_fault: bool
+    since: float
+    until: float
+
+
+class StateRow(NamedTuple):
+    """Where the state of an asset is."""
+
+    states: AssetStates
+    row: int
+
+    @property
+    def t(self) -> float:
+        """Time of its last sample [UTC s]."""
+        return float(self.states.columns["t"][self.row])
+
+    def read(self, before: AssetState) -> AssetState:
+        """Return the state; `before`: when it came here."""
+        return self.states.read(self.row, before)
+
+    def leave(self) -> None:
+        """Let the row be empty."""
+        self.states.columns["is_here"][self.row] = False
+
+
+class AssetStates:
+    """A row for each of so many assets, whose monitors have states of `size` numbers; it may be empty."""
+
+    def __init__(self, assets: int, size: int) -> None:
+        self.columns = np.zeros(assets, COLUMNS)
+        self.monitor, self.quality = np.zeros((assets, size)), np.zeros((assets, quality.init_state().size))
+        # the newest evaluations of each asset, since its state is here; its column `lane` says which of them
+        self._evaluations = np.full(assets, None, dtype=object)
+
+    def put(self, row: int, state: AssetState, rest: RestPeriod) -> StateRow:
+        """Write a state into a row."""
+        position, history, evaluation = state.position, state.history, state.evaluation
+        self.columns[row] = (
+            True,
+            *(position.t, position.sequence, position.stream, position.blocks, position.samples, position.digest),
+            *(state.samples, _number(state.last_t), _number(evaluation.t), evaluation.exceeded),
+            *(_number(history.period), history.excess, history.level, _number(state.alarms_at)),
+            *(0, *rest),
+        )
+        self.monitor[row], self.quality[row], self._evaluations[row] = state.monitor, state.quality, None
+        return StateRow(self, row)
+
+    def read(self, row: int, before: AssetState) -> AssetState:
+        """Return the state in a row; `before`: as it was put there."""
+        one = dict(zip(COLUMNS.names or (), self.columns[row].item(), strict=True))
+        if one["blocks"] == before.position.blocks:
+            return before
+        changed = {key: one[key] for key in ("t", "sequence", "blocks", "digest")}
+        evaluations: LaneEvaluations | None = self._evaluations[row]
+        history, latest = before.history, before.evaluation
+        if evaluations is not None:
+            history = HistoryState(int(one["period"]), one["excess"], one["level"])
+            latest = evaluations.latest(one["lane"])
+        return evolve(
+            before,
+            monitor=self.monitor[row].copy(),
+            quality=self.quality[row].copy(),
+            position=evolve(before.position, samples=one["counted"], **changed),
+            history=history,
+            evaluation=latest,
+            **{key: one[key] for key in ("samples", "last_t", "alarms_at")},
+        )
+
+    def are_next(self, rows: IndexArray, sequences: Sequence[int], streams: Sequence[int]) -> BoolArray:
+        """Tell which of some blocks follow what was counted."""
+        one = self.columns[rows]
+        return np.asarray((one["sequence"] + 1 == sequences) & (one["stream"] == streams))
+
+    def are_quiet(self, rows: IndexArray, found: LanesOutput) -> BoolArray:
+        """Tell which blocks lead to nothing but the state after them; `found`: what they have led to so far."""
+        one, active = self.columns[rows], quality.ACTIVE
+        quiet = (one["since"] <= found.t) & (found.t < one["until"])
+        quiet &= (found.quality[:, active] == self.quality[rows, active]).all(axis=1)
+        exceeded, new = one["exceeded"], found.evaluations
+        if new is not None:
+            exceeded = new.exceeded
+            quiet &= (new.periods == one["period"]).all(axis=0)
+            quiet &= new.t // SIZE_EVERY_S == one["evaluated"] // SIZE_EVERY_S
+        return np.asarray(quiet & (exceeded == one["is_fault"]))
+
+    def advance(self, rows: IndexArray, found: LanesOutput, lanes: IndexArray, packed: Sequence[bytes]) -> list[int]:
+        """Take what some `lanes` of quiet blocks, of samples packed like this, have led to; return their numbers."""
+        one, new = self.columns[rows], found.evaluations
+        numbers: list[int] = one["blocks"].tolist()
+        one["t"] = one["last_t"] = one["alarms_at"] = found.t[lanes]
+        one["digest"] = [zlib.crc32(each, before) for each, before in zip(packed, one["digest"].tolist(), strict=True)]
+        for name, more in (("sequence", 1), ("blocks", 1), ("counted", found.size), ("samples", found.size)):
+            one[name] += more
+        if new is not None:
+            _, level, excess = new.peaks[:, lanes]
+            for name, values in (("excess", excess), ("level", level)):
+                one[name] = np.where(values > one[name], values, one[name])
+            one["exceeded"], one["evaluated"], one["lane"] = new.exceeded[lanes], new.t[lanes], lanes
+            self._evaluations[rows] = new
+        self.columns[rows], self.monitor[rows], self.quality[rows] = one, found.monitor[lanes], found.quality[lanes]
+        return numbers
+
+
+class StateHolder:
+    """Has the state of one asset: a record, or where this has gone on since."""
+
+    def __init__(self) -> None:
+        # another thread may read the state: whatever it finds here is a whole one, if not the newest
+        self._state: AssetState | None = None
+        self._row: StateRow | None = None
+
+    @property
+    def state(self) -> AssetState | None:
+        """All that decides what its next block leads to, as it is now; None before it has begun."""
+        row, state = self._row, self._state
+        return state if row is None or state is None else row.read(state)
+
+    @state.setter
+    def state(self, state: AssetState | None) -> None:
+        self._state = state
+        if self._row is not None:
+            self._row.leave()
+            self._row = None
+
+    @property
+    def has_state(self) -> bool:
+        """Whether it has begun."""
+        return self._state is not None
+
+    def take_state(self) -> AssetState:
+        """Return the state, and let it be nowhere else."""
+        if self._row is not None:
+            self.state = self.state
+        assert self._state is not None, "begin or resume comes first"
+        return self._state
+
+    def _move_to(self, row: StateRow) -> None:
+        self._row = row
+
+    @property
+    def heard(self) -> bool:
+        """Whether a block of it was ever counted."""
+        return self._state is not None and self._state.position.blocks > 0
+
+    @property
+    def t(self) -> float:
+        """Time of the last sample that was counted, or since when it waits for the first [UTC s]; NaN: it does not."""
+        row, state = self._row, self._state
+        return row.t if row is not None else math.nan if state is None else state.position.t
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
