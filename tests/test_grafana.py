@@ -61,6 +61,9 @@ def test_every_query_runs_and_finds_what_is_there(postgres: Postgres) -> None:
     )
     states = {"alarm": "fault", "before": "normal", "after": "unacknowledged", "cause": "", "who": "system"}
     batch.rows["transitions"].append({**common, **states, "document": document})
+    # of an asset that is not chosen; what is of no asset at all is the service's own, and always shown
+    batch.rows["transitions"].append({**common, **states, "asset": "crane", "after": "normal", "document": document})
+    batch.first_needed["crane"] = 0
     batch.rows["audit"].append({"at": NOW, "who": "ann", "asset": "press", "what": "started", "document": {}})
     batch.rows["outbox"].append(
         {"key": "a", "sink": "desk", "event": {}, "created": NOW, "due": NOW, "attempts": 1, "outcome": ""}
