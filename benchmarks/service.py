@@ -309,6 +309,7 @@ if __name__ == "__main__":
     command.add_argument("--format", choices=("json", "binary"), default="json", help="of the messages")
     command.add_argument("--overview", action="store_true", help="several cases")
     given = command.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # servers and service end with us
     cases = OVERVIEW
     if not given.overview:
         how = given.workers, given.postgres, given.format == "binary"

@@ -8,6 +8,7 @@ import sqlite3
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pyarrow.compute as pc
@@ -23,6 +24,7 @@ from servoscope.cli.render.history import row_table
 from servoscope.core.errors import StoreError, StoreUnavailableError
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
+from servoscope.service.housekeeping import ASSETS_AT_ONCE, Housekeeping
 from servoscope.service.records import TableRow
 from servoscope.service.service import Service
 from servoscope.service.store import Batch, Store, schema, tables
@@ -295,6 +297,22 @@ def test_a_long_history_is_thinned_by_the_database_to_what_was_largest(store: St
     rows, count = query_downsampled(store, "press", (100.0, 110.0), 1000)
     assert count == len(rows) == 10 and [row["t"] for row in rows] == [100.0 + k for k in range(10)]
     assert query_downsampled(store, "lift", (0.0, 1e9), 10) == ([], 0)
+
+
+def test_sizes_of_many_assets_are_thinned_some_at_each_look(store: Store) -> None:
+    """All of them at once would keep the blocks of a large service waiting."""
+    names, batch = [f"axis{i}" for i in range(ASSETS_AT_ONCE + 5)], Batch()
+    size = {"kind": "live", "name": "leakage", "value": 1.2, "low": 1.1, "high": 1.3, "healthy": 1.0}
+    batch.rows["sizes"] = [{"asset": name, "t": t, **size} for name in names for t in (10.0, 20.0)]
+    store.write(batch, "hall", 1)
+    context: Any = SimpleNamespace(store=store)
+    housekeeping = Housekeeping(context)
+    housekeeping._to_thin = dict.fromkeys(names, 1e7)
+    left = []
+    for _ in range(2):
+        housekeeping._thin_sizes()
+        left.append(len(store.fetch(sa.select(tables.sizes))))
+    assert left == [ASSETS_AT_ONCE + 2 * 5, ASSETS_AT_ONCE + 5] and not housekeeping._to_thin
 
 
 def test_what_others_change_is_told_in_the_audit(store: Store) -> None:
