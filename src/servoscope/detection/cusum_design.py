@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -13,17 +12,36 @@ from servoscope.core.errors import LoopError, SimulationError
 from servoscope.detection.chi2_test import SECONDS_PER_YEAR
 from servoscope.detection.expectation import Expectation, residual_noise_model
 from servoscope.estimation.filter_bank import closed_loop_system, nominal_theta
-from servoscope.estimation.kernel.cusum import LAGS, CusumConstants, lagged_columns, whitening_filter
+from servoscope.estimation.kernel.cusum import (
+    LAGS,
+    CusumConstants,
+    direction_shares,
+    lagged_columns,
+    lagged_directions,
+    whitening_filter,
+)
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Pipeline
+from servoscope.models.lti import (
+    LinearSystem,
+    block_diagonal,
+    output_deviations,
+    stretched_filter,
+    truncate_states,
+    unit_states,
+)
 from servoscope.models.plants import Plant
 
 FACTOR = 4.0  # in information from one size to the next: in between, a CUSUM is at most a fifth slower than the best
 FASTEST = 2000.0  # 1/s; a change with more information shows within a few samples anyway
+IN_ONE_STEP = 20.0  # information of one step of the test, with more of which a change is found at the next one anyway
 OVERSHOOT = 1.166  # twice Siegmund's 0.583: by how much a random walk passes its limit, in its own steps
 SLOWEST = 0.05  # 1/s; with less, a change would take a quarter of an hour
 LOST = 0.1  # of a change's information at most, where changes are made of few directions: its CUSUM is a ninth slower
+ROUNDS = 200  # in which directions are sought
 TRIED = 8  # sizes per direction at which the information is computed
+TOLERANCE = 0.02  # of a change's size: by how much the shadow may err that serves steps once per evaluation
+MOTION = 1.0  # s, below which a reference moves the less the faster
 RANK_TOLERANCE = 1e-9  # of the largest singular value: smaller ones are rounding
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
 FEWEST = 500  # updates with less of which a reference says nothing
@@ -85,7 +103,7 @@ def choose_cusum_hypotheses(
     found = []
     for fault in plant.faults:
         for bound in np.log(fault.ratio_range):
-            for x in _hypothesis_sizes(partial(whitened.shift, fault.parameter), float(bound), whitened.rate):
+            for x in whitened.sizes(fault.parameter, float(bound)):
                 try:
                     d = whitened.shift(fault.parameter, x)
                 except SimulationError:
@@ -133,15 +151,39 @@ class _WhitenedResidual:
             self.warm_up :
         ]
 
+    def sizes(self, parameter: str, bound: float) -> list[float]:
+        """Return sizes between nothing and a bound, `FACTOR` apart in information per second, largest first.
+
+        The information is computed at a few sizes and read off in between on logarithmic scales.
+        """
+        tried, information = [], []
+        for x in np.geomspace(abs(bound), 1e-3, TRIED) * np.sign(bound):
+            try:
+                d = self.shift(parameter, float(x))
+            except SimulationError:  # nobody could have recorded it
+                continue
+            tried.append(float(np.log(abs(x))))
+            information.append(float(np.log(max(self.rate * float(d @ d) / len(d), 1e-300))))
+        if not tried:
+            return []
+        logs = np.minimum.accumulate(np.array(information))[::-1]  # a larger change may tell less: the smaller counts
+        fastest = min(FASTEST, IN_ONE_STEP * self.rate / self.together) if self.together > 1 else FASTEST
+        target, sizes = min(np.log(fastest), logs[-1]), []
+        while target >= max(np.log(SLOWEST), logs[0]):
+            sizes.append(float(np.sign(bound) * np.exp(np.interp(target, logs, np.array(tried)[::-1]))))
+            target -= np.log(FACTOR)
+        return sizes
+
     def combine(self, chosen: Sequence[CusumHypothesis]) -> list[CusumHypothesis]:
         """Return the members with changes that are combinations of few: `LOST` of no change's information is lost."""
-        changes = np.array([member.change for member in chosen]).reshape(-1, self.phi.shape[1])
-        shifts = self.phi @ changes.T
-        size = np.linalg.norm(shifts, axis=0)
-        left, singular, right = np.linalg.svd(shifts / size, full_matrices=False)
-        lost = 1.0 - np.cumsum((singular[:, None] * right) ** 2, axis=0)  # with so many directions, of each change
-        count = 1 + int(np.argmax(lost.max(axis=1) <= LOST))
-        kept = (changes.T / size) @ (right[:count].T / singular[:count]) @ (left[:, :count].T @ shifts)
+        R = np.linalg.qr(self.phi, mode="r")  # |R change| is the size of a change's shift
+        shifts = R @ np.array([member.change for member in chosen]).T
+        unit = shifts / np.linalg.norm(shifts, axis=0)
+        for count in range(1, len(R) + 1):
+            left, lost = _fairest_directions(unit, count)
+            if lost <= LOST:
+                break
+        kept = np.linalg.solve(R, left @ (left.T @ shifts))
         return [replace(member, change=tuple(change.tolist())) for member, change in zip(chosen, kept.T, strict=True)]
 
     def worst_case(self, chosen: Sequence[CusumHypothesis], covariance: FloatArray) -> tuple[CusumHypothesis, ...]:
@@ -164,27 +206,20 @@ class _WhitenedResidual:
         return tuple(found)
 
 
-def _hypothesis_sizes(shift: Callable[[float], FloatArray], bound: float, rate: float) -> list[float]:
-    """Return sizes between nothing and a bound, `FACTOR` apart in information per second, largest first.
+def _fairest_directions(unit: FloatArray, count: int) -> tuple[FloatArray, float]:
+    """Return orthonormal directions (n, count) of unit vectors (n, m), and the share that the worst of these loses.
 
-    The information is computed at a few sizes and read off in between on logarithmic scales.
+    The worst ones get more weight in a singular value decomposition, round by round (Arora, Hazan and Kale, 2012).
     """
-    tried, information = [], []
-    for x in np.geomspace(abs(bound), 1e-3, TRIED) * np.sign(bound):
-        try:
-            d = shift(float(x))
-        except SimulationError:  # nobody could have recorded it
-            continue
-        tried.append(float(np.log(abs(x))))
-        information.append(float(np.log(max(rate * float(d @ d) / len(d), 1e-300))))
-    if not tried:
-        return []
-    logs = np.minimum.accumulate(np.array(information))[::-1]  # a larger change may tell less: the smaller one counts
-    target, sizes = min(np.log(FASTEST), logs[-1]), []
-    while target >= max(np.log(SLOWEST), logs[0]):
-        sizes.append(float(np.sign(bound) * np.exp(np.interp(target, logs, np.array(tried)[::-1]))))
-        target -= np.log(FACTOR)
-    return sizes
+    weights, least = np.ones(unit.shape[1]), np.inf
+    for _ in range(ROUNDS):
+        left = np.linalg.svd(unit * np.sqrt(weights))[0][:, :count]
+        lost = np.maximum(1.0 - ((left.T @ unit) ** 2).sum(axis=0), 0.0)
+        if lost.max() < least:
+            best, least = left, float(lost.max())
+        weights = weights * np.exp(0.5 * lost / max(float(lost.max()), RANK_TOLERANCE))
+        weights /= weights.mean()
+    return best, least
 
 
 def build_cusum_constants(
@@ -208,21 +243,28 @@ def build_cusum_constants(
         quiet = closed_loop_system(pipeline.loop, plant).input(np.eye(3, 1))
     except LoopError as error:
         raise SimulationError(str(error)) from None
-    shadow = quiet.then(pipeline.bank.linear)
     numerator, denominator, gain, warm = whitening_filter(residual_noise_model(pipeline, plant, noise))
-    rows = np.concatenate([[1.0], 1.0 / scale])[:, None]
+    theta, n = nominal_theta(pipeline.loop, plant) * scale, len(scale)
+    regressors = quiet.then(pipeline.bank.linear).output(np.diag(np.concatenate([[1.0], 1.0 / scale])))
+    residual = regressors.output(np.concatenate([[1.0], -theta])[None, :])
+    columns = regressors.output(np.eye(n, n + 1, 1))
     changes = np.array([member.change for member in hypotheses]) * np.pad(scale, (0, LAGS), mode="edge")
-    directions = np.zeros((0, 0))
     if pipeline.loop.monitor.sequential_step == "evaluation":
         _, singular, vectors = np.linalg.svd(changes / np.linalg.norm(changes, axis=1)[:, None], full_matrices=False)
         directions = vectors[singular > RANK_TOLERANCE * singular[0]]
+        white = stretched_filter(numerator * gain, denominator, pipeline.stride)
+        columns = white.then(columns).then(lagged_directions(directions, pipeline.stride))
+        shadow = _truncate_shadow(pipeline, residual, columns, direction_shares(changes, directions), gain)
+    else:
+        directions = np.zeros((0, 0))
+        shadow = replace(columns, C=np.vstack([residual.C, columns.C]), D=np.vstack([residual.D, columns.D]))
     return CusumConstants(
         A=shadow.A,
         B=shadow.B,
-        C=np.ascontiguousarray(rows * shadow.C),
-        D=np.ascontiguousarray(rows * shadow.D),
+        C=np.ascontiguousarray(shadow.C),
+        D=np.ascontiguousarray(shadow.D),
         X0=shadow.steady,
-        theta=nominal_theta(pipeline.loop, plant) * scale,
+        theta=theta,
         numerator=numerator,
         denominator=denominator,
         gain=gain,
@@ -231,3 +273,21 @@ def build_cusum_constants(
         limits=limits,
         directions=directions,
     )
+
+
+def _truncate_shadow(
+    pipeline: Pipeline, residual: LinearSystem, columns: LinearSystem, shares: FloatArray, gain: float
+) -> LinearSystem:
+    """Return r -> [residual of the healthy loop, white columns], in few states.
+
+    Columns only weigh the measured residual: theirs may err by `TOLERANCE` of each change without a false alarm more.
+    What is subtracted from it errs by as much of the smallest change.
+    """
+    pole = float(np.exp(-1.0 / (MOTION * pipeline.loop.sample_rate)))
+    both = unit_states(block_diagonal([residual, columns]).input(np.ones((2, 1))), pole)
+    rows = np.zeros((len(shares) + 1, 1 + shares.shape[1]))
+    rows[0, 0], rows[1:, 1:] = gain, shares
+    size = output_deviations(both.output(rows), pole)
+    size[0] = size[1:].min()
+    rows /= size[:, None]
+    return truncate_states(both, rows, pole, TOLERANCE)

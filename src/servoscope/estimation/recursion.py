@@ -26,7 +26,7 @@ from servoscope.estimation.kernel.buffers import BufferPool
 from servoscope.estimation.kernel.build import build_kernels
 from servoscope.estimation.kernel.cusum import LAGS, CusumConstants, evaluation_weights
 from servoscope.estimation.kernel.sample_steps import CUSUM_BATCH, HEADER_SIZE, SAMPLE, KernelSizes, KernelSpec
-from servoscope.estimation.kernel.sparse_lti import pack_coefficients, sparsity_pattern
+from servoscope.estimation.kernel.sparse_lti import pack_coefficients, pad_system, pairs_structure, sparsity_pattern
 from servoscope.models.lti import LinearSystem
 
 LANE_COUNT = {"float64": 8, "float32": 16}  # assets side by side: one vector; twice as many leave the first-level cache
@@ -101,12 +101,9 @@ def _offsets(sizes: dict[str, int]) -> dict[str, int]:
     return dict(zip((*sizes, "end"), ends, strict=True))
 
 
-def _shadow_system(c: RecursionConstants) -> LinearSystem:
-    """Return r -> [residual of the healthy loop, phi] for the sequential test."""
-    w = c.watch
-    assert w is not None
-    first = np.concatenate([[1.0], -w.theta])[None, :]
-    return LinearSystem(w.A, w.B, np.vstack([first @ w.C, w.C[1:]]), np.vstack([first @ w.D, w.D[1:]]))
+def _shadow_system(test: CusumConstants, states: int, rows: int) -> LinearSystem:
+    """Return r -> [residual of the healthy loop, columns] of a sequential test, filled up with zeros."""
+    return pad_system(LinearSystem(test.A, test.B, test.C, test.D), states, rows)
 
 
 def _whitening_order(test: CusumConstants) -> int:
@@ -276,20 +273,24 @@ if hasattr(os, "register_at_fork"):
 def structure_key(c: RecursionConstants) -> Hashable:
     """Return the sizes and settings that assets of one fleet must have in common."""
     spec = _kernel_spec([c])
-    sizes = spec.sizes._replace(lags=0, memory=0, watched=0, floats=0)
-    return spec.estimator, sizes, spec.directions > 0, spec.bank, c.stride, c.every, c.memory
+    together = spec.sizes.directions > 0
+    sizes = spec.sizes._replace(lags=0, memory=0, watched=0, floats=0, directions=0)
+    if together:  # their shadows are filled up to one size
+        sizes = sizes._replace(shadow=0)
+    return spec.estimator, sizes, together, spec.bank, c.stride, c.every, c.memory
 
 
 def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
     first = constants[0]
-    watched = [c for c in constants if c.watch is not None]
-    shadows = [_shadow_system(c) for c in watched]
+    tests = [c.watch for c in constants if c.watch is not None]
     n, rows = len(first.basis), len(first.bank.C)
-    nxs = len(shadows[0].A) if shadows else 0
-    memory = max((_whitening_order(c.watch) for c in watched if c.watch), default=0)
-    count = max((len(c.watch.limits) for c in watched if c.watch), default=0)
-    q = max((len(c.watch.directions) for c in watched if c.watch), default=0)
-    sums = {"psi": q, "late": LAGS, "sums": q * (q + 3) // 2} if q else {"psi": (n + LAGS) * bool(nxs)}
+    memory = max(map(_whitening_order, tests), default=0)
+    nxs, columns, count, q = (
+        max((len(getattr(test, name)) for test in tests), default=0) for name in ("A", "C", "limits", "directions")
+    )
+    shadows = [_shadow_system(test, nxs, columns) for test in tests]
+    if q:
+        shadows.append(pairs_structure(nxs, columns))  # like loops share machine code
     lags = max(len(c.a) for c in constants)
     speed = 0
     if first.codes or first.only_moving or first.still_speed > 0.0:
@@ -300,7 +301,8 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
         {
             **{"power": 1, "drift": 1, "level": 1, "peak": 1, "x": len(first.bank.A), "velocity": 2 * bool(speed)},
             **{"theta": n, "P": 0 if first.steady else n * n, "S": n * (n + 1) // 2, "M": n * lags},
-            **{"Psi": n * n * start, "shadow": nxs, "white": ((q or n) + 1) * memory, **sums},
+            **{"Psi": n * n * start, "shadow": nxs, "white": memory if q else (n + 1) * memory},
+            **({"sums": q * (q + 3) // 2} if q else {"psi": (n + LAGS) * bool(nxs)}),
         }
     )
     bank, shadow = sparsity_pattern([c.bank for c in constants]), sparsity_pattern(shadows) if shadows else ((), ())
@@ -317,7 +319,6 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
                 "rate": 0 if start else 1,
                 "response": frequencies * 2 * (n + 1),
                 "shapes": len(first.shapes),
-                **({"directions": q * (n + LAGS)} if q else {}),
             },
         }
     )
@@ -339,6 +340,7 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
         start=start,
         row=5 + n + 2 * n * n if start else 4 + n + n * n + 6 * frequencies,
         floats=to["end"],
+        directions=q,
     )
     spec = KernelSpec(
         first.estimator, sizes, tuple(to.items()), tuple((*at.items(), ("tail", at["end"]))), bank, shadow
@@ -355,19 +357,18 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
         return np.pad(x, (0, size - len(x)))
 
     shadow = pad(np.zeros(0), dict(spec.at)["white"] - dict(spec.at)["shadow"] + 1 + 2 * memory)
-    directions = np.zeros((spec.directions, n + LAGS))
     members = np.zeros((spec.sums or n + LAGS + 1, watched))
     if test is not None:
-        system = _shadow_system(c)
+        system = _shadow_system(test, spec.sizes.shadow, len(spec.shadow[0]))
         apart = np.linalg.solve(c.basis, test.theta / c.scale) - c.theta
         shadow = np.concatenate(
             [
-                *(pack_coefficients(spec.shadow, system), test.X0[:, 0], apart, [test.gain]),
+                *(pack_coefficients(spec.shadow, system), pad(test.X0[:, 0], spec.sizes.shadow), apart, [test.gain]),
                 *(pad(test.numerator[1 : 1 + memory], memory), pad(test.denominator[1 : 1 + memory], memory)),
             ]
         )
-        if spec.directions:
-            directions[: len(test.directions)] = test.directions
+        if spec.sums:
+            directions = np.pad(test.directions, ((0, spec.sizes.directions - len(test.directions)), (0, 0)))
             members[:, : len(test.limits)] = evaluation_weights(test.changes, directions, test.limits)
         else:
             members[:, : len(test.limits)] = np.vstack([test.changes.T / test.limits, -0.5 * test.limits])
@@ -391,7 +392,6 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
                 shadow,
                 *evaluation,
                 c.shapes,
-                directions.ravel(),
                 members.ravel(),
             ),
         ]

@@ -15,8 +15,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.files import atomic_write, exclusive_folder
 from servoscope.core.jit.c_source import c_literal
 from servoscope.detection.baseline import Baseline
-from servoscope.estimation.kernel.cusum import LAGS
-from servoscope.estimation.kernel.sample_steps import HEADER_SIZE, KernelSizes
+from servoscope.estimation.kernel.sample_steps import HEADER_SIZE, KernelSpec
 from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text
 from servoscope.export.golden import GoldenRun, golden_text
 from servoscope.export.image import pack_image
@@ -161,7 +160,7 @@ def _code(made: ExportConstants, name: str, single: bool) -> dict[str, str]:
         "healthy": ",\n".join(f"    {{{real}, {imag}}}" for real, imag in healthy),
         "fingerprint": ", ".join(f"0x{byte:02X}u" for byte in made.mark),
         "functions": functions.replace("@evaluation@", f"{name}_evaluation"),
-        "locals": _locals(size, single),
+        "locals": _locals(made.spec, single),
         "before": _before(made.recursion.constants[0].every, bool(size.shadow)),
         "update": f"update_estimate(s, h, v, shadow, e{'' if size.steady else ', &state->numbers[PRIVATE]'});",
         "after": _after(made) if size.watched else "",
@@ -207,17 +206,19 @@ def wrapped(items: Iterable[str]) -> list[str]:
     return [*lines, line]
 
 
-def _locals(size: KernelSizes, single: bool) -> str:
+def _locals(spec: KernelSpec, single: bool) -> str:
+    size, rows = spec.sizes, spec.shadow_rows
     number, zero = ("float", "0.0f") if single else ("double", "0.0")
     lines = [
         f"{number} v[{size.rows}] = {{{', '.join([zero] * size.rows)}}};",
-        f"{number} shadow[{size.n + 1}] = {{{', '.join([zero] * (size.n + 1))}}};",
+        f"{number} shadow[{rows}] = {{{', '.join([zero] * rows)}}};",
         f"{number} e[2] = {{{zero}, {zero}}};",
     ]
     lines.append("double status[1] = {MISSING};")
     if size.watched:
-        lines += [f"{number} *g = &s[CUSUMS];", f"{number} w[{size.n + LAGS + 1}];"]
-        lines += ["double when[1];", f"{number} top[1];"]
+        lines += [f"{number} *g = &s[CUSUMS];", f"{number} top[1];"]
+        if not spec.sums:
+            lines += [f"{number} w[{spec.columns + 1}];", "double when[1];"]
     return "\n".join(f"    {line}" for line in lines)
 
 
@@ -226,11 +227,11 @@ def _before(every: int, shadow: bool) -> str:
 
 
 def _after(made: ExportConstants) -> str:
-    lines = ["store_residual(s, h, status, e, w, when);"]
     if made.spec.sums:
         every, sums = made.recursion.constants[0].every, dict(made.spec.to)["sums"]
-        lines += [f"if (((number + 1u) % {every}u) == 0u) {{", f"    top[0] = update_cusums(g, &s[{sums}]);"]
+        lines = [f"if (((number + 1u) % {every}u) == 0u) {{", f"    top[0] = update_cusums(g, &s[{sums}]);"]
         lines += ["    end_evaluation(s, h, top);", "}"]
     else:
+        lines = ["store_residual(s, h, status, e, w, when);"]
         lines += ["top[0] = update_cusums(g, w);", "update_alarm(s, h, top, when);"]
     return "\n".join(f"    {line}" for line in lines)

@@ -12,7 +12,6 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.jit.st_source import st_literal
 from servoscope.detection.baseline import Baseline
-from servoscope.estimation.kernel.cusum import LAGS
 from servoscope.estimation.kernel.sample_steps import HEADER_SIZE
 from servoscope.export.c_monitor import NAME, fill_template, wrapped
 from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text
@@ -52,7 +51,7 @@ def _words(made: ExportConstants) -> dict[str, Any]:
     texts = step_texts(made.spec, made.members)
     last = {
         "theta": n,
-        "theta_and_one": n + 1,
+        "shadow": made.spec.shadow_rows,
         "covariance": n * n,
         "response": 6 * F,
         "gamma": 2 * F,
@@ -60,7 +59,7 @@ def _words(made: ExportConstants) -> dict[str, Any]:
         "counter": HEADER_SIZE,
         "cusum": max(size.watched, 1),
         "regressor": size.rows,
-        "whitened": n + LAGS + 1,
+        "whitened": made.spec.columns + 1,
         "constant": len(made.table),
     }
     return (

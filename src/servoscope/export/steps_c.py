@@ -9,7 +9,7 @@ from typing import Any
 
 from servoscope.core.jit.c_source import CBuilder, CRows, c_literal
 from servoscope.estimation import estimators
-from servoscope.estimation.kernel.cusum import LAGS, update_cusum, update_cusum_by_sums
+from servoscope.estimation.kernel.cusum import update_cusum, update_cusum_by_sums
 from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
 from servoscope.estimation.kernel.sample_steps import TILE, KernelSpec, SampleSteps
 from servoscope.export.estimator_c import translate_update
@@ -43,7 +43,8 @@ def _functions(spec: KernelSpec, members: int, single: bool) -> list[str]:
     if size.shadow:
         made.append(_function("begin_evaluation", STATE, steps.begin_evaluation, single))
     if size.watched:
-        made += [_store_residual(steps, single), _update_cusums(spec, members, single)]
+        made += [] if spec.sums else [_store_residual(steps, single)]
+        made.append(_update_cusums(spec, members, single))
         made.append(_end_evaluation(steps, single) if spec.sums else _update_alarm(steps, single))
     return [*made, _evaluate(spec, single)]
 
@@ -137,8 +138,6 @@ def _general_update(spec: KernelSpec, steps: SampleSteps) -> list[str]:
 def _store_residual(steps: SampleSteps, single: bool) -> str:
     def body(s: CRows, h: CRows, status: CRows, e: CRows, w: CRows, when: CRows) -> None:
         steps.store_residual(CRows(s.builder, "c"), s, h, status, e, w, when, 0)
-        if steps.sums:
-            steps.accumulate_sums(s, w, 0)
 
     return _function(
         "store_residual", (*STATE, "double *status", "number *e", "number *w", "double *when"), body, single
@@ -147,7 +146,7 @@ def _store_residual(steps: SampleSteps, single: bool) -> str:
 
 def _update_cusums(spec: KernelSpec, members: int, single: bool) -> str:
     """Return the loop over the CUSUMs; those that only fill up a vector stay at zero and are left out."""
-    builder, columns, watched, tail = CBuilder(single), spec.sizes.n + LAGS, spec.sizes.watched, dict(spec.at)["tail"]
+    builder, columns, watched, tail = CBuilder(single), spec.columns, spec.sizes.watched, dict(spec.at)["tail"]
     table = [builder.read(f"c[{tail + watched * k} + j]") for k in range(spec.sums or columns + 1)]
     observed = [builder.read(f"w[{k}]") for k in range(spec.sums or columns + 1)]
     if spec.sums:

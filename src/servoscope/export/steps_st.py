@@ -10,7 +10,7 @@ from servoscope.core.errors import BaselineError
 from servoscope.core.jit.c_source import CRows
 from servoscope.core.jit.st_source import STBuilder
 from servoscope.estimation import estimators
-from servoscope.estimation.kernel.cusum import LAGS, update_cusum, update_cusum_by_sums
+from servoscope.estimation.kernel.cusum import update_cusum, update_cusum_by_sums
 from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
 from servoscope.estimation.kernel.sample_steps import TILE, KernelSpec, SampleSteps
 
@@ -61,17 +61,14 @@ def step_texts(spec: KernelSpec, members: int) -> StepTexts:
         "evaluate": _evaluate(spec),
     }
     if size.watched:
-
-        def store_residual(c: CRows, s: CRows, h: CRows, status: CRows, e: CRows, w: CRows, when: CRows) -> None:
-            steps.store_residual(c, s, h, status, e, w, when, 0)
-            if spec.sums:
-                steps.accumulate_sums(s, w, 0)
-
-        texts["store_residual"] = _traced(store_residual, ("c", "s", "h", "status", "e", "w", "when"))
         texts["update_cusums"] = _update_cusums(spec, members)
         if spec.sums:
             texts["update_alarm"] = _traced(steps.end_evaluation, ("s", "h", "top"))
         else:
+            texts["store_residual"] = _traced(
+                lambda c, s, h, status, e, w, when: steps.store_residual(c, s, h, status, e, w, when, 0),
+                ("c", "s", "h", "status", "e", "w", "when"),
+            )
             texts["update_alarm"] = _traced(
                 lambda s, h, top, when: steps.update_alarm(s, h, top, when, 0), ("s", "h", "top", "when")
             )
@@ -110,7 +107,7 @@ def _advance_filters(steps: SampleSteps) -> list[str]:
 
 def _update_cusums(spec: KernelSpec, members: int) -> list[str]:
     """Return the loop over the CUSUMs; those that only fill up a vector stay at zero and are left out."""
-    builder, columns, watched, tail = STBuilder(), spec.sizes.n + LAGS, spec.sizes.watched, dict(spec.at)["tail"]
+    builder, columns, watched, tail = STBuilder(), spec.columns, spec.sizes.watched, dict(spec.at)["tail"]
     table = [builder.read(f"constants[{tail + watched * k} + j]") for k in range(spec.sums or columns + 1)]
     if spec.sums:
         sums = [builder.read(f"numbers[{dict(spec.to)['sums'] + k}]") for k in range(spec.sums)]

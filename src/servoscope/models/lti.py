@@ -16,6 +16,7 @@ from servoscope.models.plants import StateSpace
 
 ITERATIONS = 20_000  # of a Riccati equation, at most
 SETTLED = 1e-12  # relative change of its solution at which it has settled
+ROUNDING = 1e-12  # relative: smaller parts of a sum do not show
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +148,94 @@ def tapped_delay_line(weights: Sequence[float] | FloatArray) -> LinearSystem:
     if n:
         B[0, 0] = 1.0
     return LinearSystem(A, B, W[:, 1:], W[:, :1])
+
+
+def stretched_filter(numerator: FloatArray, denominator: FloatArray, stride: int) -> LinearSystem:
+    """Return the filter ``numerator(z^-stride) / denominator(z^-stride)``: of one length, the latter begins with 1."""
+    n = (len(numerator) - 1) * stride
+    a, b = np.zeros(n), np.zeros(n)
+    a[stride - 1 :: stride], b[stride - 1 :: stride] = denominator[1:], numerator[1:] - numerator[0] * denominator[1:]
+    A = np.eye(n, k=-1)
+    A[:1] = -a
+    return LinearSystem(A, np.eye(n, 1), b[None, :], np.array([[numerator[0]]]))
+
+
+def unit_states(system: LinearSystem, pole: float) -> LinearSystem:
+    """Return the same system in states of about unit variance under white noise through ``1/(z - pole)``."""
+    d = np.linalg.norm(_reach(system, pole)[:-1], axis=1)
+    d = np.where(d > 0.0, d, 1.0)
+    return LinearSystem(system.A * d / d[:, None], system.B / d[:, None], system.C * d, system.D)
+
+
+def output_deviations(system: LinearSystem, pole: float) -> FloatArray:
+    """Return the standard deviation of each output when unit white noise comes through ``1/(z - pole)``, shape (p,)."""
+    return np.asarray(np.linalg.norm(np.hstack([system.C, system.D]) @ _reach(system, pole), axis=1))
+
+
+def truncate_states(system: LinearSystem, rows: FloatArray, pole: float, tolerance: float) -> LinearSystem:
+    """Return a system with one input that does nearly the same with few states (balanced truncation, Moore, 1981).
+
+    The combinations ``rows @ v`` of its outputs, shape (p', p), err by at most `tolerance` in standard deviations under
+    white noise through ``1/(z - pole)``, if any number of states can do that; constant inputs lead to the same outputs.
+    Its own states are `unit_states`, the new ones those of `companion_pairs`.
+    """
+    reached, seen = _reach(system, pole)[:-1], _gramian_factor(system.A.T, (rows @ system.C).T)
+    left, singular, right = np.linalg.svd(seen.T @ reached)
+    least, best = np.inf, system
+    for count in range(2, len(singular) + 1, 2):
+        root = np.sqrt(singular[:count])
+        T, back = reached @ right[:count].T / root, (seen @ left[:, :count] / root).T
+        A = back @ system.A @ T
+        if np.abs(np.linalg.eigvals(A)).max() >= 1.0:  # more states than the system has but for rounding
+            break
+        smaller = companion_pairs(LinearSystem(A, back @ system.B, system.C @ T, 0.0 * system.D))
+        D = system.D + system.C @ system.steady - smaller.C @ smaller.steady
+        smaller = LinearSystem(smaller.A, smaller.B, smaller.C, D)
+        difference = block_diagonal([system, smaller]).input(np.ones((2, 1))).output(np.hstack([rows, -rows]))
+        error = float(output_deviations(difference, pole).max())
+        if error < least:
+            least, best = error, smaller
+        if error <= tolerance:
+            break
+    return best
+
+
+def _reach(system: LinearSystem, pole: float) -> FloatArray:
+    """Return a factor of the covariance of states and input, the last row, under noise through ``1/(z - pole)``."""
+    n = len(system.A)
+    A = np.block([[system.A, system.B], [np.zeros((1, n)), np.array([[pole]])]])
+    return _gramian_factor(A, np.eye(n + 1, 1, -n))
+
+
+def _gramian_factor(A: FloatArray, B: FloatArray) -> FloatArray:
+    """Return L with ``L L' = sum_i A^i B B' A'^i``, by doubling (Smith, 1968): small parts keep their digits."""
+    L, power = B, A
+    while True:
+        more = power @ L
+        U, s, _ = np.linalg.svd(np.hstack([L, more]), full_matrices=False)
+        L, power = np.asarray(U * s, dtype=np.float64), power @ power
+        if np.all(np.abs(more).max(axis=1) <= ROUNDING * np.abs(L).max(axis=1)):
+            return L
+
+
+def companion_pairs(system: LinearSystem) -> LinearSystem:
+    """Return the same system, of one input, in pairs of states ``x1+ = a1 x1 + a2 x2 + w, x2+ = x1``.
+
+    Its poles must be distinct. Real ones are paired largest with smallest, so that no state becomes large.
+    """
+    poles, V = np.linalg.eig(system.A)
+    gains = (system.C @ V) * np.linalg.solve(V, system.B.astype(np.complex128))[:, 0]
+    parts = sorted(zip(poles, gains.T, strict=True), key=lambda part: abs(part[0]))
+    real = [part for part in parts if part[0].imag == 0.0]
+    if len(real) % 2:
+        real.insert(0, (np.complex128(0.0), np.zeros(len(gains))))
+    pairs = [(part, (part[0].conjugate(), part[1].conj())) for part in parts if part[0].imag > 0.0]
+    pairs += list(zip(real[: len(real) // 2], real[: len(real) // 2 - 1 : -1], strict=True))
+    A, C = np.zeros((2 * len(pairs), 2 * len(pairs))), np.zeros((len(gains), 2 * len(pairs)))
+    for k, ((p, g), (q, h)) in enumerate(pairs):
+        A[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = [[(p + q).real, -(p * q).real], [1.0, 0.0]]
+        C[:, 2 * k], C[:, 2 * k + 1] = (g + h).real, -(g * q + h * p).real
+    return LinearSystem(A, np.tile([[1.0], [0.0]], (len(pairs), 1)), C, system.D)
 
 
 def sample_system(

@@ -23,7 +23,7 @@ SAMPLE_STEPS = (
 # loops over the samples of a tile, and the arrays that stay in registers meanwhile
 TILE_LOOPS = {
     **{"accumulate_size": ("e",), "advance_shadow": ("s",), "update_undisturbed": ("s", "h")},
-    **{"whiten_undisturbed": ("s", "h"), "accumulate_sums": ("s",), "update_alarm": ("s", "h")},
+    **{"whiten_undisturbed": ("s", "h"), "update_alarm": ("s", "h")},
 }
 # as `_step_one`, for one lane whose neighbours may do something else
 SINGLE_LANE_STEPS = "begin_filters", "advance_filters", "update_estimate", "record_update", "reset_noise"
@@ -42,7 +42,7 @@ def build_kernels(spec: KernelSpec, lanes: int, width: int, own: int) -> SimpleN
     shared = "" if own else "c"
     names: dict[str, object] = {
         **{f"_{x}": getattr(sizes, x) for x in ("n", "rows", "row", "floats", "frequencies", "extra", "watched")},
-        **{"_columns": sizes.n + 1, "_gain_rows": sizes.n + 2, "_tile": 4 * TILE},
+        **{"_columns": spec.shadow_rows, "_gain_rows": sizes.n + 2, "_tile": 4 * TILE},
         **{"_sums": spec.sums, "_sums_at": dict(spec.to).get("sums", 0)},
         **{
             "_shadow": sizes.shadow,

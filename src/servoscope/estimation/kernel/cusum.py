@@ -16,6 +16,7 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.jit import dot, fma, maximum, minimum
 from servoscope.estimation.noise_model import ArmaNoise
+from servoscope.models.lti import LinearSystem, tapped_delay_line
 
 CLIP = 4.0  # standard deviations that one sample may contribute: a spike alone raises no alarm
 CAP = 2.0  # largest CUSUM, in limits: it falls soon after an actuator is repaired
@@ -27,12 +28,12 @@ LAGS = 2  # delayed copies of the last column, for changes that come between sam
 class CusumConstants(NamedTuple):
     """Constants of the sequential test; without members there is none.
 
-    ``A, B, C, D, X0`` are the shadow, r -> [eta, phi]; `theta` the coefficients that the residual is formed with;
+    ``A, B, C, D, X0`` are the shadow, r -> [residual, phi]; `theta` the coefficients that the residual is formed with;
     `numerator` and `denominator` the whitening filter, both of one length, first element 1, and `gain` its factor;
     `warm` the updates that it needs; `changes` (members, n + `LAGS`) the weights of the columns and `limits`
     (members,) where a CUSUM alarms. With `directions` (q, n + `LAGS`), whose combinations the changes are, CUSUMs step
-    once per evaluation, with what its updates sum up to; without, at each update. Scaled as
-    `estimation.recursion.RecursionConstants`.
+    once per evaluation, with what its updates sum up to, and the shadow's columns are those of the directions, white;
+    without, at each update. Scaled as `estimation.recursion.RecursionConstants`.
     """
 
     A: FloatArray
@@ -67,6 +68,22 @@ def lagged_columns(phi: FloatArray) -> FloatArray:
     return np.column_stack([phi, *late])
 
 
+def lagged_directions(directions: FloatArray, stride: int) -> LinearSystem:
+    """Return columns -> combinations of them and of delayed copies of the last, whose updates are `stride` apart."""
+    n = directions.shape[1] - LAGS
+    late = np.zeros((len(directions), LAGS * stride + 1))
+    late[:, ::stride] = directions[:, n - 1 :]
+    delays = tapped_delay_line(late)
+    return LinearSystem(
+        delays.A, delays.B @ np.eye(1, n, n - 1), delays.C, np.hstack([directions[:, : n - 1], delays.D])
+    )
+
+
+def direction_shares(changes: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return the share of each direction in each change, shape (members, q)."""
+    return np.asarray(np.linalg.lstsq(directions.T, changes.T, rcond=None)[0].T)
+
+
 def whiten_sample(c: Any, model: int, s: Any, at: int, memory: int, x: Any) -> Any:
     """Whiten one sample; s[at:] holds the filter's memory (transposed direct form II).
 
@@ -81,7 +98,7 @@ def whiten_sample(c: Any, model: int, s: Any, at: int, memory: int, x: Any) -> A
 
 def evaluation_weights(changes: FloatArray, directions: FloatArray, limits: FloatArray) -> FloatArray:
     """Return by how much each sum of `accumulate_sums` moves each CUSUM in units of its limit, (sums, members)."""
-    shares = np.linalg.lstsq(directions.T, changes.T, rcond=None)[0]
+    shares = direction_shares(changes, directions).T
     rows, columns = np.tril_indices(len(directions))
     squares = np.where(rows == columns, -0.5, -1.0)[:, None] * shares[rows] * shares[columns]
     return np.vstack([shares, squares]) / limits

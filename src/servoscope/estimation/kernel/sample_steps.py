@@ -57,6 +57,7 @@ class KernelSizes(NamedTuple):
     start: bool
     row: int
     floats: int
+    directions: int  # of changes, whose sums move the CUSUMs once per evaluation
 
 
 class KernelSpec(NamedTuple):
@@ -70,15 +71,19 @@ class KernelSpec(NamedTuple):
     shadow: SparsityPattern
 
     @property
-    def directions(self) -> int:
-        """Number of directions of changes whose sums move the CUSUMs once per evaluation; 0: each update moves them."""
-        to = dict(self.to)
-        return to["late"] - to["psi"] if "late" in to else 0
+    def sums(self) -> int:
+        """Number of sums that are taken over an evaluation's updates; 0: each update moves the CUSUMs."""
+        return self.sizes.directions * (self.sizes.directions + 3) // 2
 
     @property
-    def sums(self) -> int:
-        """Number of sums that are taken over an evaluation's updates."""
-        return self.directions * (self.directions + 3) // 2
+    def shadow_rows(self) -> int:
+        """Number of outputs of the shadow, room for as many where there is none."""
+        return len(self.shadow[0]) or self.sizes.n + 1
+
+    @property
+    def columns(self) -> int:
+        """Number of white columns that the sequential test takes of each update."""
+        return self.sizes.directions or self.sizes.n + LAGS
 
 
 class SampleSteps:
@@ -92,8 +97,7 @@ class SampleSteps:
     def __init__(self, spec: KernelSpec, steady: Any, single_lane: bool = False) -> None:
         self.size, self.to, self.at = spec.sizes, SimpleNamespace(**dict(spec.to)), SimpleNamespace(**dict(spec.at))
         self._bank, self._shadow, self._steady, self.single_lane = spec.bank, spec.shadow, steady, single_lane
-        self.directions, self.sums = spec.directions, spec.sums
-        self.columns = self.directions or self.size.n + LAGS  # that the test takes of each update
+        self.sums, self.columns = spec.sums, spec.columns
 
     def begin_evaluation(self, s: Any, h: Any) -> None:
         """Forget the largest CUSUM of the evaluation before."""
@@ -116,12 +120,10 @@ class SampleSteps:
         return undisturbed
 
     def advance_shadow(self, c: Any, s: Any, w: Any, tile: Any, i: Any) -> None:
-        """Pass an undisturbed r through the healthy loop: columns and residual of the test go to w, not yet white."""
-        shadow = sparse_lti.advance_system(self._shadow, c, self.at.shadow, s, self.to.shadow, [tile[i]])
-        columns = self._combine_columns(c, s, shadow[1:])
-        for k, column in enumerate(columns):
-            w[i * (self.columns + 1) + k] = column
-        w[i * (self.columns + 1) + self.columns] = shadow[0]
+        """Pass an undisturbed r through the healthy loop: columns and residual of the test go to w."""
+        found = sparse_lti.advance_system(self._shadow, c, self.at.shadow, s, self.to.shadow, [tile[i]])
+        for k, number in zip([self.columns, *range(self.columns)], found, strict=False):
+            w[i * (self.columns + 1) + k] = number
 
     def update_undisturbed(self, c: Any, s: Any, h: Any, w: Any, when: Any, tile: Any, i: Any) -> None:
         """Process an undisturbed sample: `advance_filters` and `update_estimate` without their special cases."""
@@ -132,13 +134,17 @@ class SampleSteps:
         if self.size.shadow:
             row = i * (self.columns + 1) + self.columns
             w[row] = self._residual(c, v, w[row], phi)
-            when[i] = h[SAMPLE]
+            if not self.sums:
+                when[i] = h[SAMPLE]
 
     def whiten_undisturbed(self, c: Any, s: Any, h: Any, w: Any, i: Any) -> None:
         """Whiten what `advance_shadow` and `update_undisturbed` left in w."""
         row = i * (self.columns + 1)
-        e = self._whiten(c, s, h, w[row + self.columns], [w[row + k] for k in range(self.directions or self.size.n)])
-        self._store_whitened(s, e, h[WHITENED] > c[self.at.warm], w, i)
+        if self.sums:
+            self._accumulate(c, s, h, [w[row + k] for k in range(self.columns)], w[row + self.columns])
+        else:
+            e = self._whiten(c, s, h, w[row + self.columns], [w[row + k] for k in range(self.size.n)])
+            self._store_whitened(s, e, h[WHITENED] > c[self.at.warm], w, i)
 
     def count_sample(self, h: Any, tile: Any, i: Any) -> Bool:
         """Count a sample; return whether it is complete and continues the one before."""
@@ -244,9 +250,9 @@ class SampleSteps:
         spans = [(to.M, size.lags * size.n)]
         if size.shadow:
             h[WHITENED] = 0.0
-            spans += [(to.white, ((self.directions or size.n) + 1) * size.memory), (to.psi, self.columns)]
-            if self.directions:
-                spans.append((to.late, LAGS))
+            spans.append((to.white, (1 if self.sums else size.n + 1) * size.memory))
+            if not self.sums:
+                spans.append((to.psi, self.columns))
         for begin, count in spans:
             for i in range(count):
                 s[begin + i] = 0.0
@@ -266,11 +272,6 @@ class SampleSteps:
             g[j] = update_cusum([c[j + count * k] for k in range(columns)], psi, white, g[j], c[j + count * columns])
             best = maximum(best, g[j])
         top[i] = best
-
-    def accumulate_sums(self, s: Any, w: Any, i: Any) -> None:
-        """Add sample i to the sums that move the CUSUMs at the end of the evaluation."""
-        row = i * (self.columns + 1)
-        accumulate_sums(s, self.to.sums, [w[row + k] for k in range(self.columns)], w[row + self.columns])
 
     def update_cusums_by_sums(self, c: Any, g: Any, sums: Any, top: Any, i: Any) -> None:
         """Update the CUSUMs g with the sums of an evaluation; c begins with their weights, `top` is row i."""
@@ -361,35 +362,36 @@ class SampleSteps:
             propagate_initial_share(s, self.to.Psi, phi, K)
 
     def _test_update(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, phi: Sequence[Any]) -> None:
-        """Whiten what the sequential test takes of one update."""
-        columns = self._combine_columns(c, s, [shadow[1 + i] for i in range(self.size.n)])
-        e[0] = self._whiten(c, s, h, self._residual(c, v, shadow[0], phi), columns)
+        """Whiten what the sequential test takes of one update, or add it to the sums of the evaluation."""
+        residual = self._residual(c, v, shadow[0], phi)
+        if self.sums:
+            self._accumulate(c, s, h, [shadow[1 + k] for k in range(self.columns)], residual)
+        else:
+            e[0] = self._whiten(c, s, h, residual, [shadow[1 + i] for i in range(self.size.n)])
+
+    def _accumulate(self, c: Any, s: Any, h: Any, psi: Sequence[Any], residual: Any) -> None:
+        """Whiten a residual; add it, times white columns, to the sums that move the CUSUMs once per evaluation."""
+        e = self._whiten_residual(c, s, h, residual)
+        counts = h[WHITENED] > c[self.at.warm]
+        accumulate_sums(s, self.to.sums, [where(counts, column, 0.0) for column in psi], e)
 
     def _residual(self, c: Any, v: Any, expected: Any, phi: Sequence[Any]) -> Any:
         """Return the residual minus the shadow's."""
         return v[0] - expected - dot([c[self.at.apart + i] for i in range(self.size.n)], phi)
 
-    def _combine_columns(self, c: Any, s: Any, columns: list[Any]) -> list[Any]:
-        """Return the shadow's columns, or the sums of them and of delayed copies of the last in which changes lie."""
-        if not self.directions:
-            return columns
-        late = self.to.late
-        columns = [*columns, *(s[late + lag] for lag in range(LAGS))]
-        for lag in range(LAGS):
-            s[late + lag] = columns[self.size.n - 1 + lag]
-        rows = [self.at.directions + d * len(columns) for d in range(self.directions)]
-        return [dot([c[row + k] for k in range(len(columns))], columns) for row in rows]
-
     def _whiten(self, c: Any, s: Any, h: Any, residual: Any, columns: Sequence[Any]) -> Any:
-        """Whiten the columns to psi, behind which delayed copies of the last may stand; return the white residual."""
+        """Whiten the columns to psi, behind which delayed copies of the last stand; return the white residual."""
         memory, to = self.size.memory, self.to
-        if not self.directions:
-            for k in range(self.columns - 1, len(columns) - 1, -1):
-                s[to.psi + k] = s[to.psi + k - 1]
+        for k in range(self.columns - 1, len(columns) - 1, -1):
+            s[to.psi + k] = s[to.psi + k - 1]
         for i, column in enumerate(columns):
             s[to.psi + i] = whiten_sample(c, self.at.white, s, to.white + (1 + i) * memory, memory, column)
+        return self._whiten_residual(c, s, h, residual)
+
+    def _whiten_residual(self, c: Any, s: Any, h: Any, residual: Any) -> Any:
         h[WHITENED] = h[WHITENED] + 1.0
-        return minimum(maximum(whiten_sample(c, self.at.white, s, to.white, memory, residual), -CLIP), CLIP)
+        white = whiten_sample(c, self.at.white, s, self.to.white, self.size.memory, residual)
+        return minimum(maximum(white, -CLIP), CLIP)
 
     def _store_whitened(self, s: Any, e: Any, counts: Bool, w: Any, i: Any) -> None:
         """Write columns and residual of sample i to w; no CUSUM moves where all of them are zero."""

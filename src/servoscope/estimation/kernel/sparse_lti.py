@@ -26,6 +26,23 @@ def sparsity_pattern(systems: Sequence[LinearSystem]) -> SparsityPattern:
     return rows[: len(rows) - states], rows[len(rows) - states :]
 
 
+def pad_system(system: LinearSystem, states: int, rows: int) -> LinearSystem:
+    """Return a system with as many states and outputs, those that are added zero."""
+    more, silent = (0, states - len(system.A)), (0, rows - len(system.C))
+    return LinearSystem(
+        np.pad(system.A, (more, more)),
+        np.pad(system.B, (more, (0, 0))),
+        np.pad(system.C, (silent, more)),
+        np.pad(system.D, (silent, (0, 0))),
+    )
+
+
+def pairs_structure(states: int, rows: int) -> LinearSystem:
+    """Return ones where a system in `models.lti.companion_pairs` with one input may have numbers."""
+    A = np.asarray(np.kron(np.eye(states // 2), [[1.0, 1.0], [1.0, 0.0]]), dtype=np.float64)
+    return LinearSystem(A, np.tile([[1.0], [0.0]], (states // 2, 1)), np.ones((rows, states)), np.ones((rows, 1)))
+
+
 def pack_coefficients(pattern: SparsityPattern, system: LinearSystem) -> FloatArray:
     """Return the entries of a system in the order in which its code takes them."""
     whole = np.block([[system.C, system.D], [system.A, system.B]])

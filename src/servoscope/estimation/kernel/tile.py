@@ -22,7 +22,7 @@ _update_undisturbed = _try_undisturbed = _residual_rows = _reduce_cusums = _lane
 _update_estimate_one = _update_cusums = _n = _store_residual = _begin_evaluation = _write_response = _UNFILLED
 _gain_rows = _rows = _process_sample = _cusum_lanes = _learn_lane = _learn_lanes = _write_internal = _UNFILLED
 _count_sample = _to = _update = _is_update = _watched = _accumulate_size = _width = _end_evaluation = _UNFILLED
-_sums = _sums_at = _accumulate_sums = _advance_shadow = _whiten_undisturbed = _shadow = _UNFILLED
+_sums = _sums_at = _advance_shadow = _whiten_undisturbed = _shadow = _UNFILLED
 
 
 def filter_sample(
@@ -152,12 +152,9 @@ def process_samples(
             _process_sample(c, s, h, tile, i, phase == stride, v, shadow, e, status, extra)
             if phase == stride:
                 phase = 0
-            if _watched:
+            if _watched and not _sums:
                 for a in range(0, _lanes, _width):
                     _store_residual(a, c, s, h, status, e, w, when, i)
-    if _sums:
-        for a in range(0, _lanes, _width):
-            _accumulate_sums(a, s, w, begin, end)
     if not _watched or (_sums and not last):
         return
     top = stack_array(c, TILE, _cusum_lanes)
