@@ -54,12 +54,16 @@ class Follower:
         """Process a block of samples, in the order of time; the old state stays valid."""
         s = samples
         monitor, trace = self.monitor.run(state.monitor, s.r, s.u, s.y, s.restart, channels=s.channels)
+        return self.judge(state, monitor, trace, len(samples))
+
+    def judge(self, state: State, monitor: FloatArray, trace: Trace, samples: int) -> tuple[State, Evaluations]:
+        """Return what `follow` returns, of what the monitor has made of so many samples."""
         index = np.rint(trace.t * self.baseline.loop.sample_rate).astype(np.int64) - state.samples
         exceeding = consecutive_exceedances(trace.exceeded, state.exceeding)
         new = replace(
             state,
             monitor=monitor,
-            samples=state.samples + len(samples),
+            samples=state.samples + samples,
             exceeding=int(exceeding[-1]) if exceeding.size else state.exceeding,
         )
         return new, Evaluations(trace, index, np.flatnonzero(exceeding > self._on_delay))

@@ -7,9 +7,11 @@ Results depend on the rows alone, not on how they were cut into blocks.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +20,8 @@ from servoscope.core.errors import ServoscopeError
 from servoscope.detection.baseline import Baseline
 from servoscope.detection.covariate_monitor import fill_channels
 from servoscope.diagnosis.diagnose import diagnose_with_trace
-from servoscope.diagnosis.follower import DiagnosisSchedule, Follower, FollowerState
+from servoscope.diagnosis.follower import DiagnosisSchedule, Evaluations, Follower, FollowerState
+from servoscope.diagnosis.monitor import Monitor
 from servoscope.fleet.common_cause import trace_evidence
 from servoscope.fleet.rows import MICRO, Rows
 from servoscope.signals.samples import Samples
@@ -87,6 +90,11 @@ class RowHistory:
         return Rows.concatenate([block.between(after_us, to_us) for block in self.blocks])
 
 
+class _RowOrder(NamedTuple):
+    rows: Rows  # without repeated ones
+    restart: BoolArray  # which of them do not follow their predecessor by one sample period
+
+
 class DayMonitor:
     """Follows days of assets of one baseline, which has its share of the fleet's budget of false alarms.
 
@@ -96,6 +104,7 @@ class DayMonitor:
     def __init__(self, baseline: Baseline, window_s: float = WINDOW) -> None:
         self.baseline = baseline
         self._follower = Follower(baseline)
+        self._lane_key = self._follower.monitor.lane_key
         self._window = round(window_s * MICRO)
         self._schedule = DiagnosisSchedule(self._window, self._window // 2)
         self._timebase = Timebase(MICRO / baseline.loop.sample_rate)
@@ -114,14 +123,31 @@ class DayMonitor:
 
         `history`: rows of this day, those of the block included, as far back as `needed_since` requires.
         """
-        first = state.last_us is None
+        block = self._order(state, rows)
+        t, taken = block.rows.t_us / MICRO, block.rows
+        samples = Samples(t, taken.r, taken.u, taken.y, block.restart, taken.channels)
+        return self._judge(state, rows, block, self._follower.follow(state, samples), history)
+
+    def _order(self, state: DayState, rows: Rows) -> _RowOrder:
+        """Return which rows are taken, and which of them do not follow their predecessors."""
         last = state.last_us if state.last_us is not None else rows.t_us[:1] - 10 * round(self._timebase.period)
         steps = np.diff(rows.t_us, prepend=last)
         repeated = self._timebase.is_repeat(steps)
-        steps, taken = steps[~repeated], rows[~repeated]
-        restart = self._timebase.is_gap(steps)
-        samples = Samples(taken.t_us / MICRO, taken.r, taken.u, taken.y, restart, taken.channels)
-        new, (trace, sample, alarms) = self._follower.follow(state, samples)
+        if repeated.any():
+            steps, rows = steps[~repeated], rows[~repeated]
+        return _RowOrder(rows, self._timebase.is_gap(steps))
+
+    def _judge(
+        self,
+        state: DayState,
+        rows: Rows,
+        ordered: _RowOrder,
+        followed: tuple[DayState, Evaluations],
+        history: RowLookup,
+    ) -> tuple[DayState, EvaluationBlock]:
+        """Return what `advance` returns, of what the follower has found."""
+        (taken, restart), first = ordered, state.last_us is None
+        new, (trace, sample, alarms) = followed
         limits = np.full(len(trace.t), self.baseline.limit)
         block = EvaluationBlock(taken.t_us[sample], trace.theta, trace.statistic, limits, trace.level, trace.exceeded)
         if not len(rows):
@@ -132,7 +158,7 @@ class DayMonitor:
             new,
             first_us=int(rows.t_us[0]) if first else state.first_us,
             last_us=int(rows.t_us[-1]),
-            repeats=state.repeats + int(repeated.sum()),
+            repeats=state.repeats + len(rows) - len(taken),
             missing=state.missing + int(empty.sum()),
             gaps=state.gaps + int(restart.sum()) - first,
             evaluations=state.evaluations + len(trace.t),
@@ -167,3 +193,53 @@ class DayMonitor:
         evidence = json.dumps(asdict(trace_evidence(self.baseline, trace)))
         document = diagnosis.model_dump_json(exclude={"recording"})
         return {"diagnosis": json.loads(document), "evidence": json.loads(evidence)}
+
+    @staticmethod
+    def advance_lanes(steps: Sequence[DayStep]) -> Iterator[tuple[DayState, EvaluationBlock] | Exception]:
+        """Process blocks of several assets, each as `advance` does, to the last bit, or yield what went wrong.
+
+        Regular blocks of one length, of monitors of one structure that are in one phase, go through the kernel side by
+        side.
+        """
+        lanes: dict[Hashable, list[tuple[int, DayStep, _RowOrder]]] = defaultdict(list)
+        found: dict[int, tuple[DayState, EvaluationBlock] | Exception] = {}
+        for i, step in enumerate(steps):
+            monitor, state, rows, _ = step
+            ordered = monitor._order(state, rows)
+            if monitor._lane_key is not None and len(ordered.rows) and not ordered.restart.any():
+                phase = int(monitor._follower.monitor.phase(state.monitor)[0])
+                lanes[monitor._lane_key, phase, len(ordered.rows)].append((i, step, ordered))
+        for together in lanes.values():
+            if len(together) < 2:
+                continue
+            distinct = list(dict.fromkeys(step.monitor for _, step, _ in together))
+            fleet = _join_monitors(tuple(distinct))
+            fleet = fleet.select(np.array([distinct.index(step.monitor) for _, step, _ in together]))
+            r, u, y = (np.array([getattr(one.rows, name) for *_, one in together]) for name in ("r", "u", "y"))
+            monitors, trace = fleet.run(np.array([step.state.monitor for _, step, _ in together]), r, u, y)
+            for lane, (i, (monitor, state, rows, history), ordered) in enumerate(together):
+                judged = monitor._follower.judge(state, monitors[lane].copy(), trace.lane(lane), r.shape[1])
+                try:
+                    found[i] = monitor._judge(state, rows, ordered, judged, history)
+                except Exception as error:  # garbage of one asset must not cost another
+                    found[i] = error
+        for i, step in enumerate(steps):
+            try:
+                yield found[i] if i in found else step.monitor.advance(step.state, step.rows, step.history)
+            except Exception as error:
+                yield error
+
+
+class DayStep(NamedTuple):
+    """A block of an asset that is to be processed: the arguments of its monitor's `advance`."""
+
+    monitor: DayMonitor
+    state: DayState
+    rows: Rows
+    history: RowLookup
+
+
+@lru_cache(maxsize=256)
+def _join_monitors(monitors: tuple[DayMonitor, ...]) -> Monitor:
+    """Return the fleet of some monitors."""
+    return Monitor.join([each._follower.monitor for each in monitors])

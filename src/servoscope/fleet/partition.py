@@ -1,25 +1,20 @@
-"""Arrow batches of many assets, as workers of Spark get them: sorted ones to results, those of streams to blocks."""
+"""Sorted Arrow batches of many assets, as workers of Spark get them, to results."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, groupby, pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.fleet.day_monitor import DayMonitor
-from servoscope.fleet.rows import Rows, covariates_from_table, rows_from_table, signals_from_table
+from servoscope.fleet.rows import Rows, rows_from_table
 from servoscope.fleet.tasks import examine_day, failed_result
 from servoscope.models.loop import Columns
 from servoscope.signals.readers.table import Table
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-BLOCKS = "asset string, baseline_of string, last_us long, rows binary"  # rows of an asset, packed; until when they are
-CHUNK = 65_536  # rows of one entry of a stream's state, about
 DAY_US = 86_400_000_000
 
 
@@ -110,39 +105,3 @@ def _split_by_key(batches: Iterable[Any], keys: Sequence[str]) -> Iterator[tuple
         edges = [0, *(np.flatnonzero(changes) + 1).tolist(), n]
         for start, stop in pairwise(edges):
             yield tuple(str(column[start].as_py()) for column in columns), batch.slice(start, stop - start)
-
-
-def pack_blocks(batches: Iterator[pa.RecordBatch], columns: Columns) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of Arrow batches as blocks of `BLOCKS`: one per batch, asset and baseline."""
-    import pyarrow as pa
-
-    keys = ("asset", "baseline_of")
-    for batch in batches:
-        if not batch.num_rows:
-            continue
-        signals = {name: pa.chunked_array([batch[name]]) for name in batch.schema.names if name not in (*keys, "at_us")}
-        table = Table("the stream", signals)
-        channels = covariates_from_table(table, columns)
-        rows = Rows(np.asarray(batch["at_us"]), *signals_from_table(table, columns), channels)
-        assets, baselines = (batch[key].dictionary_encode(null_encoding="encode") for key in keys)
-        code = np.asarray(assets.indices, np.int64) * len(baselines.dictionary) + np.asarray(baselines.indices)
-        order = np.argsort(code, kind="stable")
-        first = np.flatnonzero(np.diff(code[order], prepend=-1))
-        own = [rows[each] for each in np.split(order, first[1:])]
-        block = {key: batch[key].take(order[first]) for key in keys}
-        block["last_us"] = pa.array([int(each.t_us.max()) for each in own])
-        block["rows"] = pa.array([each.pack() for each in own], pa.binary())
-        yield pa.RecordBatch.from_pydict(block)
-
-
-def join_blocks(frames: Iterator[Any]) -> Iterator[tuple[str, Rows]]:
-    """Yield blocks in larger pieces, each with its baseline: blocks may be tiny, a piece is one entry of the state."""
-    parts: list[Rows] = []
-    for frame in frames:
-        for baseline, packed in zip(frame["baseline_of"], frame["rows"], strict=True):
-            parts.append(Rows.unpack(bytes(packed)))
-            if sum(map(len, parts)) >= CHUNK:
-                yield str(baseline), Rows.concatenate(parts)
-                parts = []
-    if parts:
-        yield str(baseline), Rows.concatenate(parts)

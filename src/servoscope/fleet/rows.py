@@ -92,15 +92,16 @@ class Rows:
         return packed + names + bytes([len(names) // 8])
 
     @classmethod
-    def unpack(cls, content: bytes) -> Rows:
-        """Return what `pack` packed."""
-        names = []
-        if len(content) % 8:
-            end = len(content) - 1 - 8 * content[-1]
-            names, content = json.loads(content[end:-1]), content[:end]
-        n = len(content) // (8 * (4 + len(names)))
-        r, u, y, *channels = np.frombuffer(content, dtype=np.float64, offset=8 * n).reshape(3 + len(names), n)
-        t_us = np.frombuffer(content, dtype=np.int64, count=n)
+    def unpack(cls, content: bytes, begin: int = 0) -> Rows:
+        """Return what `pack` packed, from byte `begin` of the content on, a multiple of 8."""
+        names, end = [], len(content)
+        if end % 8:
+            end -= 1 + 8 * content[-1]
+            names = json.loads(content[end:-1])
+        n = (end - begin) // (8 * (4 + len(names)))
+        signals = np.frombuffer(content, dtype=np.float64, offset=begin + 8 * n, count=(3 + len(names)) * n)
+        r, u, y, *channels = signals.reshape(3 + len(names), n)
+        t_us = np.frombuffer(content, dtype=np.int64, offset=begin, count=n)
         return cls(t_us, r, u, y, dict(zip(names, channels, strict=True)))
 
 
