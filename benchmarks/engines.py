@@ -1,8 +1,10 @@
 """How fast fleets are: one machine, Spark's tasks, DataFrames and streams on the same lake; rows per second.
 
     python benchmarks/engines.py FOLDER [--assets 8] [--minutes 5] [--rate 1000] [--window 10]
+    python benchmarks/engines.py FOLDER --messages --assets 1000 --minutes 8 --rate 100 [--json]
 
-The lake is made in FOLDER unless it is there. Processor time counts all processes, those of Spark included.
+The lake is made in FOLDER unless it is there. Processor time counts all processes, those of Spark included. With
+--messages a stream is measured whose rows are messages of a second, a minute of all assets per micro-batch.
 """
 
 from __future__ import annotations
@@ -13,11 +15,14 @@ import resource
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from tables import Table, show
 
 from servoscope import fleet
 from servoscope.detection.baseline import Baseline
@@ -58,6 +63,29 @@ def make(folder: Path, assets: int, minutes: float, rate: float) -> int:
     return rows
 
 
+def make_messages(folder: Path, assets: int, minutes: int, rate: float) -> None:
+    """Write a minute of messages of a second per file, all assets in it; with the baseline."""
+    loop, n = loop_at(rate), round(rate)
+    r = reference("multisine", 60.0 * minutes, rate)
+    x, noise = simulate(loop, r, seed=1)[0], np.random.default_rng(3)
+    learn_baseline(loop, [simulate(loop, r[: 60 * n], seed=2)[0]]).save(folder / "baseline.json")
+    (folder / "messages").mkdir()
+    names = [f"P{asset:05d}" for asset in range(assets)]
+    offsets = pa.array(range(0, 60 * assets * n + 1, n), pa.int32())
+    begin = np.datetime64(f"{DAYS[0]}T06:00:00", "us")
+    for minute in range(minutes):
+        seconds = np.arange(60 * minute, 60 * minute + 60)
+        once = {name: getattr(x, name)[60 * minute * n :][: 60 * n].reshape(60, 1, n) for name in "ruy"}
+        signals = {name: np.broadcast_to(values, (60, assets, n)) for name, values in once.items()}
+        signals["y"] = signals["y"] + 1e-9 * noise.normal(size=(60, assets, n))
+        lists = {name: pa.ListArray.from_arrays(offsets, values.ravel()) for name, values in signals.items()}
+        t = begin + np.repeat(seconds, assets).astype("timedelta64[s]")
+        table = pa.table({"asset": names * 60, "t": t, "dt": np.full(len(t), 1.0 / rate), **lists})
+        path = folder / "messages" / f"{minute:04d}.parquet"
+        pq.write_table(table, path, row_group_size=5000)
+        os.utime(path, (1e9 + minute, 1e9 + minute))  # Spark takes them in this order
+
+
 def measured(name: str, rows: int, work: Callable[[], object], pids: Callable[[], list[int]] = list) -> None:
     """Print rows per second and processor time per row."""
     begin, used = time.perf_counter(), cpu(pids())
@@ -72,8 +100,9 @@ def cpu(pids: list[int]) -> float:
     total = sum(one.ru_utime + one.ru_stime for one in both)
     tick = os.sysconf("SC_CLK_TCK")
     for pid in pids:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        total += sum(map(int, fields[11:15])) / tick
+        with suppress(OSError):  # it has ended; its parent counts it
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            total += sum(map(int, fields[11:15])) / tick
     return total
 
 
@@ -101,7 +130,12 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1000.0)
     parser.add_argument("--window", type=float, default=10.0, help="seconds that a diagnosis sees")
     parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--messages", action="store_true", help="measure a stream of messages, and nothing else")
+    parser.add_argument("--json", action="store_true", help="with --messages: print one JSON object")
     asked = parser.parse_args()
+    if asked.messages:
+        table = stream_of_messages(asked.folder, asked.assets, round(asked.minutes), asked.rate, asked.cores)
+        return show([table], asked.json)
     rows = make(asked.folder, asked.assets, asked.minutes, asked.rate)
     lake = str(asked.folder / "lake")
     file = asked.folder / "baseline.json"
@@ -119,11 +153,11 @@ def main() -> None:
         on_spark(asked.folder, lake, rows, cores, asked.window, plan)
 
 
-def on_spark(folder: Path, lake: str, rows: int, cores: int, window: float, plan: Callable[[str], Plan]) -> None:
-    """Measure Spark on so many cores."""
-    from servoscope.fleet import sinks, spark, streaming
+def session_of(cores: int) -> Any:
+    """Start Spark on so many cores of this machine."""
+    from servoscope.fleet import spark
 
-    session = spark.session(
+    return spark.session(
         f"local[{cores}]",
         spark__driver__memory="2g",
         spark__ui__enabled="false",
@@ -133,6 +167,43 @@ def on_spark(folder: Path, lake: str, rows: int, cores: int, window: float, plan
         spark__sql__shuffle__partitions=str(2 * cores),
         spark__log__level="OFF",
     )
+
+
+def stream_of_messages(folder: Path, assets: int, minutes: int, rate: float, cores: int) -> Table:
+    """Return what a sample of a stream of messages costs, micro-batch by micro-batch."""
+    from servoscope.fleet import sinks, streaming
+
+    if not (folder / "baseline.json").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        make_messages(folder, assets, minutes, rate)
+    session, baseline = session_of(cores), Baseline.load(folder / "baseline.json")
+    shutil.rmtree(folder / "stream", ignore_errors=True)
+    options = {"maxFilesPerTrigger": "1"}
+    stream = sinks.file_stream(session, str(folder / "messages"), baseline.loop.columns, options)
+    query = sinks.start(streaming.follow(stream, baseline, assets=assets), folder / "stream", every_s=None)
+    cells, samples = [], 60 * assets * rate
+    before, used = time.perf_counter(), cpu(descendants())
+    for number in range(minutes):
+        while query.isActive and not (folder / f"stream/results/batch={number:09d}/_SUCCESS").exists():
+            time.sleep(0.1)
+        now, total = time.perf_counter(), cpu(descendants())
+        cells.append((str(number + 1), f"{1e9 * (total - used) / samples:.0f}", f"{samples / (now - before):.3g}"))
+        before, used = now, total
+    sinks.wait_for_stream(query)
+    session.stop()
+    note = (
+        f"{assets} assets at {rate:g} Hz, messages of a second in Parquet, {samples:.3g} samples per micro-batch, on "
+        f"{cores} cores; each batch follows what the one before has stored, the first has nothing to follow and starts "
+        f"up. Load average {os.getloadavg()[0]:.1f}."
+    )
+    return Table("Stream of messages", note, ("micro-batch", "ns of processor per sample", "samples/s"), tuple(cells))
+
+
+def on_spark(folder: Path, lake: str, rows: int, cores: int, window: float, plan: Callable[[str], Plan]) -> None:
+    """Measure Spark on so many cores."""
+    from servoscope.fleet import sinks, spark, streaming
+
+    session = session_of(cores)
     at = f"Spark local[{cores}]"
     session.range(2).count()
     measured(f"{at}, tasks", rows, lambda: fleet.run(plan("tasks"), spark.spark(session)), descendants)

@@ -42,7 +42,7 @@ def written(folder: Path, rows: int, fault: bool) -> list[Path]:
             k = np.arange(begin, min(begin + PIECE, rows))
             r = minute[k % len(minute)]
             n_u, n_y = NOISE_U_STD * rng.standard_normal(len(k)), NOISE_Y_STD * rng.standard_normal(len(k))
-            u, _, y = simulation.advance((fault * (k >= rows // 2)).astype(np.int64), r, n_u, n_y)
+            u, _, y = simulation.run((fault * (k >= rows // 2)).astype(np.int64), r, n_u, n_y)
             table = pa.table([k / loop.sample_rate, r, u, y + n_y], schema=schema)
             columns.write_table(table)
             text.write_table(table)

@@ -151,15 +151,24 @@ def put(folder: Path, name: str, asset: str, table: pa.Table, number: int) -> No
     os.utime(path, (1e9 + number, 1e9 + number))
 
 
+def messages_of(table: pa.Table, size: int) -> pa.Table:
+    """Return rows as messages of some samples each."""
+    offsets = pa.array([*range(0, table.num_rows, size), table.num_rows], pa.int32())
+    return pa.table(
+        {name: pa.ListArray.from_arrays(offsets, table[name].combine_chunks()) for name in table.column_names}
+    )
+
+
 def day_of(lake: Path, asset: str, day: int) -> pa.Table:
     (path,) = lake.rglob(f"asset={asset}/day={lakes.DAYS[day]}/*.parquet")
     return pq.read_table(path, partitioning=None)
 
 
-def the_next_day(folder: Path) -> None:
+def the_next_day(folder: Path, *, in_messages: bool = False) -> None:
     """Let one row come that ends all days before."""
     at = pa.array([datetime.datetime(2026, 11, 3, 0, 1)], pa.timestamp("us"))
-    put(folder, "next", "P0", pa.table({"t": at, "r": [0.0], "u": [0.0], "y": [0.0]}), 99)
+    row = pa.table({"t": at, "r": [0.0], "u": [0.0], "y": [0.0]})
+    put(folder, "next", "P0", messages_of(row, 1) if in_messages else row, 99)
 
 
 def followed(session: Any, plan: Plan, folder: Path, output: Path, store: str | None = None) -> None:
@@ -181,14 +190,16 @@ def items_of(session: Any, output: Path) -> dict[tuple[str, str], dict[str, Any]
     return {(entry["asset"], entry["day"]): entry for entry in entries}
 
 
+@pytest.mark.parametrize("in_messages", [False, True], ids=["rows", "messages"])
 def test_a_stream_finds_what_one_machine_finds_and_writes_the_same_traces(
-    session: Any, plan: Plan, tmp_path: Path
+    session: Any, plan: Plan, tmp_path: Path, in_messages: bool
 ) -> None:
     set_batches(session, 10_000)
     for day in (0, 1):
         for asset in ("P0", "P1", "P3"):
-            put(tmp_path / "in", str(day), asset, day_of(Path(plan.lake.location), asset, day), day)
-    the_next_day(tmp_path / "in")
+            table = day_of(Path(plan.lake.location), asset, day)
+            put(tmp_path / "in", str(day), asset, messages_of(table, 64) if in_messages else table, day)
+    the_next_day(tmp_path / "in", in_messages=in_messages)
     store = str(tmp_path / "history.db")
     followed(session, plan, tmp_path / "in", tmp_path / "out", store)
     wanted = without_files(journal(plan.output), "P0", "P1", "P3")
@@ -208,6 +219,14 @@ def test_a_stream_finds_what_one_machine_finds_and_writes_the_same_traces(
     for name in ("time_us", "statistic", "threshold", "level"):
         assert [row[name] for row in rows] == trace.column(name).to_pylist(), name
     assert [row.theta[2] for row in rows] == trace.column("theta_2").to_pylist()
+
+
+def test_json_objects_are_rows_or_messages(session: Any) -> None:
+    given = {"asset": "P0", "t": 1.5, "dt": 0.01, "r": [0.0, 1.0], "u": [2.0, 3.0], "y": [4.0, 5.0]}
+    for known in (given, {"asset": "P1", "t": 1.5, "r": 0.0, "u": 2.0, "y": 4.0}):
+        raw = session.createDataFrame([(json.dumps(known),)], "value string")
+        (row,) = sinks.parse_json(raw, lakes.loop().columns, in_messages="dt" in known).collect()
+        assert row.asDict() == known
 
 
 def test_tiny_batches_of_one_row_in_any_order_change_nothing(session: Any, plan: Plan, tmp_path: Path) -> None:

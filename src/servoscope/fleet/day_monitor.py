@@ -90,7 +90,7 @@ class RowHistory:
         return Rows.concatenate([block.between(after_us, to_us) for block in self.blocks])
 
 
-class _OrderedRows(NamedTuple):
+class _RowOrder(NamedTuple):
     rows: Rows  # without repeated ones
     restart: BoolArray  # which of them do not follow their predecessor by one sample period
 
@@ -128,20 +128,20 @@ class DayMonitor:
         samples = Samples(t, taken.r, taken.u, taken.y, block.restart, taken.channels)
         return self._judge(state, rows, block, self._follower.follow(state, samples), history)
 
-    def _order(self, state: DayState, rows: Rows) -> _OrderedRows:
+    def _order(self, state: DayState, rows: Rows) -> _RowOrder:
         """Return which rows are taken, and which of them do not follow their predecessors."""
         last = state.last_us if state.last_us is not None else rows.t_us[:1] - 10 * round(self._timebase.period)
         steps = np.diff(rows.t_us, prepend=last)
         repeated = self._timebase.is_repeat(steps)
         if repeated.any():
             steps, rows = steps[~repeated], rows[~repeated]
-        return _OrderedRows(rows, self._timebase.is_gap(steps))
+        return _RowOrder(rows, self._timebase.is_gap(steps))
 
     def _judge(
         self,
         state: DayState,
         rows: Rows,
-        ordered: _OrderedRows,
+        ordered: _RowOrder,
         followed: tuple[DayState, Evaluations],
         history: RowLookup,
     ) -> tuple[DayState, EvaluationBlock]:
@@ -201,7 +201,7 @@ class DayMonitor:
         Regular blocks of one length, of monitors of one structure that are in one phase, go through the kernel side by
         side.
         """
-        lanes: dict[Hashable, list[tuple[int, DayStep, _OrderedRows]]] = defaultdict(list)
+        lanes: dict[Hashable, list[tuple[int, DayStep, _RowOrder]]] = defaultdict(list)
         found: dict[int, tuple[DayState, EvaluationBlock] | Exception] = {}
         for i, step in enumerate(steps):
             monitor, state, rows, _ = step

@@ -14,6 +14,7 @@ from servoscope.fleet.common_cause import PRIOR, Prior
 from servoscope.fleet.partition import DAY_US
 from servoscope.fleet.report import write_fleet_report
 from servoscope.fleet.rows import MICRO, required_columns
+from servoscope.fleet.stream_blocks import SAMPLE_TIME
 from servoscope.fleet.stream_shard import SCHEMA
 from servoscope.fleet.summary import Fleet, summarise_fleet
 from servoscope.models.loop import Columns
@@ -53,13 +54,23 @@ def kafka_stream(session: SparkSession, _: str, columns: Columns, options: Mappi
     """Return a stream of JSON objects from Kafka, with ``asset``, a time in seconds since 1970, and the signals.
 
     `session`: with Spark's package for Kafka; `columns`: each signal is one column, not a sum; `options`: of Spark's
-    source, such as ``kafka.bootstrap.servers`` and ``subscribe``.
+    source, such as ``kafka.bootstrap.servers`` and ``subscribe``, and ``messages``: "true" where signals are arrays of
+    a block whose first time and sample time ``dt`` stand beside them.
     """
+    options = dict(options)
+    in_messages = options.pop("messages", "false") == "true"
+    return parse_json(session.readStream.format("kafka").options(**options).load(), columns, in_messages=in_messages)
+
+
+def parse_json(raw: DataFrame, columns: Columns, *, in_messages: bool) -> DataFrame:
+    """Return the JSON objects of the column ``value`` as rows of one sample, or as messages with arrays of signals."""
     from pyspark.sql import functions as F
 
-    names = [columns.time or "t", columns.reference, columns.input, *columns.outputs]
-    schema = ", ".join(["asset string", *(f"`{name.strip('`')}` double" for name in names)])
-    raw = session.readStream.format("kafka").options(**options).load()
+    single = [columns.time or "t", *([SAMPLE_TIME] if in_messages else [])]
+    types = dict.fromkeys(single, "double")
+    kind = "array<double>" if in_messages else "double"
+    types |= dict.fromkeys([columns.reference, columns.input, *columns.outputs], kind)
+    schema = ", ".join(["asset string", *(f"`{name.strip('`')}` {of}" for name, of in types.items())])
     return raw.select(F.from_json(raw["value"].cast("string"), schema).alias("row")).select("row.*")
 
 

@@ -30,8 +30,8 @@ SCHEMA = (
     "kind string, asset string, day string, time_us long, theta array<double>, statistic double, threshold double, "
     "level double, late long, result string"
 )
-CHUNK = 65_536  # rows of one entry of the state, about
-HELD = 16 * CHUNK  # rows that a worker has in memory at a time, about, unless one asset has more
+CHUNK = 8_192  # rows of one entry of the state, about: larger ones cost the collector of the Java machine dearly
+HELD = 128 * CHUNK  # rows that a worker has in memory at a time, about, unless one asset has more
 FAR_PAST = -(2**62)
 
 
