@@ -68,6 +68,7 @@ class ServiceMetrics:
         # of blocks: how many in each bin, and their sum [s]; one by one they would take longer than a kernel
         self._latencies = np.zeros(len(BUCKETS_S) + 1, dtype=np.int64), 0.0
         self._commits = histogram("commit", "Duration of a commit")
+        self._render_s = 0.0  # processor time of `render` so far [s]
         self._rejections = counter("refused", "Messages that could not be used", ["source", "asset", "kind"])
         self.registry.register(self)  # calls `collect`
 
@@ -85,7 +86,10 @@ class ServiceMetrics:
         """Return all of them in the format of Prometheus."""
         from prometheus_client import generate_latest
 
-        return generate_latest(self.registry)
+        start = time.thread_time()
+        text = generate_latest(self.registry)
+        self._render_s += time.thread_time() - start
+        return text
 
     def collect(self) -> Iterator[Metric]:
         """Yield what is read from the service."""
@@ -124,7 +128,7 @@ class ServiceMetrics:
         for name, why in service.troubles.items():
             trouble.add_metric([name], float(bool(why)))
         layers = CounterMetricFamily("servoscope_processor_seconds", "Processor time by layer", labels=["layer"])
-        shares = TotalCounter(service.layers.seconds)
+        shares = TotalCounter({**service.layers.seconds, "metrics": self._render_s})
         for source in service.sources.values():
             shares.update(source.layer_seconds)
         for layer, seconds in shares.items():
