@@ -58,6 +58,10 @@ class BenchmarkResult:
         return {"figures": [asdict(figure) for figure in self.figures], "facts": dict(self.facts)}
 
 
+WHOLE, SELDOM = "everything", "everything, test once per evaluation"
+WARM_UP = 3  # blocks of a fleet before it is measured: until the noise filter is full, fewer samples are tested
+
+
 def benchmark_loop(**monitor: Any) -> Loop:
     """Return the reference rig with other monitor settings."""
     from servoscope.models.loop import Loop
@@ -214,16 +218,20 @@ def _measure_fleet(
     baseline: Baseline, recording: Recording, repeats: int, amount: BenchmarkSize
 ) -> tuple[list[BenchmarkRow], dict[str, float]]:
     from servoscope.diagnosis.monitor import Monitor
+    from servoscope.learning.learn import learn_baseline
 
+    seldom = learn_baseline(benchmark_loop(sequential_step="evaluation"), [recording])
     rng, total = np.random.default_rng(0), amount.fleet * FLEET_SAMPLES
     begin = rng.integers(0, recording.samples - FLEET_SAMPLES, amount.fleet)
     at = begin[:, None] + np.arange(FLEET_SAMPLES)
     jobs: dict[str, Callable[[], object]] = {}
     for precision, number in (("double", np.float64), ("single", np.float32)):
         signals = [signal[at].astype(number) for signal in (recording.r, recording.u, recording.y)]
-        for what, each in (("bare", _without_cusum(baseline)), ("everything", baseline)):
+        for what, each in (("bare", _without_cusum(baseline)), (WHOLE, baseline), (SELDOM, seldom)):
             monitor = Monitor([each] * amount.fleet, precision=precision)  # type: ignore[arg-type]
-            state, _ = monitor.run(monitor.init(), *signals)
+            state = monitor.init()
+            for _ in range(WARM_UP):
+                state, _ = monitor.run(state, *signals)
             name = f"fleet of {amount.fleet}, {precision}, {what}"
 
             def job(m: Any = monitor, s: Any = state, x: Any = signals) -> None:
@@ -273,9 +281,16 @@ def _measure_peers(baseline: Baseline, recording: Recording, repeats: int, amoun
 
 def _compare_fleet_with_peer(figures: list[BenchmarkRow]) -> dict[str, float]:
     """Return how often all of a fleet's sample goes into one update of the best-known peer, if that is installed."""
-    fleet = next(each.processor for each in figures if each.name.endswith("double, everything, 1 core"))
     peer = next((each.processor for each in figures if each.name == "Kalman filter, filterpy"), None)
-    return {} if peer is None else {"filterpy's update over everything of a fleet's sample, one core": peer / fleet}
+    if peer is None:
+        return {}
+    fleets = {
+        what: next(one for one in figures if one.name.endswith(f"double, {what}, 1 core")) for what in (WHOLE, SELDOM)
+    }
+    return {
+        f"filterpy's update over a fleet's sample, {what}, one core": peer / fleet.processor
+        for what, fleet in fleets.items()
+    }
 
 
 def monte_carlo(baseline: Baseline, count: int, seconds: float = 60.0) -> dict[str, float]:
