@@ -144,6 +144,36 @@ def test_samples_go_on_with_the_service_that_follows_their_asset_now(store: Stor
     assert [sequence for sequence, _ in store.recent_samples("press")] == [7, 8, 9]
 
 
+def test_whoever_takes_over_reads_the_rows_that_may_concern_him(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A service on a database of many, which reads its file again, must not look through the samples of all others."""
+    other, read = Feed(store, "hall-1"), list[str]()
+    for _ in range(3):
+        other.write(["press"], {})
+    plain = bundles._read_contents
+    monkeypatch.setattr(bundles, "_read_contents", lambda text: read.append(text) or plain(text))
+    neighbour = next(
+        name for k in range(1000) if bundles.bundle_number(name := f"a{k}") == bundles.bundle_number("press")
+    )
+    for assets, rows_read in (([], 0), ([neighbour], 3)):
+        store.take_over("hall-2", assets)
+        assert len(read) == rows_read
+    assert rows(store, tables.bundles) == 3
+
+
+def test_no_row_is_larger_than_a_database_takes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After an outage a commit has thousands of blocks; SQLite takes no row beyond a gigabyte."""
+    monkeypatch.setattr(bundles, "ROW_BYTES", 1000)
+    feed = Feed(store)
+    for _ in range(3):
+        feed.write(["press", "lift"] * 40, {})
+        feed.check()
+    sizes = [len(samples) for (samples,) in store.fetch_tuples(sa.select(tables.bundles.c.samples))]
+    assert len(sizes) > 20 and max(sizes) < 1200  # and the block that came last
+    feed.write([], {"press": 119, "lift": 120})
+    feed.check()
+    assert rows(store, tables.bundles) == 1
+
+
 def test_a_row_is_deleted_when_nobody_needs_a_block_of_it() -> None:
     index = BundleIndex([])
     (row,) = index.advance([("a", 0, b"x" * 8), ("a", 1, b"y" * 8)], {}).new

@@ -146,6 +146,16 @@ def test_what_is_sent_again_takes_the_place_of_its_earlier_copy() -> None:
     assert acknowledged(bytes(received)) == [11, 12, 13]
 
 
+def test_what_is_too_large_does_not_wait_in_memory() -> None:
+    """It would until its turn: while the store is away as many as may be in flight, each four times the largest."""
+    settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", largest=1024)
+    source = MqttSource(settings, frozenset(["press"]), Path(), "reader")
+    for qos in (0, 1):
+        source._on_message(ReceivedMessage("servoscope/v1/data/press", bytes(1025), qos, 1, False))
+    assert not source._waiting
+    assert [(one.asset, one.kind, one.count) for one in source.rejections.take()] == [("press", "oversized", 2)]
+
+
 def test_the_socket_is_left_alone_until_a_share_of_its_buffer_is_full() -> None:
     """Otherwise a broker that sends faster than that in a pause would wait for us."""
     client = create_bulk_client(BrokerSettings(host="127.0.0.1"), Path(), "reader", lambda one: None)

@@ -6,6 +6,7 @@ import contextlib
 import gzip
 import shutil
 import threading
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -123,6 +124,40 @@ def test_a_backup_is_of_one_moment_while_rows_are_written(store: Store, url: str
         sizes.append(commits)
     assert sizes == sorted(set(sizes)) and sizes[0] >= 30
     assert sorted(one.name for one in tmp_path.iterdir() if "part" in one.name) == []
+
+
+def write_samples(store: Store, commits: int, asset: str, samples: bytes) -> None:
+    """Write a block of an asset with each commit."""
+    index = store.bundle_index("hall")
+    for k in range(commits):
+        batch = Batch(bundles=index.advance([(asset, 1_000_000 + k, samples)], {}))
+        store.write(batch, "hall", store.last_commit("hall") + 1)
+
+
+def test_a_copy_holds_a_few_rows_of_samples_in_memory(store: Store, tmp_path: Path) -> None:
+    """Of a large service each row has megabytes."""
+    write_samples(store, 64, "press", bytes(2**18))
+    tracemalloc.start()
+    try:
+        copied = copy_store(store, str(tmp_path / "copy.sqlite"))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert copied["bundles"] == 64
+    assert peak < 32 * 2**18
+
+
+def test_a_reader_sees_the_tables_that_a_service_adds_meanwhile(tmp_path: Path) -> None:
+    """After an update the pages may be opened before the service, whose tables are of the version before then."""
+    for version in (1, 2):
+        path = str(old_store(tmp_path, version))
+        with (
+            contextlib.closing(Store.open(path)) as reader,
+            contextlib.closing(Store.open(path, write=True)) as service,
+        ):
+            write_samples(service, 1, "press", b"samples")
+            assert reader.has_sizes
+            assert reader.recent_samples("press")[-1] == (1_000_000, b"samples")
 
 
 def test_a_copy_never_replaces_a_history(tmp_path: Path, empty: str) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import random
 import time
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,6 +29,7 @@ from servoscope.service.asset_groups import AssetGroups, BlockResult
 from servoscope.service.build import build_components
 from servoscope.service.checkpoint import pack_state, unpack_state
 from servoscope.service.config import DiagnosisSettings, ServiceFile
+from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.reception import FOLLOWED, Reception
 from servoscope.service.records import StepResult
 from servoscope.service.service import Service
@@ -210,6 +214,37 @@ def test_states_that_waited_are_computed_again_after_a_kill(tmp_path: Path, monk
         for name in ("whole", "cut")
     )
     assert cut == whole
+
+
+class WatchedArray(np.ndarray):
+    """Lets another one look each time that something was written into it."""
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        super().__setitem__(key, value)
+        self.look()
+
+
+def test_metrics_are_read_at_any_moment_of_a_turn(monitors: list[Monitor], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their thread comes between any two steps: the newest evaluations may be of fewer assets than those before."""
+    together = {f"asset{i}": Asset(f"asset{i}", monitors[0].baselines[0], monitors[0], POLICY) for i in range(3)}
+    groups, blocks, texts = AssetGroups(together), streams()["asset0"], list[bytes]()
+    writer_now = SimpleNamespace(unavailable_since=None, waiting=0, capacity=1)
+    service = SimpleNamespace(assets=together, sources={}, troubles={}, layers=groups.layers, writer=writer_now)
+    service.last_turn = time.monotonic()
+    metrics, states = ServiceMetrics(service), groups._fleets[0].states
+    states._evaluations = states._evaluations.view(WatchedArray)
+    monkeypatch.setattr(WatchedArray, "look", lambda _: texts.append(metrics.render()), raising=False)
+    for k, block in enumerate(blocks[:30]):
+        awake = list(together)[1 if k % 3 == 2 else 0 :]  # the last asset is now the third, now the second of a turn
+        turn = [replace(block, asset=name, sequence=int(groups._assets[name].heard) and k) for name in awake]
+        list(groups.process(turn))
+    assert len(texts) > 30
+    assert b'servoscope_blocks_total{asset="asset2"} 30.0' in metrics.render()
+    before = [weakref.ref(one) for one in states._evaluations if one is not None]
+    for asset in together.values():
+        asset.take_state()  # as of one that falls silent
+    gc.collect()
+    assert before and not any(one() for one in before)
 
 
 def test_what_is_measured_now_is_gathered_into_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,13 +67,13 @@ class StateRow(NamedTuple):
         """Time of its last sample [UTC s]."""
         return float(self.states.columns["t"][self.row])
 
-    def read(self, before: AssetState) -> AssetState:
-        """Return the state; `before`: when it came here."""
-        return self.states.read(self.row, before)
+    def read(self, before: AssetState, *, evaluation: bool = True) -> AssetState:
+        """Return the state; `before`: when it came here; `evaluation`: False leaves that as it was then."""
+        return self.states.read(self.row, before, evaluation=evaluation)
 
     def leave(self) -> None:
         """Let the row be empty."""
-        self.states.columns["is_here"][self.row] = False
+        self.states.leave(self.row)
 
 
 class AssetStates:
@@ -98,13 +98,18 @@ class AssetStates:
         self.monitor[row], self.quality[row], self._evaluations[row] = state.monitor, state.quality, None
         return StateRow(self, row)
 
-    def read(self, row: int, before: AssetState) -> AssetState:
-        """Return the state in a row; `before`: as it was put there."""
+    def leave(self, row: int) -> None:
+        """Let a row be empty: an asset that falls silent must not hold the evaluations of all others."""
+        self.columns["is_here"][row] = False
+        self._evaluations[row] = None
+
+    def read(self, row: int, before: AssetState, *, evaluation: bool = True) -> AssetState:
+        """Return the state in a row; `before`: as it was put there; `evaluation`: False leaves that as it was then."""
         one = dict(zip(COLUMNS.names or (), self.columns[row].item(), strict=True))
         if one["blocks"] == before.position.blocks:
             return before
         changed = {key: one[key] for key in ("t", "sequence", "blocks", "digest")}
-        evaluations: LaneEvaluations | None = self._evaluations[row]
+        evaluations: LaneEvaluations | None = self._evaluations[row] if evaluation else None
         history, latest = before.history, before.evaluation
         if evaluations is not None:
             history = HistoryState(int(one["period"]), one["excess"], one["level"])
@@ -158,7 +163,6 @@ class StateHolder:
     """Has the state of one asset: a record, or where this has gone on since."""
 
     def __init__(self) -> None:
-        # another thread may read the state: whatever it finds here is a whole one, if not the newest
         self._state: AssetState | None = None
         self._row: StateRow | None = None
 
@@ -174,6 +178,15 @@ class StateHolder:
         if self._row is not None:
             self._row.leave()
             self._row = None
+
+    @property
+    def visible_state(self) -> AssetState | None:
+        """The state for another thread, while it may change: without its newest evaluation.
+
+        That is in two places, which would not fit together for a moment.
+        """
+        row, state = self._row, self._state  # each of them whole, if not the newest
+        return state if row is None or state is None else row.read(state, evaluation=False)
 
     @property
     def has_state(self) -> bool:

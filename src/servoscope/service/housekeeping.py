@@ -158,6 +158,8 @@ class Housekeeping:
     def _thin_sizes(self) -> None:
         """Thin the sizes of some assets: those of all of them at once would keep blocks waiting."""
         thinned = 0
+        # those of an asset that has gone to another service are thinned there
+        self._to_thin = {name: t for name, t in self._to_thin.items() if name in self._service.assets}
         for name in list(self._to_thin)[:ASSETS_AT_ONCE]:
             thinned += thin_sizes(self._service.store, name, self._to_thin[name], self._thinned.get(name))
             self._thinned[name] = self._to_thin.pop(name)

@@ -98,9 +98,9 @@ class ServiceMetrics:
 
         service, followed = self._service, {}
         for name, asset in self._service.assets.items():
-            if asset.state is not None:
+            if (state := asset.visible_state) is not None:
                 # the newest evaluation takes longer than all else to write down, and is no metric
-                state = evolve(asset.state, evaluation=LatestEvaluation())
+                state = evolve(state, evaluation=LatestEvaluation())
                 followed[name] = state.position, asset.status(state)
         for key, words in STREAM_COUNTERS.items():
             family = CounterMetricFamily(f"servoscope_{key}", words, labels=["asset"])

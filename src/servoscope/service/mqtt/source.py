@@ -163,12 +163,21 @@ class MqttSource(BlockSource):
         """What is wrong with the connection, in words; empty: nothing."""
         return self._broker.trouble
 
+    def _check_size(self, message: ReceivedMessage, waiting: int) -> None:
+        """Raise MessageError if a message is too large to wait in memory, or one too many beside those that do."""
+        if len(message.payload) > self.settings.largest:
+            raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
+        if not message.qos and waiting >= self.settings.in_flight:
+            raise MessageError("overflow", "sent without acknowledgement, faster than it can be processed")
+
     def _on_message(self, message: ReceivedMessage) -> None:
         """Queue a message, in the client's thread."""
-        if not message.qos and len(self._waiting) >= self.settings.in_flight:
+        try:
+            self._check_size(message, len(self._waiting))
+        except MessageError as error:
             asset = topics.parse_asset(message.topic)
-            reason = "sent without acknowledgement, faster than it can be processed"
-            self.rejections.add(asset if asset in self._assets else "", "overflow", reason)
+            self.rejections.add(asset if asset in self._assets else "", error.kind, str(error))
+            self._ack(_AckHandle(message.mid, message.qos, self._connection))
             return
         one = _Arrival(message, self._connection, self._client.empty_at)
         if self._waiting_again:
@@ -189,8 +198,6 @@ class MqttSource(BlockSource):
                 if 0 < len(message.topic) < 1000:
                     self._client.unsubscribe(message.topic)
                 raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
-            if len(message.payload) > self.settings.largest:
-                raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
             decoded = decode_block(asset, message.payload, one.came_at, self._covariates.get(asset, ()))
             self._check_order(decoded)
         except MessageError as error:
@@ -285,10 +292,7 @@ class PlantSource(MessageSource, MqttSource):
         mapping = self._collector.mapping
         acknowledge = partial(self._ack, _AckHandle(message.mid, message.qos, self._connection))
         try:
-            if len(message.payload) > self.settings.largest:
-                raise MessageError("oversized", f"{len(message.payload)} bytes, largest = {self.settings.largest}")
-            if not message.qos and self._collector.waiting >= self.settings.in_flight:
-                raise MessageError("overflow", "sent without acknowledgement, faster than it can be processed")
+            self._check_size(message, self._collector.waiting)
         except MessageError as error:
             self.rejections.add(mapping.find_asset(message.topic), error.kind, str(error))
             acknowledge()

@@ -22,6 +22,7 @@ from servoscope.service.store.rows import Row
 
 BUNDLES = 64  # that all assets are shared out among: whoever reads one asset reads the rows of its bundle
 PATIENCE = 80  # commits: two rounds of checkpoints, after which a row that is needed in part is no longer waited for
+ROW_BYTES = 2**24  # about, at which another row begins: after an outage a commit may have more than a database takes
 RATE_DIGITS = 2  # of the rate of time stamps [Hz]
 
 
@@ -81,21 +82,23 @@ class BundleIndex:
             changes.sparse.append(key)
         # after an outage most of them are old by now
         wanted = [one for one in blocks if one[1] >= first_needed.get(one[0], one[1])]
-        bundles: defaultdict[int, tuple[list[BundlePart], list[bytes]]] = defaultdict(lambda: ([], []))
+        bundles: defaultdict[BundleKey, tuple[list[BundlePart], list[bytes]]] = defaultdict(lambda: ([], []))
+        sizes, newest = defaultdict[int, int](int), self._number  # of each bundle, bytes so far
         for (asset, sequence, _), (stored, regular) in zip(
             wanted, leave_out_times([one[2] for one in wanted]), strict=True
         ):
             bundle = self._bundles.get(asset)
             if bundle is None:
                 bundle = self._bundles[asset] = bundle_number(asset)
-            parts, samples = bundles[bundle]
+            sizes[bundle] += len(stored)
+            parts, samples = bundles[bundle, newest + sizes[bundle] // ROW_BYTES]
             parts.append((asset, sequence, len(stored), regular))
             samples.append(stored)
-        for bundle, (parts, samples) in bundles.items():
-            self._hold((bundle, self._number), parts)
+        for (bundle, number), (parts, samples) in bundles.items():
+            self._hold((bundle, number), parts)
+            self._number = max(self._number, number)
             contents = _write_contents(parts)
-            row = {"bundle": bundle, "number": self._number, "contents": contents, "samples": b"".join(samples)}
-            changes.new.append(row)
+            changes.new.append({"bundle": bundle, "number": number, "contents": contents, "samples": b"".join(samples)})
         return changes
 
     def _hold(self, key: BundleKey, parts: Sequence[BundlePart]) -> None:
@@ -251,7 +254,12 @@ def dissolve_row(connection: sa.Connection, owner: str, key: BundleKey) -> None:
 
 def dissolve_rows_of_others(connection: sa.Connection, owner: str, assets: Collection[str]) -> None:
     """Dissolve the rows of other owners with blocks of these assets: `owner` follows them now."""
-    others = sa.select(*_columns("bundle", "owner", "number", "contents")).where(tables.bundles.c.owner != owner)
-    for bundle, of, number, contents in connection.execute(others).all():
-        if any(asset in assets for asset, *_ in _read_contents(contents)):
-            dissolve_row(connection, of, (bundle, number))
+    theirs = sa.select(*_columns("bundle", "owner", "number", "contents")).where(tables.bundles.c.owner != owner)
+    own = tables.bundles.c.bundle.in_({bundle_number(asset) for asset in assets})
+    found = [
+        (of, (bundle, number))
+        for bundle, of, number, contents in connection.execute(theirs.where(own))
+        if any(asset in assets for asset, *_ in _read_contents(contents))
+    ]
+    for of, key in found:
+        dissolve_row(connection, of, key)

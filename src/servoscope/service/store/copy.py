@@ -14,9 +14,10 @@ from servoscope.core.errors import StoreError
 from servoscope.service.network import NetworkSettings
 from servoscope.service.store import engine
 from servoscope.service.store.store import Store
-from servoscope.service.store.tables import METADATA
+from servoscope.service.store.tables import METADATA, bundles
 
 ROWS_PER_PART = 1000
+BUNDLES_PER_PART = 8  # of a large service such a row has megabytes
 
 
 def copy_store(
@@ -41,9 +42,9 @@ def copy_store(
 
 
 def _copy_rows(reading: sa.Connection, writing: sa.Connection, table: sa.Table) -> int:
-    count = 0
-    rows = reading.execution_options(stream_results=True).execute(sa.select(table)).mappings()
-    for part in rows.partitions(ROWS_PER_PART):
+    count, size = 0, BUNDLES_PER_PART if table is bundles else ROWS_PER_PART
+    rows = reading.execute(sa.select(table), execution_options={"yield_per": size}).mappings()
+    for part in rows.partitions():
         writing.execute(table.insert(), [dict(row) for row in part])
         count += len(part)
     key = table.primary_key.columns.values()[0]

@@ -100,7 +100,7 @@ class Store:
         self._url, self._engine = url, connections
         self._lock: engine.WriterLock | None = None
         self._has_lock = False
-        self.version = 0  # of its tables
+        self._version = 0  # of its tables
 
     @classmethod
     def open(
@@ -145,7 +145,9 @@ class Store:
         Two processes that begin with an empty file lock each other out for a moment, and a reader may see the file
         before its tables. SQLite does not wait there, as one of them would wait for the other for ever.
         """
-        self.version = self._retry(end, lambda connection: schema.create_or_migrate(connection, self.name, write=write))
+        self._version = self._retry(
+            end, lambda connection: schema.create_or_migrate(connection, self.name, write=write)
+        )
 
     def _retry(self, end: float, work: Callable[[sa.Connection], Result]) -> Result:
         """Return what some work in a transaction does, tried until `end`, monotonic [s]."""
@@ -166,7 +168,14 @@ class Store:
     @property
     def has_sizes(self) -> bool:
         """Whether it keeps sizes over time; a store of version 1 does not until servoscope run has opened it."""
-        return self.version >= schema.SIZES_FROM
+        with self._transaction() as connection:
+            return self._has(schema.SIZES_FROM, connection)
+
+    def _has(self, version: int, connection: sa.Connection) -> bool:
+        """Whether its tables are of a version, or of a later one; a service may migrate them under a reader."""
+        if self._version < version:
+            self._version = schema.create_or_migrate(connection, self.name, write=False)
+        return self._version >= version
 
     def acquire_lock(self, assets: Sequence[str]) -> None:
         """Acquire the right to write about these assets and no others, until `close` or the end of the process.
@@ -281,7 +290,7 @@ class Store:
     ) -> Iterator[tuple[str, list[tuple[int, bytes]]]]:
         """Yield each of many assets, in any order, and its recent samples."""
         with self.snapshot() as connection:
-            yield from read_samples(connection, assets, newest, in_bundles=self.version >= schema.BUNDLES_FROM)
+            yield from read_samples(connection, assets, newest, in_bundles=self._has(schema.BUNDLES_FROM, connection))
 
     def bundle_index(self, owner: str) -> BundleIndex:
         """Return which rows hold the samples of an owner's assets."""
