@@ -152,10 +152,10 @@ class TestCheckpoint:
         ):
             checkpoint.unpack_state(other, "press")
 
-    def test_another_baseline_is_refused(self, packed: bytes) -> None:
-        other = replace(checkpoint.unpack_state(packed, "press"), baseline="0123")
-        with pytest.raises(StateError, match=r"belongs to another baseline .* run --anew press"):
-            asset().resume(other, [])
+    def test_another_baseline_or_size_is_refused(self, packed: bytes) -> None:
+        for change, text in (({"baseline": "0"}, "another baseline"), ({"monitor": np.zeros(3)}, "another servoscope")):
+            with pytest.raises(StateError, match=rf"{text} .* run --anew press"):
+                asset().resume(replace(checkpoint.unpack_state(packed, "press"), **change), [])
 
 
 def result(verdict: Verdict, onset: float | None = None, **values: Any) -> StoredDiagnosis:

@@ -183,6 +183,21 @@ def followed(session: Any, plan: Plan, folder: Path, output: Path, store: str | 
                 raise
 
 
+def test_a_checkpoint_is_continued_as_it_was_laid_out_or_not_at_all(session: Any, tmp_path: Path) -> None:
+    from servoscope.core.errors import OutputError
+
+    layout = {"layout": streaming.LAYOUT, "shards": 64}
+    for _ in range(2):
+        sinks.claim_checkpoint(session, str(tmp_path / "new"), layout)
+    for changed, text in (({"shards": 32}, "has 64 shards, the stream 32"), ({"layout": 0}, "of another version")):
+        with pytest.raises(OutputError, match=text):
+            sinks.claim_checkpoint(session, str(tmp_path / "new"), layout | changed)
+    (tmp_path / "old" / "offsets").mkdir(parents=True)
+    (tmp_path / "old" / "offsets" / "0").write_text("v1\n{}\n")
+    with pytest.raises(OutputError, match="of another version"):
+        sinks.claim_checkpoint(session, str(tmp_path / "old"), layout)
+
+
 def items_of(session: Any, output: Path) -> dict[tuple[str, str], dict[str, Any]]:
     rows = sinks.read_results(session, output).where("kind = 'item'").select("result").collect()
     entries = [json.loads(row.result) for row in rows]
@@ -294,6 +309,9 @@ def test_a_killed_driver_goes_on_from_its_checkpoint_and_late_rows_are_counted(
     for asset in ("P0", "P1"):
         put(tmp_path / "in", "1", asset, day_of(Path(plan.lake.location), asset, 1), 50)
     followed(session, plan, tmp_path / "in", tmp_path / "out")
+    frame = sinks.file_stream(session, str(tmp_path / "in"), lakes.loop().columns)
+    with pytest.raises(ServoscopeError, match="has 64 shards, the stream 3: take as many"):
+        sinks.start(streaming.follow(frame, plan.output / "baselines", assets=4, shards=3), tmp_path / "out")
     put(tmp_path / "in", "late", "P1", first["P1"].slice(100, 30), 98)
     the_next_day(tmp_path / "in")
     followed(session, plan, tmp_path / "in", tmp_path / "out")

@@ -99,6 +99,13 @@ def test_a_list_of_another_length_than_its_block_is_missing_and_a_row_without_ti
     assert not np.isnan(rows.y).any()
 
 
+def test_a_message_whose_sample_time_is_missing_or_absurd_is_left_out() -> None:
+    sent = messages(day(0), 10, times=False).slice(0, 5)
+    steps = pa.array([0.01, None, np.nan, 1e30, -1e30])
+    rows = unpacked([sent.set_column(sent.schema.get_field_index("dt"), "dt", steps)])["P0"]
+    assert_same(rows, unpacked([sent.slice(0, 1)])["P0"])
+
+
 def test_columns_are_those_of_rows_or_of_messages() -> None:
     names = ["t", "r", "u", "y"]
     check_lists([], names, "t")
@@ -172,3 +179,21 @@ def test_a_shard_follows_assets_together_as_each_alone_to_the_last_bit() -> None
         assert np.array_equal(np.array(mine[mine.kind == "trace"].theta.tolist()), trace[0].theta)
     verdicts = {json.loads(text)["asset"]: json.loads(text)["diagnosis"]["verdict"] for text in found.result.dropna()}
     assert verdicts["P1"] == "fault" and verdicts["P0"] == "healthy"
+
+
+def test_a_day_whose_baseline_is_learned_again_under_way_fails_alone() -> None:
+    old, new = (learn_baseline(lakes.loop(), [lakes.recorded(i, 0, 15.0)]) for i in (0, 1))
+    head, entries, frames = Memory(), Memory(), []
+    days = {"P0": day(0, 1), "P1": day(1, 1)}
+    first = int(np.datetime64(f"{lakes.DAYS[1]}T06:00:00", "us").astype(np.int64))
+    midnight = (first // DAY_US + 1) * DAY_US
+    for part, own in ((slice(0, 700), old), (slice(700, None), new)):
+        sent = pa.concat_tables([table.take(list(range(table.num_rows))[part]) for table in days.values()])
+        (batch,) = pack_blocks(sent.combine_chunks().to_batches(), "t", COLUMNS, 1)
+        shard = StreamShard(head, entries, head, Baselines.from_source({"P0": own, "P1": new}, 2, 8.0))
+        frames += shard.store_rows([AssetRows.unpack(packed) for packed in batch["rows"].to_pylist()])
+        frames += shard.process_until(midnight if own is new else first + 6_900_000)
+        shard.save()
+    items = {item["asset"]: item for item in map(json.loads, pd.concat(frames).result.dropna())}
+    assert items["P0"]["status"] == "failed" and "its baseline changed during the day" in items["P0"]["error"]
+    assert items["P1"]["status"] == "examined"

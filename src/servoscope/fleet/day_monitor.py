@@ -48,6 +48,7 @@ class EvaluationBlock:
 class DayState(FollowerState):
     """What is kept of a day between two blocks; `samples` are the rows that the monitor processed."""
 
+    baseline: str = ""  # hash of the one that it is followed with
     first_us: int | None = None  # first row of the day [us]
     last_us: int | None = None  # last row so far [us]
     repeats: int = 0  # rows with the time of an earlier one
@@ -111,7 +112,7 @@ class DayMonitor:
 
     def start(self) -> DayState:
         """Return the state before the first row of a day."""
-        return DayState(monitor=self._follower.init())
+        return DayState(monitor=self._follower.init(), baseline=self.baseline.hash)
 
     def needed_since(self, state: DayState) -> int:
         """Return the time [us] up to which rows are not needed any more."""

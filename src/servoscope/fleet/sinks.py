@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from servoscope.core.errors import RecordingError, ServoscopeError
+from servoscope.core.errors import OutputError, RecordingError, ServoscopeError
 from servoscope.fleet.common_cause import PRIOR, Prior
 from servoscope.fleet.partition import DAY_US
 from servoscope.fleet.report import write_fleet_report
@@ -102,26 +102,61 @@ def start(
 
     Raises
     ------
+    OutputError
+        If the checkpoint belongs to another version of servoscope, or to another number of shards.
     StoreError
         If the store cannot be used.
     """
+    folder = str(checkpoint or f"{output}/checkpoint")
+    claim_checkpoint(followed.sparkSession, folder, followed.schema["kind"].metadata)
     if store is not None:
         from servoscope.service.store import Batch, Store  # late: it needs an extra of its own
 
         history = Store.open(store, write=True)
 
     def write(batch: DataFrame, number: int) -> None:
-        folder = f"{output}/results/batch={number:09d}"
-        batch.write.mode("overwrite").partitionBy("kind").parquet(folder)
+        results = f"{output}/results/batch={number:09d}"
+        batch.write.mode("overwrite").partitionBy("kind").parquet(results)
         if store is not None and history.last_commit(OWNER) <= number:
-            items = batch.sparkSession.read.schema(SCHEMA).parquet(folder).where("kind = 'item'").select("result")
+            items = batch.sparkSession.read.schema(SCHEMA).parquet(results).where("kind = 'item'").select("result")
             rows: list[Row] = [_diagnosis_row(json.loads(row.result)) for row in items.collect()]
             history.write(Batch(rows={"diagnoses": rows}), OWNER, number + 1)
 
     writer = followed.writeStream.foreachBatch(write).outputMode("append")
-    writer = writer.option("checkpointLocation", str(checkpoint or f"{output}/checkpoint"))
+    writer = writer.option("checkpointLocation", folder)
     trigger: dict[str, Any] = {"availableNow": True} if every_s is None else {"processingTime": f"{every_s:g} seconds"}
     return writer.trigger(**trigger).start()
+
+
+def claim_checkpoint(session: SparkSession, folder: str, layout: Mapping[str, int]) -> None:
+    """Write into a new checkpoint how its state is laid out, or compare with what is written there.
+
+    Spark would go on with whatever it finds: assets that another number of shards puts elsewhere would begin anew.
+
+    Raises OutputError if it is laid out otherwise.
+    """
+    from pyspark.errors import AnalysisException
+    from pyspark.sql import functions as F
+
+    def lines(path: str) -> list[str]:
+        try:
+            return [row.value for row in session.read.text(path).collect()]
+        except AnalysisException:  # there is none
+            return []
+
+    found, otherwise = lines(f"{folder}/servoscope"), "begin in another folder after a day is over"
+    if not found and not lines(f"{folder}/offsets"):
+        text = F.lit(json.dumps(dict(layout))).alias("value")
+        session.range(1).select(text).write.mode("overwrite").text(f"{folder}/servoscope")
+        return
+    known = json.loads(found[0]) if found else {}
+    if known.get("layout") != layout["layout"]:
+        raise OutputError(f"{folder}: this checkpoint is of another version: go on with that one, or {otherwise}")
+    if known != layout:
+        raise OutputError(
+            f"{folder}: this checkpoint has {known['shards']} shards, the stream {layout['shards']}: take as many, "
+            f"or {otherwise}"
+        )
 
 
 def _diagnosis_row(entry: Mapping[str, Any]) -> dict[str, Any]:

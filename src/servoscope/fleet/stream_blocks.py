@@ -14,7 +14,7 @@ from servoscope.core.arrays import IntArray
 from servoscope.core.errors import RecordingError
 from servoscope.fleet.rows import MICRO, Rows, covariates_from_table, signals_from_table, time_from_table
 from servoscope.models.loop import Columns
-from servoscope.signals.readers.table import Table
+from servoscope.signals.readers.table import Table, number_column
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -23,6 +23,7 @@ BLOCKS = "shard int, last_us long, rows binary"  # rows of the assets of a shard
 KEYS = ("asset", "baseline_of")
 ONES = np.uint64(0x0101010101010101)
 SAMPLE_TIME = "dt"  # [s], the column of messages whose time is that of their first sample
+LONGEST = 86_400.0  # s of a message; what claims more would set the clock of the whole stream
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +114,9 @@ def _flatten(batch: pa.RecordBatch, time: str, columns: Columns) -> tuple[IntArr
     t_us, known = time_from_table(table, columns)
     if lists and time not in lists:
         number = np.arange(len(t_us)) - np.repeat(np.cumsum(counts) - counts, counts)
-        t_us = t_us + np.rint(number * np.asarray(flat[SAMPLE_TIME]) * MICRO).astype(np.int64)
+        step = number_column(table, SAMPLE_TIME, "sample time")
+        known &= np.abs(step) * np.repeat(counts, counts) < LONGEST  # not so where there is none
+        t_us = t_us + np.rint(number * np.where(known, step, 0.0) * MICRO).astype(np.int64)
     rows = Rows(t_us, *signals_from_table(table, columns), covariates_from_table(table, columns))
     if known.all():
         return counts, rows

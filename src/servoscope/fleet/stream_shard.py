@@ -12,13 +12,14 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from servoscope.core.errors import ServoscopeError
+from servoscope.core.errors import BaselineError, ServoscopeError
 from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.day_monitor import DayMonitor, DayState, DayStep, EvaluationBlock
 from servoscope.fleet.partition import DAY_US, day_name
@@ -116,12 +117,12 @@ class StreamShard:
         for block in blocks:
             for asset, baseline, rows in block.split():
                 state = self._states.setdefault(asset, StreamState())
-                state.baseline = baseline
                 behind = rows.t_us <= state.processed_until_us
                 if behind.any():
                     late.update((asset, day) for day in (rows.t_us[behind] // DAY_US).tolist())
                     rows = rows[~behind]
                 if len(rows):
+                    state.baseline = baseline
                     waiting[asset].append(rows)
                     held += len(rows)
             if held >= HELD:
@@ -182,7 +183,7 @@ class StreamShard:
                     yield self._close_day(asset, state)
                 state.day = day
                 try:
-                    monitor = self._baselines.day_monitor(state.baseline)
+                    monitor = self._day_monitor(state)
                 except Exception as error:  # garbage of one asset must not end the stream
                     state.error = state.error or error_text(error)
                 if not state.error:
@@ -204,9 +205,17 @@ class StreamShard:
             if state.day is not None and until_us >= (state.day + 1) * DAY_US:
                 yield self._close_day(asset, state)
             keep = until_us
-            if state.state is not None and state.day is not None and not state.error:
-                keep = min(keep, self._baselines.day_monitor(state.baseline).needed_since(state.state))
+            if state.state is not None and not state.error:
+                with suppress(BaselineError):  # a day that cannot go on needs no rows, and says so when it is over
+                    keep = min(keep, self._day_monitor(state).needed_since(state.state))
             state.blocks = {number: ends for number, ends in state.blocks.items() if ends[1] > keep}
+
+    def _day_monitor(self, state: StreamState) -> DayMonitor:
+        """Return the monitor of a day; raises BaselineError if there is none, or the day began with another."""
+        monitor = self._baselines.day_monitor(state.baseline)
+        if state.state is not None and state.state.baseline != monitor.baseline.hash:
+            raise BaselineError("its baseline changed during the day: the new one begins with the next day")
+        return monitor
 
     def _trace_frame(self, evaluations: Mapping[str, EvaluationBlock]) -> Any:
         blocks, counts = list(evaluations.values()), [len(block.t_us) for block in evaluations.values()]
@@ -233,7 +242,7 @@ class StreamShard:
         try:
             if state.error or state.state is None:
                 raise ServoscopeError(state.error)
-            monitor = self._baselines.day_monitor(state.baseline)
+            monitor = self._day_monitor(state)
             result = day_result(monitor, monitor.finish(state.state, partial(self._rows, asset)))
         except Exception as error:
             result = failed_result(error)

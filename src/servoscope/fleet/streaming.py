@@ -29,6 +29,7 @@ PARTITIONS = "spark.sql.shuffle.partitions"
 DEFAULT_PARTITIONS = "200"  # Spark's own: of a small stream, most would be empty, and each costs a task per batch
 PARTITIONS_PER_CORE = 3
 SHARDS = 64
+LAYOUT = 1  # of keys and states in a checkpoint: raised when one of them changes its meaning
 
 
 def follow(
@@ -80,6 +81,7 @@ def follow(
         If a column is missing, or the session's time zone is not UTC.
     """
     from pyspark.sql import functions as F
+    from pyspark.sql.types import StructType
 
     session = frame.sparkSession
     if session.conf.get("spark.sql.session.timeZone") not in ("UTC", "Etc/UTC", "GMT", "Z"):
@@ -102,8 +104,10 @@ def follow(
     marked = blocks.select("*", last).withWatermark("_at", f"{round(delay_s * 1e3)} milliseconds")
     # without the column that bears the watermark Spark drops no late row unseen: they are counted here, by asset
     rows = marked.select("shard", "rows")
+    schema = StructType.fromDDL(SCHEMA)
+    schema["kind"].metadata = {"layout": LAYOUT, "shards": shards}  # for `sinks.start`, which knows the checkpoint
     processor = _create_processor(known)
-    return rows.groupBy("shard").transformWithStateInPandas(processor, SCHEMA, "append", "eventtime")
+    return rows.groupBy("shard").transformWithStateInPandas(processor, schema, "append", "eventtime")
 
 
 def _set_partitions(session: SparkSession, assets: int) -> None:

@@ -118,12 +118,13 @@ class Asset(StateHolder):
         """Continue from a checkpoint; `stored`: the blocks in the store, under the store's numbers.
 
         Returns those that were counted after the checkpoint, for `process`: they lead to nothing but the state after
-        them. Raises StateError if it belongs to another baseline.
+        them. Raises StateError if it belongs to another baseline or layout.
         """
+        other = "belongs to another baseline" if state.baseline != self.baseline.hash else "is of another servoscope"
         if state.baseline != self.baseline.hash or state.monitor.shape != self.monitor.init().shape:
             raise StateError(
-                f"{self.name}: its saved state belongs to another baseline ({state.baseline}, now "
-                f"{self.baseline.hash}): run --anew {self.name} begins with a new state, behind the samples counted"
+                f"{self.name}: its saved state {other} ({state.baseline}, now {self.baseline.hash}): "
+                f"run --anew {self.name} begins with a new state, behind the samples counted"
             )
         t = state.position.t
         alarms = self._alarms.begin(self.name, t, state.alarms)
