@@ -284,19 +284,20 @@ class Monitor:
 
         Read it with `latest`. NaN in any of the three is a gap.
         """
-        if self._sides.first.covariates is not None:
-            raise RecordingError("step knows no covariates, which this baseline has: use run")
         if self._step is None or len(state) != self._size or state.ndim != 1:
+            if self._sides.first.covariates is not None:
+                raise RecordingError("step knows no covariates, which this baseline has: use run")
             if state.shape != self._shape or self.fleet or self._single_precision:
                 raise RecordingError(
                     "step follows one asset: give the state of a monitor with one baseline, or use run"
                 )
             self._step, self._step_constants = self._groups[0][1].stepper
-        one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
-        self._follow_sides(state[None, :], list(one), gap, {})
-        if self._prefix_size:
-            u = float(self._apply_input_stages(state[None, :], one[0], one[1], one[2], gap)[0, 0])
-            state = state[self._prefix_size :]
+        if self._prefix_size or self._size > self._side_at:  # arrays of one number take longer than the step itself
+            one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
+            self._follow_sides(state[None, :], list(one), gap, {})
+            if self._prefix_size:
+                u = float(self._apply_input_stages(state[None, :], one[0], one[1], one[2], gap)[0, 0])
+                state = state[self._prefix_size :]
         return self._step(self._step_constants, state, r, u, y)
 
     def _apply_input_stages(
