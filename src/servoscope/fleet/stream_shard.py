@@ -102,7 +102,8 @@ class StreamShard:
 
     def save(self) -> None:
         """Save the states, and set the timer: for the first row that waits, or the end of a day that is open."""
-        due = min((each.due_us for each in self._states.values() if each.due_us is not None), default=None)
+        times = [each.due_us for each in self._states.values()]
+        due = min((time for time in times if time is not None), default=None)
         if due is not None:
             self._handle.registerTimer(due // 1000 + 1)
         packed = {asset: state.pack() for asset, state in self._states.items()}

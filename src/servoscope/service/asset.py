@@ -215,10 +215,9 @@ class Asset(StateHolder):
 
     def keep(self, sequence: int, block: Block, packed: bytes) -> None:
         """Keep the samples of a quiet block, stored under this number, whose state is there."""
-        assert self._state is not None
         last = block.t.item(-1)
         self._window.append(sequence, block.t.item(0), last, block.t.size, packed)
-        self._window.trim(last, self._state.pending_diagnoses)
+        self._window.trim(last, self.pending_diagnoses)
 
     def _leave_out(self, block: Block, kind: Literal["late", "future"], **seconds: float) -> StepResult:
         """Count a block that is left out for its time stamps; its place in its stream has passed."""
@@ -235,15 +234,16 @@ class Asset(StateHolder):
     def advance_time(self, elapsed_s: float) -> StepResult:
         """Advance the asset's clock without a block: after a while, silence is an alarm."""
         self._result = StepResult([], [])
-        if self.state is None:
+        if not self.has_state:
             return self._result
-        now = self.state.position.t + elapsed_s
+        state = self.take_state()
+        now = state.position.t + elapsed_s
         # before its first block it waits: that is told by its reception, and not as the silence of a sensor
-        quality_state, changed = self.state.quality, tuple[quality.QualityFinding, ...]()
+        quality_state, changed = state.quality, tuple[quality.QualityFinding, ...]()
         if self.heard:
-            quality_state, changed = quality.tick(self._limits, self.state.quality, now)
+            quality_state, changed = quality.tick(self._limits, state.quality, now)
             self._ticked |= bool(changed)
-        self.state = replace(self.state, quality=quality_state)
+        self.state = replace(state, quality=quality_state)
         if changed or not self.heard or "silent" in quality.active_findings(quality_state):
             self._advance_alarms(now)
         return self._result
@@ -265,9 +265,7 @@ class Asset(StateHolder):
 
         `started`: asset and window of those that are not asked for again.
         """
-        if self._state is None or not self._state.pending_diagnoses:
-            return []
-        t, after_s, pending = self.t, self._schedule.after, self._state.pending_diagnoses
+        t, after_s, pending = self.t, self._schedule.after, self.pending_diagnoses
         # complete, or never to be because the clock was set back
         ready = [window for window in pending if ended or not window.until - after_s <= t < window.until]
         return [

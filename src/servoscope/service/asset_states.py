@@ -16,6 +16,7 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, IndexArray
 from servoscope.service.block_lanes import LaneEvaluations, LanesOutput
 from servoscope.service.checkpoint import AssetState, evolve
+from servoscope.service.examination_schedule import PendingDiagnosis
 from servoscope.service.residual_history import HistoryState
 from servoscope.service.store.rows import SIZE_EVERY_S
 from servoscope.signals import quality
@@ -192,6 +193,11 @@ class StateHolder:
     def has_state(self) -> bool:
         """Whether it has begun."""
         return self._state is not None
+
+    @property
+    def pending_diagnoses(self) -> tuple[PendingDiagnosis, ...]:
+        """The full diagnoses that it waits for; quiet blocks ask for none, so that the record knows them."""
+        return () if self._state is None else self._state.pending_diagnoses
 
     def take_state(self) -> AssetState:
         """Return the state, and let it be nowhere else."""

@@ -72,7 +72,7 @@ class Service:
         self.assets, self.notifier = components.assets, components.notifier
         self._groups, self._publishers = components.groups, components.publishers
         # those of which a full diagnosis may be pending, in order
-        self._awaiting = {name: None for name, one in self.assets.items() if one.state and one.state.pending_diagnoses}
+        self._awaiting = {name: None for name, one in self.assets.items() if one.pending_diagnoses}
 
     def reload(self, path: Path) -> None:
         """Change to what the service file says now, soon; for a signal's handler or another thread."""
@@ -202,7 +202,7 @@ class Service:
                 continue
             block, result = found
             asset = self.assets[block.asset]
-            if asset.state is not None and asset.state.pending_diagnoses:
+            if asset.pending_diagnoses:
                 self._awaiting[asset.name] = None
             if isinstance(result, ServoscopeError):
                 log("error", "block refused", asset=block.asset, sequence=block.sequence, why=str(result))
@@ -241,7 +241,7 @@ class Service:
         """Start the full diagnoses that are due, and take the results of those that are done."""
         for name in list(self._awaiting):
             asset = self.assets[name]
-            if asset.state is None or not asset.state.pending_diagnoses:
+            if not asset.pending_diagnoses:
                 del self._awaiting[name]
             for window, blocks in asset.due_diagnoses(ended=ended, started=self._diagnosis_jobs):
                 self._diagnosis_jobs[name, window] = self._diagnosis_worker.submit(asset.baseline, name, blocks)
