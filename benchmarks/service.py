@@ -39,6 +39,7 @@ START_S = 300.0  # in which a service begins
 SILENT_S = 30.0  # without a block that is counted: the rest is lost
 AHEAD = 20  # blocks of each asset that are sent and not yet counted, where they are sent as fast as they are taken
 WARM_BLOCKS = 10  # of each asset, before anything is counted: filters, first verdicts, memory
+STRETCH = 300  # blocks of each asset: a longer run in true time is also shown by such stretches
 TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
@@ -219,8 +220,21 @@ def kernel_time(monitor: Monitor, recording: ss.Recording) -> float:
     return best / 6000
 
 
-def measure(case: Case) -> tuple[Table, tuple[str, ...]]:
-    """Run broker, service and sender; return the table by layer, and the case's row of the overview."""
+class Measurement(NamedTuple):
+    """What a case cost."""
+
+    layers: Table
+    row: tuple[str, ...]  # of the overview
+    stretches: Table  # without rows: the run was short
+
+
+def stretch_row(minute: float, before: Counter[str], after: Counter[str]) -> tuple[str, ...]:
+    """Return what a stretch of a run, which begins at `minute`, shows of its latency."""
+    return f"{minute:g}", *(f"{quantile(before, after, share):g} s" for share in (0.5, 0.99, 0.999, 1.0))
+
+
+def measure(case: Case) -> Measurement:
+    """Run broker, service and sender."""
     program, server_programs = mosquitto(), programs() if case.postgres else None
     if program is None or (case.postgres and server_programs is None):
         raise SystemExit("mosquitto or PostgreSQL is not on this machine: scripts/install-test-servers installs them")
@@ -252,6 +266,9 @@ def measure(case: Case) -> tuple[Table, tuple[str, ...]]:
             pids = service.pid, broker.pid, feeder.pid
             before, begin = wait_for_blocks(listen, feeder, assets * WARM_BLOCKS, stored=False), time.monotonic()
             spent = [processor_time(pid) for pid in pids]
+            looks = [before]
+            for sent in range(WARM_BLOCKS + STRETCH, blocks, STRETCH) if case.speed else ():
+                looks.append(wait_for_blocks(listen, feeder, assets * sent, stored=False))
             after = wait_for_blocks(listen, feeder, assets * blocks, stored=True)
             seconds, report = time.monotonic() - begin, feeder.report
             used, broker_used, own = (processor_time(pid) - earlier for pid, earlier in zip(pids, spent, strict=True))
@@ -270,14 +287,14 @@ def measure(case: Case) -> tuple[Table, tuple[str, ...]]:
         raise SystemExit("all blocks came before the first look: more --blocks are needed")
     prefix = 'servoscope_processor_seconds_total{layer="'
     layers = {key.split('"')[1]: after[key] - before[key] for key in after if key.startswith(prefix)}
-    receive, looks = layers.pop("receive", 0.0), layers.pop("metrics", 0.0)
-    used -= looks  # a list of all assets every second or two is the benchmark's doing
+    receive, listing = layers.pop("receive", 0.0), layers.pop("metrics", 0.0)
+    used -= listing  # a list of all assets every second or two is the benchmark's doing
     rows = [(layer, spent) for layer, spent in layers.items()]
     rows += [
         ("the client, with its acknowledgements", receive),
         ("the service, without the client", used - receive),
         ("the service, all of it", used),
-        ("its metrics, as often as this benchmark asks for them", looks),
+        ("its metrics, as often as this benchmark asks for them", listing),
         ("the broker", broker_used),
         ("the sender", own),
     ]
@@ -297,7 +314,14 @@ def measure(case: Case) -> tuple[Table, tuple[str, ...]]:
     )
     per_sample = (f"{1e6 * spent / samples:.2f}" for spent in (used - receive, used))
     row = case.words, *per_sample, f"{used / samples / kernel:.0f}", p50, p99, load
-    return Table("A sample through the service", note, ("layer", "time", "over the kernel"), tuple(cells)), row
+    pairs = enumerate(zip(looks, [*looks[1:], after], strict=True))
+    stretches = tuple(stretch_row(k * STRETCH / 60.0, *pair) for k, pair in pairs)
+    columns = "from minute", "p50", "p99", "p99.9", "largest"
+    return Measurement(
+        Table("A sample through the service", note, ("layer", "time", "over the kernel"), tuple(cells)),
+        row,
+        Table("Latency in the course of the run", case.words, columns, stretches[: len(stretches) * (len(looks) > 1)]),
+    )
 
 
 if __name__ == "__main__":
@@ -319,5 +343,6 @@ if __name__ == "__main__":
     measured = [measure(one) for one in cases]
     columns = ("assets", "without the client, us", "service, us", "over the kernel", "p50", "p99", "load")
     note = "Processor time of the service per sample; latency from the last sample of a block to its results stored."
-    rows = tuple(row for _, row in measured)
-    show([measured[0][0], Table("The service end to end", note, columns, rows)], given.json, {})
+    rows = tuple(one.row for one in measured)
+    stretches = [one.stretches for one in measured if one.stretches.rows]
+    show([measured[0].layers, *stretches, Table("The service end to end", note, columns, rows)], given.json, {})
