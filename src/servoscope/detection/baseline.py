@@ -24,7 +24,7 @@ from servoscope.detection.expectation import NO_REFERENCE, BaselineRun, Expectat
 from servoscope.detection.feature_model import FeatureModel
 from servoscope.detection.learned_fault import LearnedFault
 from servoscope.detection.motion import MotionRange
-from servoscope.detection.plant_fit import match_ratios
+from servoscope.detection.plant_fit import fault_directions, match_ratios
 from servoscope.detection.sensors import SensorModel
 from servoscope.detection.threshold_calibration import CalibrationFactors, t2_threshold
 from servoscope.estimation.filter_bank import nominal_theta
@@ -304,6 +304,11 @@ class Baseline(ShortRepr, BaselineMemory):
         if under is not None:
             heard = worst_case_hypotheses(under, self.plant, self.loudest, np.array(self.ratios_covariance), heard)
         return build_cusum_constants(pipeline, self.plant, noise, np.array(self.scale), heard, budget)
+
+    @cached_property
+    def fault_directions(self) -> dict[str, FloatArray]:
+        """What a relative change of each parameter adds to the healthy coefficients, each of shape (n,)."""
+        return fault_directions(self.loop, self.plant, np.array(self.theta))
 
     @cached_property
     def bias(self) -> FloatArray:

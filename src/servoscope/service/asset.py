@@ -360,8 +360,9 @@ class Asset(StateHolder):
     def _examine(self) -> None:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self._current, self.policy.diagnosis
-        t, features, fault = state.position.t, state.evaluation.features, single_fault(state.examination.faults)
-        if is_at_rest(state.examination, t, state.evaluation.exceeded):
+        t, known = state.position.t, state.examination
+        details = state.evaluation.features, single_fault(known.faults), known.verdict
+        if is_at_rest(known, t, state.evaluation.exceeded):
             return
         recent = partial(self._window.after, t - settings.window_s)
         examination, result = update_examination(
@@ -369,7 +370,7 @@ class Asset(StateHolder):
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, self._carry_covariates(recent()), features, fault),
+            lambda: examine_blocks(self.baseline, self.name, self._carry_covariates(recent()), *details),
             self._phase,
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )

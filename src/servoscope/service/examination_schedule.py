@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from servoscope.core.messages import message, render
+from servoscope.detection.result import Verdict
 from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.examination import StoredDiagnosis
@@ -39,7 +40,7 @@ class ExaminationState:
     """What is kept between two examinations; times are [UTC s]."""
 
     due: float  # the next one
-    verdict: str = "undetermined"  # of the last one
+    verdict: Verdict = "undetermined"  # of the last one
     summary: str = field(default_factory=lambda: render(message("service.examination.none")))
     since: float = 0.0  # since when the verdict holds
     onset: float | None = None  # since when the fault is there
