@@ -1,4 +1,4 @@
-"""Examinations of a service: whatever is spared on the way to them, they say what a full one says, bit for bit."""
+"""Examinations of a service: what is spared on the way to them changes no bit, and they never come all at once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from servoscope.diagnosis.diagnose import diagnose_examination
 from servoscope.diagnosis.examine import Examination
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
-from servoscope.service.examination import StoredDiagnosis, blocks_to_recording, examine_blocks
+from servoscope.service.config import DiagnosisSettings
+from servoscope.service.examination import StoredDiagnosis, blocks_to_recording, examine_blocks, undetermined
+from servoscope.service.examination_schedule import FIRST_PER_S, ExaminationState, update_examination
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, spikes, time_axis
 from servoscope.simulation import FaultEvent, reference, simulate
@@ -193,3 +195,28 @@ def test_what_is_whitened_is_what_lapack_makes_of_it() -> None:
     covariance[7, 2] = covariance[7, 1]
     with pytest.raises(np.linalg.LinAlgError):
         whiten(-covariance, deviation)
+
+
+@pytest.mark.parametrize("assets", [1, 1000, 6000, 20_000])
+@pytest.mark.parametrize("begin", [START, START + 211.7])
+def test_assets_that_begin_together_are_examined_one_after_the_other(assets: int, begin: float) -> None:
+    settings, found = DiagnosisSettings(), undetermined("none").model_copy(update={"verdict": "healthy"})
+    times: list[list[float]] = [[], [], []]
+    for phase in np.random.default_rng(1).permutation((np.arange(assets) + 0.5) / assets).tolist():
+        state = ExaminationState.begin(begin, settings, phase, assets)
+        for each in times:
+            t = state.due
+            each.append(t - begin)
+            early, nothing = update_examination(state, settings, t - 1e-3, False, lambda: found, phase)
+            state, result = update_examination(state, settings, t, False, lambda: found, phase)
+            assert (early, nothing, result) == (early, None, found)
+            assert settings.every_s / 2.0 <= state.due - t <= 1.5 * settings.every_s
+    first, second, third = map(np.array, times)
+    span = min(max(assets / FIRST_PER_S, settings.window_s), settings.every_s)
+    assert settings.window_s <= first.min() and first.max() <= settings.window_s + span
+    np.testing.assert_allclose(third, second + settings.every_s, atol=1e-5)  # at their places from then on
+    if span == settings.every_s:
+        np.testing.assert_allclose(second, first + settings.every_s, atol=1e-5)
+    most = max(assets / span, assets / settings.every_s)
+    for several in (first, np.concatenate([second, third])):
+        assert np.bincount((several // 30.0).astype(int)).max() <= 30.0 * most + 2.0

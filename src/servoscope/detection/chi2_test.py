@@ -89,7 +89,7 @@ def whiten(covariance: FloatArray, deviation: FloatArray) -> FloatArray:
 
 def t2_statistic(theta: FloatArray, expected: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return ``T^2 = (theta - mu)' Cov^-1 (theta - mu)``, shape (K,)."""
-    return np.asarray((whiten(covariance, theta - expected) ** 2).sum(axis=-1))
+    return _sum_of_squares(whiten(covariance, theta - expected))
 
 
 def noncentrality(covariance: FloatArray, Psi: FloatArray, directions: FloatArray) -> FloatArray:
@@ -102,7 +102,15 @@ def noncentrality(covariance: FloatArray, Psi: FloatArray, directions: FloatArra
     (K, m).
     """
     moved = (np.eye(Psi.shape[-1]) - Psi) @ directions.T
-    return np.asarray((whiten(covariance, moved) ** 2).sum(axis=-2))
+    return _sum_of_squares(whiten(covariance, moved))
+
+
+def _sum_of_squares(white: FloatArray) -> FloatArray:
+    """Return the sums over the components of deviations (K, n) or (K, n, m), shape (K,) or (K, m)."""
+    total = white[:, 0] ** 2
+    for i in range(1, white.shape[1]):  # a few columns of many evaluations: NumPy's sum takes three times as long
+        total += white[:, i] ** 2
+    return np.asarray(total)
 
 
 @dataclass(frozen=True)

@@ -214,11 +214,10 @@ def diagnose_examination(
 ) -> tuple[Diagnosis, BiasCorrection | None]:
     """Return the diagnosis of an examination, and how its estimates become those of the actuator itself."""
     recording, baseline, last = exam.recording, exam.baseline, exam.evaluations - 1
-    alarm = first_alarm(exam, progress)
+    alarm, at, features = first_alarm(exam, progress), last, exam.features
     verdict: Verdict = "fault"
     intervals: tuple[FaultInterval, ...] = ()
     onset: Onset | None = None
-    at, features = last, exam.features
     changed = features.changed if features is not None else None
     if alarm is not None:
         at = alarm.evaluation

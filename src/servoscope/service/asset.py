@@ -56,6 +56,7 @@ class AssetPolicy:
     residual_every_s: float
     prognosis: PrognosisSettings = field(default_factory=PrognosisSettings)
     limits: AssetLimits = field(default_factory=dict)
+    assets: int = field(default=1, compare=False)  # of the process: one more changes nothing for the others
 
 
 class NextBlock(NamedTuple):
@@ -143,14 +144,13 @@ class Asset(StateHolder):
         """Begin with a new state, before the first sample or behind those that were counted."""
         before = {} if self.heard or self.state is None else self.state.alarms_now
         standing = {name: one for name, one in before.items() if one.sequence}
-        due = position.t + self.policy.diagnosis.window_s * (1.0 + self._phase)
         self.state = AssetState(
             asset=self.name,
             baseline=self.baseline.hash,
             position=position,
             monitor=self.monitor.init(),
             quality=quality.init_state(),
-            examination=ExaminationState(due=due, since=position.t),
+            examination=ExaminationState.begin(position.t, self.policy.diagnosis, self._phase, self.policy.assets),
             # those that stand since before the first block go on
             alarms=self._alarms.begin(self.name, position.t, standing),
         )

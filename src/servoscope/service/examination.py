@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,9 @@ from servoscope.signals import Recording, clean
 
 if TYPE_CHECKING:  # its kernels are loaded when something is examined
     from servoscope.diagnosis.examine import Examination
+
+
+KERNEL_SAMPLES = 400  # that bring all kernels of an examination to work
 
 
 class StoredDiagnosis(BaseModel):
@@ -122,6 +126,16 @@ def examine_blocks(
     headline = message("service.examination.fault", excess=excess, level=level if baseline.members else None)
     size = _follow_size(exam, fault, first) if fault is not None else None
     return StoredDiagnosis(verdict="fault", headline=headline, onset=onset, size=size)
+
+
+def compile_examination(baseline: Baseline) -> None:
+    """Examine some noise, so that samples do not wait for the compiler while an asset is first examined."""
+    t = np.arange(KERNEL_SAMPLES) / baseline.loop.sample_rate
+    covariates = np.zeros((0, 1)) if baseline.covariates is None else baseline.covariates.origin[:, None]
+    signals = np.random.default_rng(0).normal(size=(3, t.size))
+    held = np.tile(covariates[: len(baseline.logged_covariates)], t.size)
+    with contextlib.suppress(ArithmeticError, np.linalg.LinAlgError):  # of numbers that mean nothing
+        examine_blocks(baseline, "", [Block.from_signals("", 0, np.concatenate([t[None], signals, held]))])
 
 
 def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | None:
