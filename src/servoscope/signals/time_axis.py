@@ -117,8 +117,9 @@ def _as_it_stands(t: FloatArray, sample_rate: float | None) -> TimeAxis | None:
     """Return the axis of one run whose steps are all alike, as most are; None where there may be more to say of it."""
     if not 2 < t.size <= outofcore.CHUNK_ROWS or not max(abs(t[0]), abs(t[-1])) < MAX_TIME_S:
         return None
-    steps = t[1:] - t[:-1]
-    mean, least, most = float(steps.mean()), float(steps.min()), float(steps.max())
+    with np.errstate(invalid="ignore", over="ignore"):  # of stamps that are no numbers
+        steps = t[1:] - t[:-1]
+        mean, least, most = float(steps.mean()), float(steps.min()), float(steps.max())
     if not 0.9 * mean < least <= most < 1.1 * mean:
         return None
     rate = _to_rate(steps.size, float(steps.sum()))
