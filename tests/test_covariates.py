@@ -12,6 +12,7 @@ import servoscope as ss
 from commands import run
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
+from servoscope.detection import plant_fit
 from servoscope.detection.covariates import CovariateAverage, CovariateModel, hold_last
 from servoscope.export.constants import ExportConstants
 from servoscope.signals import writers
@@ -68,6 +69,20 @@ def test_coefficients_follow_the_law_of_the_oil(warm: ss.Baseline) -> None:
     assert hot.theta[0] / cold.theta[0] == pytest.approx(np.exp(0.6), rel=0.003)
     assert hot.ratios["C_ie"] / cold.ratios["C_ie"] == pytest.approx(np.exp(0.6), rel=0.01)
     assert hot.ratios["p_s"] / cold.ratios["p_s"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_small_solutions_are_those_of_general_ones(warm: ss.Baseline, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, temperatures = warm.covariates, np.linspace(31.0, 55.0, 5)
+    assert model is not None
+    matched = [warm.at({"oil": c}).ratios for c in temperatures.tolist()]
+    monkeypatch.setattr(plant_fit, "NEWTON_STEPS", 0)  # the general search instead
+    for ratios, c in zip(matched, temperatures.tolist(), strict=True):
+        assert ratios == pytest.approx(warm.at({"oil": c}).ratios, rel=1e-5)
+    c, origin = temperatures[:, None], np.array(warm.theta)
+    G, size = model.basis(c), np.where(model.proportional, model.theta(origin, c), 1.0)
+    C = np.array(model.covariance).reshape(G.shape[1], len(origin), G.shape[1], len(origin))
+    expected = np.einsum("kp,piqj,kq,ki,kj->kij", G, C, G, size, size)
+    np.testing.assert_allclose(model.theta_covariance(origin, c), expected, rtol=1e-12)
 
 
 def test_warm_up_is_healthy_where_it_is_a_leak_without_the_covariate(warm: ss.Baseline) -> None:

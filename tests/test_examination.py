@@ -1,4 +1,4 @@
-"""Examinations of a service: whatever is spared on the way to them, they say what a full one says, bit for bit."""
+"""Examinations of a service: what is spared on the way to them changes no bit, and they never come all at once."""
 
 from __future__ import annotations
 
@@ -7,19 +7,25 @@ import pickle
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import halls
+from servoscope.core.errors import RecordingError
 from servoscope.core.messages import message
 from servoscope.detection.baseline import Baseline
+from servoscope.detection.chi2_test import whiten
 from servoscope.detection.cusum_design import sure_level, worst_case_hypotheses
 from servoscope.detection.expectation import Expectation, reference_path
 from servoscope.diagnosis.diagnose import diagnose_examination
 from servoscope.diagnosis.examine import Examination
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
-from servoscope.service.examination import StoredDiagnosis, blocks_to_recording, examine_blocks
+from servoscope.service.config import DiagnosisSettings
+from servoscope.service.examination import StoredDiagnosis, blocks_to_recording, examine_blocks, undetermined
+from servoscope.service.examination_schedule import FIRST_PER_S, ExaminationState, update_examination
 from servoscope.service.sources.block import Block
-from servoscope.signals import Recording, spikes
+from servoscope.signals import Recording, spikes, time_axis
 from servoscope.simulation import FaultEvent, reference, simulate
 
 START = 1767225600.0
@@ -68,6 +74,9 @@ def test_what_is_stored_is_that_of_a_full_examination() -> None:
         stored = examine_blocks(baseline, "a", blocks)
         assert stored == slowly(baseline, blocks)
         assert stored.verdict == "healthy"
+        assert examine_blocks(baseline, "a", blocks, known="undetermined") == stored
+        again = examine_blocks(baseline, "a", blocks, known="healthy")
+        assert again == stored.model_copy(update={"document": {}})
         assert examine_blocks(baseline, "a", blocks) == stored  # nothing of a window stays in what is kept
     leak = window(4, "multisine", FaultEvent.parse("C_ie=1.2@10"))
     assert slowly(baseline, leak) is None
@@ -124,23 +133,90 @@ def test_a_copy_takes_along_what_holds_for_it_only() -> None:
     assert pickle.loads(pickle.dumps(baseline)).pipeline().every == pipeline.every
 
 
-def test_a_smooth_signal_is_known_to_have_no_spikes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_quiet_signal_is_known_to_have_no_spikes(monkeypatch: pytest.MonkeyPatch) -> None:
     rng, run = np.random.default_rng(0), np.zeros(3000, dtype=np.int32)
     run[1500:] = 1
     t = np.arange(3000) / 100.0
     made = [
         scale * np.sin(2.0 * np.pi * f * t) + level * rng.normal(size=t.size)
-        for scale, f, level in [(1.0, 0.3, 0.0), (1.0, 0.5, 0.01), (0.0, 1.0, 1.0), (1e-9, 7.0, 1e-11), (5.0, 0.2, 0.3)]
+        for scale, f, level in [(1.0, 0.3, 0.0), (1.0, 9.0, 0.01), (0.0, 1.0, 1.0), (1e-9, 7.0, 1e-11), (5.0, 0.2, 0.3)]
     ]
+    made.append(np.repeat(rng.normal(size=300), 10))  # steps
     for x in made.copy():
         for at, width in ((700, 1), (1499, 2), (1500, 3), (0, 2), (2999, 1), (2000, 6)):
-            for height in (0.3, 3.0, 100.0):
+            for height in (0.12, 0.3, 1.5, 3.0, 100.0):
                 spiky = x.copy()
                 spiky[at : at + width] += height * np.ptp(x)
                 made.append(spiky)
-    smooth = [spikes._is_smooth(x, 0.1) for x in made]
+    quiet = [spikes._is_quiet(x, run, 0.1) for x in made]
     found = [spikes.find_spikes(x, run, share=0.1) for x in made]
-    assert any(smooth) and any(rows.size for rows in found)
-    monkeypatch.setattr(spikes, "_is_smooth", lambda x, share: False)
+    stepping = [np.abs(np.diff(x)).max() > 0.1 * np.ptp(x) for x in made]
+    assert any(map(all, zip(quiet, stepping, strict=True))) and any(rows.size for rows in found)
+    monkeypatch.setattr(spikes, "_is_quiet", lambda x, run, share: False)
     for x, rows in zip(made, found, strict=True):
         np.testing.assert_array_equal(rows, spikes.find_spikes(x, run, share=0.1))
+
+
+@given(st.data())
+def test_a_regular_time_axis_is_laid_as_any_other(data: st.DataObject) -> None:
+    rate, count = data.draw(st.sampled_from([10.0, 100.0, 333.0])), data.draw(st.integers(30, 200))
+    spread, drift = data.draw(st.sampled_from([0.0, 1e-9, 0.02, 0.045, 0.06, 0.3])), data.draw(st.floats(-0.004, 0.004))
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    t = (np.arange(count) * (1.0 + drift) + spread * rng.uniform(-1.0, 1.0, count)) / rate
+    if (odd := data.draw(st.sampled_from([None, np.nan, np.inf, -np.inf, 1e101, 1e308, -1.0, 0.1]))) is not None:
+        t[data.draw(st.integers(0, count - 1))] = odd
+    expected = data.draw(st.sampled_from([None, rate, 1.1 * rate]))
+
+    def lay() -> object:
+        try:
+            axis = time_axis.build_time_axis(t, None, expected, "log")
+        except RecordingError as error:
+            return str(error)
+        arrays = [x.tobytes() for x in (axis.t, axis.run, axis.dropped)]
+        return arrays, axis.sample_rate, axis.defects, [(first, rows.tolist()) for first, rows in axis.sorted_rows]
+
+    quickly = lay()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(time_axis, "_as_it_stands", lambda t, sample_rate: None)
+        assert lay() == quickly
+
+
+def test_what_is_whitened_is_what_lapack_makes_of_it() -> None:
+    rng = np.random.default_rng(3)
+    roots, units = rng.normal(size=(50, 4, 4)), np.array([1.0, 1e-6, 1e3, 1.0])
+    covariance = roots @ np.swapaxes(roots, 1, 2) * np.outer(units, units)
+    deviation = rng.normal(size=(50, 4, 3)) * units[:, None]
+    expected = np.linalg.solve(covariance, deviation)
+    white = whiten(covariance, deviation)
+    np.testing.assert_allclose(
+        np.swapaxes(white, 1, 2) @ white, np.swapaxes(deviation, 1, 2) @ expected, rtol=1e-6, atol=1e-9
+    )
+    np.testing.assert_array_equal(whiten(covariance, deviation[..., 0]), white[..., 0])
+    covariance[7, 2] = covariance[7, 1]
+    with pytest.raises(np.linalg.LinAlgError):
+        whiten(-covariance, deviation)
+
+
+@pytest.mark.parametrize("assets", [1, 1000, 6000, 20_000])
+@pytest.mark.parametrize("begin", [START, START + 211.7])
+def test_assets_that_begin_together_are_examined_one_after_the_other(assets: int, begin: float) -> None:
+    settings, found = DiagnosisSettings(), undetermined("none").model_copy(update={"verdict": "healthy"})
+    times: list[list[float]] = [[], [], []]
+    for phase in np.random.default_rng(1).permutation((np.arange(assets) + 0.5) / assets).tolist():
+        state = ExaminationState.begin(begin, settings, phase, assets)
+        for each in times:
+            t = state.due
+            each.append(t - begin)
+            early, nothing = update_examination(state, settings, t - 1e-3, False, lambda: found, phase)
+            state, result = update_examination(state, settings, t, False, lambda: found, phase)
+            assert (early, nothing, result) == (early, None, found)
+            assert settings.every_s / 2.0 <= state.due - t <= 1.5 * settings.every_s
+    first, second, third = map(np.array, times)
+    span = min(max(assets / FIRST_PER_S, settings.window_s), settings.every_s)
+    assert settings.window_s <= first.min() and first.max() <= settings.window_s + span
+    np.testing.assert_allclose(third, second + settings.every_s, atol=1e-5)  # at their places from then on
+    if span == settings.every_s:
+        np.testing.assert_allclose(second, first + settings.every_s, atol=1e-5)
+    most = max(assets / span, assets / settings.every_s)
+    for several in (first, np.concatenate([second, third])):
+        assert np.bincount((several // 30.0).astype(int)).max() <= 30.0 * most + 2.0

@@ -24,7 +24,7 @@ from servoscope.detection.expectation import NO_REFERENCE, BaselineRun, Expectat
 from servoscope.detection.feature_model import FeatureModel
 from servoscope.detection.learned_fault import LearnedFault
 from servoscope.detection.motion import MotionRange
-from servoscope.detection.plant_fit import match_ratios
+from servoscope.detection.plant_fit import fault_directions, match_ratios
 from servoscope.detection.sensors import SensorModel
 from servoscope.detection.threshold_calibration import CalibrationFactors, t2_threshold
 from servoscope.estimation.filter_bank import nominal_theta
@@ -222,14 +222,10 @@ class Baseline(ShortRepr, BaselineMemory):
         c = np.array([float(values[name]) for name in model.names])
         if (outside := model.describe_outside(c[None])) is not None:
             raise BaselineError(str(outside))
-        origin = np.array(self.theta)
-        theta = model.theta(origin, c)
+        theta = model.theta(origin := np.array(self.theta), c)
         covariance = self.covariance_array() + model.theta_covariance(origin, c)
-        update: dict[str, Any] = {
-            "theta": tuple(theta.tolist()),
-            "covariance": tuple(map(tuple, covariance.tolist())),
-            "covariates": None,
-        }
+        update: dict[str, Any] = {"theta": tuple(theta.tolist()), "covariance": tuple(map(tuple, covariance.tolist()))}
+        update["covariates"] = None
         if self.model_theta:
             update["model_theta"] = tuple((np.array(self.model_theta) + theta - origin).tolist())
         if self.ratios:
@@ -249,9 +245,8 @@ class Baseline(ShortRepr, BaselineMemory):
     @property
     def tuning(self) -> Tuning:
         """What the recursion takes."""
-        arrays = (self.theta, self.scale, self.P_d)
-        theta, scale, P_d = (np.array(value) for value in arrays)
-        a, b, gamma = (np.array(value) for value in (self.noise_a, self.noise_b, self.noise_gamma))
+        theta, scale, P_d = map(np.array, (self.theta, self.scale, self.P_d))
+        a, b, gamma = map(np.array, (self.noise_a, self.noise_b, self.noise_gamma))
         return Tuning(theta, scale, P_d, self.R, ArmaNoise(a, b, gamma, self.noise_variance))
 
     @property
@@ -304,6 +299,11 @@ class Baseline(ShortRepr, BaselineMemory):
         if under is not None:
             heard = worst_case_hypotheses(under, self.plant, self.loudest, np.array(self.ratios_covariance), heard)
         return build_cusum_constants(pipeline, self.plant, noise, np.array(self.scale), heard, budget)
+
+    @cached_property
+    def fault_directions(self) -> dict[str, FloatArray]:
+        """What a relative change of each parameter adds to the healthy coefficients, each of shape (n,)."""
+        return fault_directions(self.loop, self.plant, np.array(self.theta))
 
     @cached_property
     def bias(self) -> FloatArray:

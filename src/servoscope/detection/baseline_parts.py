@@ -14,7 +14,7 @@ from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.models.loop import Loop
 
 # what a baseline remembers: computed from the fields of its loop alone, or from any but some that stand beside it
-OF_LOOP, OF_ALL = ("loop", "_pipeline"), ("baseline_run", "bias")
+OF_LOOP, OF_ALL = ("loop", "_pipeline"), ("baseline_run", "bias", "fault_directions")
 LOOP_FIELDS = {"loop", "loop_settings", "stage_one", "still_speed", "instrument"}
 BESIDE = {"features", "point", "others"}
 

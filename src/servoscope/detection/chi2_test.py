@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,6 +64,7 @@ def consecutive_exceedances(exceeded: BoolArray, before: int = 0) -> IntArray:
     return np.asarray(k - below)
 
 
+@functools.lru_cache(1024)  # it takes a search, and a baseline asks for its own each time that it is examined
 def required_noncentrality(n: int, limit: float) -> float:
     """Return the noncentrality at which a chi-square with n degrees of freedom exceeds `limit` with `POWER`."""
     from scipy import special
@@ -75,32 +77,19 @@ def whiten(covariance: FloatArray, deviation: FloatArray) -> FloatArray:
 
     `covariance`: shape (K, n, n); `deviation`: shape (K, n) or (K, n, m).
     """
-    n = covariance.shape[-1]
-    # columns of many evaluations at a time: LAPACK takes longer to begin than a matrix of this size takes
-    C = np.ascontiguousarray(np.moveaxis(covariance, 0, -1))
-    columns = np.moveaxis(deviation if deviation.ndim == 3 else deviation[..., None], 0, -1)
-    size = np.sqrt(np.maximum(np.array([C[i, i] for i in range(n)]), np.finfo(float).tiny))
-    L: dict[tuple[int, int], FloatArray] = {}
-    white = np.empty(columns.shape)
-    for i in range(n):
-        for j in range(i + 1):
-            left = C[i, j] / (size[i] * size[j]) + (1e-12 if i == j else 0.0)
-            for k in range(j):
-                left -= L[i, k] * L[j, k]
-            if i == j and not (left > 0.0).all():
-                raise np.linalg.LinAlgError("a covariance is not positive definite")
-            L[i, j] = np.sqrt(left) if i == j else left / L[j, j]
-        rest = columns[i] / size[i]
-        for k in range(i):
-            rest -= L[i, k] * white[k]
-        white[i] = rest / L[i, i]
-    white = np.moveaxis(white, -1, 0)
-    return np.asarray(white[..., 0] if deviation.ndim == 2 else white)
+    from servoscope.estimation.moments import whiten_each  # late: loads numba
+
+    columns = deviation if deviation.ndim == 3 else deviation[..., None]
+    C, d = np.ascontiguousarray(covariance, dtype=np.float64), np.ascontiguousarray(columns, dtype=np.float64)
+    white, n = np.empty(d.shape), C.shape[-1]
+    if not whiten_each(C, d, np.empty(n), np.empty((n, n)), white):
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    return white[..., 0] if deviation.ndim == 2 else white
 
 
 def t2_statistic(theta: FloatArray, expected: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return ``T^2 = (theta - mu)' Cov^-1 (theta - mu)``, shape (K,)."""
-    return np.asarray((whiten(covariance, theta - expected) ** 2).sum(axis=-1))
+    return _sum_of_squares(whiten(covariance, theta - expected))
 
 
 def noncentrality(covariance: FloatArray, Psi: FloatArray, directions: FloatArray) -> FloatArray:
@@ -113,7 +102,15 @@ def noncentrality(covariance: FloatArray, Psi: FloatArray, directions: FloatArra
     (K, m).
     """
     moved = (np.eye(Psi.shape[-1]) - Psi) @ directions.T
-    return np.asarray((whiten(covariance, moved) ** 2).sum(axis=-2))
+    return _sum_of_squares(whiten(covariance, moved))
+
+
+def _sum_of_squares(white: FloatArray) -> FloatArray:
+    """Return the sums over the components of deviations (K, n) or (K, n, m), shape (K,) or (K, m)."""
+    total = white[:, 0] ** 2
+    for i in range(1, white.shape[1]):  # a few columns of many evaluations: NumPy's sum takes three times as long
+        total += white[:, i] ** 2
+    return np.asarray(total)
 
 
 @dataclass(frozen=True)

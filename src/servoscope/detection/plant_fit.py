@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,8 @@ from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
 FREE = 1.0  # standard deviation of how far covariates may move the logarithm of a parameter
+FARTHEST = 3.0  # how far they move it at most
+NEWTON_STEPS, NEARBY, SETTLED = 20, 1e-6, 1e-9  # of the search for it: steps, and lengths in the logarithm
 PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
 
 
@@ -168,19 +170,33 @@ def match_ratios(
 
     Least squares weighted by the covariance (n, n) of theta; a parameter that theta does not tell stays where it is.
     """
-    from scipy.optimize import least_squares as minimise
-
     before = np.log(list(ratios.values()))
     size = np.sqrt(np.diag(covariance))
-    factor = np.linalg.cholesky(covariance / np.outer(size, size))
+    white = np.linalg.inv(np.linalg.cholesky(covariance / np.outer(size, size))) / size
 
     def misfit(x: FloatArray) -> FloatArray:
         plant = loop.plant.scaled(dict(zip(ratios, np.exp(before + x).tolist(), strict=True)))
-        off = (nominal_theta(loop, plant) - theta) / size
-        return np.concatenate([np.linalg.solve(factor, off), x / FREE])
+        return np.concatenate([white @ (nominal_theta(loop, plant) - theta), x / FREE])
 
-    found = minimise(misfit, np.zeros(len(before)), bounds=(-3.0, 3.0))
-    return dict(zip(ratios, np.exp(before + found.x).tolist(), strict=True))
+    x = _minimise_squares(misfit, len(before))
+    return dict(zip(ratios, np.exp(before + x).tolist(), strict=True))
+
+
+def _minimise_squares(misfit: Callable[[FloatArray], FloatArray], parameters: int) -> FloatArray:
+    """Return where the sum of squares is least, near 0 and within `FARTHEST`."""
+    x = np.zeros(parameters)
+    for _ in range(NEWTON_STEPS):  # a window of a service moves a few parameters a little: three or four steps
+        now = misfit(x)
+        slopes = [(misfit(x + NEARBY * e) - now) / NEARBY for e in np.eye(parameters)]
+        step = np.linalg.lstsq(np.stack(slopes, axis=1), -now, rcond=None)[0]
+        x = x + step
+        if not np.abs(x).max() < FARTHEST:
+            break
+        if np.abs(step).max() < SETTLED:
+            return x
+    from scipy.optimize import least_squares  # several times as slow near 0, and sure of its way
+
+    return np.asarray(least_squares(misfit, np.zeros(parameters), bounds=(-FARTHEST, FARTHEST)).x)
 
 
 def fault_directions(

@@ -214,29 +214,23 @@ def diagnose_examination(
 ) -> tuple[Diagnosis, BiasCorrection | None]:
     """Return the diagnosis of an examination, and how its estimates become those of the actuator itself."""
     recording, baseline, last = exam.recording, exam.baseline, exam.evaluations - 1
-    warnings = [DiagnosisWarning.of(defect) for defect in recording.defects] + estimate_warnings(exam)
-    alarm = first_alarm(exam, progress)
+    alarm, at, features = first_alarm(exam, progress), last, exam.features
     verdict: Verdict = "fault"
     intervals: tuple[FaultInterval, ...] = ()
     onset: Onset | None = None
-    detectable: dict[str, tuple[float, float]] = {}
-    unwatched: tuple[Message, ...] = ()
-    at, features = last, exam.features
     changed = features.changed if features is not None else None
     if alarm is not None:
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
-        doubts += covariate_warnings(exam, at)
-    elif changed is not None:
+        warnings = _all_warnings(exam, doubts + covariate_warnings(exam, at))
+        headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
+    elif features is not None and changed is not None:
         unknown = (Candidate(name=UNKNOWN, probability=1.0),)
-        doubts = []
+        warnings = _all_warnings(exam, [])
         intervals = (FaultInterval(detected_at_s=exam.features_changed_s, probability=1.0, candidates=unknown),)
+        headline = features.headline(changed, baseline.point)
     else:
-        detectable = detectable_sizes(exam)
-        doubts = power_warnings(exam, detectable)
-        verdict = "undetermined" if doubts or exam.apparent_alarm.any() else "healthy"
-        unwatched = unwatched_changes(baseline.plant, detectable)
-    warnings += motion_warnings(exam) + warm_up_warnings(exam) + doubts
+        verdict, headline, warnings = judge_without_alarm(exam)
     interval = next((one for one in intervals if _covers(one, float(exam.t(at)))), intervals[-1] if intervals else None)
     correction = estimate_bias_correction(exam, interval.candidates if interval else (), onset, at)
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
@@ -244,10 +238,6 @@ def diagnose_examination(
     reasons = build_reasons(exam, explained, interval) if alarm is not None and interval is not None else ()
     if features is not None and changed is not None:
         reasons = (*reasons, *features.reasons(changed))
-    if features is not None and changed is not None and alarm is None:
-        headline = features.headline(changed, baseline.point)
-    else:
-        headline = build_headline(verdict, intervals, detectable, warnings, baseline.point, unwatched)
     diagnosis = Diagnosis(
         recording=recording.name,
         samples=recording.samples,
@@ -263,6 +253,20 @@ def diagnose_examination(
         point=baseline.point or None,
     )
     return diagnosis, correction
+
+
+def judge_without_alarm(exam: Examination) -> tuple[Verdict, Message, list[DiagnosisWarning]]:
+    """Return the verdict, the headline and the warnings of an examination that has found no change."""
+    detectable = detectable_sizes(exam)
+    doubts = power_warnings(exam, detectable)
+    verdict: Verdict = "undetermined" if doubts or exam.apparent_alarm.any() else "healthy"
+    warnings, unwatched = _all_warnings(exam, doubts), unwatched_changes(exam.baseline.plant, detectable)
+    return verdict, build_headline(verdict, (), detectable, warnings, exam.baseline.point, unwatched), warnings
+
+
+def _all_warnings(exam: Examination, doubts: Sequence[DiagnosisWarning]) -> list[DiagnosisWarning]:
+    defects = [DiagnosisWarning.of(defect) for defect in exam.recording.defects]
+    return [*defects, *estimate_warnings(exam), *motion_warnings(exam), *warm_up_warnings(exam), *doubts]
 
 
 def _explain_alarm(

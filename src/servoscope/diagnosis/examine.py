@@ -68,13 +68,15 @@ class Examination:
     change: AxisChange | None = None  # within the recording, where it is one of a motor axis
     along: CovariatePath | None = None  # what covariates make of the coefficients; None where none were learned
     replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
+    quick: bool = False  # whether features are left out: of assets that are monitored, the monitor follows them
 
     @classmethod
     def from_recording(cls, baseline: Baseline, recording: Recording, *, quick: bool = False) -> Examination:
         """Run the recursion over the recording and compare it with what a healthy loop would show.
 
-        `quick`: whether the level of the sequential test may be held against the baseline's own limits where neither
-        these nor those for the recording's reference, which take several times as long as all the rest, raise an alarm.
+        `quick`: whether features are left out, and the level of the sequential test may be held against the baseline's
+        own limits where neither these nor those for the recording's reference, which take several times as long as all
+        the rest, raise an alarm.
 
         Raises RecordingError if the recording's sample rate is not the loop's.
         """
@@ -106,12 +108,12 @@ class Examination:
         growth = 1.0 if exam.noise is None else _noise_growth(exam.pipeline, exam.estimates)
         if growth > 1.0:  # it shifts the expectation, and the sequential test would take it for steps of a change
             exam = _run_recursion(baseline, recording, exam.pipeline, along, growth)
-        exam, change = replace(exam, along=along), None
+        change, exam = None, exam if along is None else replace(exam, along=along)
         if baseline.axis is not None and not exam.drifts:
             from servoscope.isolation.ml.axis_scan import find_axis_change
 
             change = find_axis_change(baseline, recording)
-        return replace(exam, skipped_share=skipped, replaced=replaced, change=change)
+        return replace(exam, skipped_share=skipped, replaced=replaced, change=change, quick=quick)
 
     @cached_property
     def drifts(self) -> bool:
@@ -148,9 +150,9 @@ class Examination:
 
     @cached_property
     def features(self) -> FeatureEvidence | None:
-        """What the recording shows besides its coefficients; None where nothing of that was learned."""
+        """What the recording shows besides its coefficients; None where nothing was learned or it is `quick`."""
         model = self.baseline.features
-        return None if model is None else FeatureEvidence.of(model, self.recording)
+        return None if model is None or self.quick else FeatureEvidence.of(model, self.recording)
 
     @property
     def _of_coefficients(self) -> tuple[Statistic, ...]:
@@ -177,7 +179,7 @@ class Examination:
     @cached_property
     def alarm(self) -> npt.NDArray[np.bool_]:
         """Whether there was an alarm of the coefficients that a motion never seen does not explain, shape (K,)."""
-        if self.motion is None or not self.apparent_alarm.any():
+        if not self.apparent_alarm.any() or self.motion is None:  # in this order: the motion takes a second reading
             return self.apparent_alarm
         exceeded = np.zeros(self.evaluations, dtype=np.bool_)
         e, limit = self.estimates, self.baseline.limit

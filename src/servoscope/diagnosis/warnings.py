@@ -7,7 +7,7 @@ import numpy as np
 from servoscope.core import outofcore
 from servoscope.core.messages import Message, message
 from servoscope.detection.chi2_test import noncentrality, required_noncentrality, t2_statistic
-from servoscope.detection.plant_fit import MOST_SATURATED, fault_directions, saturated_share
+from servoscope.detection.plant_fit import MOST_SATURATED, saturated_share
 from servoscope.detection.result import Candidate, DiagnosisWarning
 from servoscope.detection.signal_defects import find_switched_off
 from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
@@ -25,8 +25,7 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
     """Return, by parameter, the smallest change that would have shown here, and what the baseline promises."""
     baseline, e = exam.baseline, exam.estimates
     promised = {p.parameter: p.change for p in baseline.promises if p.change is not None and p.change < NO_PROMISE}
-    directions = fault_directions(baseline.loop, baseline.plant, exam.tuning.theta)
-    rows = np.array([directions[parameter] for parameter in promised])
+    rows = np.array([baseline.fault_directions[parameter] for parameter in promised])
     best = np.zeros(len(rows))
     for at in outofcore.iter_chunks(0, exam.evaluations, e.S, e.Psi, at_once=AT_ONCE) if len(rows) else ():
         ok = e.updates[at] > 0
@@ -51,7 +50,7 @@ def changes_like_warmth(exam: Examination) -> dict[str, float]:
     step = 0.5 * (np.array(along.model.high) - np.array(along.model.low))
     warmth = (along.model.theta(along.theta, c + 1e-3 * step) - along.model.theta(along.theta, c - 1e-3 * step)) / 2e-3
     found = {}
-    for name, d in fault_directions(exam.baseline.loop, exam.baseline.plant, exam.tuning.theta).items():
+    for name, d in exam.baseline.fault_directions.items():
         known_d, known_w = np.linalg.solve(exam.covariance(last), np.stack([d, warmth], axis=1)).T
         if float(d @ known_w) ** 2 >= ALIKE * float(d @ known_d) * float(warmth @ known_w):
             found[name] = 2.0 * abs(float(d @ known_w)) / float(d @ known_d)

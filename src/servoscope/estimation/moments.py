@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -46,6 +47,48 @@ def propagate_initial_share(s: Any, at: int, phi: Sequence[Any], K: Sequence[Any
         left = dot(phi, [s[at + n * i + j] for i in range(n)])
         for i in range(n):
             s[at + n * i + j] = fma(-K[i], left, s[at + n * i + j])
+
+
+@functools.partial(kernel, heap=False)
+def add_products(rows: IntArray, columns: IntArray, weights: FloatArray, x: FloatArray, out: FloatArray) -> None:
+    """Add the elements of a matrix, one after the other, each times a row of x (m, K), to the rows of out (p, K)."""
+    for e in range(len(weights)):
+        i, j, weight = rows[e], columns[e], weights[e]
+        for k in range(x.shape[1]):
+            out[i, k] += weight * x[j, k]
+
+
+@functools.partial(kernel, heap=False)
+def whiten_each(
+    covariance: FloatArray, deviation: FloatArray, size: FloatArray, L: FloatArray, out: FloatArray
+) -> bool:
+    """Write L^-1 d of each of K deviations (K, n, m), where L L' is its covariance (K, n, n); return whether L exists.
+
+    Units are evened out by `size` (n,), scratch memory like `L` (n, n).
+    """
+    K, n, m = deviation.shape
+    tiny = 2.2250738585072014e-308
+    for k in range(K):
+        for i in range(n):
+            power = covariance[k, i, i]
+            size[i] = math.sqrt(tiny if power < tiny else power)
+        for i in range(n):
+            for j in range(i + 1):
+                left = covariance[k, i, j] / (size[i] * size[j]) + (1e-12 if i == j else 0.0)
+                for l in range(j):
+                    left -= L[i, l] * L[j, l]
+                if i == j:
+                    if not left > 0.0:
+                        return False
+                    L[i, i] = math.sqrt(left)
+                else:
+                    L[i, j] = left / L[j, j]
+            for c in range(m):
+                rest = deviation[k, i, c] / size[i]
+                for l in range(i):
+                    rest -= L[i, l] * out[k, l, c]
+                out[k, i, c] = rest / L[i, i]
+    return True
 
 
 @functools.partial(kernel, heap=False)

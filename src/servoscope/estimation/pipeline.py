@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import LoopError
@@ -272,9 +271,8 @@ class Pipeline:
     def unpack(self, c: RecursionConstants, rows: FloatArray, index: IntArray) -> Estimates:
         """Turn rows of a recursion, shape (K, row), into estimates in physical units."""
         n, basis = self.bank.n, c.basis
-        theta, S, Psi = np.split(rows[:, 5:], [n, n + n * n], axis=1)
-        # basis S basis' and basis Psi/basis, each a product with the elements in one row
-        both, back = np.kron(basis, basis), np.kron(basis, np.linalg.inv(basis).T)
+        theta, S, Psi = rows[:, 5 : 5 + n], rows[:, 5 + n : 5 + n + n * n], rows[:, 5 + n + n * n :]
+        both, back = _products(n, basis.tobytes())
         return Estimates(
             index=index,
             updates=rows[:, 0],
@@ -282,17 +280,40 @@ class Pipeline:
             power=rows[:, 2] / c.variance,
             level=rows[:, 3],
             crossed=rows[:, 4],
-            theta=c.origin + _transform_rows(theta, basis),
+            theta=c.origin + _transform_rows(theta, _elements(basis)),
             S=_transform_rows(S, both).reshape(-1, n, n),
             Psi=_transform_rows(Psi, back).reshape(-1, n, n),
         )
 
 
-def _transform_rows(rows: FloatArray, matrix: npt.NDArray[np.floating[Any]]) -> FloatArray:
+class _Elements(NamedTuple):
+    """The elements of a matrix (p, m) that are not 0: their rows, columns and values."""
+
+    p: int
+    rows: IntArray
+    columns: IntArray
+    values: FloatArray
+
+
+def _elements(matrix: FloatArray) -> _Elements:
+    rows, columns = np.nonzero(matrix)
+    return _Elements(len(matrix), rows, columns, matrix[rows, columns])
+
+
+@lru_cache(1024)  # a baseline asks for its own with each recording
+def _products(n: int, basis: bytes) -> tuple[_Elements, _Elements]:
+    """Return basis S basis' and basis Psi/basis, each as a product with the elements of S or Psi in one row."""
+    own = np.frombuffer(basis).reshape(n, n)
+    both, back = (np.asarray(np.kron(own, other)) for other in (own, np.linalg.inv(own).T))
+    return _elements(both), _elements(back)
+
+
+def _transform_rows(rows: FloatArray, matrix: _Elements) -> FloatArray:
     """Return a matrix (p, m) times each of K rows, shape (K, p); a row's bits do not depend on the others."""
-    columns, found = np.ascontiguousarray(rows.T), np.zeros((len(matrix), len(rows)))
-    for i, j in np.argwhere(matrix):
-        found[i] += matrix[i, j] * columns[j]
+    from servoscope.estimation.moments import add_products  # late: loads numba
+
+    found = np.zeros((matrix.p, len(rows)))
+    add_products(*matrix[1:], np.ascontiguousarray(rows.T, dtype=np.float64), found)
     return np.ascontiguousarray(found.T)
 
 

@@ -56,6 +56,7 @@ class AssetPolicy:
     residual_every_s: float
     prognosis: PrognosisSettings = field(default_factory=PrognosisSettings)
     limits: AssetLimits = field(default_factory=dict)
+    assets: int = field(default=1, compare=False)  # of the process: one more changes nothing for the others
 
 
 class NextBlock(NamedTuple):
@@ -143,14 +144,13 @@ class Asset(StateHolder):
         """Begin with a new state, before the first sample or behind those that were counted."""
         before = {} if self.heard or self.state is None else self.state.alarms_now
         standing = {name: one for name, one in before.items() if one.sequence}
-        due = position.t + self.policy.diagnosis.window_s * (1.0 + self._phase)
         self.state = AssetState(
             asset=self.name,
             baseline=self.baseline.hash,
             position=position,
             monitor=self.monitor.init(),
             quality=quality.init_state(),
-            examination=ExaminationState(due=due, since=position.t),
+            examination=ExaminationState.begin(position.t, self.policy.diagnosis, self._phase, self.policy.assets),
             # those that stand since before the first block go on
             alarms=self._alarms.begin(self.name, position.t, standing),
         )
@@ -360,8 +360,9 @@ class Asset(StateHolder):
     def _examine(self) -> None:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self._current, self.policy.diagnosis
-        t, features, fault = state.position.t, state.evaluation.features, single_fault(state.examination.faults)
-        if is_at_rest(state.examination, t, state.evaluation.exceeded):
+        t, known = state.position.t, state.examination
+        details = state.evaluation.features, single_fault(known.faults), known.verdict
+        if is_at_rest(known, t, state.evaluation.exceeded):
             return
         recent = partial(self._window.after, t - settings.window_s)
         examination, result = update_examination(
@@ -369,7 +370,7 @@ class Asset(StateHolder):
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, self._carry_covariates(recent()), features, fault),
+            lambda: examine_blocks(self.baseline, self.name, self._carry_covariates(recent()), *details),
             self._phase,
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )

@@ -23,6 +23,7 @@ from servoscope.service.asset import Asset, AssetPolicy
 from servoscope.service.asset_groups import AssetGroups
 from servoscope.service.checkpoint import StreamPosition, unpack_state
 from servoscope.service.config import ServiceFile
+from servoscope.service.examination import compile_examination
 from servoscope.service.notifications import Notifier
 from servoscope.service.outlook import AssetLimits
 from servoscope.service.publishers.base import StatusPublisher
@@ -146,7 +147,12 @@ def resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asse
 def build_assets(config: ServiceFile) -> dict[str, Asset]:
     """Return the assets of a service file, without a state; raises ConfigError if a baseline cannot be used."""
     policy = AssetPolicy(
-        config.diagnosis, config.quality, config.alarms, config.store.residual_every_s, config.prognosis
+        config.diagnosis,
+        config.quality,
+        config.alarms,
+        config.store.residual_every_s,
+        config.prognosis,
+        assets=len(config.assets),
     )
     files: dict[Path, Baseline] = {}
     shared: dict[tuple[Path, str | None], tuple[Baseline, Monitor]] = {}
@@ -186,6 +192,8 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
     for asset in {id(one.baseline): one for one in assets.values()}.values():
         asset.compile_kernels()
+    for asset in {one.monitor.lane_key or one.baseline.loop.plant.kind: one for one in assets.values()}.values():
+        compile_examination(asset.baseline)  # one of each kind: its kernels are those of all others
     return assets
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,9 @@ from servoscope.signals import Recording, clean
 
 if TYPE_CHECKING:  # its kernels are loaded when something is examined
     from servoscope.diagnosis.examine import Examination
+
+
+KERNEL_SAMPLES = 400  # that bring all kernels of an examination to work
 
 
 class StoredDiagnosis(BaseModel):
@@ -75,22 +79,28 @@ def undetermined(key: str, **values: Any) -> StoredDiagnosis:
 
 
 def examine_blocks(
-    baseline: Baseline, name: str, blocks: Sequence[Block], features: float | None = None, fault: str | None = None
+    baseline: Baseline,
+    name: str,
+    blocks: Sequence[Block],
+    features: float | None = None,
+    fault: str | None = None,
+    known: Verdict | None = None,
 ) -> StoredDiagnosis:
     """Examine the last minutes with the reference that was applied in them, without a refit.
 
     `features`: their score in the monitor, as a multiple of its limit. It has seen more spans than the last minutes
     hold, so its word counts where the coefficients are healthy. `fault`: the one that was named, to follow its size.
+    `known`: the verdict that the store has already: the same one again has no document, which takes as long as the rest
+    of the diagnosis.
 
     Where the samples cannot be used, the verdict is ``undetermined`` and the headline has the reason.
     """
-    from servoscope.diagnosis.diagnose import diagnose_examination
+    from servoscope.diagnosis.diagnose import diagnose_examination, judge_without_alarm
     from servoscope.diagnosis.examine import Examination
 
     try:
         recording, start = blocks_to_recording(baseline, name, blocks)
         exam = Examination.from_recording(baseline, recording, quick=True)
-        exam = replace(exam, baseline=exam.baseline.model_copy(update={"features": None}))
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
     if exam.along is not None and (outside := exam.along.outside) is not None:
@@ -99,6 +109,10 @@ def examine_blocks(
         if features is not None and features > 1.0:
             headline = message("service.examination.features", excess=features)
             return StoredDiagnosis(verdict="fault", headline=headline, onset=None)
+        if known is not None:
+            verdict, headline, _ = judge_without_alarm(exam)
+            if verdict == known:
+                return StoredDiagnosis(verdict=verdict, headline=headline)
         diagnosis, _ = diagnose_examination(exam)
         document = diagnosis.model_dump(mode="json")
         return StoredDiagnosis(verdict=diagnosis.verdict, headline=diagnosis.headline, document=document)
@@ -112,6 +126,16 @@ def examine_blocks(
     headline = message("service.examination.fault", excess=excess, level=level if baseline.members else None)
     size = _follow_size(exam, fault, first) if fault is not None else None
     return StoredDiagnosis(verdict="fault", headline=headline, onset=onset, size=size)
+
+
+def compile_examination(baseline: Baseline) -> None:
+    """Examine some noise, so that samples do not wait for the compiler while an asset is first examined."""
+    t = np.arange(KERNEL_SAMPLES) / baseline.loop.sample_rate
+    covariates = np.zeros((0, 1)) if baseline.covariates is None else baseline.covariates.origin[:, None]
+    signals = np.random.default_rng(0).normal(size=(3, t.size))
+    held = np.tile(covariates[: len(baseline.logged_covariates)], t.size)
+    with contextlib.suppress(ArithmeticError, np.linalg.LinAlgError):  # of numbers that mean nothing
+        examine_blocks(baseline, "", [Block.from_signals("", 0, np.concatenate([t[None], signals, held]))])
 
 
 def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | None:

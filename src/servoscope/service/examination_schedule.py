@@ -2,9 +2,9 @@
 
 The recursion tests every sample against the baseline's own coefficients. An examination compares the last minutes with
 what a healthy loop would have shown under the reference that was really applied; it takes milliseconds. There is one
-from time to time, and one at once when the recursion and the verdict disagree; while they go on disagreeing, the time
-between two of them doubles. A new fault is diagnosed in full some seconds later (`servoscope.diagnose`), and again each
-time it has become twice as old.
+from time to time, each asset at its own place in the period, and one at once when the recursion and the verdict
+disagree; while they go on disagreeing, the time between two of them doubles. A new fault is diagnosed in full some
+seconds later (`servoscope.diagnose`), and again each time it has become twice as old.
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from servoscope.core.messages import message, render
+from servoscope.detection.result import Verdict
 from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.examination import StoredDiagnosis
 
 FIRST_RETRY_S = 1.0  # until a disagreement is examined for the second time
+# of the assets of a process that begin together: 3 % of a core at 3 ms each, beside samples that may need all the rest
+FIRST_PER_S = 10.0
 DAY_S = 86400.0  # between two full diagnoses of a fault that lasts, at most
 
 
@@ -39,7 +42,7 @@ class ExaminationState:
     """What is kept between two examinations; times are [UTC s]."""
 
     due: float  # the next one
-    verdict: str = "undetermined"  # of the last one
+    verdict: Verdict = "undetermined"  # of the last one
     summary: str = field(default_factory=lambda: render(message("service.examination.none")))
     since: float = 0.0  # since when the verdict holds
     onset: float | None = None  # since when the fault is there
@@ -56,6 +59,17 @@ class ExaminationState:
     # size, sized: the newest size of the fault, by an examination, and when that was [UTC s]; {}: no such size yet
     size: dict[str, Any] = field(default_factory=dict)
     sized: float | None = None
+
+    @classmethod
+    def begin(cls, t: float, settings: DiagnosisSettings, phase: float, assets: int = 1) -> ExaminationState:
+        """Return the state at the first sample, at `t` [UTC s], of one of so many assets that may begin together.
+
+        It is first examined after a window, within another one; within more where these would be more than
+        `FIRST_PER_S`, up to a period, that is at its place in it.
+        """
+        whole, every = t + settings.window_s, settings.every_s
+        span = max(settings.window_s, min(assets / FIRST_PER_S, every))
+        return cls(due=whole + span * ((phase - whole / every) % 1.0), since=t)
 
 
 def examination_phase(asset: str) -> float:

@@ -71,7 +71,7 @@ def clean(
     carried = {name: axis.reorder(channel) for name, channel in extra.items()}
 
     empty = [outofcore.find_rows(lambda rows, x=x: ~np.isfinite(x[rows]), x) for x in logged[2:]]  # type: ignore[misc]
-    unusable = np.unique(np.concatenate(empty))
+    unusable = _union(*empty)
     incomplete = [label for label, rows in zip(labels, empty, strict=True) if rows.size]
     defects += defects_at("nan", unusable, axis.t, channels=incomplete)
     columns = [outofcore.drop_rows(column, unusable) for column in logged]
@@ -80,10 +80,10 @@ def clean(
     defects += defects_at("repeat", repeated, axis.t)
     columns = [outofcore.drop_rows(column, repeats) for column in columns]
     spikes, spiky = _find_spikes(columns[2], columns[3], columns[4], columns[1], labels)
-    original = _original_rows(spikes, np.union1d(unusable, repeated))
+    original = _original_rows(spikes, _union(unusable, repeated))
     defects += defects_at("spike", original, axis.t, channels=spiky)
-    dropped = np.union1d(unusable, original)
-    gone = np.union1d(dropped, repeated)
+    dropped = _union(unusable, original)
+    gone = _union(dropped, repeated)
     if dropped.size > MAX_DROPPED_SHARE * axis.t.size:
         raise RecordingError(
             f"{name}: {dropped.size} of {axis.t.size} rows hold NaN or spikes, that is too little to use"
@@ -123,8 +123,15 @@ def clean(
     return with_defects(recording, *defects)
 
 
+def _union(*rows: IndexArray) -> IndexArray:
+    """Return the rows that are among any of these, in order."""
+    return np.unique(np.concatenate(rows)) if any(each.size for each in rows) else rows[0]
+
+
 def _original_rows(rows: IndexArray, dropped: IndexArray) -> IndexArray:
     """Return where rows stood before others were dropped."""
+    if not (rows.size and dropped.size):
+        return rows
     return np.asarray(rows + np.searchsorted(dropped - np.arange(dropped.size), rows, side="right"))
 
 
@@ -204,7 +211,7 @@ def _find_spikes(
         in_r, in_u = _find_input_spikes(r, u, run)
     found = in_r, in_u, y_search.result()
     spiky = [label for label, rows in zip(labels, found, strict=True) if rows.size]
-    return np.unique(np.concatenate(found)), spiky
+    return _union(*found), spiky
 
 
 def _find_input_spikes(r: FloatArray, u: FloatArray, run: Int32Array) -> tuple[IndexArray, IndexArray]:

@@ -70,6 +70,8 @@ def build_time_axis(
     Raises RecordingError if the time axis runs backwards or in disorder, is too coarse or irregular, or the rate is not
     the expected one.
     """
+    if marks is None and (axis := _as_it_stands(t, sample_rate)) is not None:
+        return axis
     lost = outofcore.find_rows(lambda rows: ~(np.abs(t[rows]) < MAX_TIME_S), t)
     if t.size - lost.size < 2:
         raise RecordingError(f"{name}: the time column holds no numbers, choose another")
@@ -109,6 +111,23 @@ def build_time_axis(
     for piece in outofcore.iter_chunks(0, t.size, run):
         run[piece] = np.searchsorted(begins, np.arange(piece.start, piece.stop), side="right")
     return TimeAxis(laid, run, used, defects, dropped, order)
+
+
+def _as_it_stands(t: FloatArray, sample_rate: float | None) -> TimeAxis | None:
+    """Return the axis of one run whose steps are all alike, as most are; None where there may be more to say of it."""
+    if not 2 < t.size <= outofcore.CHUNK_ROWS or not max(abs(t[0]), abs(t[-1])) < MAX_TIME_S:
+        return None
+    with np.errstate(invalid="ignore", over="ignore"):  # of stamps that are no numbers
+        steps = t[1:] - t[:-1]
+        mean, least, most = float(steps.mean()), float(steps.min()), float(steps.max())
+    if not 0.9 * mean < least <= most < 1.1 * mean:
+        return None
+    rate = _to_rate(steps.size, float(steps.sum()))
+    used = sample_rate if sample_rate is not None else rate
+    off = max(abs(least * used - 1.0), abs(most * used - 1.0))
+    if off > 0.99 * JITTER or abs(rate / used - 1.0) > 0.99 * RATE_NOTE:
+        return None
+    return TimeAxis(t, np.zeros(t.size, dtype=np.int32), used, [], NO_ROWS, [])
 
 
 def _steps_within_runs(t: FloatArray, begins: IndexArray, rows: slice) -> FloatArray:
@@ -209,7 +228,7 @@ def _measure_rate(
         near = steps[(steps > 0.5 * typical) & (steps < GAP_STEP * typical)]
         total, count = total + float(near.sum()), count + near.size
     # The mean is right also where stamps are rounded, for example 3, 3, 4 ms at 300 Hz; the median is not.
-    rate = float(f"{count / total:.9g}")  # stamps are no better than that, and 25 Hz should read 25
+    rate = _to_rate(count, total)
     if expected is not None and abs(rate / expected - 1.0) > RATE_TOLERANCE:
         factor = next(
             (unit for unit, f in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if abs(rate * f / expected - 1) < 0.02),
@@ -233,6 +252,10 @@ def _measure_rate(
             " log at a fixed rate, or have them resampled: --resample, or resample = true in [columns]"
         )
     return rate, jitter
+
+
+def _to_rate(steps: int, seconds: float) -> float:
+    return float(f"{steps / seconds:.9g}")  # stamps are no better than that, and 25 Hz should read 25
 
 
 def _separate_runs(t: FloatArray, begins: IndexArray, period: float) -> FloatArray:
