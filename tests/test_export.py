@@ -100,7 +100,7 @@ def test_without_the_sequential_test(tmp_path: Path) -> None:
     same(Drive.built(baseline, tmp_path), baseline, 20_000)
 
 
-def test_with_a_step_of_the_sequential_test_per_evaluation(tmp_path: Path) -> None:
+def test_with_a_step_of_the_sequential_test_at_each_update(tmp_path: Path) -> None:
     baseline = fresh(altered(demo(), sequential_step="update"))
     same(Drive.built(baseline, tmp_path), baseline, 20_000)
 
