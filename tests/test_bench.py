@@ -17,7 +17,7 @@ FIGURES = (
     *(
         f"fleet of 100, {precision}, {what}{cores}"
         for precision in ("double", "single")
-        for what in ("bare", "everything", "everything, test once per evaluation")
+        for what in ("bare", "everything", "everything, test at each update")
         for cores in ("", ", 1 core")
     ),
     *(f"service, {layer}" for layer in ("decode", "assemble", "quality", "kernel", "judge", "store", "publish")),
@@ -36,7 +36,7 @@ FACTS = (
     "processor time of a fleet on one core, share of that on all",
     "cores",
     "filterpy's update over a fleet's sample, everything, one core",
-    "filterpy's update over a fleet's sample, everything, test once per evaluation, one core",
+    "filterpy's update over a fleet's sample, everything, test at each update, one core",
     "100 simulations of 60 s, s",
     "100 simulations followed as a fleet, s",
     "alarms among those with a leak, share",

@@ -70,9 +70,7 @@ def test_bits_of_the_monitor_without_fused_multiply_adds(tmp_path: Path) -> None
     assert found[:, :-1].tobytes() == np.load(tmp_path / "rows.npy").tobytes()
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"on_delay": 0.3, "off_delay": 1.5}, {"sequential_step": "evaluation"}], ids=str
-)
+@pytest.mark.parametrize("settings", [{}, {"on_delay": 0.3, "off_delay": 1.5}, {"sequential_step": "update"}], ids=str)
 def test_verdicts_of_the_monitor(settings: dict[str, Any]) -> None:
     """The numbers differ by rounding, the verdicts and the time of the alarm not at all."""
     baseline = fresh(altered(demo(), **settings))

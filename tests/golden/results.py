@@ -27,7 +27,7 @@ ESTIMATORS = ("akf", "iv-akf", "kf", "rls", "dfrls", "rls-reset", "nlms", "slidi
 COMMANDS = {
     "inspect": ("inspect", "suspect.parquet", "--loop", "rig.toml", "--json"),
     "inspect-axis": ("inspect", "axis.parquet", "--loop", "axis.toml", "--json"),
-    "learn": ("learn", "rig.toml", "healthy.parquet", "-o", "OUT/rig.json", "--json"),
+    "learn": ("learn", "OUT/rig.toml", "healthy.parquet", "-o", "OUT/rig.json", "--json"),
     "diagnose": ("diagnose", "rig.json", "healthy.parquet", "suspect.parquet", "--json"),
     "diagnose-axis": ("diagnose", "axis.json", "axis-suspect.parquet", "--json"),
     "diagnose-points": ("diagnose", "points.json", "worn.parquet", "--point", "cold", "--json"),
@@ -85,6 +85,8 @@ def command(folder: Path, *words: str, told: str = "") -> str:
 
 def documents(name: str, output: Path) -> list[Any]:
     """Return the JSON that a command of `COMMANDS` prints; files that it writes go to a folder."""
+    step = '[monitor]\nsequential_step = "update"\n'  # the only one that version 0.1.0 knew
+    (output / "rig.toml").write_text(f"{(FOLDER / 'rig.toml').read_text(encoding='utf-8')}{step}", encoding="utf-8")
     words = [word.replace("OUT", str(output)) for word in COMMANDS[name]]
     text = command(FOLDER, *words)
     try:

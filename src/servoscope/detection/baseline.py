@@ -17,7 +17,13 @@ from servoscope.core.files import atomic_write
 from servoscope.core.messages import MessageText
 from servoscope.core.short_repr import ShortRepr
 from servoscope.detection.axis_model import AxisModel
-from servoscope.detection.baseline_parts import BaselineMemory, BaselineSource, DetectableChange, ExactPredictorFit
+from servoscope.detection.baseline_parts import (
+    BaselineMemory,
+    BaselineSource,
+    DetectableChange,
+    ExactPredictorFit,
+    parse_stored_loop,
+)
 from servoscope.detection.covariates import CovariateModel
 from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, sure_level, worst_case_hypotheses
 from servoscope.detection.expectation import NO_REFERENCE, BaselineRun, Expectation
@@ -181,7 +187,7 @@ class Baseline(ShortRepr, BaselineMemory):
     @cached_property
     def loop(self) -> Loop:
         """The loop."""
-        return Loop.from_dict(self.loop_settings)
+        return parse_stored_loop(self.loop_settings)
 
     @property
     def logged_covariates(self) -> tuple[str, ...]:
@@ -340,10 +346,7 @@ class Baseline(ShortRepr, BaselineMemory):
     def save(self, path: str | Path) -> None:
         """Write the baseline as JSON; nothing half-written stays behind.
 
-        Raises
-        ------
-        OutputError
-            If the file cannot be written.
+        Raises OutputError if the file cannot be written.
         """
         content = {"format": FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
         atomic_write(Path(path), (json.dumps(content, indent=1) + "\n").encode())
@@ -365,10 +368,7 @@ class Baseline(ShortRepr, BaselineMemory):
     def load(cls, path: str | Path) -> Self:
         """Read a baseline.
 
-        Raises
-        ------
-        BaselineError
-            If the file is missing, is no baseline, or is one of another version.
+        Raises BaselineError if the file is missing, is no baseline, or is one of another version.
         """
         path = Path(path)
         try:

@@ -68,6 +68,17 @@ class ExactPredictorFit(BaselineModel):
     misfit: float
 
 
+def parse_stored_loop(settings: Mapping[str, Any]) -> Loop:
+    """Return the loop that a baseline was learned with; raises LoopError if it is damaged.
+
+    Without `sequential_step` it was learned when the sequential test knew no other step than each update.
+    """
+    monitor = settings.get("monitor", {})
+    if isinstance(monitor, Mapping):
+        settings = {**settings, "monitor": {"sequential_step": "update", **monitor}}
+    return Loop.from_dict(settings)
+
+
 def digest(loop: Loop, arrays: list[FloatArray]) -> str:
     """Return a hash of a loop and of all samples that were learned from: 16 hexadecimal digits."""
     h = hashlib.sha256(loop.hash().encode())

@@ -167,10 +167,11 @@ class _WhitenedResidual:
         if not tried:
             return []
         logs = np.minimum.accumulate(np.array(information))[::-1]  # a larger change may tell less: the smaller counts
-        fastest = min(FASTEST, IN_ONE_STEP * self.rate / self.together) if self.together > 1 else FASTEST
-        target, sizes = min(np.log(fastest), logs[-1]), []
+        largest = np.log(IN_ONE_STEP * self.rate / self.together) if self.together > 1 else np.inf
+        target, sizes = min(np.log(FASTEST), logs[-1]), []  # the same sizes for both steps, but for the largest
         while target >= max(np.log(SLOWEST), logs[0]):
-            sizes.append(float(np.sign(bound) * np.exp(np.interp(target, logs, np.array(tried)[::-1]))))
+            if target <= largest:
+                sizes.append(float(np.sign(bound) * np.exp(np.interp(target, logs, np.array(tried)[::-1]))))
             target -= np.log(FACTOR)
         return sizes
 

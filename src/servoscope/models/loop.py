@@ -116,9 +116,9 @@ class MonitorSettings(Settings):
     update_when: Literal["auto", "always", "moving"] = "auto"
     rest_speed: NonNegative = 0.0  # speed [output per s] below which the output counts as resting
     evaluation_rate: Positive = 10.0  # how often iFRF, residual and statistic are evaluated [Hz]
-    # when the sequential test decides: at every ``update`` of the estimator, or once per ``evaluation``, by what the
-    # updates since the one before sum up to; that takes less time, and alarms come up to an evaluation later
-    sequential_step: Literal["update", "evaluation"] = "update"
+    # when the sequential test decides: once per ``evaluation``, by what the updates since the one before sum up to, or
+    # at every ``update`` of the estimator; that takes more time, and alarms come up to an evaluation earlier
+    sequential_step: Literal["update", "evaluation"] = "evaluation"
     # monitored frequencies [Hz]
     frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
     false_alarms_per_year: Positive = 1.0  # budget that the alarm is set for, after its delays
@@ -350,13 +350,14 @@ class Loop(ShortRepr, Settings):
             del plain["monitor"]["hidden_warm_up"]
         if self.monitor.covariate_hold_s == COVARIATE_HOLD_S:
             del plain["monitor"]["covariate_hold_s"]
-        if self.monitor.sequential_step == "update":
-            del plain["monitor"]["sequential_step"]
         return {key: value for key, value in plain.items() if value is not None}
 
     def hash(self) -> str:
         """Return a digest of all settings, the same on every machine: 16 hexadecimal digits."""
-        canonical = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        plain = self.to_dict()
+        if self.monitor.sequential_step == "update":
+            del plain["monitor"]["sequential_step"]  # what loops meant that were hashed before it came
+        canonical = json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
