@@ -37,7 +37,7 @@ from servoscope.service.service import Service
 from servoscope.service.sources.block import Block
 from servoscope.signals.quality import QualitySettings
 
-BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
+BEGAN = 1767225580.0  # 2025-12-31T23:59:40Z: coefficients are stored in the middle of what is sent
 POLICY = AssetPolicy(
     DiagnosisSettings(window_s=20.0, every_s=30.0), QualitySettings(), AlarmSettings.model_validate({}), 2.0
 )
@@ -87,6 +87,7 @@ def test_assets_of_one_structure_go_together_to_the_bits_that_each_has_alone(mon
         expected[name] = [row for block in blocks for row in alone[name].process(block).rows]
     assert sum(row.table == "residuals" for row in expected["asset1"]) > 10
     assert any(row.table == "transitions" for row in expected["asset1"])  # its leak is alarmed
+    assert len({row.values["t"] for row in expected["asset0"] if row.table == "sizes"}) == 2
     while any(waiting.values()):
         turn = [blocks.pop(0) for blocks in waiting.values() for _ in range(min(chance.randrange(4), len(blocks)))]
         for name, rows in halls.block_rows(groups.process(turn)):

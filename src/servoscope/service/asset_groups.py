@@ -30,7 +30,7 @@ class BlockResult(NamedTuple):
 
 
 class QuietBlocks(NamedTuple):
-    """Blocks, at most one of each asset, that have led to nothing but the states after them and rows of the history."""
+    """Blocks, at most one of each asset, that have led to nothing but states and rows that are due at their times."""
 
     assets: list[Asset]
     blocks: list[Block]

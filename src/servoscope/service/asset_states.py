@@ -1,8 +1,8 @@
 """The states of assets that are followed together, as arrays: most blocks change nothing but a row of them.
 
-Such a block is quiet: it follows the one before it, no examination or alarm comes from it, at most one row of the
-history, and the state after it is a row of numbers. All that a quiet block does not change stays in the record that the
-asset has.
+Such a block is quiet: it follows the one before it, no examination or alarm comes from it, rows of the history and of
+the coefficients only when they are due, and the state after it is a row of numbers. All that a quiet block does not
+change stays in the record that the asset has.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from servoscope.service.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.examination_schedule import PendingDiagnosis
 from servoscope.service.records import TableRow
 from servoscope.service.residual_history import HistoryState
-from servoscope.service.store.rows import SIZE_EVERY_S
+from servoscope.service.store.rows import SIZE_EVERY_S, coefficient_rows
 from servoscope.signals import quality
 
 COLUMNS = np.dtype(
@@ -155,7 +155,6 @@ class AssetStates:
         if new is not None:
             exceeded = new.exceeded
             quiet &= np.isfinite(one["period"]) & (new.count_periods(one["period"]) <= 1)
-            quiet &= new.t // SIZE_EVERY_S == one["evaluated"] // SIZE_EVERY_S
         return np.asarray(quiet & (exceeded == one["is_fault"]))
 
     def advance(
@@ -164,7 +163,7 @@ class AssetStates:
         """Take what some `lanes` of quiet blocks have led to.
 
         `signals`: of all lanes, shape (blocks, 4 + k, N); the digest goes on as by what `Block.pack` returns. Returns
-        the numbers of the blocks, and rows of the history, each with which of the lanes it is of.
+        the numbers of the blocks, and rows of the history and of the coefficients, each with the place of its lane.
         """
         one, new = self.columns[rows], found.evaluations
         count = signals.shape[1] - 4
@@ -185,6 +184,11 @@ class AssetStates:
                 (lane, TableRow("residuals", {"number": number, **row}))
                 for lane, number, row in zip(due.tolist(), counts, values, strict=True)
             ]
+            sized = new.t[lanes] // SIZE_EVERY_S != one["evaluated"] // SIZE_EVERY_S  # as `period_number` says
+            for lane in np.flatnonzero(sized).tolist():
+                latest = new.latest(int(lanes[lane]))
+                sizes = coefficient_rows(float(new.t[lanes[lane]]), latest.status.parameters)
+                history += [(lane, TableRow("sizes", row)) for row in sizes]
             one["exceeded"], one["evaluated"], one["lane"] = new.exceeded[lanes], new.t[lanes], lanes
             self._evaluations[rows] = new
         self.columns[rows], self.monitor[rows], self.quality[rows] = one, found.monitor[lanes], found.quality[lanes]
