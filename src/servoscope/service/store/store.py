@@ -370,10 +370,10 @@ class Store:
         with self._transaction() as connection:
             return [tuple(row) for row in connection.execute(query)]
 
-    def fetch(self, query: sa.Select[Any]) -> list[Row]:
-        """Return the rows of a query."""
+    def fetch(self, query: sa.Select[Any], values: Row | None = None) -> list[Row]:
+        """Return the rows of a query; `values`: of its parameters."""
         with self._transaction() as connection:
-            return [dict(row) for row in connection.execute(query).mappings()]
+            return [dict(row) for row in connection.execute(query, values).mappings()]
 
 
 def _is_new(path: str | None) -> bool:
