@@ -16,7 +16,9 @@ from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
 from servoscope.service.records import StepResult, TableRow
 from servoscope.service.service import Service
+from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
+from servoscope.service.store.bundles import restore_times
 from servoscope.signals import Recording, writers
 from servoscope.simulation import FaultEvent, reference, simulate
 
@@ -95,14 +97,21 @@ def hall(folder: Path, name: str, *, speed: float = 0.0, store: str = "", more: 
 
 
 def block_rows(processed: Iterable[BlockResult | QuietBlocks]) -> Iterator[tuple[str, list[TableRow]]]:
-    """Yield the rows to which each block has led, with its asset; a quiet block leads to its samples alone."""
+    """Yield the rows to which each block has led, with its asset; those of quiet blocks as if they were alone."""
     for one in processed:
         if isinstance(one, QuietBlocks):
-            for asset, number, packed in zip(one.assets, one.numbers, one.packed, strict=True):
-                yield asset.name, [TableRow("recent", {"sequence": number, "samples": packed})]
+            for i, (asset, (number, *_, samples, regular)) in enumerate(zip(one.assets, one.packed, strict=True)):
+                values = {"sequence": number, "samples": samples, "regular": regular}
+                yield asset.name, [TableRow("recent", values), *(row for place, row in one.history if place == i)]
         else:
             assert isinstance(one.result, StepResult), one.result
             yield one.block.asset, one.result.rows
+
+
+def stored_block(asset: str, row: TableRow) -> Block:
+    """Return the block of an asset whose samples a row has."""
+    samples = restore_times(row.values["samples"]) if row.values["regular"] else row.values["samples"]
+    return Block.unpack(asset, row.values["sequence"], samples)
 
 
 def asked(config: Path, query: str) -> list[Any]:

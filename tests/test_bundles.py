@@ -13,21 +13,24 @@ from hypothesis import strategies as st
 
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Batch, Store, bundles, tables
-from servoscope.service.store.bundles import BundleIndex, leave_out_times, restore_times
+from servoscope.service.store.bundles import BundleIndex, pack_samples, restore_times
 
 BEGAN = 1767225600.25  # [UTC s]
 
 
-def packed(t: np.ndarray, covariates: int = 0, seed: int = 0) -> bytes:
-    signals = np.random.default_rng(seed).standard_normal((3 + covariates, t.size))
-    return Block.from_signals("press", 0, np.concatenate([t[None], signals])).pack()
+def signals(t: np.ndarray, covariates: int = 0, seed: int = 0) -> np.ndarray:
+    return np.concatenate([t[None], np.random.default_rng(seed).standard_normal((3 + covariates, t.size))])
+
+
+def packed(rows: np.ndarray) -> bytes:
+    return Block.from_signals("press", 0, rows).pack()
 
 
 @pytest.mark.parametrize("rate", [0.5, 12.5, 50.0, 100.0, 1000.0, 8192.0])
 @pytest.mark.parametrize("covariates", [0, 2])
 def test_regular_time_stamps_are_not_stored_and_come_back_to_the_last_bit(rate: float, covariates: int) -> None:
-    blocks = [packed(BEGAN + k + np.arange(64) / rate, covariates, k) for k in range(3)]
-    found = leave_out_times(blocks)
+    rows = [signals(BEGAN + k + np.arange(64) / rate, covariates, k) for k in range(3)]
+    found, blocks = pack_samples(np.stack(rows)), list(map(packed, rows))
     assert [restore_times(short) for short, _ in found] == blocks
     assert all(
         regular and len(short) == len(block) - 62 * 8 for (short, regular), block in zip(found, blocks, strict=True)
@@ -39,17 +42,20 @@ def test_time_stamps_that_are_not_regular_to_the_last_bit_are_kept() -> None:
     for k, value in ((50, np.nextafter(t[50], np.inf)), (3, np.nan), (99, np.inf), (0, -0.0)):
         changed = t.copy()
         changed[k] = value
-        assert leave_out_times([packed(changed)]) == [(packed(changed), False)]
+        found = pack_samples(np.stack([signals(changed), signals(t)]))  # one beside one that is regular
+        assert found[0] == (packed(signals(changed)), False) and found[1][1]
     zero = np.arange(100) / 100.0
     zero[0] = -0.0  # equals t_0, in other bits
-    backwards, one = packed(t[::-1]), packed(t[:1])
-    assert leave_out_times([packed(zero), one, backwards])[:2] == [(packed(zero), False), (one, False)]
+    for one in map(signals, (zero, t[:1])):
+        assert pack_samples(one[None]) == [(packed(one), False)]
 
 
-@given(st.lists(st.binary(max_size=100), max_size=5))
-def test_any_bytes_come_back(blocks: list[bytes]) -> None:
-    found = leave_out_times(blocks)
-    assert [restore_times(stored) if regular else stored for stored, regular in found] == blocks
+@given(st.integers(0, 3), st.integers(1, 6), st.data())
+def test_any_samples_come_back(covariates: int, size: int, data: st.DataObject) -> None:
+    lists = st.lists(st.floats(width=64), min_size=(4 + covariates) * size, max_size=(4 + covariates) * size)
+    blocks = np.array(data.draw(st.lists(lists, min_size=1, max_size=3))).reshape(-1, 4 + covariates, size)
+    found = pack_samples(blocks)
+    assert [restore_times(stored) if regular else stored for stored, regular in found] == list(map(packed, blocks))
 
 
 class Feed:
@@ -70,9 +76,9 @@ class Feed:
         for asset in assets:
             sequence = self.counts[asset]
             self.counts[asset] += 1
-            samples = packed(BEGAN + sequence + np.arange(4) / 4.0, seed=sequence)
-            blocks.append((asset, sequence, samples))
-            self.needed[asset][sequence] = samples
+            samples = signals(BEGAN + sequence + np.arange(4) / 4.0, seed=sequence)
+            blocks.append((asset, sequence, *pack_samples(samples[None])[0]))
+            self.needed[asset][sequence] = packed(samples)
         for asset, first in first_needed.items():
             self.needed[asset] = {k: one for k, one in self.needed[asset].items() if k >= first}
         batch = Batch(first_needed=dict(first_needed), bundles=self.index.advance(blocks, first_needed))
@@ -176,8 +182,8 @@ def test_no_row_is_larger_than_a_database_takes(store: Store, monkeypatch: pytes
 
 def test_a_row_is_deleted_when_nobody_needs_a_block_of_it() -> None:
     index = BundleIndex([])
-    (row,) = index.advance([("a", 0, b"x" * 8), ("a", 1, b"y" * 8)], {}).new
+    (row,) = index.advance([("a", 0, b"x" * 8, False), ("a", 1, b"y" * 8, False)], {}).new
     assert row["samples"] == b"x" * 8 + b"y" * 8
     assert index.advance([], {"a": 1}).unneeded == []
     assert index.advance([], {"a": 2}).unneeded == [(row["bundle"], row["number"])]
-    assert index.advance([("a", 2, b"")], {"a": 3}).new == []  # after an outage: it is too old by now
+    assert index.advance([("a", 2, b"", False)], {"a": 3}).new == []  # after an outage: it is too old by now

@@ -24,7 +24,7 @@ from servoscope.cli.render.history import row_table
 from servoscope.core.errors import StoreError, StoreUnavailableError
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
-from servoscope.service.housekeeping import ASSETS_AT_ONCE, Housekeeping
+from servoscope.service.housekeeping import THIN_WITHIN_S, Housekeeping
 from servoscope.service.records import TableRow
 from servoscope.service.service import Service
 from servoscope.service.store import Batch, Store, schema, tables
@@ -301,12 +301,13 @@ def test_a_long_history_is_thinned_by_the_database_to_what_was_largest(store: St
 
 def test_sizes_of_many_assets_are_thinned_some_at_each_look(store: Store) -> None:
     """All of them at once would keep the blocks of a large service waiting."""
-    names, batch = [f"axis{i}" for i in range(ASSETS_AT_ONCE + 5)], Batch()
+    names, batch = [f"axis{i}" for i in range(5)], Batch()
     size = {"kind": "live", "name": "leakage", "value": 1.2, "low": 1.1, "high": 1.3, "healthy": 1.0}
     batch.rows["sizes"] = [{"asset": name, "t": t, **size} for name in names for t in (10.0, 20.0)]
     store.write(batch, "hall", 1)
     # one of them belongs to another service by now
-    context: Any = SimpleNamespace(store=store, assets=dict.fromkeys(names))
+    others = (f"other{i}" for i in range(round(2.0 * THIN_WITHIN_S)))
+    context: Any = SimpleNamespace(store=store, assets=dict.fromkeys([*names, *others]))
     batch = Batch()
     batch.rows["sizes"] = [{"asset": "gone", "t": t, **size} for t in (10.0, 20.0)]
     store.write(batch, "hall", 2)
@@ -316,7 +317,7 @@ def test_sizes_of_many_assets_are_thinned_some_at_each_look(store: Store) -> Non
     for _ in range(2):
         housekeeping._thin_sizes()
         left.append(len(store.fetch(sa.select(tables.sizes))))
-    assert left == [2 + ASSETS_AT_ONCE + 2 * 5, 2 + ASSETS_AT_ONCE + 5] and not housekeeping._to_thin
+    assert left == [2 + 3 + 2 * 2, 2 + 5] and not housekeeping._to_thin
 
 
 def test_what_others_change_is_told_in_the_audit(store: Store) -> None:

@@ -130,7 +130,7 @@ def write_samples(store: Store, commits: int, asset: str, samples: bytes) -> Non
     """Write a block of an asset with each commit."""
     index = store.bundle_index("hall")
     for k in range(commits):
-        batch = Batch(bundles=index.advance([(asset, 1_000_000 + k, samples)], {}))
+        batch = Batch(bundles=index.advance([(asset, 1_000_000 + k, samples, False)], {}))
         store.write(batch, "hall", store.last_commit("hall") + 1)
 
 

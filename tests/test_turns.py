@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 import halls
 from halls import RESULTS, asked, hall
@@ -36,7 +37,7 @@ from servoscope.service.service import Service
 from servoscope.service.sources.block import Block
 from servoscope.signals.quality import QualitySettings
 
-BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
+BEGAN = 1767225580.0  # 2025-12-31T23:59:40Z: coefficients are stored in the middle of what is sent
 POLICY = AssetPolicy(
     DiagnosisSettings(window_s=20.0, every_s=30.0), QualitySettings(), AlarmSettings.model_validate({}), 2.0
 )
@@ -86,6 +87,7 @@ def test_assets_of_one_structure_go_together_to_the_bits_that_each_has_alone(mon
         expected[name] = [row for block in blocks for row in alone[name].process(block).rows]
     assert sum(row.table == "residuals" for row in expected["asset1"]) > 10
     assert any(row.table == "transitions" for row in expected["asset1"])  # its leak is alarmed
+    assert len({row.values["t"] for row in expected["asset0"] if row.table == "sizes"}) == 2
     while any(waiting.values()):
         turn = [blocks.pop(0) for blocks in waiting.values() for _ in range(min(chance.randrange(4), len(blocks)))]
         for name, rows in halls.block_rows(groups.process(turn)):
@@ -162,11 +164,12 @@ def test_whatever_happens_to_some_assets_all_come_to_what_they_come_to_alone(
         if chance.random() < 0.3 and name in saved:  # killed: it goes on from its checkpoint and what came since
             killed, reception = together[name], together[name].reception
             together[name] = Asset(name, killed.baseline, killed.monitor, POLICY)
-            stored = [Block.unpack(name, *one.values.values()) for one in found[name] if one.table == "recent"]
+            stored = [halls.stored_block(name, one) for one in found[name] if one.table == "recent"]
             groups = AssetGroups(together)
             left = together[name].resume(unpack_state(saved[name], name), stored[-80:])
             behind += len(left)
-            assert all([row.table for row in rows] == ["recent"] for _, rows in halls.block_rows(groups.process(left)))
+            again = [row for _, rows in halls.block_rows(groups.process(left)) for row in rows]
+            assert all(row in found[name] for row in again)  # nothing that was not stored with these blocks
             together[name].reception = reception
     assert found == expected
     assert quiet > 100 and behind > 5
@@ -216,6 +219,31 @@ def test_states_that_waited_are_computed_again_after_a_kill(tmp_path: Path, monk
     assert cut == whole
 
 
+def test_rows_of_the_history_that_no_state_knows_keep_their_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a kill a setting is changed, or a new state begins: samples then lead to fewer rows than are stored."""
+    halls.files(tmp_path)
+    config = hall(tmp_path, "hall")
+    monkeypatch.setattr(writer, "MIN_CHECKPOINTS", 0)  # only what cannot wait is written
+    monkeypatch.setattr(writer, "CHECKPOINT_SHARE", 10**9)
+    monkeypatch.setattr(service_module, "MAX_BLOCKS_PER_POLL", 3)
+    killed = halls.service_of(config)
+    for _ in range(40):
+        killed._run_once()
+        killed._commit()
+    state = unpack_state(killed.store.checkpoints(["press"])["press"]["state"], "press")
+    killed.store.close()
+    ((last,),) = asked(config, "SELECT max(number) FROM residuals WHERE asset = 'press'")
+    assert last > state.position.rows
+    config.write_text(config.read_text().replace("residual_every_s = 2.0", "residual_every_s = 500.0"))
+    for restarted in ([], ["press"]):
+        found = build_components(ServiceFile.load(config), restarted)
+        found.store.close()
+        resumed = found.assets["press"].state
+        assert resumed is not None and resumed.position.rows == last
+
+
 class WatchedArray(np.ndarray):
     """Lets another one look each time that something was written into it."""
 
@@ -239,7 +267,11 @@ def test_metrics_are_read_at_any_moment_of_a_turn(monitors: list[Monitor], monke
         turn = [replace(block, asset=name, sequence=int(groups._assets[name].heard) and k) for name in awake]
         list(groups.process(turn))
     assert len(texts) > 30
-    assert b'servoscope_blocks_total{asset="asset2"} 30.0' in metrics.render()
+    text = metrics.render()
+    assert b'servoscope_blocks_total{asset="asset2"} 30.0' in text
+    (verdicts,) = (one for one in text_string_to_metric_families(text.decode()) if one.name == "servoscope_verdict")
+    shown = {one.labels["asset"]: one.labels["verdict"] for one in verdicts.samples}
+    assert shown == {name: one.status(one.state).verdict for name, one in together.items() if one.state is not None}
     before = [weakref.ref(one) for one in states._evaluations if one is not None]
     for asset in together.values():
         asset.take_state()  # as of one that falls silent

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.core.arrays import ComplexArray, FloatArray, IndexArray
+from servoscope.core.arrays import ComplexArray, FloatArray
 from servoscope.estimation.filter_bank import FilterBank
 
 CHI2_95_2DOF = 5.991464547107979  # chi-square quantile, 2 degrees of freedom: an ellipse that holds 95 %
@@ -59,8 +59,8 @@ class ResponseRow(NamedTuple):
     imag_variance: float
 
 
-def response_rows(estimate: FrequencyResponse, nominal: FrequencyResponse, k: int | IndexArray) -> FloatArray:
-    """Return the evaluations `k` of a response as plain numbers, the fields of `ResponseRow`: shape (..., F, 8)."""
+def response_rows(estimate: FrequencyResponse, nominal: FrequencyResponse, k: Any) -> FloatArray:
+    """Return a response as plain numbers, the fields of `ResponseRow`, shape (..., F, 8), at an index `k` of arrays."""
     H, healthy, C = estimate.H[k], nominal.H[k], estimate.covariance[k]
     f = np.broadcast_to(estimate.frequencies, H.shape)
     parts = (f, H.real, H.imag, healthy.real, healthy.imag, C[..., 0, 0], C[..., 0, 1], C[..., 1, 1])

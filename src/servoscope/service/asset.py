@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -37,11 +37,12 @@ from servoscope.service.examination_schedule import (
     update_examination,
 )
 from servoscope.service.outlook import AssetLimits, Outlook, PrognosisSettings, single_fault
-from servoscope.service.recent_blocks import RecentBlocks
+from servoscope.service.recent_blocks import PackedBlock, RecentBlocks
 from servoscope.service.reception import FOLLOWED, Reception
-from servoscope.service.records import BlockRefusal, StepResult, TableRow, transition_row
+from servoscope.service.records import REPEATABLE, BlockRefusal, StepResult, TableRow, transition_row
 from servoscope.service.sources.block import Block
-from servoscope.service.sources.continuity import BlockContinuity, check_continuity
+from servoscope.service.sources.continuity import NextBlock, check_continuity
+from servoscope.service.store.bundles import pack_samples
 from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
 from servoscope.signals import quality
 
@@ -57,13 +58,6 @@ class AssetPolicy:
     prognosis: PrognosisSettings = field(default_factory=PrognosisSettings)
     limits: AssetLimits = field(default_factory=dict)
     assets: int = field(default=1, compare=False)  # of the process: one more changes nothing for the others
-
-
-class NextBlock(NamedTuple):
-    """A block that is to be followed, and how it follows what was counted."""
-
-    block: Block
-    continuity: BlockContinuity = BlockContinuity(0, anew=False)
 
 
 class Asset(StateHolder):
@@ -163,11 +157,15 @@ class Asset(StateHolder):
         """Return what users see of a state."""
         return asset_status(state, self._alarms.definitions, self._metadata, self.reception)
 
+    def standing_alarms(self, state: AssetState) -> list[tuple[str, str, str]]:
+        """Return name, priority and state of each alarm that is not normal."""
+        return self._alarms.standing(state.alarms)
+
     @property
     def first_needed_sequence(self) -> int:
         """The number of the first block of the window: earlier ones are no longer needed."""
         first = self._window.first_sequence
-        return self._current.position.blocks if first is None else first
+        return first if first is not None else self._current.position.blocks
 
     def process(self, block: Block, latest: float = math.inf) -> StepResult:
         """Process a block; one that was counted before has no effect, nor has one that is later than `latest` [UTC s].
@@ -198,26 +196,25 @@ class Asset(StateHolder):
 
     def follow(self, accepted: NextBlock) -> LaneOutput:
         """Follow an accepted block alone."""
-        block, continuity = accepted
-        return self.lanes.follow(self.monitor, self._current, block.signals, restart=continuity.is_broken)
+        block, restart = accepted.block, accepted.continuity.is_broken
+        return self.lanes.follow(self.monitor, self._current, block.signals, restart=restart)
 
     def conclude(self, accepted: NextBlock, followed: LaneOutput) -> StepResult:
         """Take what an accepted block has led to."""
-        before, self._result = self.take_state(), StepResult([], [])
-        self._count(*accepted, followed)
+        before = self.take_state()
+        self._count(accepted, followed)
         self._examine()
         self._advance_alarms(self._current.position.t)
         self._window.trim(self._current.position.t, self._current.pending_diagnoses)
-        after, undisturbed = self._current, self.reception == FOLLOWED and not self._ticked
-        self._ticked = False
+        after, undisturbed, self._ticked = self._current, self.reception == FOLLOWED and not self._ticked, False
         nothing_else = after.alarms is before.alarms and after.examination is before.examination
-        return self._result._replace(repeatable=nothing_else and undisturbed and len(self._result.rows) == 1)
+        repeatable = nothing_else and undisturbed and REPEATABLE.issuperset(row.table for row in self._result.rows)
+        return self._result._replace(repeatable=repeatable)
 
-    def keep(self, sequence: int, block: Block, packed: bytes) -> None:
-        """Keep the samples of a quiet block, stored under this number, whose state is there."""
-        last = block.t.item(-1)
-        self._window.append(sequence, block.t.item(0), last, block.t.size, packed)
-        self._window.trim(last, self.pending_diagnoses)
+    def keep(self, block: PackedBlock) -> None:
+        """Keep the samples of a quiet block whose state is there."""
+        self._window.append(block)
+        self._window.trim(block[2], self.pending_diagnoses)
 
     def _leave_out(self, block: Block, kind: Literal["late", "future"], **seconds: float) -> StepResult:
         """Count a block that is left out for its time stamps; its place in its stream has passed."""
@@ -324,12 +321,14 @@ class Asset(StateHolder):
     def _add_sizes(self, rows: Iterable[dict[str, Any]]) -> None:
         self._result.rows.extend(TableRow("sizes", row) for row in rows)
 
-    def _count(self, block: Block, continuity: BlockContinuity, followed: LaneOutput) -> None:
+    def _count(self, accepted: NextBlock, followed: LaneOutput) -> None:
         """Keep a block and the state after it."""
-        state, position, packed = self._current, self._current.position, block.pack()
+        (block, continuity, packed), state = accepted, self._current
+        position, (samples, regular) = state.position, packed or pack_samples(block.signals[None])[0]
         # stored under a number of our own, because the sender's may begin anew
-        self._window.append(position.blocks, block.t.item(0), block.t.item(-1), block.t.size, packed)
-        self._result.rows.append(TableRow("recent", {"sequence": position.blocks, "samples": packed}))
+        self._window.append((position.blocks, block.t.item(0), block.t.item(-1), block.t.size, samples, regular))
+        stored = {"sequence": position.blocks, "samples": samples, "regular": regular}
+        self._result = StepResult([TableRow("recent", stored)], [])
         if continuity.is_broken:
             self._result.rows.append(continuity.audit_row(position, block))
         self.state = evolve(
@@ -348,7 +347,7 @@ class Asset(StateHolder):
                 blocks=position.blocks + 1,
                 samples=position.samples + block.t.size,
                 lost=position.lost + continuity.lost,
-                digest=zlib.crc32(packed, position.digest),
+                digest=zlib.crc32(block.pack(), position.digest),
             ),
         )
         for row in followed.rows:

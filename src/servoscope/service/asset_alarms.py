@@ -13,6 +13,7 @@ from servoscope.service.alarms import (
     AlarmStandstill,
     AlarmState,
     AlarmTransition,
+    LifecycleState,
     OperatorCommand,
     advance_alarms,
     initial_alarm_state,
@@ -63,6 +64,14 @@ class AssetAlarms:
         still = not transitions and not self._by_numbers
         self._settled = AlarmStandstill(known, t, next_event_time(self.definitions, alarms)) if still else None
         return evolve(state, alarms=alarms, alarms_at=None), transitions
+
+    def standing(self, alarms: Mapping[str, AlarmState]) -> list[tuple[str, str, str]]:
+        """Return name, priority and state of each of these alarms that is not normal."""
+        return [
+            (name, self.definitions[name].priority, one.state.value)
+            for name, one in alarms.items()
+            if one.state is not LifecycleState.NORMAL
+        ]
 
     def execute(
         self, state: AssetState, alarm: str, command: OperatorCommand

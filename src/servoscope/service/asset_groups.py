@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -11,11 +12,14 @@ import numpy as np
 from servoscope.core.arrays import FloatArray, IndexArray
 from servoscope.core.errors import ServoscopeError
 from servoscope.diagnosis.monitor import Monitor
-from servoscope.service.asset import Asset, NextBlock
+from servoscope.service.asset import Asset
 from servoscope.service.asset_states import AssetStates
 from servoscope.service.layer_times import LayerTimes
-from servoscope.service.records import StepResult
+from servoscope.service.recent_blocks import PackedBlock
+from servoscope.service.records import StepResult, TableRow
 from servoscope.service.sources.block import Block
+from servoscope.service.sources.continuity import NextBlock
+from servoscope.service.store.bundles import pack_samples
 
 
 class BlockResult(NamedTuple):
@@ -26,12 +30,12 @@ class BlockResult(NamedTuple):
 
 
 class QuietBlocks(NamedTuple):
-    """Blocks, at most one of each asset, that have led to nothing but the states after them."""
+    """Blocks, at most one of each asset, that have led to nothing but states and rows that are due at their times."""
 
     assets: list[Asset]
     blocks: list[Block]
-    numbers: list[int]  # under which the store has them
-    packed: list[bytes]  # their samples, as the store has them
+    packed: list[PackedBlock]  # their samples, under their numbers, as the store has them
+    history: list[tuple[int, TableRow]]  # each row with which of the blocks it is of
 
 
 class _Fleet(NamedTuple):
@@ -92,7 +96,7 @@ class AssetGroups:
             yield from self._process_round(turn.values(), latest)
 
     def _process_round(self, turn: Iterable[Block], latest: float) -> Iterator[BlockResult | QuietBlocks]:
-        together: dict[tuple[int, tuple[int, ...]], list[Block]] = defaultdict(list)
+        together: dict[tuple[int, tuple[int, ...], bool], list[Block]] = defaultdict(list)
         alone = list[Block]()
         for block in turn:
             place = self._places.get(block.asset)
@@ -101,13 +105,14 @@ class AssetGroups:
             except ServoscopeError as error:  # one asset's trouble must not stop the others
                 yield BlockResult(block, error)
                 continue
-            if place is None or not place.asset.heard:
+            if place is None:
                 alone.append(block)
             else:
-                together[place.fleet, block.signals.shape].append(block)
-        for (fleet, shape), blocks in together.items():
+                together[place.fleet, block.signals.shape, place.asset.heard].append(block)
+        for (fleet, shape, heard), blocks in together.items():
             signals = np.concatenate([one.signals for one in blocks]).reshape(len(blocks), *shape)
-            yield from self._process_together(self._fleets[fleet], blocks, signals, latest, alone)
+            process = self._process_together if heard else self._process_first
+            yield from process(self._fleets[fleet], blocks, signals, latest, alone)
         for block in alone:
             yield BlockResult(block, self._process_alone(block, latest))
 
@@ -124,6 +129,34 @@ class AssetGroups:
         followed = asset.follow(accepted)
         self.layers.enter("judge")
         return asset.conclude(accepted, followed)
+
+    def _process_first(
+        self, fleet: _Fleet, blocks: Sequence[Block], signals: FloatArray, latest: float, alone: list[Block]
+    ) -> Iterator[BlockResult]:
+        """Process the first blocks of assets, of one shape; those that must go `alone` are added there.
+
+        One by one they take twice as long, and all assets of a plant may begin at once.
+        """
+        self.layers.enter("assemble")
+        lanes, t = self._assets[blocks[0].asset].lanes, signals[:, 0]
+        begins = lanes.begin_regularly(t) & ~(t[:, -1] > latest)
+        begins &= np.array([not one.stream or not one.sequence for one in blocks])
+        chosen = np.flatnonzero(begins)
+        own = [blocks[i] for i in chosen.tolist()]
+        alone += [blocks[i] for i in np.flatnonzero(~begins).tolist()]
+        if not own:
+            return
+        self.layers.enter("judge")
+        places, assets = [self._places[one.asset] for one in own], [self._assets[one.asset] for one in own]
+        accepted = [asset.accept(block, latest) for asset, block in zip(assets, own, strict=True)]
+        states = [asset.take_state() for asset in assets]
+        before = np.stack([one.monitor for one in states]), np.stack([one.quality for one in states])
+        part = fleet.monitor.select(np.array([one.baseline for one in places]))
+        found = lanes.follow_lanes(part, before, 0, signals[chosen], self.layers, begins=True)
+        packed = pack_samples(signals[chosen])
+        for i, (asset, one) in enumerate(zip(assets, accepted, strict=True)):
+            assert isinstance(one, NextBlock), "nothing came before it, and it is not of the future"
+            yield BlockResult(own[i], asset.conclude(one._replace(packed=packed[i]), found.lane(i, states[i])))
 
     def _process_together(
         self, fleet: _Fleet, blocks: Sequence[Block], signals: FloatArray, latest: float, alone: list[Block]
@@ -157,17 +190,18 @@ class AssetGroups:
         part = fleet.monitor.select(np.array([self._places[one.asset].baseline for one in blocks]))
         before, samples = (states.monitor[rows], states.quality[rows]), int(states.columns["samples"][rows[0]])
         found = assets[0].lanes.follow_lanes(part, before, samples, signals, self.layers)
-        are_quiet = states.are_quiet(rows, found)
+        are_quiet, packed = states.are_quiet(rows, found), pack_samples(signals)
         for i in np.flatnonzero(~are_quiet).tolist():
-            accepted = NextBlock(blocks[i])
+            accepted = NextBlock(blocks[i], packed=packed[i])
             followed = found.lane(i, assets[i].take_state())
             yield BlockResult(blocks[i], assets[i].conclude(accepted, followed))
         quiet = np.flatnonzero(are_quiet)
         if quiet.size:
-            own = quiet.tolist()
-            mine, theirs = [blocks[i] for i in own], [assets[i] for i in own]
-            packed = [one.pack() for one in mine]
-            numbers = states.advance(rows[quiet], found, quiet, packed)
-            for asset, number, block, samples_of in zip(theirs, numbers, mine, packed, strict=True):
-                asset.keep(number, block, samples_of)
-            yield QuietBlocks(theirs, mine, numbers, packed)
+            chosen = quiet.tolist()
+            own, theirs = [packed[i] for i in chosen], [assets[i] for i in chosen]
+            numbers, history = states.advance(rows[quiet], found, quiet, signals)
+            times = signals[quiet, 0][:, [0, -1]].T.tolist()
+            kept = list(zip(numbers, *times, repeat(found.size, quiet.size), *zip(*own, strict=True), strict=True))
+            for asset, block in zip(theirs, kept, strict=True):
+                asset.keep(block)
+            yield QuietBlocks(theirs, [blocks[i] for i in chosen], kept, history)

@@ -1,7 +1,8 @@
 """The states of assets that are followed together, as arrays: most blocks change nothing but a row of them.
 
-Such a block is quiet: it follows the one before it, no examination, alarm or row of the store comes from it, and the
-state after it is a row of numbers. All that a quiet block does not change stays in the record that the asset has.
+Such a block is quiet: it follows the one before it, no examination or alarm comes from it, rows of the history and of
+the coefficients only when they are due, and the state after it is a row of numbers. All that a quiet block does not
+change stays in the record that the asset has.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.core.arrays import BoolArray, IndexArray
-from servoscope.service.block_lanes import LaneEvaluations, LanesOutput
-from servoscope.service.checkpoint import AssetState, evolve
+from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
+from servoscope.service.block_lanes import LanesOutput
+from servoscope.service.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.examination_schedule import PendingDiagnosis
+from servoscope.service.records import TableRow
 from servoscope.service.residual_history import HistoryState
-from servoscope.service.store.rows import SIZE_EVERY_S
+from servoscope.service.store.rows import SIZE_EVERY_S, coefficient_rows
 from servoscope.signals import quality
 
 COLUMNS = np.dtype(
@@ -31,6 +33,7 @@ COLUMNS = np.dtype(
         ("blocks", np.int64),
         ("counted", np.int64),
         ("digest", np.int64),
+        ("rows", np.int64),
         # of what was followed: times are NaN where there is none
         ("samples", np.int64),
         ("last_t", np.float64),
@@ -47,6 +50,10 @@ COLUMNS = np.dtype(
         ("until", np.float64),
     ]
 )
+
+# columns of the position, and its fields in their order
+POSITION = ["t", "sequence", "blocks", "counted", "digest", "rows"]
+POSITION_FIELDS = ["samples" if name == "counted" else name for name in POSITION]
 
 
 class RestPeriod(NamedTuple):
@@ -66,11 +73,11 @@ class StateRow(NamedTuple):
     @property
     def t(self) -> float:
         """Time of its last sample [UTC s]."""
-        return float(self.states.columns["t"][self.row])
+        return float(self.states.t[self.row])
 
-    def read(self, before: AssetState, *, evaluation: bool = True) -> AssetState:
-        """Return the state; `before`: when it came here; `evaluation`: False leaves that as it was then."""
-        return self.states.read(self.row, before, evaluation=evaluation)
+    def read(self, before: AssetState) -> AssetState:
+        """Return the state; `before`: when it came here."""
+        return self.states.read(self.row, before)
 
     def leave(self) -> None:
         """Let the row be empty."""
@@ -82,6 +89,8 @@ class AssetStates:
 
     def __init__(self, assets: int, size: int) -> None:
         self.columns = np.zeros(assets, COLUMNS)
+        self.t = self.columns["t"]  # of the last sample of each [UTC s]
+        self._positions = self.columns[POSITION]
         self.monitor, self.quality = np.zeros((assets, size)), np.zeros((assets, quality.init_state().size))
         # the newest evaluations of each asset, since its state is here; its column `lane` says which of them
         self._evaluations = np.full(assets, None, dtype=object)
@@ -92,6 +101,7 @@ class AssetStates:
         self.columns[row] = (
             True,
             *(position.t, position.sequence, position.stream, position.blocks, position.samples, position.digest),
+            position.rows,
             *(state.samples, _number(state.last_t), _number(evaluation.t), evaluation.exceeded),
             *(_number(history.period), history.excess, history.level, _number(state.alarms_at)),
             *(0, *rest),
@@ -104,13 +114,12 @@ class AssetStates:
         self.columns["is_here"][row] = False
         self._evaluations[row] = None
 
-    def read(self, row: int, before: AssetState, *, evaluation: bool = True) -> AssetState:
-        """Return the state in a row; `before`: as it was put there; `evaluation`: False leaves that as it was then."""
-        one = dict(zip(COLUMNS.names or (), self.columns[row].item(), strict=True))
-        if one["blocks"] == before.position.blocks:
+    def read(self, row: int, before: AssetState) -> AssetState:
+        """Return the state in a row; `before`: as it was put there."""
+        position, evaluations = self.read_position(row, before.position), self._evaluations[row]
+        if position is before.position:
             return before
-        changed = {key: one[key] for key in ("t", "sequence", "blocks", "digest")}
-        evaluations: LaneEvaluations | None = self._evaluations[row] if evaluation else None
+        one = dict(zip(COLUMNS.names or (), self.columns[row].item(), strict=True))
         history, latest = before.history, before.evaluation
         if evaluations is not None:
             history = HistoryState(int(one["period"]), one["excess"], one["level"])
@@ -119,11 +128,18 @@ class AssetStates:
             before,
             monitor=self.monitor[row].copy(),
             quality=self.quality[row].copy(),
-            position=evolve(before.position, samples=one["counted"], **changed),
+            position=position,
             history=history,
             evaluation=latest,
             **{key: one[key] for key in ("samples", "last_t", "alarms_at")},
         )
+
+    def read_position(self, row: int, before: StreamPosition) -> StreamPosition:
+        """Return the position of the state in a row; `before`: as it was put there."""
+        values = self._positions[row].item()
+        if values[POSITION.index("blocks")] == before.blocks:
+            return before
+        return evolve(before, **dict(zip(POSITION_FIELDS, values, strict=True)))
 
     def are_next(self, rows: IndexArray, sequences: Sequence[int], streams: Sequence[int]) -> BoolArray:
         """Tell which of some blocks follow what was counted."""
@@ -138,26 +154,45 @@ class AssetStates:
         exceeded, new = one["exceeded"], found.evaluations
         if new is not None:
             exceeded = new.exceeded
-            quiet &= (new.periods == one["period"]).all(axis=0)
-            quiet &= new.t // SIZE_EVERY_S == one["evaluated"] // SIZE_EVERY_S
+            quiet &= np.isfinite(one["period"]) & (new.count_periods(one["period"]) <= 1)
         return np.asarray(quiet & (exceeded == one["is_fault"]))
 
-    def advance(self, rows: IndexArray, found: LanesOutput, lanes: IndexArray, packed: Sequence[bytes]) -> list[int]:
-        """Take what some `lanes` of quiet blocks, of samples packed like this, have led to; return their numbers."""
+    def advance(
+        self, rows: IndexArray, found: LanesOutput, lanes: IndexArray, signals: FloatArray
+    ) -> tuple[list[int], list[tuple[int, TableRow]]]:
+        """Take what some `lanes` of quiet blocks have led to.
+
+        `signals`: of all lanes, shape (blocks, 4 + k, N); the digest goes on as by what `Block.pack` returns. Returns
+        the numbers of the blocks, and rows of the history and of the coefficients, each with the place of its lane.
+        """
         one, new = self.columns[rows], found.evaluations
-        numbers: list[int] = one["blocks"].tolist()
+        count = signals.shape[1] - 4
+        tail, numbers_of = bytes([count] * (count > 0)), signals.astype("<f8", copy=False)
+        digests = zip(lanes.tolist(), one["digest"].tolist(), strict=True)
+        numbers, history = one["blocks"].tolist(), list[tuple[int, TableRow]]()
         one["t"] = one["last_t"] = one["alarms_at"] = found.t[lanes]
-        one["digest"] = [zlib.crc32(each, before) for each, before in zip(packed, one["digest"].tolist(), strict=True)]
+        one["digest"] = [zlib.crc32(tail, zlib.crc32(numbers_of[lane], before)) for lane, before in digests]
         for name, more in (("sequence", 1), ("blocks", 1), ("counted", found.size), ("samples", found.size)):
             one[name] += more
         if new is not None:
-            _, level, excess = new.peaks[:, lanes]
-            for name, values in (("excess", excess), ("level", level)):
-                one[name] = np.where(values > one[name], values, one[name])
+            before = np.stack([one["excess"], one["level"]])
+            (one["excess"], one["level"]), due, values = new.update_histories(lanes, one["period"], before)
+            one["period"] = new.periods[lanes, -1]
+            one["rows"][due] += 1
+            counts = one["rows"][due].tolist()
+            history = [
+                (lane, TableRow("residuals", {"number": number, **row}))
+                for lane, number, row in zip(due.tolist(), counts, values, strict=True)
+            ]
+            sized = new.t[lanes] // SIZE_EVERY_S != one["evaluated"] // SIZE_EVERY_S  # as `period_number` says
+            for lane in np.flatnonzero(sized).tolist():
+                latest = new.latest(int(lanes[lane]))
+                sizes = coefficient_rows(float(new.t[lanes[lane]]), latest.status.parameters)
+                history += [(lane, TableRow("sizes", row)) for row in sizes]
             one["exceeded"], one["evaluated"], one["lane"] = new.exceeded[lanes], new.t[lanes], lanes
             self._evaluations[rows] = new
         self.columns[rows], self.monitor[rows], self.quality[rows] = one, found.monitor[lanes], found.quality[lanes]
-        return numbers
+        return numbers, history
 
 
 class StateHolder:
@@ -181,13 +216,15 @@ class StateHolder:
             self._row = None
 
     @property
-    def visible_state(self) -> AssetState | None:
-        """The state for another thread, while it may change: without its newest evaluation.
+    def visible_record(self) -> tuple[AssetState, StreamPosition] | None:
+        """The record and the position, for another thread, while they may change; None before it has begun.
 
-        That is in two places, which would not fit together for a moment.
+        Quality findings, examination and alarms are those of the record as long as the state is a row.
         """
         row, state = self._row, self._state  # each of them whole, if not the newest
-        return state if row is None or state is None else row.read(state, evaluation=False)
+        if state is None:
+            return None
+        return state, state.position if row is None else row.states.read_position(row.row, state.position)
 
     @property
     def has_state(self) -> bool:
@@ -199,12 +236,28 @@ class StateHolder:
         """The full diagnoses that it waits for; quiet blocks ask for none, so that the record knows them."""
         return () if self._state is None else self._state.pending_diagnoses
 
+    def renew_record(self) -> AssetState:
+        """Return the state, and let the record be as it is now: what it had of earlier turns is let go."""
+        self._state = state = self.state
+        assert state is not None, "begin or resume comes first"
+        return state
+
     def take_state(self) -> AssetState:
         """Return the state, and let it be nowhere else."""
         if self._row is not None:
             self.state = self.state
         assert self._state is not None, "begin or resume comes first"
         return self._state
+
+    def count_rows(self, last: int) -> None:
+        """Let further rows have numbers behind `last`, of one that is stored.
+
+        Nearly always they have: not if a setting was changed after a kill, so that the samples in the store lead to
+        fewer rows than they did, nor if a new state begins without them.
+        """
+        state = self.take_state()
+        if last > state.position.rows:
+            self.state = evolve(state, position=evolve(state.position, rows=last))
 
     def _move_to(self, row: StateRow) -> None:
         self._row = row

@@ -146,6 +146,16 @@ def asset_summary(examination: ExaminationState, findings: Iterable[str], recept
     return render(message("service.examination.data_quality", findings=quality.describe_findings(findings)))
 
 
+def asset_verdict(examination: ExaminationState, findings: Iterable[str], reception: Reception) -> str:
+    """Return the verdict that holds, with what data quality and the reception leave of the last examination's."""
+    verdict = quality.limit_verdict(examination.verdict, findings)
+    if verdict == "healthy" and reception != FOLLOWED:
+        verdict = "undetermined"  # nobody knows what it does now
+    if verdict == "undetermined" and examination.fault_at is not None:
+        verdict = "fault"  # it was seen on sound data, and nothing has shown since that it has gone
+    return verdict
+
+
 def asset_snapshot(
     state: AssetState, findings: tuple[str, ...], reception: Reception, outlook: OutlookWord
 ) -> AssetSnapshot:
@@ -172,14 +182,12 @@ def asset_status(
 ) -> AssetStatus:
     """Return the status of an asset."""
     examination, findings = state.examination, quality.active_findings(state.quality)
-    verdict = quality.limit_verdict(examination.verdict, findings)
-    ne107 = evaluate_ne107(verdict, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
+    now = quality.limit_verdict(examination.verdict, findings)
+    ne107 = evaluate_ne107(now, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
     named, evaluation = examination.named, state.evaluation.status
-    if verdict == "healthy" and reception != FOLLOWED:
-        verdict = "undetermined"  # nobody knows what it does now
-    summary = named if verdict == "fault" and named else asset_summary(examination, findings, reception)
-    if verdict == "undetermined" and examination.fault_at is not None:
-        verdict = "fault"  # it was seen on sound data, and nothing has shown since that it has gone
+    verdict = asset_verdict(examination, findings, reception)
+    summary = named if now == "fault" and named else asset_summary(examination, findings, reception)
+    if verdict == "fault" and now != "fault":
         fault = named or render(message("service.examination.seen"))
         summary = render(message("service.examination.stands", fault=fault, t=examination.fault_at, since=summary))
     return AssetStatus.model_construct(  # its values are checked where it is read

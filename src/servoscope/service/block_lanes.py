@@ -5,19 +5,29 @@ Both ways lead to the same bits, so that nothing depends on which assets happen 
 
 from __future__ import annotations
 
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.checkpoint import AssetState
 from servoscope.service.layer_times import LayerTimes
-from servoscope.service.residual_history import HistoryState, LatestEvaluation, update_history
+from servoscope.service.residual_history import (
+    HistoryState,
+    LastEvaluations,
+    LatestEvaluation,
+    history_row,
+    ifrf_residual,
+    known_excess,
+    residual_rows,
+    update_history,
+)
 from servoscope.signals import quality
-from servoscope.signals.timebase import Timebase
+from servoscope.signals.timebase import MAX_TIME_S, Timebase
 
 
 class LaneOutput(NamedTuple):
@@ -36,23 +46,51 @@ class LaneEvaluations:
     """The evaluations of a block of each of several assets, at `times` [UTC s], shape (assets, K), K > 0.
 
     What is judged of them, of each asset: `exceeded`, whether the last one is above a limit; `peaks`, of the whole
-    block, shape (3, assets); `t`, time of the last one [UTC s]; `periods` of the history in which the first and the
-    last one lie, shape (2, assets).
+    block, shape (3, assets); `t`, time of the last one [UTC s]; `periods` of the history in which they lie, shape
+    (assets, K).
     """
 
     def __init__(self, trace: Trace, times: FloatArray, every_s: float) -> None:
         self._trace, self._times, self._every_s = trace, times, every_s
         self.exceeded, self.peaks, self.t = trace.exceeded[:, -1], _peaks(trace), times[:, -1]
-        self.periods = np.floor(times[:, [0, -1]].T / every_s)
+        self.periods = np.floor(times / every_s)
+        self._last = cache(partial(LastEvaluations, trace))  # most are replaced before anybody looks
 
     def latest(self, lane: int) -> LatestEvaluation:
         """Return the newest one of an asset."""
         excess, level, _ = self.peaks[:, lane].tolist()
-        return LatestEvaluation.from_trace(self._trace, float(self.t[lane]), (excess, level), lane)
+        t, features, last = float(self.t[lane]), self._trace.features, self._last
+        learned = None if features is None else float(features[lane, -1])
+        return LatestEvaluation(bool(self.exceeded[lane]), (excess, level), learned, t, lambda: last().status(lane, t))
 
     def update_history(self, lane: int, state: HistoryState) -> tuple[HistoryState, list[dict[str, Any]]]:
         """Add those of an asset to its history, as `residual_history.update_history` does."""
         return update_history(state, self._trace.lane(lane), self._times[lane], self._every_s)
+
+    def count_periods(self, before: FloatArray) -> IndexArray:
+        """Return how many periods of the history begin with them; `before`: those under way, shape (assets,)."""
+        return np.asarray(np.count_nonzero(np.diff(self.periods, prepend=before[:, None]), axis=1))
+
+    def update_histories(
+        self, lanes: IndexArray, period: FloatArray, peaks: FloatArray
+    ) -> tuple[FloatArray, IndexArray, list[dict[str, Any]]]:
+        """Add those of some assets to their histories, as `update_history` does, where no more than one row is due.
+
+        `period`: under way, shape (lanes,); `peaks`: its largest statistics, shape (2, lanes). Returns the peaks of the
+        period that is under way then, in which of the lanes a row is due, and these rows.
+        """
+        begins, largest = np.diff(self.periods[lanes], prepend=period[:, None]) != 0.0, self.peaks[[2, 1]][:, lanes]
+        due, after = np.flatnonzero(begins.any(axis=1)), np.where(largest > peaks, largest, peaks)
+        if not due.size:
+            return after, due, []
+        own, place = lanes[due], begins[due].argmax(axis=1)
+        found = np.stack([known_excess(self._trace)[own], self._trace.level[own]])
+        is_before = np.arange(found.shape[-1]) <= place[:, None]
+        until, since = (np.where(side, found, 0.0).max(axis=-1) for side in (is_before, ~is_before))
+        until, after[:, due] = np.where(until > peaks[:, due], until, peaks[:, due]), np.where(since > 0.0, since, 0.0)
+        residuals = map(residual_rows, ifrf_residual(self._trace, (own, place)))
+        rows = zip(self._times[own, place].tolist(), *until.tolist(), residuals, strict=True)
+        return after, due, [history_row(*row) for row in rows]
 
 
 class LanesOutput(NamedTuple):
@@ -112,6 +150,10 @@ class BlockLanes:
         """
         return self._timebase.is_regular(t, last)
 
+    def begin_regularly(self, t: FloatArray) -> BoolArray:
+        """Tell which of some first blocks, with times `t` (blocks, N), need no sorting."""
+        return self.are_regular(t, t[:, 0] - self._timebase.period) & (np.abs(t[:, [0, -1]]) < MAX_TIME_S).all(axis=1)
+
     def follow_lanes(
         self,
         fleet: Monitor,
@@ -119,17 +161,23 @@ class BlockLanes:
         samples: int,
         signals: FloatArray,
         layers: LayerTimes,
+        *,
+        begins: bool = False,
     ) -> LanesOutput:
         """Follow regular blocks of the assets of a fleet, of one length and one phase, side by side.
 
         `before`: states of monitor and data quality, shape (blocks, ...) each; `samples`: that the monitor of the first
-        asset has processed; `signals`: of the blocks, shape (blocks, 4 + k, N).
+        asset has processed; `signals`: of the blocks, shape (blocks, 4 + k, N); `begins`: whether nothing came before.
         """
         t, given = signals[:, 0], signals[:, 1:4]
         known = np.isfinite(given)
         used = given if known.all() else np.where(known, given, np.nan)
         layers.enter("kernel")
-        monitors, trace = fleet.run(before[0], used[:, 0], used[:, 1], used[:, 2])
+        restart = None
+        if begins:
+            restart = np.zeros(t.shape, dtype=np.bool_)
+            restart[:, 0] = True
+        monitors, trace = fleet.run(before[0], used[:, 0], used[:, 1], used[:, 2], restart)
         layers.enter("quality")
         checked = quality.check_lanes(self._limits, before[1], t, given)
         layers.enter("judge")
@@ -147,6 +195,5 @@ def _peaks(trace: Trace) -> FloatArray:
 
     Shape (3, ...). The history counts T^2 only where the estimator has learned something.
     """
-    excess = np.nan_to_num(trace.statistic / trace.threshold)
-    known = np.where(trace.ready, excess, 0.0)
-    return np.array([excess.max(axis=-1), trace.level.max(axis=-1), known.max(axis=-1, initial=0.0)])
+    excess = np.nan_to_num(trace.statistic / trace.threshold).max(axis=-1)
+    return np.array([excess, trace.level.max(axis=-1), known_excess(trace).max(axis=-1, initial=0.0)])

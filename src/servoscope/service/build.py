@@ -100,7 +100,7 @@ def resume_assets(
 
     Raises StateError if a saved state cannot be used.
     """
-    uncounted = list[Block]()
+    uncounted, behind = list[Block](), set[str]()  # behind: assets of which the store may know more than their states
     stored = store.recent_samples_of([name for name in assets if name in rows])
     for name, samples in chain(stored, ((name, []) for name in assets if name not in rows)):
         asset, blocks = assets[name], [Block.unpack(name, *one) for one in samples]
@@ -109,13 +109,18 @@ def resume_assets(
             for block in blocks[bisect.bisect_left(blocks, position.blocks, key=lambda one: one.sequence) :]:
                 position = position.skip(block.t, block.pack())
             asset.begin(position)
+            behind.add(name)
         elif name in rows:
-            uncounted += asset.resume(unpack_state(rows[name]["state"], name), blocks)
+            left = asset.resume(unpack_state(rows[name]["state"], name), blocks)
+            uncounted += left
+            behind |= {name} if left else set()
         if not asset.heard:
             asset.expect(time.time())
             asset.reception = UNHEARD
     # their checkpoints waited; all that they lead to is the state after them
     deque(groups.process(uncounted), maxlen=0)
+    for name, number in store.last_residuals(behind).items():
+        assets[name].count_rows(number)
 
 
 def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, BlockSource]]:

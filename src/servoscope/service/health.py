@@ -72,11 +72,18 @@ def status_gauges(statuses: Iterable[tuple[str, AssetStatus]]) -> Iterator[Metri
     for name, status in statuses:
         verdicts.add_metric([name, status.verdict], 1.0)
         count.update((alarm, one.priority or "", one.state.value) for alarm, one in status.alarms.items())
+    yield from (verdicts, alarm_gauge(count))
+
+
+def alarm_gauge(count: Mapping[tuple[str, str, str], int]) -> Metric:
+    """Return how many alarms of each name, priority and state are not normal."""
+    from prometheus_client.core import GaugeMetricFamily
+
     labels = ["alarm", "priority", "state"]
     alarms = GaugeMetricFamily("servoscope_alarms", "Alarms that are not normal", labels=labels)
     for key, number in count.items():
         alarms.add_metric(list(key), number)
-    yield from (verdicts, alarms)
+    return alarms
 
 
 class _Metrics(Protocol):

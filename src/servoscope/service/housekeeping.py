@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from typing import Protocol
@@ -23,7 +24,7 @@ from servoscope.service.store.series import thin_sizes
 from servoscope.service.writer import StoreWriter
 
 RETENTION_EVERY_S = 3600.0
-ASSETS_AT_ONCE = 5  # whose sizes are thinned at one look, a millisecond each: 18 000 in an hour
+THIN_WITHIN_S = 1800.0  # the sizes of all assets are thinned, some at each look, a millisecond each
 REJECTIONS_EVERY_S = 60.0  # between two audit rows about a flood of bad messages
 
 
@@ -160,7 +161,7 @@ class Housekeeping:
         thinned = 0
         # those of an asset that has gone to another service are thinned there
         self._to_thin = {name: t for name, t in self._to_thin.items() if name in self._service.assets}
-        for name in list(self._to_thin)[:ASSETS_AT_ONCE]:
+        for name in list(self._to_thin)[: math.ceil(len(self._service.assets) / THIN_WITHIN_S)]:
             thinned += thin_sizes(self._service.store, name, self._to_thin[name], self._thinned.get(name))
             self._thinned[name] = self._to_thin.pop(name)
         if thinned:

@@ -12,10 +12,9 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import ConfigError
 from servoscope.service.asset import Asset
-from servoscope.service.checkpoint import evolve
-from servoscope.service.health import status_gauges
+from servoscope.service.asset_metrics import write_asset_series
+from servoscope.service.health import alarm_gauge
 from servoscope.service.layer_times import LayerTimes
-from servoscope.service.residual_history import LatestEvaluation
 from servoscope.service.sources.base import BlockSource, Rejection
 from servoscope.service.writer import StoreWriter
 
@@ -24,14 +23,6 @@ if TYPE_CHECKING:
 
 
 BUCKETS_S = tuple(float(f"{base}e{power}") for power in (-3, -2, -1, 0, 1) for base in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0))
-STREAM_COUNTERS = {
-    "blocks": "Blocks that were counted",
-    "samples": "Samples that were counted",
-    "lost": "Blocks that never came",
-    "repeated": "Blocks that came once more and were left out",
-    "late": "Blocks left out because their time stamps lie behind what was counted",
-    "future": "Blocks left out because their time stamps lie ahead of the service's clock",
-}
 
 
 class MetricsContext(Protocol):
@@ -68,6 +59,7 @@ class ServiceMetrics:
         # of blocks: how many in each bin, and their sum [s]; one by one they would take longer than a kernel
         self._latencies = np.zeros(len(BUCKETS_S) + 1, dtype=np.int64), 0.0
         self._commits = histogram("commit", "Duration of a commit")
+        self._alarms = TotalCounter[tuple[str, str, str]]()  # that are not normal, by name, priority and state
         self._render_s = 0.0  # processor time of `render` so far [s]
         self._rejections = counter("refused", "Messages that could not be used", ["source", "asset", "kind"])
         self.registry.register(self)  # calls `collect`
@@ -87,7 +79,9 @@ class ServiceMetrics:
         from prometheus_client import generate_latest
 
         start = time.thread_time()
-        text = generate_latest(self.registry)
+        series = write_asset_series(self._service.assets)
+        self._alarms = series.alarms
+        text = generate_latest(self.registry) + series.text.encode()
         self._render_s += time.thread_time() - start
         return text
 
@@ -96,26 +90,7 @@ class ServiceMetrics:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
         from prometheus_client.utils import floatToGoString
 
-        service, followed = self._service, {}
-        for name, asset in self._service.assets.items():
-            if (state := asset.visible_state) is not None:
-                # the newest evaluation takes longer than all else to write down, and is no metric
-                state = evolve(state, evaluation=LatestEvaluation())
-                followed[name] = state.position, asset.status(state)
-        for key, words in STREAM_COUNTERS.items():
-            family = CounterMetricFamily(f"servoscope_{key}", words, labels=["asset"])
-            for name, (position, _) in followed.items():
-                family.add_metric([name], getattr(position, key))
-            yield family
-        last = GaugeMetricFamily("servoscope_last_sample_time_seconds", "Time of the last sample", labels=["asset"])
-        for name, (position, _) in followed.items():
-            if position.blocks:
-                last.add_metric([name], position.t)
-        receptions = GaugeMetricFamily(
-            "servoscope_reception", "1 for how an asset's samples come in", labels=["asset", "source", "state"]
-        )
-        for name, asset in service.assets.items():
-            receptions.add_metric([name, asset.source, asset.reception.state], 1.0)
+        service = self._service
         trouble = GaugeMetricFamily(
             "servoscope_connection_trouble", "Whether something is wrong with a source or outlet", labels=["name"]
         )
@@ -143,11 +118,9 @@ class ServiceMetrics:
         yield from (
             latency,
             layers,
-            receptions,
             trouble,
             intervals,
-            last,
-            *status_gauges((name, status) for name, (_, status) in followed.items()),
+            alarm_gauge(self._alarms),
             up,
         )
         for name, words, value in (

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterable
+from itertools import groupby
+
+import numpy as np
 
 from servoscope.service.examination_schedule import PendingDiagnosis
 from servoscope.service.sources.block import Block
+from servoscope.service.store.bundles import pack_samples, restore_times
+
+# number, first and last time [UTC s], how many samples, and these as `pack_samples` returns them; plain, as the garbage
+# collector skips these
+PackedBlock = tuple[int, float, float, int, bytes, bool]
 
 
 class RecentBlocks:
@@ -18,11 +26,12 @@ class RecentBlocks:
 
     def __init__(self, asset: str, span_s: float, rate: float, blocks: Iterable[Block] = ()) -> None:
         self._asset, self._span_s, self._most = asset, span_s, 2.0 * span_s * rate
-        # number, first and last time [UTC s], how many samples, and these packed
-        self._blocks = deque[tuple[int, float, float, int, bytes]]()
+        self._blocks = deque[PackedBlock]()
         self._samples = 0
-        for one in blocks:
-            self.append(one.sequence, one.t.item(0), one.t.item(-1), one.t.size, one.pack())
+        for _, alike in groupby(blocks, key=lambda one: one.signals.shape):
+            own = list(alike)
+            for one, packed in zip(own, pack_samples(np.stack([each.signals for each in own])), strict=True):
+                self.append((one.sequence, one.t.item(0), one.t.item(-1), one.t.size, *packed))
 
     def __len__(self) -> int:
         return len(self._blocks)
@@ -32,10 +41,10 @@ class RecentBlocks:
         """The number of the first block; None if there is none."""
         return self._blocks[0][0] if self._blocks else None
 
-    def append(self, sequence: int, first: float, last: float, size: int, packed: bytes) -> None:
-        """Add a block that follows the others: its number, first and last time [UTC s], size, and packed samples."""
-        self._blocks.append((sequence, first, last, size, packed))
-        self._samples += size
+    def append(self, block: PackedBlock) -> None:
+        """Add a block that follows the others."""
+        self._blocks.append(block)
+        self._samples += block[3]
 
     def begins_with(self, t: float) -> bool:
         """Whether one of the blocks begins at `t` [UTC s]."""
@@ -43,20 +52,20 @@ class RecentBlocks:
 
     def after(self, t: float) -> list[Block]:
         """Return the blocks that end after `t` [UTC s]."""
-        return [self._unpack(one[0], one[4]) for one in self._blocks if one[2] > t]
+        return [self._unpack(one[0], *one[4:]) for one in self._blocks if one[2] > t]
 
     def within(self, pending: PendingDiagnosis) -> list[Block]:
         """Return the blocks that a full diagnosis looks at."""
         found = (one for one in self._blocks if one[0] >= pending.first and one[1] < pending.until)
-        return [self._unpack(one[0], one[4]) for one in found]
+        return [self._unpack(one[0], *one[4:]) for one in found]
 
     def trim(self, t: float, pending: Collection[PendingDiagnosis]) -> None:
         """Drop what is not needed at `t` [UTC s] any more; also where the clock was set back."""
-        first = min(one.first for one in pending) if pending else None
-        while self._blocks and (first is None or self._blocks[0][0] < first):
-            if self._blocks[0][2] > t - self._span_s and self._samples <= self._most:
+        first, begin, blocks = min(one.first for one in pending) if pending else None, t - self._span_s, self._blocks
+        while blocks and (first is None or blocks[0][0] < first):
+            if blocks[0][2] > begin and self._samples <= self._most:
                 return
-            self._samples -= self._blocks.popleft()[3]
+            self._samples -= blocks.popleft()[3]
 
-    def _unpack(self, sequence: int, packed: bytes) -> Block:
-        return Block.unpack(self._asset, sequence, packed)
+    def _unpack(self, sequence: int, packed: bytes, regular: bool) -> Block:
+        return Block.unpack(self._asset, sequence, restore_times(packed) if regular else packed)

@@ -6,6 +6,9 @@ from typing import Any, NamedTuple
 
 from servoscope.service.alarms import AlarmDefinition, AlarmTransition
 
+# tables of what the samples and the state before them lead to, whenever and however often that is computed
+REPEATABLE = frozenset({"recent", "residuals", "sizes"})
+
 
 class TableRow(NamedTuple):
     """A row for the store: its table and its values."""

@@ -38,25 +38,43 @@ class EvaluationStatus(BaseModel):
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
-def evaluation_status(trace: Trace, t: float) -> EvaluationStatus:
-    """Return the status after a block of one asset with evaluations, the last of which was at `t` [UTC s]."""
-    excess = np.nan_to_num(trace.statistic / trace.threshold)
-    std = np.sqrt(np.maximum(np.diagonal(trace.covariance[-1]), 0.0))
-    values = zip(trace.names, trace.theta[-1].tolist(), std.tolist(), trace.expected[-1].tolist(), strict=True)
-    ready = bool(trace.ready[-1])
-    responses = response_rows(trace.ifrf, trace.ifrf_expected, -1).tolist() if ready else []
-    learned: dict[str, Any] = {} if trace.features is None else {"features": float(trace.features[-1])}
-    return EvaluationStatus.model_construct(  # its values are checked where it is read
-        **learned,
-        t=t,
-        statistic=float(excess[-1]),
-        level=float(trace.level[-1]),
-        peaks=(float(excess.max()), float(trace.level.max())),
-        residual=ifrf_residual(trace, -1),
-        exceeded=bool(trace.exceeded[-1]),
-        responses=tuple(ResponseRow(*row) for row in responses if all(map(math.isfinite, row))),
-        parameters=tuple(row for row in values if ready and all(map(math.isfinite, row[1:]))),
-    )
+class LastEvaluations:
+    """The last evaluation of a block of each of several assets as arrays, of which a status is a row.
+
+    `trace`: of a fleet, or of one asset. Of many assets together it takes a tenth of one by one.
+    """
+
+    def __init__(self, trace: Trace) -> None:
+        at = (slice(None) if trace.statistic.ndim == 2 else None, -1)  # of each array, shape (assets, ...)
+        excess = np.nan_to_num(trace.statistic / trace.threshold)
+        std = np.sqrt(np.maximum(np.diagonal(trace.covariance[at], axis1=-2, axis2=-1), 0.0))
+        parameters = np.stack([trace.theta[at], std, trace.expected[at]], axis=-1)
+        responses, ready = response_rows(trace.ifrf, trace.ifrf_expected, at), trace.ready[at][:, None]
+        statistics = excess[at], trace.level[at], excess.max(axis=-1).ravel(), trace.level.max(axis=-1).ravel()
+        self._statistics, self._exceeded = np.stack(statistics, axis=-1), trace.exceeded[at]
+        self._features = None if trace.features is None else trace.features[at]
+        self._residual, self._names = ifrf_residual(trace, at), trace.names
+        # each with which of its rows are known
+        self._parameters = parameters, ready & np.isfinite(parameters).all(axis=-1)
+        self._responses = responses, ready & np.isfinite(responses).all(axis=-1)
+
+    def status(self, asset: int, t: float) -> EvaluationStatus:
+        """Return the status of an asset after its block; `t`: of the last evaluation [UTC s]."""
+        statistic, level, *peaks = self._statistics[asset].tolist()
+        (parameters, known), (responses, seen) = ((x[asset], y[asset]) for x, y in (self._parameters, self._responses))
+        values = zip(self._names, parameters.tolist(), known.tolist(), strict=True)
+        learned: dict[str, Any] = {} if self._features is None else {"features": float(self._features[asset])}
+        return EvaluationStatus.model_construct(  # its values are checked where it is read
+            **learned,
+            t=t,
+            statistic=statistic,
+            level=level,
+            peaks=tuple(peaks),
+            residual=residual_rows(self._residual[asset]),
+            exceeded=bool(self._exceeded[asset]),
+            responses=tuple(ResponseRow(*row) for row in responses[seen].tolist()),
+            parameters=tuple((name, *row) for name, row, is_known in values if is_known),
+        )
 
 
 class LatestEvaluation:
@@ -77,17 +95,10 @@ class LatestEvaluation:
         self._write = write
 
     @classmethod
-    def from_trace(
-        cls, trace: Trace, t: float, peaks: tuple[float, float], lane: int | None = None
-    ) -> LatestEvaluation:
-        """Return the last evaluation of a block, at `t` [UTC s]; `lane`: of which asset, of a fleet's trace."""
-        own = () if lane is None else (lane,)
-        features = None if trace.features is None else float(trace.features[*own, -1])
-
-        def write() -> EvaluationStatus:
-            return evaluation_status(trace if lane is None else trace.lane(lane), t)
-
-        return cls(bool(trace.exceeded[*own, -1]), peaks, features, t, write)
+    def from_trace(cls, trace: Trace, t: float, peaks: tuple[float, float]) -> LatestEvaluation:
+        """Return the last evaluation of a block of one asset, at `t` [UTC s]."""
+        features = None if trace.features is None else float(trace.features[-1])
+        return cls(bool(trace.exceeded[-1]), peaks, features, t, lambda: LastEvaluations(trace).status(0, t))
 
     @classmethod
     def from_status(cls, status: EvaluationStatus) -> LatestEvaluation:
@@ -122,7 +133,7 @@ def update_history(
     if not t.size:
         return state, []
     periods = np.floor(t / every_s).astype(np.int64)
-    excess = np.nan_to_num(np.where(trace.ready, trace.statistic / trace.threshold, 0.0))
+    excess = known_excess(trace)
     before = int(periods[0]) if state.period is None else state.period
     rows, first, peaks = [], 0, (state.excess, state.level)
     # the last evaluation may be one that begins a period: it counts once
@@ -131,15 +142,32 @@ def update_history(
         peaks = max(peaks[0], float(new[0].max(initial=0.0))), max(peaks[1], float(new[1].max(initial=0.0)))
         first = k + 1
         if periods[k] != (before if k == 0 else periods[k - 1]):
-            residual = ifrf_residual(trace, k)
-            rows.append({"t": float(t[k]), "statistic": peaks[0], "level": peaks[1], "residual": residual})
+            rows.append(history_row(float(t[k]), *peaks, residual_rows(ifrf_residual(trace, k))))
             peaks = 0.0, 0.0
     return HistoryState(int(periods[-1]), *peaks), rows
 
 
-def ifrf_residual(trace: Trace, k: int) -> tuple[ResidualRow, ...]:
-    """Return the residual of the iFRF at evaluation k, per frequency; None where it is unknown."""
+def known_excess(trace: Trace) -> FloatArray:
+    """Return T^2 as a multiple of its limit; the history counts it only where the estimator has learned something."""
+    return np.nan_to_num(np.where(trace.ready, trace.statistic / trace.threshold, 0.0))
+
+
+def history_row(t: float, statistic: float, level: float, residual: tuple[ResidualRow, ...]) -> dict[str, Any]:
+    """Return a row of the history, without its number."""
+    return {"t": t, "statistic": statistic, "level": level, "residual": residual}
+
+
+def ifrf_residual(trace: Trace, k: Any) -> FloatArray:
+    """Return the residual of the iFRF at evaluations `k`, an index: shape (..., F, 4), as in `ResidualRow`."""
     healthy = trace.ifrf_expected.H[k]
-    numbers = [trace.ifrf.frequencies, *(f(trace.ifrf.H[k] - healthy) for f in (np.real, np.imag)), np.abs(healthy)]
-    rows: list[Any] = np.stack(numbers, axis=1).tolist()
+    difference = trace.ifrf.H[k] - healthy
+    f = np.broadcast_to(trace.ifrf.frequencies, healthy.shape)
+    return np.stack([f, difference.real, difference.imag, np.abs(healthy)], axis=-1)
+
+
+def residual_rows(residual: FloatArray) -> tuple[ResidualRow, ...]:
+    """Return the residual of one evaluation as it is stored, shape (F, 4): None where it is unknown."""
+    rows: list[Any] = residual.tolist()
+    if np.isfinite(residual).all():
+        return tuple(map(tuple, rows))
     return tuple((row[0], *(x if math.isfinite(x) else None for x in row[1:])) for row in rows)

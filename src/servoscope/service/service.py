@@ -218,9 +218,11 @@ class Service:
             self.writer.set_checkpoint(asset, block.completed_at, can_wait=result.repeatable)
 
     def _store_quiet(self, found: QuietBlocks) -> None:
-        for asset, number, packed in zip(found.assets, found.numbers, found.packed, strict=True):
-            self.writer.add_block(asset.name, number, packed)
+        for asset, (number, *_, samples, regular) in zip(found.assets, found.packed, strict=True):
+            self.writer.add_block(asset.name, number, samples, regular)
             self._receptions[asset.name].hear(self._listening_s)
+        for place, row in found.history:
+            self.writer.add(found.assets[place].name, [row])
         self.writer.set_checkpoints(found.assets, [one.completed_at for one in found.blocks])
 
     def handle_result(self, asset: Asset, result: StepResult) -> None:

@@ -83,15 +83,15 @@ class StoreWriter:
         """Take rows of an asset, or of the service."""
         for table, values in rows:
             if table == "recent":
-                self.add_block(owner, values["sequence"], values["samples"])
+                self.add_block(owner, **values)
                 continue
             # only the audit says when it was written: all else is the same for every run over the same samples
             at = {"at": time.time()} if table == "audit" else {}
             self._gathered.batch.rows[table].append({"asset": owner, **at, **values})
 
-    def add_block(self, asset: str, sequence: int, samples: bytes) -> None:
-        """Take a block of an asset, packed, under the store's number."""
-        self._gathered.samples.append((asset, sequence, samples))
+    def add_block(self, asset: str, sequence: int, samples: bytes, regular: bool) -> None:
+        """Take a block of an asset under the store's number, packed as `pack_samples` does."""
+        self._gathered.samples.append((asset, sequence, samples, regular))
 
     def set_checkpoint(self, asset: Asset, completed_at: float | None = None, *, can_wait: bool = False) -> None:
         """Take the state of an asset, after a block that had been complete at `completed_at`, if there was one.
@@ -152,7 +152,7 @@ class StoreWriter:
         waiting = (name for name in self._checkpoints if name not in self._urgent)  # the oldest first
         for name in [*self._urgent, *islice(waiting, count)]:
             asset = self._checkpoints.pop(name)
-            state, batch.first_needed[name] = asset.take_state(), asset.first_needed_sequence
+            state, batch.first_needed[name] = asset.renew_record(), asset.first_needed_sequence
             row = {"asset": name, "sequence": state.position.sequence, "state": pack_state(state)}
             batch.checkpoints[name] = {**row, "status": asset.status(state).to_json(), "at": time.time()}
         self._urgent = set()

@@ -27,6 +27,14 @@ class BlockContinuity(NamedTuple):
         return audit_row("blocks lost" if self.lost else "stream began anew", {"blocks": self.lost, **streams})
 
 
+class NextBlock(NamedTuple):
+    """A block that is to be followed, and how it follows what was counted."""
+
+    block: Block
+    continuity: BlockContinuity = BlockContinuity(0, anew=False)
+    packed: tuple[bytes, bool] | None = None  # its samples, if `pack_samples` has packed them
+
+
 def check_continuity(counted: StreamPosition | None, block: Block, latest: float = math.inf) -> BlockContinuity | None:
     """Return how a block follows what was counted; None: it was counted before, or its place has passed.
 

@@ -26,7 +26,8 @@ ROW_BYTES = 2**24  # about, at which another row begins: after an outage a commi
 RATE_DIGITS = 2  # of the rate of time stamps [Hz]
 
 
-SampleBlock = tuple[str, int, bytes]  # an asset, a sequence, and its packed samples as `Block.pack` returns them
+# an asset, a sequence, its samples, and whether they are without time stamps (`pack_samples`)
+SampleBlock = tuple[str, int, bytes, bool]
 # what a bundle's row tells of one of its blocks: asset, sequence, bytes in the row, and whether it is without its time
 # stamps, which follow from the first one and the rate
 BundlePart = tuple[str, int, int, bool]
@@ -84,9 +85,7 @@ class BundleIndex:
         wanted = [one for one in blocks if one[1] >= first_needed.get(one[0], one[1])]
         bundles: defaultdict[BundleKey, tuple[list[BundlePart], list[bytes]]] = defaultdict(lambda: ([], []))
         sizes, newest = defaultdict[int, int](int), self._number  # of each bundle, bytes so far
-        for (asset, sequence, _), (stored, regular) in zip(
-            wanted, leave_out_times([one[2] for one in wanted]), strict=True
-        ):
+        for asset, sequence, stored, regular in wanted:
             bundle = self._bundles.get(asset)
             if bundle is None:
                 bundle = self._bundles[asset] = bundle_number(asset)
@@ -110,34 +109,28 @@ class BundleIndex:
             held.append((sequence, key))
 
 
-def leave_out_times(blocks: Sequence[bytes]) -> list[tuple[bytes, bool]]:
-    """Return packed blocks, and whether they are without time stamps: where these are t_0 + k / rate to the last bit.
+def pack_samples(signals: FloatArray) -> list[tuple[bytes, bool]]:
+    """Return blocks of one shape as bytes, and of each whether it is without time stamps.
 
-    Such a block begins with t_0 and the rate, and `restore_times` returns what it was.
+    `signals`: t, r, u, y and the covariates of each, shape (blocks, 4 + k, N). Time stamps are left out where they are
+    t_0 + i / rate to the last bit: such a block begins with t_0 and the rate, and `restore_times` returns what
+    `Block.pack` would have returned, as other blocks are.
     """
-    found = [(one, False) for one in blocks]
-    alike: defaultdict[tuple[int, bytes], list[int]] = defaultdict(list)
-    for i, one in enumerate(blocks):
-        alike[len(one), one[-1:] if len(one) % 8 == 1 else b""].append(i)
-    for (length, tail), places in alike.items():
-        rows = 4 + tail[0] if tail else 4  # t, r, u, y and the covariates
-        n = length // 8 // rows
-        if n < 2 or 8 * rows * n + len(tail) != length:
-            continue
-        numbers = np.frombuffer(b"".join([blocks[i][: 8 * rows * n] for i in places]), dtype="<f8").reshape(-1, rows, n)
-        t, first = numbers[:, 0], numbers[:, 0, :1]
-        with np.errstate(all="ignore"):  # what is no time is kept as it is
-            rate = np.round((n - 1) / (t[:, -1:] - first), RATE_DIGITS)
-            regular = ((first + np.arange(n) / rate).view(np.int64) == t.view(np.int64)).all(axis=1)
-        short = np.concatenate([first, rate, numbers[:, 1:].reshape(len(places), -1)], axis=1)
-        for i, one_short, is_regular in zip(places, short, regular.tolist(), strict=True):
-            if is_regular:
-                found[i] = one_short.tobytes() + tail, True
-    return found
+    numbers, (count, rows, n) = signals.astype("<f8", copy=False), signals.shape
+    tail = bytes([rows - 4]) if rows > 4 else b""
+    t, first = numbers[:, 0], numbers[:, 0, :1]
+    if n < 2:
+        return [(one.tobytes() + tail, False) for one in numbers]
+    with np.errstate(all="ignore"):  # what is no time is kept as it is
+        rate = np.round((n - 1) / (t[:, -1:] - first), RATE_DIGITS)
+        regular = ((first + np.arange(n) / rate).view(np.int64) == t.view(np.int64)).all(axis=1)
+    short = np.concatenate([first, rate, numbers[:, 1:].reshape(count, -1)], axis=1)
+    stored = (short[i] if is_regular else numbers[i] for i, is_regular in enumerate(regular.tolist()))
+    return [(one.tobytes() + tail, is_regular) for one, is_regular in zip(stored, regular.tolist(), strict=True)]
 
 
 def restore_times(stored: bytes) -> bytes:
-    """Return the packed block that `leave_out_times` made shorter."""
+    """Return the packed block that `pack_samples` made shorter."""
     tail = stored[-1:] if len(stored) % 8 == 1 else b""
     (first, rate), signals = np.frombuffer(stored[:16], dtype="<f8"), stored[16 : len(stored) - len(tail)]
     n = len(signals) // 8 // (3 + tail[0] if tail else 3)
@@ -208,16 +201,25 @@ def _columns(*names: str) -> list[sa.Column[Any]]:
     return [tables.bundles.c[name] for name in names]
 
 
-def _is_row(owner: str, bundle: Any, number: Any) -> sa.ColumnElement[bool]:
+def _is_row(owner: Any, bundle: Any, number: Any) -> sa.ColumnElement[bool]:
     columns = tables.bundles.c
     return sa.and_(columns.bundle == bundle, columns.owner == owner, columns.number == number)
 
 
-def _read_row(connection: sa.Connection, owner: str, key: BundleKey, *, lock: bool = False) -> list[SampleBlock]:
-    """Return the blocks of a row, none if there is no such row any more."""
+# to make a statement takes longer than to execute it
+NEW_ROW = tables.bundles.insert()
+UNNEEDED_ROW = tables.bundles.delete().where(
+    _is_row(*(sa.bindparam(name) for name in ("of", "of_bundle", "of_number")))
+)
+
+
+def _read_row(
+    connection: sa.Connection, owner: str, key: BundleKey, *, lock: bool = False
+) -> list[tuple[str, int, bytes]]:
+    """Return the blocks of a row, each packed as `Block.pack` does, none if there is no such row any more."""
     query = sa.select(*_columns("contents", "samples")).where(_is_row(owner, *key))
     row = connection.execute(query.with_for_update() if lock else query).first()
-    found, at = list[SampleBlock](), 0
+    found, at = list[tuple[str, int, bytes]](), 0
     contents, whole = ("[]", b"") if row is None else row
     for asset, sequence, size, regular in _read_contents(contents):
         stored = whole[at : at + size]
@@ -231,11 +233,10 @@ def write_bundles(connection: sa.Connection, owner: str, changes: BundleChanges)
     for key in changes.sparse:
         dissolve_row(connection, owner, key)
     if changes.unneeded:
-        unneeded = _is_row(owner, sa.bindparam("of_bundle"), sa.bindparam("of_number"))
-        keys = [{"of_bundle": bundle, "of_number": number} for bundle, number in changes.unneeded]
-        connection.execute(tables.bundles.delete().where(unneeded), keys)
+        keys = [{"of": owner, "of_bundle": bundle, "of_number": number} for bundle, number in changes.unneeded]
+        connection.execute(UNNEEDED_ROW, keys)
     if changes.new:
-        connection.execute(tables.bundles.insert(), [{"owner": owner, **row} for row in changes.new])
+        connection.execute(NEW_ROW, [{"owner": owner, **row} for row in changes.new])
 
 
 def dissolve_row(connection: sa.Connection, owner: str, key: BundleKey) -> None:

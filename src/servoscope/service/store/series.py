@@ -7,7 +7,10 @@ day. The sizes of full diagnoses are never thinned.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from functools import cache
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -33,25 +36,30 @@ def thin_sizes(store: Store, asset: str, now: float, since: float | None = None)
     `now`: by the asset's clock; `since`: when it was done last, None: never. The errors of the values of a mean may be
     the same, so its interval is as wide as theirs.
     """
-    table, gone = tables.sizes, 0
+    gone = 0
     for age, width in TIERS:
-        end = np.floor((now - age) / width)
-        of_asset = (table.c.asset == asset) & (table.c.kind != "full") & (table.c.t < end * width)
-        if since is not None:
-            of_asset &= table.c.t >= np.floor((since - age) / width) * width
-        part = sa.cast(sa.func.floor(table.c.t / width), sa.BigInteger).label("part")
-        means = [sa.func.avg(table.c[name]).label(name) for name in ("t", "value", "low", "high", "healthy")]
-        crowded = (
-            sa.select(table.c.asset, table.c.kind, table.c.name, part, sa.func.count().label("rows"), *means)
-            .where(of_asset)
-            .group_by(table.c.asset, table.c.kind, table.c.name, part)
-            .having(sa.func.count() > 1)
-        )
-        found = store.fetch(crowded)
+        end = math.floor((now - age) / width) * width
+        begin = -math.inf if since is None else math.floor((since - age) / width) * width
+        found = store.fetch(_crowded_parts(width), {"of_asset": asset, "begin": begin, "end": end})
         spans = [{**row, "from_t": row["part"] * width, "to_t": (row["part"] + 1) * width} for row in found]
         store.replace_sizes(spans)
         gone += sum(row["rows"] - 1 for row in found)
     return gone
+
+
+@cache  # to make the statement takes longer than to find that there is nothing
+def _crowded_parts(width: float) -> sa.Select[Any]:
+    """Return the query of the parts of an asset's sizes, `width` [s] each, that hold several rows, with their means."""
+    table = tables.sizes
+    of_asset = (table.c.asset == sa.bindparam("of_asset")) & (table.c.kind != "full")
+    part = sa.cast(sa.func.floor(table.c.t / width), sa.BigInteger).label("part")
+    means = [sa.func.avg(table.c[name]).label(name) for name in ("t", "value", "low", "high", "healthy")]
+    return (
+        sa.select(table.c.asset, table.c.kind, table.c.name, part, sa.func.count().label("rows"), *means)
+        .where(of_asset & (table.c.t >= sa.bindparam("begin")) & (table.c.t < sa.bindparam("end")))
+        .group_by(table.c.asset, table.c.kind, table.c.name, part)
+        .having(sa.func.count() > 1)
+    )
 
 
 def read_series(

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -37,6 +38,9 @@ from servoscope.service.store.rows import (
 
 Result = TypeVar("Result")
 OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
+OLD_SAMPLES = tables.recent.delete().where(
+    (tables.recent.c.asset == sa.bindparam("of")) & (tables.recent.c.sequence < sa.bindparam("below"))
+)
 
 
 @dataclass
@@ -66,18 +70,15 @@ class Batch:
                 connection.execute(tables.METADATA.tables[name].insert(), rows)
         if self.checkpoints:
             _upsert(connection, tables.checkpoints, list(self.checkpoints.values()))
-        of: sa.BindParameter[Any] = sa.bindparam("of")
         if self.first_needed:
             first: list[Row] = [{"asset": asset, "sequence": sequence} for asset, sequence in self.first_needed.items()]
             _upsert(connection, tables.needed, first)
-            below: sa.BindParameter[int] = sa.bindparam("below")
-            old = tables.recent.delete().where((tables.recent.c.asset == of) & (tables.recent.c.sequence < below))
-            connection.execute(old, [{"of": row["asset"], "below": row["sequence"]} for row in first])
+            connection.execute(OLD_SAMPLES, [{"of": row["asset"], "below": row["sequence"]} for row in first])
         write_bundles(connection, owner, self.bundles)
         for key, changes in ((tables.commands.c.id, self.outcomes), (tables.outbox.c.key, self.deliveries)):
             if changes:
                 rows = [{"of": each, **row} for each, row in changes.items()]
-                connection.execute(key.table.update().where(key == of), rows)
+                connection.execute(key.table.update().where(key == sa.bindparam("of")), rows)
 
 
 def commit_key(owner: str) -> str:
@@ -86,11 +87,15 @@ def commit_key(owner: str) -> str:
 
 
 def _upsert(connection: sa.Connection, table: sa.Table, rows: list[Row]) -> None:
-    dialect = postgresql if connection.dialect.name == "postgresql" else sqlite
-    insert = dialect.insert(table)
+    connection.execute(_upsert_statement(connection.dialect.name, table), rows)
+
+
+@cache  # to make a statement takes as long as to execute it for fifty rows
+def _upsert_statement(dialect_name: str, table: sa.Table) -> sa.Insert:
+    insert = postgresql.insert(table) if dialect_name == "postgresql" else sqlite.insert(table)
     keys = [column.name for column in table.primary_key]
     changed = {column.name: insert.excluded[column.name] for column in table.c if column.name not in keys}
-    connection.execute(insert.on_conflict_do_update(index_elements=keys, set_=changed), rows)
+    return insert.on_conflict_do_update(index_elements=keys, set_=changed)
 
 
 class Store:
@@ -292,6 +297,13 @@ class Store:
         with self.snapshot() as connection:
             yield from read_samples(connection, assets, newest, in_bundles=self._has(schema.BUNDLES_FROM, connection))
 
+    def last_residuals(self, assets: Iterable[str]) -> dict[str, int]:
+        """Return the number of the last row of the residuals of each of these assets, 0 where there is none."""
+        table = tables.residuals
+        last = sa.select(sa.func.max(table.c.number)).where(table.c.asset == sa.bindparam("of"))
+        with self._transaction() as connection:
+            return {name: connection.execute(last, {"of": name}).scalar() or 0 for name in assets}
+
     def bundle_index(self, owner: str) -> BundleIndex:
         """Return which rows hold the samples of an owner's assets."""
         with self._transaction() as connection:
@@ -358,10 +370,10 @@ class Store:
         with self._transaction() as connection:
             return [tuple(row) for row in connection.execute(query)]
 
-    def fetch(self, query: sa.Select[Any]) -> list[Row]:
-        """Return the rows of a query."""
+    def fetch(self, query: sa.Select[Any], values: Row | None = None) -> list[Row]:
+        """Return the rows of a query; `values`: of its parameters."""
         with self._transaction() as connection:
-            return [dict(row) for row in connection.execute(query).mappings()]
+            return [dict(row) for row in connection.execute(query, values).mappings()]
 
 
 def _is_new(path: str | None) -> bool:
