@@ -34,6 +34,26 @@ def test_bytes_travel_as_text_of_seven_bits(content: bytes) -> None:
     assert len(text) <= 64 * (len(content) // 56 + 1) + 3  # an eighth more, and the length
 
 
+@given(
+    st.one_of(
+        st.lists(st.integers(-(2**60), 2**60), max_size=20),
+        st.builds(lambda step, n: list(range(-step, n * step, step)) * 2, st.integers(1, 10**6), st.integers(1, 40)),
+    ),
+    st.sampled_from([(), ("load",), ("load", "oil temperature")]),
+)
+def test_rows_travel_as_bytes_with_times_that_keep_step_as_their_steps(
+    times: list[int], names: tuple[str, ...]
+) -> None:
+    x = np.arange(float(len(times)))
+    rows = Rows(np.array(times, dtype=np.int64), x, x + 0.1, -x, {name: x + len(name) for name in names})
+    packed = rows.pack(b"8 bytes:")
+    found = Rows.unpack(packed, 8)
+    assert_same(found, rows)
+    assert {name: x.tolist() for name, x in found.channels.items()} == {k: x.tolist() for k, x in rows.channels.items()}
+    if len(times) > 20 and not names:
+        assert len(packed) == 8 + 16 + 4 * 16 + 24 * len(times)  # two starts and two runs of steps
+
+
 def day(asset: int, which: int = 0, leak: float = 1.0, samples: slice = slice(None)) -> pa.Table:
     """A day of an asset, one row per sample, with its name."""
     table = lakes.table_of(lakes.recorded(asset, which, 15.0, leak), which)
@@ -133,6 +153,20 @@ class Memory(dict[Any, Any]):
         self["head"] = value
 
 
+def test_what_the_next_watermark_will_have_passed_is_stored_apart_from_the_rest() -> None:
+    head, entries = Memory(), Memory()
+    rows = {
+        asset: Rows(np.arange(5000) * 1000 + begin, *np.zeros((3, 5000))) for asset, begin in (("P0", 0), ("P1", 7))
+    }
+    blocks = [AssetRows([(asset, "A")], [1000], each[i : i + 1000]) for asset, each in rows.items() for i in (0, 3000)]
+    assert not list(StreamShard(head, entries, head, Baselines({}, 1, 8.0), 500_000).store_rows(blocks))
+    stored = [AssetRows.unpack(from_text(text)).rows.t_us for (text,) in entries.values()]
+    assert sum(map(len, stored)) == 4000
+    cut = rows["P1"].t_us[3999] - 500_000
+    assert sorted((each > cut).all() for each in stored) == [False, True]
+    assert not any((each > cut).any() and (each <= cut).any() for each in stored)
+
+
 def test_a_shard_follows_assets_together_as_each_alone_to_the_last_bit() -> None:
     loop = lakes.loop()
     baselines = {f"P{i}": learn_baseline(loop, [lakes.recorded(i, 0, 15.0)]) for i in (0, 1)}
@@ -151,17 +185,17 @@ def test_a_shard_follows_assets_together_as_each_alone_to_the_last_bit() -> None
             for table in days.values()
         ]
         (batch,) = pack_blocks(pa.concat_tables(now).combine_chunks().to_batches(), "t", COLUMNS, 1)
-        shard = StreamShard(head, entries, head, known)
+        shard = StreamShard(head, entries, head, known, 500_000)
         frames += shard.store_rows([AssetRows.unpack(packed) for packed in batch["rows"].to_pylist()])
         shard.save()
-        shard = StreamShard(head, entries, head, known)  # a worker knows what is in the state, and no more
+        shard = StreamShard(head, entries, head, known, 500_000)  # a worker knows what is in the state, and no more
         frames += shard.process_until(first + second * 1_000_000 + 2_500_000)
         shard.save()
     late = AssetRows([("P0", "P0")], [5], unpacked([days["P0"]])["P0"][:5])
-    shard = StreamShard(head, entries, head, known)
+    shard = StreamShard(head, entries, head, known, 500_000)
     frames += shard.store_rows([late])
     shard.save()
-    shard = StreamShard(head, entries, head, known)
+    shard = StreamShard(head, entries, head, known, 500_000)
     midnight = (first // DAY_US + 1) * DAY_US
     assert head.timers[-1] * 1000 > first and min(head.timers[-1:]) * 1000 < midnight
     frames += shard.process_until(midnight)
@@ -190,7 +224,7 @@ def test_a_day_whose_baseline_is_learned_again_under_way_fails_alone() -> None:
     for part, own in ((slice(0, 700), old), (slice(700, None), new)):
         sent = pa.concat_tables([table.take(list(range(table.num_rows))[part]) for table in days.values()])
         (batch,) = pack_blocks(sent.combine_chunks().to_batches(), "t", COLUMNS, 1)
-        shard = StreamShard(head, entries, head, Baselines.from_source({"P0": own, "P1": new}, 2, 8.0))
+        shard = StreamShard(head, entries, head, Baselines.from_source({"P0": own, "P1": new}, 2, 8.0), 0)
         frames += shard.store_rows([AssetRows.unpack(packed) for packed in batch["rows"].to_pylist()])
         frames += shard.process_until(midnight if own is new else first + 6_900_000)
         shard.save()

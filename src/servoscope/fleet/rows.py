@@ -81,15 +81,21 @@ class Rows:
         }
         return cls(t_us, r, u, y, channels)
 
-    def pack(self) -> bytes:
-        """Return them as bytes, 32 per row; channels add 8 each, and their names with a byte for the length."""
-        columns = (self.t_us, self.r, self.u, self.y, *self.channels.values())
-        packed = b"".join(np.ascontiguousarray(x).tobytes() for x in columns)
-        if not self.channels:
-            return packed
-        names = json.dumps(list(self.channels)).encode()
+    def pack(self, head: bytes = b"") -> bytes:
+        """Return them as bytes behind others: 24 per row where times keep step, 8 more for each channel, and its name.
+
+        Two numbers come first: how many rows there are, and of how many runs of equal steps their times are made, 0
+        where the times themselves take less. Where there are channels, the last byte says how long their names are.
+        """
+        steps = np.diff(self.t_us, prepend=0)
+        begins = np.flatnonzero(np.diff(steps, prepend=~steps[:1]))
+        runs = len(begins) if 2 * len(begins) < len(self) else 0
+        times = (steps[begins], np.diff(begins, append=len(self))) if runs else (self.t_us,)
+        columns = (np.array([len(self), runs]), *times, self.r, self.u, self.y, *self.channels.values())
+        names = json.dumps(list(self.channels)).encode() if self.channels else b""
         names += b" " * (-len(names) % 8)
-        return packed + names + bytes([len(names) // 8])
+        tail = names + bytes([len(names) // 8]) if names else b""
+        return b"".join((head, *(np.ascontiguousarray(x).data for x in columns), tail))
 
     @classmethod
     def unpack(cls, content: bytes, begin: int = 0) -> Rows:
@@ -98,10 +104,11 @@ class Rows:
         if end % 8:
             end -= 1 + 8 * content[-1]
             names = json.loads(content[end:-1])
-        n = (end - begin) // (8 * (4 + len(names)))
-        signals = np.frombuffer(content, dtype=np.float64, offset=begin + 8 * n, count=(3 + len(names)) * n)
+        n, runs = np.frombuffer(content, dtype=np.int64, offset=begin, count=2).tolist()
+        times = np.frombuffer(content, dtype=np.int64, offset=begin + 16, count=2 * runs or n)
+        t_us = np.cumsum(np.repeat(times[:runs], times[runs:])) if runs else times
+        signals = np.frombuffer(content, dtype=np.float64, offset=begin + 16 + times.nbytes, count=(3 + len(names)) * n)
         r, u, y, *channels = signals.reshape(3 + len(names), n)
-        t_us = np.frombuffer(content, dtype=np.int64, offset=begin, count=n)
         return cls(t_us, r, u, y, dict(zip(names, channels, strict=True)))
 
 

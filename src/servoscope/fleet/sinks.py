@@ -116,7 +116,7 @@ def start(
 
     def write(batch: DataFrame, number: int) -> None:
         results = f"{output}/results/batch={number:09d}"
-        batch.write.mode("overwrite").partitionBy("kind").parquet(results)
+        batch.write.mode("overwrite").option("parquet.enable.dictionary", "false").partitionBy("kind").parquet(results)
         if store is not None and history.last_commit(OWNER) <= number:
             items = batch.sparkSession.read.schema(SCHEMA).parquet(results).where("kind = 'item'").select("result")
             rows: list[Row] = [_diagnosis_row(json.loads(row.result)) for row in items.collect()]

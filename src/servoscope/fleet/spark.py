@@ -53,6 +53,8 @@ def session(master: str | None = None, **settings: str) -> SparkSession:
         builder = builder.master(master)
     # times of day are UTC everywhere; one thread of linear algebra per worker, as on one machine
     fixed = {"spark__sql__session__timeZone": "UTC", "spark__executorEnv__OPENBLAS_NUM_THREADS": "1"}
+    # of glibc: blocks of rows are freed and wanted again all the time, and new memory has to be cleared first
+    fixed |= {f"spark__executorEnv__MALLOC_{name}_THRESHOLD_": str(1 << 25) for name in ("MMAP", "TRIM")}
     # what PySpark thinks of the pandas beside it is nothing that its user can change
     warnings.filterwarnings("ignore", "PySpark does not yet fully support pandas", FutureWarning)
     fixed |= {"spark__executorEnv__PYTHONWARNINGS": "ignore::FutureWarning", "spark__ui__showConsoleProgress": "false"}

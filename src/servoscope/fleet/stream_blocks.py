@@ -44,7 +44,7 @@ class AssetRows:
     def pack(self) -> bytes:
         """Return them as bytes: a line of JSON, filled up to whole numbers of 8 bytes, and the packed rows."""
         line = json.dumps([list(self.keys), list(self.counts)]).encode()
-        return line + b" " * (-(len(line) + 1) % 8) + b"\n" + self.rows.pack()
+        return self.rows.pack(line + b" " * (-(len(line) + 1) % 8) + b"\n")
 
     @classmethod
     def unpack(cls, content: bytes) -> AssetRows:

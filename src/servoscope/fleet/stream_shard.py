@@ -83,11 +83,13 @@ class StreamState:
 class StreamShard:
     """The assets of a shard, for as long as a worker processes them.
 
-    `head`, `entries`, `handle`: Spark's value of all states, its map of raw rows, and what sets timers.
+    `head`, `entries`, `handle`: Spark's value of all states, its map of raw rows, and what sets timers; `delay_us`: how
+    far the watermark stays behind the latest row [us].
     """
 
-    def __init__(self, head: Any, entries: Any, handle: Any, baselines: Baselines) -> None:
+    def __init__(self, head: Any, entries: Any, handle: Any, baselines: Baselines, delay_us: int) -> None:
         self._head, self._entries, self._handle, self._baselines = head, entries, handle, baselines
+        self._delay_us = delay_us
         self._states: dict[str, StreamState] = {}
         self._next_entry = 0
         self._cache: dict[int, dict[str, Rows]] = {}
@@ -137,15 +139,23 @@ class StreamShard:
             yield output(["late"] * len(late), asset=assets, day=list(map(day_name, days)), late=counts)
 
     def _add_entries(self, waiting: Mapping[str, list[Rows]]) -> None:
-        """Store rows, those of an asset together, in entries of about `CHUNK` rows."""
-        parts: dict[str, Rows] = {}
-        for asset, pieces in waiting.items():
-            parts[asset] = Rows.concatenate(pieces).sort_by_time()
-            if sum(map(len, parts.values())) >= CHUNK:
+        """Store rows, those of an asset together, in entries of about `CHUNK` rows.
+
+        What the next watermark will have passed is stored apart from what it will not: an entry of both is read twice.
+        """
+        ordered = {asset: Rows.concatenate(pieces).sort_by_time() for asset, pieces in waiting.items()}
+        latest = max((int(rows.t_us[-1]) for rows in ordered.values()), default=FAR_PAST)
+        for after, until in ((FAR_PAST, latest - self._delay_us), (latest - self._delay_us, latest)):
+            parts: dict[str, Rows] = {}
+            for asset, rows in ordered.items():
+                low, high = np.searchsorted(rows.t_us, (after, until), side="right").tolist()
+                if low < high:
+                    parts[asset] = rows[low:high]
+                if sum(map(len, parts.values())) >= CHUNK:
+                    self._add_entry(parts)
+                    parts = {}
+            if parts:
                 self._add_entry(parts)
-                parts = {}
-        if parts:
-            self._add_entry(parts)
 
     def _add_entry(self, parts: Mapping[str, Rows]) -> None:
         keys = [(asset, self._states[asset].baseline) for asset in parts]

@@ -14,7 +14,7 @@ from servoscope.core.errors import LoopError, RecordingError
 from servoscope.detection.baseline import Baseline
 from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.day_monitor import WINDOW
-from servoscope.fleet.rows import required_columns
+from servoscope.fleet.rows import MICRO, required_columns
 from servoscope.fleet.stream_blocks import BLOCKS, SAMPLE_TIME, AssetRows, check_lists, pack_blocks
 from servoscope.fleet.stream_shard import SCHEMA, StreamShard
 from servoscope.models.loop import Columns
@@ -29,7 +29,7 @@ PARTITIONS = "spark.sql.shuffle.partitions"
 DEFAULT_PARTITIONS = "200"  # Spark's own: of a small stream, most would be empty, and each costs a task per batch
 PARTITIONS_PER_CORE = 3
 SHARDS = 64
-LAYOUT = 1  # of keys and states in a checkpoint: raised when one of them changes its meaning
+LAYOUT = 2  # of keys and states in a checkpoint: raised when one of them changes its meaning
 
 
 def follow(
@@ -106,7 +106,7 @@ def follow(
     rows = marked.select("shard", "rows")
     schema = StructType.fromDDL(SCHEMA)
     schema["kind"].metadata = {"layout": LAYOUT, "shards": shards}  # for `sinks.start`, which knows the checkpoint
-    processor = _create_processor(known)
+    processor = _create_processor(known, round(delay_s * MICRO))
     return rows.groupBy("shard").transformWithStateInPandas(processor, schema, "append", "eventtime")
 
 
@@ -117,7 +117,7 @@ def _set_partitions(session: SparkSession, assets: int) -> None:
         session.conf.set(PARTITIONS, str(min(max(assets, 1), PARTITIONS_PER_CORE * context.defaultParallelism)))
 
 
-def _create_processor(baselines: Baselines) -> Any:
+def _create_processor(baselines: Baselines, delay_us: int) -> Any:
     """Return the stateful processor; its class needs PySpark, which is imported late."""
     from pyspark.sql.streaming import StatefulProcessor
 
@@ -128,7 +128,7 @@ def _create_processor(baselines: Baselines) -> Any:
             self.entries = handle.getMapState("entries", "number long", "content string")
 
         def shard(self) -> StreamShard:
-            return StreamShard(self.head, self.entries, self.handle, baselines)
+            return StreamShard(self.head, self.entries, self.handle, baselines, delay_us)
 
         def handleInputRows(self, key: Any, rows: Iterator[Any], timerValues: Any) -> Iterator[Any]:
             shard = self.shard()
