@@ -22,6 +22,8 @@ EXAMPLES = (
     "learn axis/loop.toml axis/monday.csv axis/tuesday.csv -o axis/baseline.json",
     "diagnose axis/baseline.json axis/friday.csv",
 )
+# what reads messages is compiled by a service with a broker
+STATEMENT = "from servoscope.service.mqtt.block_kernels import parse_regular; list(parse_regular([b'']))"
 KERNELS = "servoscope/core/jit/kernels"
 PROCESSOR = {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}  # as core/jit/cache.py looks for them
 
@@ -40,8 +42,9 @@ def compile_kernels(sources: Path, folder: Path, examples: tuple[str, ...] = EXA
         paths = [str(Path(work) / "src"), *filter(None, [os.environ.get("PYTHONPATH")])]
         folders = {"NUMBA_CACHE_DIR": str(cache), "MPLCONFIGDIR": work}
         variables = {"PYTHONPATH": os.pathsep.join(paths), **folders, **PROCESSOR}
-        for example in examples:
-            argv = [sys.executable, "-m", "servoscope", *example.split()]
+        commands = [["-m", "servoscope", *example.split()] for example in examples]
+        for command in (*commands, ["-c", STATEMENT]):
+            argv = [sys.executable, *command]
             subprocess.run(argv, cwd=work, env=os.environ | variables, check=True, stdout=subprocess.DEVNULL)
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)

@@ -230,6 +230,16 @@ class TestCache:
         assert done[0].returncode == 0, done[0].stderr
         assert done[0].stdout == done[1].stdout
 
+    def test_a_constant_of_numpy_is_part_of_the_key(self) -> None:
+        def kernel_with(constant: np.uint64) -> Any:
+            def masked(word: np.uint64) -> np.uint64:
+                return word & constant
+
+            return compile.kernel(masked)
+
+        keys = [kernel_key(kernel_with(np.uint64(mask))) for mask in (7, 7, 15)]
+        assert keys[0] == keys[1] != keys[2]
+
     def test_without_a_folder_it_compiles_for_this_process(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def fail(cache: Any, function: Any) -> None:
             raise RuntimeError("cannot cache function: no locator available")

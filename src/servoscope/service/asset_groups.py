@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from itertools import repeat
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -54,6 +54,9 @@ class _Place(NamedTuple):
     row: int
 
 
+_PlacedBlock: TypeAlias = tuple[_Place, Block]
+
+
 class AssetGroups:
     """Follows the blocks of several assets, each as if it were alone, to the last bit."""
 
@@ -96,23 +99,22 @@ class AssetGroups:
             yield from self._process_round(turn.values(), latest)
 
     def _process_round(self, turn: Iterable[Block], latest: float) -> Iterator[BlockResult | QuietBlocks]:
-        together: dict[tuple[int, tuple[int, ...], bool], list[Block]] = defaultdict(list)
+        together: dict[tuple[int, tuple[int, ...]], list[_PlacedBlock]] = defaultdict(list)
         alone = list[Block]()
         for block in turn:
             place = self._places.get(block.asset)
             try:
-                block.start_time()
+                shape = block.shape
             except ServoscopeError as error:  # one asset's trouble must not stop the others
                 yield BlockResult(block, error)
                 continue
             if place is None:
                 alone.append(block)
             else:
-                together[place.fleet, block.signals.shape, place.asset.heard].append(block)
-        for (fleet, shape, heard), blocks in together.items():
-            signals = np.concatenate([one.signals for one in blocks]).reshape(len(blocks), *shape)
-            process = self._process_together if heard else self._process_first
-            yield from process(self._fleets[fleet], blocks, signals, latest, alone)
+                together[place.fleet, shape].append((place, block))
+        for (fleet, shape), placed in together.items():
+            signals = np.concatenate([block.signals for _, block in placed]).reshape(len(placed), *shape)
+            yield from self._process_together(self._fleets[fleet], placed, signals, latest, alone)
         for block in alone:
             yield BlockResult(block, self._process_alone(block, latest))
 
@@ -131,64 +133,78 @@ class AssetGroups:
         return asset.conclude(accepted, followed)
 
     def _process_first(
-        self, fleet: _Fleet, blocks: Sequence[Block], signals: FloatArray, latest: float, alone: list[Block]
+        self, fleet: _Fleet, placed: Sequence[_PlacedBlock], signals: FloatArray, latest: float, alone: list[Block]
     ) -> Iterator[BlockResult]:
         """Process the first blocks of assets, of one shape; those that must go `alone` are added there.
 
         One by one they take twice as long, and all assets of a plant may begin at once.
         """
         self.layers.enter("assemble")
-        lanes, t = self._assets[blocks[0].asset].lanes, signals[:, 0]
+        lanes, t = placed[0][0].asset.lanes, signals[:, 0]
         begins = lanes.begin_regularly(t) & ~(t[:, -1] > latest)
-        begins &= np.array([not one.stream or not one.sequence for one in blocks])
+        begins &= np.array([not block.stream or not block.sequence for _, block in placed])
         chosen = np.flatnonzero(begins)
-        own = [blocks[i] for i in chosen.tolist()]
-        alone += [blocks[i] for i in np.flatnonzero(~begins).tolist()]
+        own = [placed[i] for i in chosen.tolist()]
+        alone += [placed[i][1] for i in np.flatnonzero(~begins).tolist()]
         if not own:
             return
         self.layers.enter("judge")
-        places, assets = [self._places[one.asset] for one in own], [self._assets[one.asset] for one in own]
-        accepted = [asset.accept(block, latest) for asset, block in zip(assets, own, strict=True)]
-        states = [asset.take_state() for asset in assets]
+        accepted = [place.asset.accept(block, latest) for place, block in own]
+        states = [place.asset.take_state() for place, _ in own]
         before = np.stack([one.monitor for one in states]), np.stack([one.quality for one in states])
-        part = fleet.monitor.select(np.array([one.baseline for one in places]))
+        part = fleet.monitor.select(np.array([place.baseline for place, _ in own]))
         found = lanes.follow_lanes(part, before, 0, signals[chosen], self.layers, begins=True)
         packed = pack_samples(signals[chosen])
-        for i, (asset, one) in enumerate(zip(assets, accepted, strict=True)):
+        for i, ((place, block), one) in enumerate(zip(own, accepted, strict=True)):
             assert isinstance(one, NextBlock), "nothing came before it, and it is not of the future"
-            yield BlockResult(own[i], asset.conclude(one._replace(packed=packed[i]), found.lane(i, states[i])))
+            result = place.asset.conclude(one._replace(packed=packed[i]), found.lane(i, states[i]))
+            yield BlockResult(block, result)
 
     def _process_together(
-        self, fleet: _Fleet, blocks: Sequence[Block], signals: FloatArray, latest: float, alone: list[Block]
+        self, fleet: _Fleet, placed: Sequence[_PlacedBlock], signals: FloatArray, latest: float, alone: list[Block]
     ) -> Iterator[BlockResult | QuietBlocks]:
         """Process blocks of one shape, with these `signals`; those that must go `alone` are added there."""
         self.layers.enter("assemble")
         states, t = fleet.states, signals[:, 0]
-        places = [self._places[one.asset] for one in blocks]
-        rows = np.array([one.row for one in places])
+        rows = np.array([place.row for place, _ in placed])
+        is_begun = np.ones(len(rows), dtype=np.bool_)
         for i in np.flatnonzero(~states.columns["is_here"][rows]).tolist():
-            places[i].asset.move_state(states, places[i].row)
-        lanes = places[0].asset.lanes
-        follows = states.are_next(rows, [one.sequence for one in blocks], [one.stream for one in blocks])
-        follows &= lanes.are_regular(t, states.columns["last_t"][rows]) & ~(t[:, -1] > latest)
-        phases = fleet.monitor.phase(states.monitor[rows])
-        for phase in [-1, *np.unique(phases[follows]).tolist()]:
-            chosen = np.flatnonzero(follows & (phases == phase) if phase >= 0 else ~follows)
-            group = blocks if chosen.size == len(blocks) else [blocks[i] for i in chosen.tolist()]
-            if phase < 0 or len(group) == 1:
-                alone += group
+            place, _ = placed[i]
+            if place.asset.heard:
+                place.asset.move_state(states, place.row)
             else:
-                own = signals if group is blocks else signals[chosen]
-                yield from self._process_lanes(fleet, group, rows[chosen], own)
+                is_begun[i] = False
+        if not is_begun.all():
+            first = np.flatnonzero(~is_begun)
+            yield from self._process_first(fleet, [placed[i] for i in first.tolist()], signals[first], latest, alone)
+            self.layers.enter("assemble")
+        monitors, lanes = states.monitor[rows], placed[0][0].asset.lanes
+        follows = states.are_next(rows, [block.sequence for _, block in placed], [block.stream for _, block in placed])
+        follows &= is_begun & lanes.are_regular(t, states.columns["last_t"][rows]) & ~(t[:, -1] > latest)
+        phases = fleet.monitor.phase(monitors)
+        for phase in [-1, *np.unique(phases[follows]).tolist()]:
+            chosen = np.flatnonzero(follows & (phases == phase) if phase >= 0 else is_begun & ~follows)
+            group = placed if chosen.size == len(placed) else [placed[i] for i in chosen.tolist()]
+            if phase < 0 or len(group) == 1:
+                alone += [block for _, block in group]
+            elif group is placed:
+                yield from self._process_lanes(fleet, group, rows, monitors, signals)
+            else:
+                yield from self._process_lanes(fleet, group, rows[chosen], monitors[chosen], signals[chosen])
 
     def _process_lanes(
-        self, fleet: _Fleet, blocks: Sequence[Block], rows: IndexArray, signals: FloatArray
+        self,
+        fleet: _Fleet,
+        placed: Sequence[_PlacedBlock],
+        rows: IndexArray,
+        monitors: FloatArray,
+        signals: FloatArray,
     ) -> Iterator[BlockResult | QuietBlocks]:
-        """Process regular blocks, whose assets are of one phase and have their states in these rows."""
+        """Process regular blocks, whose assets are of one phase; their states are in these rows."""
         self.layers.enter("assemble")
-        assets, states = [self._assets[one.asset] for one in blocks], fleet.states
-        part = fleet.monitor.select(np.array([self._places[one.asset].baseline for one in blocks]))
-        before, samples = (states.monitor[rows], states.quality[rows]), int(states.columns["samples"][rows[0]])
+        assets, blocks, states = [place.asset for place, _ in placed], [block for _, block in placed], fleet.states
+        part = fleet.monitor.select(np.array([place.baseline for place, _ in placed]))
+        before, samples = (monitors, states.quality[rows]), int(states.columns["samples"][rows[0]])
         found = assets[0].lanes.follow_lanes(part, before, samples, signals, self.layers)
         are_quiet, packed = states.are_quiet(rows, found), pack_samples(signals)
         for i in np.flatnonzero(~are_quiet).tolist():

@@ -17,14 +17,18 @@ from servoscope.core.jit.template import specialise
 
 __all__ = [
     "Bool",
+    "as_float",
     "dot",
     "fma",
     "inline",
     "kernel",
     "lane_view",
+    "leading_zeros",
+    "load_word",
     "make_transpose",
     "maximum",
     "minimum",
+    "multiply_high",
     "on_compilation",
     "prefetch",
     "sine",
@@ -33,21 +37,27 @@ __all__ = [
     "stack_array",
     "subroutine",
     "trace_function",
+    "trailing_zeros",
     "tril_index",
     "where",
 ]
 
 if TYPE_CHECKING:
     from servoscope.core.jit.compile import (
+        as_float,
         inline,
         kernel,
         lane_view,
+        leading_zeros,
+        load_word,
         make_transpose,
+        multiply_high,
         on_compilation,
         prefetch,
         stack_array,
         subroutine,
         trace_function,
+        trailing_zeros,
     )
 else:  # hidden from type checkers, which would otherwise accept any name
 

@@ -74,19 +74,27 @@ def run_trial(backend: Any) -> np.ndarray[Any, Any]:
         "_prefetch": backend.prefetch,
     }
     names["_sum_rows"] = backend.subroutine(specialise(_trial_sum, names))
+    for name in ("as_float", "load_word", "multiply_high", "leading_zeros", "trailing_zeros"):
+        names[f"_{name}"] = getattr(backend, name)
     x = (np.arange(64.0).reshape(8, 8) - 30.0) / 7.0
-    y = np.zeros((10, 8))
+    y, words = np.zeros((10, 8)), np.zeros(5, np.uint64)
     backend.kernel(specialise(_trial, names, "trial"), heap=False)(x, y)
-    return y
+    backend.kernel(specialise(_trial_words, names, "words"), heap=False)(np.arange(3, 15, dtype=np.uint8), words)
+    return np.concatenate([y.ravel(), words.astype(np.float64)])
 
 
 # what the templates of the trial are filled with
 _any: Any = None
+_as_float: Any = None
 _lane_view: Any = None
+_leading_zeros: Any = None
+_load_word: Any = None
+_multiply_high: Any = None
 _prefetch: Any = None
 _stack_array: Any = None
 _step: Any = None
 _sum_rows: Any = None
+_trailing_zeros: Any = None
 _transpose: Any = None
 
 
@@ -115,3 +123,11 @@ def _trial(x: Any, y: Any) -> None:
     _sum_rows(s, y)
     if _any(0, _lane_view(x[0], 8, 0), s):
         y[0, 0] += 1.0
+
+
+def _trial_words(data: Any, words: Any) -> None:
+    words[0] = _load_word(data, 3)
+    words[1] = _multiply_high(words[0], words[0])
+    words[2] = _leading_zeros(words[1])
+    words[3] = _trailing_zeros(words[0])
+    words[4] = 2.0**200 * _as_float(words[0])

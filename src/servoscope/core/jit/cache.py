@@ -156,7 +156,7 @@ class _Walk:
             self._add(*sorted(map(repr, value)))
         elif isinstance(value, dict):
             self._visit_all(value.items())
-        elif isinstance(value, np.ndarray):
+        elif isinstance(value, np.ndarray | np.generic):
             self._add(value.dtype, value.shape, value.tobytes())
         elif isinstance(value, SimpleNamespace) or self._is_own(type(value)):
             self._visit_all((type(value), getattr(value, "__dict__", {})))

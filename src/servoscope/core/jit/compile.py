@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import sys
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numba
@@ -220,6 +221,58 @@ def prefetch(typing: Any, x: Any, i: Any, j: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(x, types.intp, types.intp), code
+
+
+@intrinsic
+def load_word(typing: Any, data: Any, i: Any) -> Any:
+    """Return bytes i to i + 7 of an array of bytes as a word, the first of them lowest."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        array = make_array(signature.args[0])(context, builder, values[0])
+        place = builder.bitcast(builder.gep(array.data, [values[1]]), ir.IntType(64).as_pointer())
+        word = builder.load(place, align=1)
+        return word if sys.byteorder == "little" else builder.bswap(word)
+
+    return types.uint64(data, types.intp), code
+
+
+@intrinsic
+def as_float(typing: Any, word: Any) -> Any:
+    """Return the number whose bits a word is: binary64, or binary32 of one of 32 bits."""
+    kind = types.float64 if word.bitwidth == 64 else types.float32
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.bitcast(values[0], context.get_data_type(kind))
+
+    return kind(word), code
+
+
+@intrinsic
+def multiply_high(typing: Any, a: Any, b: Any) -> Any:
+    """Return the upper 64 bits of the product of two words."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        wide = ir.IntType(128)
+        product = builder.mul(*(builder.zext(value, wide) for value in values))
+        return builder.trunc(builder.lshr(product, wide(64)), ir.IntType(64))
+
+    return types.uint64(types.uint64, types.uint64), code
+
+
+@intrinsic
+def leading_zeros(typing: Any, word: Any) -> Any:
+    """Return how many bits of a word are zero above its highest one; 64: all."""
+    return types.uint64(types.uint64), lambda context, builder, signature, values: builder.ctlz(
+        values[0], ir.IntType(1)(0)
+    )
+
+
+@intrinsic
+def trailing_zeros(typing: Any, word: Any) -> Any:
+    """Return how many bits of a word are zero below its lowest one; 64: all."""
+    return types.uint64(types.uint64), lambda context, builder, signature, values: builder.cttz(
+        values[0], ir.IntType(1)(0)
+    )
 
 
 @contextlib.contextmanager

@@ -86,6 +86,31 @@ def prefetch(x: Any, i: int, j: int) -> None:
     """Do nothing: there is no code that could wait for memory."""
 
 
+def load_word(data: Any, i: int) -> Any:
+    """Return bytes i to i + 7 of an array of bytes as a word, the first of them lowest."""
+    return np.uint64(int.from_bytes(data[i : i + 8].tobytes(), "little"))
+
+
+def as_float(word: Any) -> Any:
+    """Return the number whose bits a word is: binary64, or binary32 of one of 32 bits."""
+    return word.view(np.float64 if word.itemsize == 8 else np.float32)
+
+
+def multiply_high(a: Any, b: Any) -> Any:
+    """Return the upper 64 bits of the product of two words."""
+    return np.uint64(int(a) * int(b) >> 64)
+
+
+def leading_zeros(word: Any) -> Any:
+    """Return how many bits of a word are zero above its highest one; 64: all."""
+    return np.uint64(64 - int(word).bit_length())
+
+
+def trailing_zeros(word: Any) -> Any:
+    """Return how many bits of a word are zero below its lowest one; 64: all."""
+    return np.uint64((int(word) & -int(word)).bit_length() - 1 if word else 64)
+
+
 @contextlib.contextmanager
 def on_compilation(call: Callable[[], None]) -> Iterator[None]:
     """Never call it: nothing is compiled."""

@@ -20,8 +20,9 @@ from servoscope.service.mapping.paths import (
 )
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder
-from servoscope.service.mqtt.payload import MAX_TIME_S, parse_json
+from servoscope.service.mqtt.payload import parse_json
 from servoscope.service.sources.assembly import SIGNALS
+from servoscope.service.sources.block import MAX_TIME_S
 
 PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts
 MAX_STAMP = 10**30  # beyond any time, in any unit

@@ -23,7 +23,7 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
@@ -31,16 +31,24 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import MessageError
-from servoscope.service.sources.block import Block
+from servoscope.service.sources.block import MAX_COUNT, MAX_TIME_S, Block
 
 MAGIC, VERSION = b"SVSB", 1
 HEADER = struct.Struct("<4sBBHII")
 BODY_HEADER = struct.Struct("<QQQdd")
 FLAG_RETAINED, FLAG_TIMES, FLAG_BINARY32 = 1, 2, 4
-MAX_COUNT = 2**63 - 1  # what a database can count
 COUNTS = ("stream", "sequence", "oldest")
-MAX_TIME_S = 253402300800.0  # s: the year 10000, from which on calendars end
+PIECE_BYTES = 2**19  # of messages that are taken together: so many stay in the processor's cache
 JSON_KEYS = {"version", "stream", "sequence", "oldest", "t", "t0", "dt", "r", "u", "y", "covariates"}
+
+
+class BlockMessage(NamedTuple):
+    """A message of an asset, and when it came, by the monotonic clock [s]; `covariates`: as in `decode_block`."""
+
+    asset: str
+    content: bytes
+    received_at: float = 0.0
+    covariates: Sequence[str] = ()
 
 
 class DecodedBlock(NamedTuple):
@@ -76,6 +84,34 @@ def encode_json(block: Block, oldest: int | None = None, covariates: Sequence[st
 
 def _plain_column(values: FloatArray) -> list[float | None]:
     return [x if math.isfinite(x) else None for x in values.tolist()]
+
+
+def decode_blocks(messages: Sequence[BlockMessage]) -> Iterator[DecodedBlock | MessageError]:
+    """Yield the block of each message, or why it is none: what `decode_block` returns or raises, in less time."""
+    from servoscope.service.mqtt.block_kernels import parse_regular  # late: it imports Numba
+
+    begin, size = 0, 0
+    for end, last in enumerate(messages, 1):
+        size += len(last.content)
+        if size < PIECE_BYTES and end < len(messages):
+            continue
+        piece, begin, size = messages[begin:end], end, 0
+        for one, found in zip(piece, parse_regular([each.content for each in piece]), strict=True):
+            if found is None or one.covariates or not _is_whole(one.content, found.checksum):
+                try:
+                    yield decode_block(*one)
+                except MessageError as error:
+                    yield error
+                continue
+            retained = found.oldest is not None
+            block = Block.from_signals(
+                one.asset, found.sequence, found.signals, one.received_at, found.stream, retained
+            )
+            yield DecodedBlock(block, found.oldest)
+
+
+def _is_whole(message: bytes, checksum: int | None) -> bool:
+    return checksum is None or zlib.crc32(memoryview(message)[HEADER.size :]) == checksum
 
 
 def decode_block(asset: str, message: bytes, received_at: float = 0.0, covariates: Sequence[str] = ()) -> DecodedBlock:

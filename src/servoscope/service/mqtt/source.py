@@ -21,7 +21,7 @@ from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import encode_rebirth
 from servoscope.service.mqtt import topics
 from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_bulk_client
-from servoscope.service.mqtt.payload import DecodedBlock, decode_block
+from servoscope.service.mqtt.payload import BlockMessage, DecodedBlock, decode_blocks
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
 
@@ -57,6 +57,7 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> MqttSource:
         """Return the source."""
         if self.payload is None:
+            list(decode_blocks([BlockMessage("", b"")]))  # compiles it, so that the first block does not wait for it
             covariates = {asset: one.covariates for asset, one in assets.items()}
             return MqttSource(self, frozenset(assets), folder, name, covariates)
         return PlantSource(self, assets, folder, name)
@@ -76,6 +77,7 @@ class _Arrival:
     """A message that waits to be decoded, and when it came at the earliest, monotonic [s]."""
 
     message: ReceivedMessage
+    asset: str
     connection: int
     came_at: float
 
@@ -83,6 +85,11 @@ class _Arrival:
     def key(self) -> tuple[str, bytes]:
         """What it is known by when it is sent again."""
         return self.message.topic, self.message.payload
+
+    @property
+    def handle(self) -> _AckHandle:
+        """How it is acknowledged."""
+        return _AckHandle(self.message.mid, self.message.qos, self.connection)
 
 
 class MqttSource(BlockSource):
@@ -172,14 +179,12 @@ class MqttSource(BlockSource):
 
     def _on_message(self, message: ReceivedMessage) -> None:
         """Queue a message, in the client's thread."""
+        one = _Arrival(message, topics.parse_asset(message.topic), self._connection, self._client.empty_at)
         try:
             self._check_size(message, len(self._waiting))
         except MessageError as error:
-            asset = topics.parse_asset(message.topic)
-            self.rejections.add(asset if asset in self._assets else "", error.kind, str(error))
-            self._ack(_AckHandle(message.mid, message.qos, self._connection))
+            self._reject(one, one.asset if one.asset in self._assets else "", error)
             return
-        one = _Arrival(message, self._connection, self._client.empty_at)
         if self._waiting_again:
             with self._lock:
                 # sent again in a new connection, it replaces its earlier copy: the queue does not grow by it
@@ -188,49 +193,59 @@ class MqttSource(BlockSource):
                     return
         self._waiting.append(one)
 
-    def _decode(self, one: _Arrival) -> tuple[Block, _AckHandle] | None:
-        """Return the block of a message; None: it is rejected, and acknowledged."""
-        message, handle = one.message, _AckHandle(one.message.mid, one.message.qos, one.connection)
-        asset = topics.parse_asset(message.topic)
-        try:
-            if asset not in self._assets:  # an earlier service file had it, and the broker has kept that
-                # empty: an alias stands for it, which we have not allowed; too long: made up
-                if 0 < len(message.topic) < 1000:
-                    self._client.unsubscribe(message.topic)
-                raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
-            decoded = decode_block(asset, message.payload, one.came_at, self._covariates.get(asset, ()))
-            self._check_order(decoded)
-        except MessageError as error:
-            self.rejections.add("" if error.kind == "unknown asset" else asset, error.kind, str(error))
-            self._ack(handle)
-            return None
-        block = decoded.block
-        position = block.stream, block.sequence
-        self._newest[asset] = max(position, self._newest.get(asset, position))
-        return block, handle._replace(position=position) if block.retained else handle
+    def _reject_stranger(self, one: _Arrival) -> None:
+        """Reject a message of another asset: an earlier service file had it, and the broker has kept that."""
+        if 0 < len(one.message.topic) < 1000:  # empty: an alias, which we have not allowed; too long: made up
+            self._client.unsubscribe(one.message.topic)
+        self._reject(
+            one, "", MessageError("unknown asset", f"{one.asset[:100]!r} is none of the assets of this source")
+        )
 
-    def _check_order(self, decoded: DecodedBlock) -> None:
-        """Reject a block that comes before an earlier one which its sender retains, and will send again."""
+    def _reject(self, one: _Arrival, asset: str, error: MessageError) -> None:
+        """Count a message that cannot be used, and acknowledge it: it would come again otherwise."""
+        self.rejections.add(asset, error.kind, str(error))
+        self._ack(one.handle)
+
+    def _find_misorder(self, decoded: DecodedBlock) -> MessageError | None:
+        """Return why a block must wait that comes before one which its sender retains, and will send again."""
         block, oldest = decoded
+        if oldest is None:
+            return None
         stream, sequence = self._newest.get(block.asset, (0, -1))
         following = sequence + 1 if stream == block.stream else 0
-        if oldest is not None and block.stream >= stream and block.sequence > max(following, oldest):
+        if block.stream >= stream and block.sequence > max(following, oldest):
             reason = f"block {block.sequence} came before block {following}, which its sender keeps"
-            raise MessageError("ahead", reason)
+            return MessageError("ahead", reason)
+        return None
 
     def poll(self, limit: int) -> list[Block]:
-        """Return blocks in the order in which they came."""
+        """Return blocks in the order in which they came; messages that are none are rejected, and acknowledged."""
         with self._lock:
             arrivals = [self._waiting.popleft() for _ in range(min(limit, len(self._waiting)))]
             if self._waiting_again:
                 for one in arrivals:
                     self._waiting_again.pop(one.key, None)
-        found = []
+        own = list[_Arrival]()
         for one in arrivals:
-            if (decoded := self._decode(one)) is not None:
-                block, handle = decoded
-                self._unacknowledged[block.asset].append(handle)
-                found.append(block)
+            if one.asset in self._assets:
+                own.append(one)
+            else:
+                self._reject_stranger(one)
+        further, found = self._covariates, list[Block]()
+        messages = [BlockMessage(x.asset, x.message.payload, x.came_at, further.get(x.asset, ())) for x in own]
+        for one, decoded in zip(own, decode_blocks(messages), strict=True):
+            if isinstance(decoded, MessageError):
+                self._reject(one, one.asset, decoded)
+                continue
+            if (misorder := self._find_misorder(decoded)) is not None:
+                self._reject(one, one.asset, misorder)
+                continue
+            block, position = decoded.block, (decoded.block.stream, decoded.block.sequence)
+            self._newest[one.asset] = max(position, self._newest.get(one.asset, position))
+            message = one.message
+            handle = _AckHandle(message.mid, message.qos, one.connection, position if block.retained else None)
+            self._unacknowledged[one.asset].append(handle)
+            found.append(block)
         return found
 
     def acknowledge(self, asset: str, blocks: int) -> None:

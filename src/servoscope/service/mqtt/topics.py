@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from servoscope.core.errors import MessageError
-from servoscope.service.mqtt.payload import MAX_COUNT
+from servoscope.service.sources.block import MAX_COUNT
 
 TopicPrefix = Annotated[str, Field(strict=True, pattern=r"^[^#+/\x00]+(/[^#+/\x00]+)*$", max_length=200)]
 

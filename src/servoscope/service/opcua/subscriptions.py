@@ -13,12 +13,11 @@ import numpy as np
 
 from servoscope.core.errors import MessageError
 from servoscope.core.messages import message, render
-from servoscope.service.mqtt.payload import MAX_TIME_S
 from servoscope.service.opcua.monitored_items import ItemGrant
 from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
 from servoscope.service.sources.base import RejectionCounter
-from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.block import MAX_TIME_S, Block, ResumePosition
 from servoscope.service.sources.resample import CLOCK_STEP_S
 from servoscope.service.sources.update_rate import SLOW_PERIODS
 

@@ -13,6 +13,8 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 
+MAX_COUNT = 2**63 - 1  # what a database can count
+MAX_TIME_S = 253402300800.0  # s: the year 10000, from which on calendars end
 NO_COVARIATES = np.zeros((0, 0))
 
 
@@ -55,6 +57,13 @@ class Block:
         if not known.size or not same or any(x.shape != shape for x in self.covariates):
             raise RecordingError(f"{self.asset}: block {self.sequence}: t, r, u, y must have one length, t a number")
         return float(self.t[known[0]])
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """How many signals and how many samples there are; raises RecordingError if it is no block."""
+        if "signals" not in vars(self) or not self.t.size:
+            self.start_time()
+        return self.signals.shape
 
     def until(self, latest: float) -> Block | None:
         """Return it without the stamps of samples that claim to be later [UTC s]; None: all of them claim that."""
