@@ -217,6 +217,18 @@ def test_any_keys_in_any_order(more: list[tuple[str, str]], place: int, spaced: 
     check([f"{{{blank}{text}{blank}}}".encode()])
 
 
+@pytest.mark.parametrize(
+    ("key", "other"),
+    [
+        *((b'"sequence"', b'"sequence%s' % end) for end in (b'2"', b'12"', b"12", b"1", b"\0")),
+        *((b'"%s"' % key, b'"%s\0"' % key) for key in (b"t", b"y", b"version", b"sequence")),
+    ],
+)
+def test_keys_are_taken_whole(key: bytes, other: bytes) -> None:
+    message = message_of("1")
+    check([message, message.replace(key, other), message])
+
+
 def test_covariates_that_an_asset_needs_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(payload, "PIECE_BYTES", 1)  # so that there are several pieces
     plain = encode_json(Block("press", 3, np.array([1.0]), *np.ones((3, 1))))

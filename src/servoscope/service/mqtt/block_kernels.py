@@ -175,6 +175,8 @@ def _read_key(text: Text, i: int) -> tuple[int, int]:
     word, size = load_word(text, i), 1
     while size <= 8 and text[i + size] != QUOTE:
         size += 1
+    if size > 8 or text[i + size - 1] == 0:  # zeros behind a shorter key would make it another one
+        return -1, 0
     if size < 8:
         word &= (Word(1) << Word(8 * size)) - Word(1)
     for key in range(len(KEYS)):
