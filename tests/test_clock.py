@@ -172,6 +172,13 @@ def test_irregular_sampling_is_refused() -> None:
     assert "far from one sample" in refusal(data, sample_rate=None)
 
 
+@pytest.mark.parametrize("sample_rate", [None, 1.0 / 0.065])
+def test_as_many_short_steps_as_long_ones_are_refused(sample_rate: float | None) -> None:
+    data = signals(201)
+    data["t"] = np.cumsum([0.0, *[0.03, 0.1] * 100])
+    assert "far from one sample" in refusal(data, sample_rate=sample_rate)
+
+
 def test_a_plateau_of_u_is_told_where_no_limits_are_known() -> None:
     data = signals()
     data["u"] = np.clip(data["u"], -0.1, 0.1)

@@ -23,7 +23,7 @@ from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.examination import StoredDiagnosis, blocks_to_recording, examine_blocks, undetermined
-from servoscope.service.examination_schedule import FIRST_PER_S, ExaminationState, update_examination
+from servoscope.service.examination_schedule import FIRST_PER_S, ExaminationState, is_at_rest, update_examination
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, spikes, time_axis
 from servoscope.simulation import FaultEvent, reference, simulate
@@ -220,3 +220,13 @@ def test_assets_that_begin_together_are_examined_one_after_the_other(assets: int
     most = max(assets / span, assets / settings.every_s)
     for several in (first, np.concatenate([second, third])):
         assert np.bincount((several // 30.0).astype(int)).max() <= 30.0 * most + 2.0
+
+
+def test_a_clock_that_is_set_back_does_not_put_off_the_first_examination() -> None:
+    settings = DiagnosisSettings()
+    state = ExaminationState.begin(START, settings, 0.25)
+    early = START - YEAR
+    assert not is_at_rest(state, early, False)
+    earlier, found = update_examination(state, settings, early, False, lambda: undetermined("none"))
+    assert found is None and earlier.due - early == state.due - START <= 2.0 * settings.window_s
+    assert is_at_rest(earlier, early + 1.0, False)

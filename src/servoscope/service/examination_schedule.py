@@ -81,7 +81,7 @@ def rest_period(state: ExaminationState) -> tuple[float, float]:
     """Return from when and until when [UTC s] `update_examination` changes nothing if the recursion agrees."""
     if state.doubts:
         return math.inf, -math.inf
-    return -math.inf if state.examined is None else state.examined, state.due
+    return state.since if state.examined is None else state.examined, state.due
 
 
 def is_at_rest(state: ExaminationState, t: float, exceeded: bool) -> bool:
@@ -104,7 +104,9 @@ def update_examination(
 
     `exceeded`: whether the recursion is above a limit; `sound`: whether the data are good enough to show a fault.
     """
-    if state.examined is not None and t < state.examined:  # the clock was set back
+    if state.examined is None and t < state.since:  # the clock was set back: the first one is as far away as before
+        state = replace(state, due=t + (state.due - state.since), since=t)
+    elif state.examined is not None and t < state.examined:
         state = replace(state, due=t, retry=t, again=t)
     disagrees = exceeded != (state.verdict == "fault")
     if not disagrees and state.doubts:
