@@ -59,6 +59,14 @@ def test_a_time_reset_starts_a_run_laid_after_the_one_before() -> None:
     assert np.bincount(recording.run).tolist() == [500] * 4
 
 
+def test_a_run_without_a_usable_row_is_not_counted() -> None:
+    data = signals()
+    data["y"][500:1000] = np.nan
+    recording = cleaned(data, run=np.arange(2000) // 500)
+    assert np.bincount(recording.run).tolist() == [500] * 3
+    assert np.flatnonzero(recording.restart).tolist() == [0, 500, 1000]
+
+
 def test_nothing_is_sorted_across_runs() -> None:
     data = signals()
     data["t"] = data["t"] % 5.0

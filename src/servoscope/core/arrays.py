@@ -1,4 +1,4 @@
-"""Types of arrays."""
+"""Types of arrays, and a choice of their rows."""
 
 from __future__ import annotations
 
@@ -11,3 +11,8 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 ComplexArray = npt.NDArray[np.complex128]
 IndexArray = npt.NDArray[np.intp]
+
+
+def select_rows(x: FloatArray, mask: BoolArray) -> FloatArray:
+    """Return the rows (M,) of x (N,) where the mask (N,) is set; x itself where it is set everywhere, not a copy."""
+    return x if mask.all() else x[mask]

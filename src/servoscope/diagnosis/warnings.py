@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servoscope.core import outofcore
+from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.detection.chi2_test import noncentrality, required_noncentrality, t2_statistic
 from servoscope.detection.plant_fit import MOST_SATURATED, saturated_share
@@ -26,11 +27,18 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
     baseline, e = exam.baseline, exam.estimates
     promised = {p.parameter: p.change for p in baseline.promises if p.change is not None and p.change < NO_PROMISE}
     rows = np.array([baseline.fault_directions[parameter] for parameter in promised])
-    best = np.zeros(len(rows))
-    for at in outofcore.iter_chunks(0, exam.evaluations, e.S, e.Psi, at_once=AT_ONCE) if len(rows) else ():
-        ok = e.updates[at] > 0
-        if ok.any():
-            best = np.maximum(best, noncentrality(exam.covariance(at)[ok], e.Psi[at][ok], rows).max(axis=0))
+
+    def largest(first: int, end: int) -> FloatArray:
+        best = np.zeros(len(rows))
+        for at in outofcore.iter_chunks(first, end, e.S, e.Psi, at_once=AT_ONCE) if len(rows) else ():
+            best = np.maximum(best, noncentrality(exam.covariance(at), e.Psi[at], rows).max(axis=0))
+        return best
+
+    begin = int(np.searchsorted(e.updates, 0.0, side="right"))  # they are counted: none comes before the first
+    middle = (begin + exam.evaluations) // 2
+    with outofcore.second_thread(exam.recording.samples) as second:
+        later = second.submit(largest, middle, exam.evaluations)
+        best = np.maximum(largest(begin, middle), later.result())
     needed = required_noncentrality(exam.pipeline.bank.n, baseline.limit)
     smallest = {
         name: float(np.sqrt(needed / one)) if one > 0.0 else np.inf for name, one in zip(promised, best, strict=True)

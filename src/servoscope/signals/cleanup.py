@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core import outofcore
-from servoscope.core.arrays import BoolArray, FloatArray, IndexArray, Int32Array
+from servoscope.core.arrays import BoolArray, FloatArray, IndexArray, Int32Array, select_rows
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.core.messages import message
 from servoscope.signals.defects import Defect, defects_at, limit_defects, split_consecutive
 from servoscope.signals.recording import Recording, with_defects
 from servoscope.signals.resample import ResampleTarget, resample_rows
 from servoscope.signals.spikes import find_spikes, follows_reference_step
-from servoscope.signals.time_axis import build_time_axis
+from servoscope.signals.time_axis import build_time_axis, number_runs
 from servoscope.signals.timebase import Timebase
 
 MIN_SAMPLES = 20
@@ -140,12 +140,12 @@ def _renumber_runs(run: Int32Array) -> tuple[Int32Array, BoolArray]:
     begins = np.append(
         0, outofcore.find_rows(lambda rows: run[rows] != run[rows.start - 1 : rows.stop - 1], run, first=1)
     )
-    numbered, restart = outofcore.empty((run.size,), np.int32), outofcore.empty((run.size,), np.bool_)
-    for rows in outofcore.iter_chunks(0, run.size, run, numbered, restart):
-        numbered[rows] = np.searchsorted(begins, np.arange(rows.start, rows.stop), side="right") - 1
+    restart = outofcore.empty((run.size,), np.bool_)
+    for rows in outofcore.iter_chunks(0, run.size, restart):
         restart[rows] = False
     restart[begins] = True
-    return numbered, restart
+    is_numbered = np.array_equal(run[begins], np.arange(begins.size))  # unless a run has lost all of its rows
+    return run if is_numbered else number_runs(begins[1:], run.size), restart
 
 
 def _check_channels(channels: list[FloatArray], name: str, labels: tuple[str, str, str]) -> None:
@@ -154,7 +154,7 @@ def _check_channels(channels: list[FloatArray], name: str, labels: tuple[str, st
     for x, label, may_rest in zip(channels, labels, (True, False, False), strict=True):
         low, high, count = np.inf, -np.inf, 0
         for rows in outofcore.iter_chunks(0, x.size, x):
-            finite = x[rows][np.isfinite(x[rows])]
+            finite = select_rows(x[rows], np.isfinite(x[rows]))
             low, high = min(low, float(finite.min(initial=np.inf))), max(high, float(finite.max(initial=-np.inf)))
             count += finite.size
         if count == 0:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core import outofcore
-from servoscope.core.arrays import FloatArray, IndexArray, Int32Array
+from servoscope.core.arrays import FloatArray, IndexArray, Int32Array, select_rows
 from servoscope.core.errors import IrregularTimeError, RecordingError
 from servoscope.core.messages import message
 from servoscope.signals.defects import Defect, mask_spans
@@ -107,10 +107,7 @@ def build_time_axis(
     if abs(rate / used - 1.0) > RATE_NOTE:
         defects.append(Defect("clock", start, end, t.size, message("defect.rate", measured=rate, used=used)))
     dropped = np.union1d(lost, wild + np.searchsorted(lost - np.arange(lost.size), wild, side="right"))
-    run = outofcore.empty((t.size,), np.int32)
-    for piece in outofcore.iter_chunks(0, t.size, run):
-        run[piece] = np.searchsorted(begins, np.arange(piece.start, piece.stop), side="right")
-    return TimeAxis(laid, run, used, defects, dropped, order)
+    return TimeAxis(laid, number_runs(begins, t.size), used, defects, dropped, order)
 
 
 def _as_it_stands(t: FloatArray, sample_rate: float | None) -> TimeAxis | None:
@@ -130,11 +127,22 @@ def _as_it_stands(t: FloatArray, sample_rate: float | None) -> TimeAxis | None:
     return TimeAxis(t, np.zeros(t.size, dtype=np.int32), used, [], NO_ROWS, [])
 
 
+def number_runs(begins: IndexArray, rows: int) -> Int32Array:
+    """Return the run of each row, from 0, where runs but for the first start at `begins`."""
+    if not begins.size:
+        return np.zeros(rows, dtype=np.int32)  # pages that nobody writes take no memory
+    run = outofcore.empty((rows,), np.int32)
+    for piece in outofcore.iter_chunks(0, rows, run):
+        run[piece] = np.searchsorted(begins, np.arange(piece.start, piece.stop), side="right")
+    return run
+
+
 def _steps_within_runs(t: FloatArray, begins: IndexArray, rows: slice) -> FloatArray:
     """Return the steps to some rows within runs, which start at `begins`."""
     rows = slice(max(rows.start, 1), rows.stop)
     first, last = np.searchsorted(begins, [rows.start, rows.stop])
-    return np.asarray(np.delete(time_steps(t, rows), begins[first:last] - rows.start))
+    steps = time_steps(t, rows)
+    return steps if first == last else np.delete(steps, begins[first:last] - rows.start)
 
 
 def _shift_run_starts(begins: IndexArray, dropped: IndexArray, left: int) -> IndexArray:
@@ -225,7 +233,7 @@ def _measure_rate(
     total, count = 0.0, 0
     for rows in outofcore.iter_chunks(0, t.size, t):
         steps = _steps_within_runs(t, begins, rows)
-        near = steps[(steps > 0.5 * typical) & (steps < GAP_STEP * typical)]
+        near = select_rows(steps, (steps > 0.5 * typical) & (steps < GAP_STEP * typical))
         total, count = total + float(near.sum()), count + near.size
     if not count:  # as many short steps as long ones: their median is near neither
         total, count = typical, 1
@@ -244,7 +252,7 @@ def _measure_rate(
     advancing = far = jitter = 0
     for rows in outofcore.iter_chunks(0, t.size, t):
         steps = _steps_within_runs(t, begins, rows) / period
-        steps = steps[steps > REPEAT_STEP]
+        steps = select_rows(steps, steps > REPEAT_STEP)
         advancing += steps.size
         far += int(((steps > GAP_STEP) | (steps < 0.5)).sum())
         jitter += int(((np.abs(steps - 1.0) > JITTER + 1e-6) & (steps <= GAP_STEP)).sum())

@@ -141,13 +141,15 @@ def _check_values(
 @inline
 def _learn_rest_noise(limits: QualityLimits, s: Any, y: float, turned: bool) -> None:
     """Learn, while r rests, whether y is noisy there: it turns at most samples, over many of its smallest changes."""
-    if s.same[R] % limits.frozen == 1.0:
+    same, stretch = s.same[R], limits.frozen
+    begins = (same if same < stretch else same % stretch) == 1.0  # a division is what costs most, and motion needs none
+    if begins:
         # The first stretch of a rest is left for the motion to settle.
-        if s.same[R] > 2.0 * limits.frozen and s.turns >= TURN_SHARE * limits.frozen:
+        if same > 2.0 * stretch and s.turns >= TURN_SHARE * stretch:
             s.noisy = max(s.noisy, 1.0 * (_width(s.rest_range) >= NOISE_LEVELS * s.smallest_change[Y]))
         s.turns = 0.0
     s.turns += turned
-    _track_range(s.rest_range, y, s.same[R] % limits.frozen == 1.0)
+    _track_range(s.rest_range, y, begins)
 
 
 @inline
