@@ -69,6 +69,9 @@ def streams() -> dict[str, list[Block]]:
     found["asset4"][30].y[10:20] = np.nan
     turned = found["asset4"][40]
     found["asset4"][40] = replace(turned, **{name: getattr(turned, name)[::-1] for name in "truy"})
+    for name in ("asset0", "asset1"):  # as sources make them whose messages have a row per moment
+        rows = (np.asfortranarray(one.signals) for one in found[name])
+        found[name] = [Block.from_signals(name, i, signals) for i, signals in enumerate(rows)]
     return found
 
 

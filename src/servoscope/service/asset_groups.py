@@ -113,7 +113,9 @@ class AssetGroups:
             else:
                 together[place.fleet, shape].append((place, block))
         for (fleet, shape), placed in together.items():
-            signals = np.concatenate([block.signals for _, block in placed]).reshape(len(placed), *shape)
+            # rows in a piece, which is not what becomes of sources that have a column per moment
+            joined = np.ascontiguousarray(np.concatenate([block.signals for _, block in placed]))
+            signals = joined.reshape(len(placed), *shape)
             yield from self._process_together(self._fleets[fleet], placed, signals, latest, alone)
         for block in alone:
             yield BlockResult(block, self._process_alone(block, latest))
