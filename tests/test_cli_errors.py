@@ -149,7 +149,9 @@ def test_no_command_overwrites_its_inputs(made: Path, tmp_path: Path) -> None:
 def test_an_interrupt_is_quiet(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: bool) -> None:
     def interrupted(path: Path) -> None:
         if compiled:  # what Python makes of one that comes while compiled code runs
-            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+            inner = SystemError("returned a result with an exception set")
+            inner.__cause__ = KeyboardInterrupt()
+            raise SystemError("returned a result with an exception set") from inner  # once for each compiled caller
         raise KeyboardInterrupt
 
     monkeypatch.setattr("servoscope.models.loop.Loop.load", interrupted)

@@ -42,7 +42,10 @@ class CommandGroup(typer.core.TyperGroup):
         except KeyboardInterrupt:
             raise typer.Exit(EXIT_INTERRUPTED) from None
         except SystemError as error:
-            if not isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C in the middle of compiled code
+            cause: BaseException | None = error  # Ctrl-C in the middle of compiled code is the first of several causes
+            while isinstance(cause, SystemError):
+                cause = cause.__cause__
+            if not isinstance(cause, KeyboardInterrupt):
                 raise
             raise typer.Exit(EXIT_INTERRUPTED) from None
         except OSError as error:

@@ -40,7 +40,7 @@ export async function show(main, { signal, linked, values }) {
   const groups = h("select", { "aria-label": "Group" }, h("option", { value: "" }, "All groups"));
   const orders = h("select", { "aria-label": "Order" }, Object.entries(ORDERS).map(([key, [words]]) => h("option", { value: key }, words)));
   orders.value = filter.order in ORDERS ? filter.order : "worst";
-  const grid = h("div", { class: "grid fleet", role: "table", "aria-label": "Assets, worst first" });
+  const grid = h("div", { class: "grid fleet", tabindex: "0", role: "table", "aria-label": "Assets, worst first" });
   let now = 0;
 
   main.replaceChildren(
