@@ -315,12 +315,12 @@ def measure(case: Case) -> Measurement:
     per_sample = (f"{1e6 * spent / samples:.2f}" for spent in (used - receive, used))
     row = case.words, *per_sample, f"{used / samples / kernel:.0f}", p50, p99, load
     pairs = enumerate(zip(looks, [*looks[1:], after], strict=True))
-    stretches = tuple(stretch_row(k * STRETCH / 60.0, *pair) for k, pair in pairs)
+    stretches = tuple(stretch_row(k * STRETCH / 60.0, *pair) for k, pair in pairs) if len(looks) > 1 else ()
     columns = "from minute", "p50", "p99", "p99.9", "largest"
     return Measurement(
         Table("A sample through the service", note, ("layer", "time", "over the kernel"), tuple(cells)),
         row,
-        Table("Latency in the course of the run", case.words, columns, stretches[: len(stretches) * (len(looks) > 1)]),
+        Table("Latency in the course of the run", case.words, columns, stretches),
     )
 
 

@@ -165,7 +165,7 @@ class Asset(StateHolder):
     def first_needed_sequence(self) -> int:
         """The number of the first block of the window: earlier ones are no longer needed."""
         first = self._window.first_sequence
-        return first if first is not None else self._current.position.blocks
+        return self._current.position.blocks if first is None else first
 
     def process(self, block: Block, latest: float = math.inf) -> StepResult:
         """Process a block; one that was counted before has no effect, nor has one that is later than `latest` [UTC s].

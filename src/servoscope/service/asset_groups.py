@@ -113,7 +113,7 @@ class AssetGroups:
             else:
                 together[place.fleet, shape].append((place, block))
         for (fleet, shape), placed in together.items():
-            # rows in a piece, which is not what becomes of sources that have a column per moment
+            # in C order, which digests and kernels need: where each block is in Fortran order, the joined array is too
             joined = np.ascontiguousarray(np.concatenate([block.signals for _, block in placed]))
             signals = joined.reshape(len(placed), *shape)
             yield from self._process_together(self._fleets[fleet], placed, signals, latest, alone)
