@@ -15,11 +15,11 @@ export async function show(main, { session, signal, values }) {
   const saved = h("div", {});
   const work = h("div", { class: "steps" });
   main.replaceChildren(h("div", { class: "head" }, h("h1", {}, "Learn a baseline")), work, section("Baselines", null, saved));
-  const [like, machines] = [new Set(), h("div", {})];
+  const machines = likes();
   const refresh = async () => {
     const all = (await get("/baselines", signal)).baselines;
     saved.replaceChildren(baselines(all));
-    machines.replaceChildren(all.length < FEWEST ? "" : likes(all, like));
+    machines.list(all);
   };
   await refresh();
   if (!mayChange(session.role, "engineer")) {
@@ -75,7 +75,7 @@ export async function show(main, { session, signal, values }) {
   learn.addEventListener("click", () =>
     during(learn, said, async (step) => {
       const recordings = used().map((each) => ({ upload: each.upload.id, ...(each.point.value.trim() && { point: each.point.value.trim() }) }));
-      const found = await job("/learnings", { loop: loop.read(), recordings, columns: mapped.read(), population: [...like] }, { signal, step });
+      const found = await job("/learnings", { loop: loop.read(), recordings, columns: mapped.read(), population: [...machines.chosen] }, { signal, step });
       for (const one of found.recordings) judged(chosen.find((each) => each.upload.id === one.upload), one.inspection);
       result.replaceChildren(learned(found, refresh));
       result.scrollIntoView({ block: "start" });
@@ -83,7 +83,7 @@ export async function show(main, { session, signal, values }) {
   );
   work.append(
     section("Loop", ["What is known of it: sampling, plant, controller. A baseline has it inside. Without a loop file ", h("a", { href: "/begin" }, "begin with a log"), "."], loop.element),
-    section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, machines, h("div", { class: "actions" }, learn, look, said)),
+    section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, machines.element, h("div", { class: "actions" }, learn, look, said)),
     result,
   );
   for (const id of values.getAll("upload")) await get(`/uploads/${part(id)}`, signal).then(add, () => {}); // those that are still there
@@ -105,10 +105,10 @@ function learned(found, refresh) {
     event.preventDefault();
     try {
       const made = await post("/baselines", { name: name.value, learning: found.learning });
-      link.replaceChildren(translate(`Saved as ${made.name}: `), h("a", { href: `/diagnose?baseline=${part(made.id)}` }, "diagnose a recording with it"));
       said.replaceChildren();
       button.disabled = true; // the name is taken now, by this
-      await refresh();
+      const words = [translate(`Saved as ${made.name}: `), h("a", { href: `/diagnose?baseline=${part(made.id)}` }, "diagnose a recording with it")];
+      await refresh().finally(() => link.replaceChildren(...words)); // saved it is, even if the list cannot be fetched
     } catch (error) {
       said.replaceChildren(complaint(error));
     }
@@ -138,15 +138,23 @@ function told(summary) {
   );
 }
 
-function likes(all, chosen) {
+/** The choice of like machines: what is open and chosen stays so when the list is fetched again. */
+function likes() {
+  const chosen = new Set();
+  const listed = h("div", {});
   const box = (one) => h("input", { type: "checkbox", checked: chosen.has(one.id), "aria-label": `Use ${one.name}`, onchange: (event) => chosen[event.target.checked ? "add" : "delete"](one.id) });
-  return h(
+  const element = h(
     "details",
-    {},
+    { hidden: true },
     h("summary", {}, "A new machine among like ones"),
     h("p", { class: "note" }, "Choose the baselines of five or more like machines: what they have in common need not be learned again, and its own recordings make it sharper."),
-    table("Like machines", ["Use", "Name", "Loop"], all.map((one) => [box(one), one.name, one.loop])),
+    listed,
   );
+  const list = (all) => {
+    element.hidden = all.length < FEWEST;
+    listed.replaceChildren(table("Like machines", ["Use", "Name", "Loop"], all.map((one) => [box(one), one.name, one.loop])));
+  };
+  return { element, chosen, list };
 }
 
 function baselines(all) {
