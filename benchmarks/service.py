@@ -118,7 +118,7 @@ def is_connected(port: int) -> bool:
 
 
 def processor_time(pid: int) -> float:
-    """Return the processor time of a process and of those that it has started, all threads [s]."""
+    """Return the processor time of a process and of those that it has started, ended or not, all threads [s]."""
     found = 0.0
     for file in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -126,7 +126,8 @@ def processor_time(pid: int) -> float:
         except OSError:
             continue
         if pid in (int(file.parent.name), int(fields[1])):
-            found += TICK_S * (int(fields[11]) + int(fields[12]))
+            own = int(file.parent.name) == pid
+            found += TICK_S * sum(int(field) for field in fields[11 : 15 if own else 13])  # user, system, ended ones
     return found
 
 
@@ -263,15 +264,17 @@ def measure(case: Case) -> Measurement:
             # without a pause between those that warm up and those that count: silence would be an alarm of each asset
             blocks = WARM_BLOCKS + case.blocks
             feeder = Feeder(Feed(broker.port, assets, blocks, case.speed, case.rate, case.binary, AHEAD), recording)
-            pids = service.pid, broker.pid, feeder.pid
+            pids = {"service": service.pid, "the broker": broker.pid, "the sender": feeder.pid}
+            if server is not None:
+                pids["PostgreSQL"] = server.pid
             before, begin = wait_for_blocks(listen, feeder, assets * WARM_BLOCKS, stored=False), time.monotonic()
-            spent = [processor_time(pid) for pid in pids]
+            earlier = {name: processor_time(pid) for name, pid in pids.items()}
             looks = [before]
             for sent in range(WARM_BLOCKS + STRETCH, blocks, STRETCH) if case.speed else ():
                 looks.append(wait_for_blocks(listen, feeder, assets * sent, stored=False))
             after = wait_for_blocks(listen, feeder, assets * blocks, stored=True)
             seconds, report = time.monotonic() - begin, feeder.report
-            used, broker_used, own = (processor_time(pid) - earlier for pid, earlier in zip(pids, spent, strict=True))
+            spent = {name: processor_time(pid) - earlier[name] for name, pid in pids.items()}
             kernel, memory = kernel_time(monitor, recording), largest_memory(service.pid)
         finally:
             if feeder is not None:
@@ -288,17 +291,16 @@ def measure(case: Case) -> Measurement:
     prefix = 'servoscope_processor_seconds_total{layer="'
     layers = {key.split('"')[1]: after[key] - before[key] for key in after if key.startswith(prefix)}
     receive, listing = layers.pop("receive", 0.0), layers.pop("metrics", 0.0)
-    used -= listing  # a list of all assets every second or two is the benchmark's doing
-    rows = [(layer, spent) for layer, spent in layers.items()]
+    used = spent.pop("service") - listing  # a list of all assets every second or two is the benchmark's doing
+    rows = list(layers.items())
     rows += [
         ("the client, with its acknowledgements", receive),
         ("the service, without the client", used - receive),
         ("the service, all of it", used),
         ("its metrics, as often as this benchmark asks for them", listing),
-        ("the broker", broker_used),
-        ("the sender", own),
+        *spent.items(),
     ]
-    cells = [(words, f"{1e6 * spent / samples:.3f} us", f"{spent / samples / kernel:.1f}") for words, spent in rows]
+    cells = [(words, f"{1e6 * cost / samples:.3f} us", f"{cost / samples / kernel:.1f}") for words, cost in rows]
     cells.append(("one log's kernel, in the same minute", f"{1e6 * kernel:.3f} us", "1"))
     load = f"{os.getloadavg()[0]:.1f}"
     p50, p99, p999, largest = (f"{quantile(before, after, share):g} s" for share in (0.5, 0.99, 0.999, 1.0))
@@ -312,7 +314,7 @@ def measure(case: Case) -> Measurement:
         f"{after['servoscope_alarms']:.0f}. Latency p50, p99, p99.9 and largest: {p50}, {p99}, {p999}, {largest} at "
         f"most. Load of the machine at the end: {load}."
     )
-    per_sample = (f"{1e6 * spent / samples:.2f}" for spent in (used - receive, used))
+    per_sample = (f"{1e6 * cost / samples:.2f}" for cost in (used - receive, used))
     row = case.words, *per_sample, f"{used / samples / kernel:.0f}", p50, p99, load
     pairs = enumerate(zip(looks, [*looks[1:], after], strict=True))
     stretches = tuple(stretch_row(k * STRETCH / 60.0, *pair) for k, pair in pairs) if len(looks) > 1 else ()

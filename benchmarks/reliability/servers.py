@@ -73,6 +73,11 @@ class Postgres:
         self._call("pg_ctl", "-D", str(self.folder), "-w", "-m", mode, "stop")
 
     @property
+    def pid(self) -> int:
+        """Its first process, while it runs."""
+        return int((self.folder / "postmaster.pid").read_text(encoding="utf-8").split()[0])
+
+    @property
     def _user(self) -> tuple[int, int]:
         """User and group that it runs as: PostgreSQL refuses to run as root."""
         try:

@@ -20,6 +20,7 @@ from servoscope.service.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.examination_schedule import PendingDiagnosis
 from servoscope.service.records import TableRow
 from servoscope.service.residual_history import HistoryState
+from servoscope.service.sources.block import covariate_tail
 from servoscope.service.store.rows import SIZE_EVERY_S, coefficient_rows
 from servoscope.signals import quality
 
@@ -166,8 +167,7 @@ class AssetStates:
         the numbers of the blocks, and rows of the history and of the coefficients, each with the place of its lane.
         """
         one, new = self.columns[rows], found.evaluations
-        count = signals.shape[1] - 4
-        tail, numbers_of = bytes([count] * (count > 0)), signals.astype("<f8", copy=False)
+        tail, numbers_of = covariate_tail(signals.shape[1] - 4), signals.astype("<f8", copy=False)
         digests = zip(lanes.tolist(), one["digest"].tolist(), strict=True)
         numbers, history = one["blocks"].tolist(), list[tuple[int, TableRow]]()
         one["t"] = one["last_t"] = one["alarms_at"] = found.t[lanes]

@@ -27,6 +27,14 @@ class ResumePosition(NamedTuple):
     last_t: float = math.nan
 
 
+def covariate_tail(count: int) -> bytes:
+    """Return what ends a packed block: a byte with the number of its covariates, nothing where it has none.
+
+    Without it the length of a packed block is a multiple of eight.
+    """
+    return bytes([count] * (count > 0))
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Samples of one asset in the order in which they came."""
@@ -109,12 +117,8 @@ class Block:
         return zlib.crc32(self.signals.tobytes(), before)
 
     def pack(self) -> bytes:
-        """Return its samples as bytes, from which `unpack` restores them bit by bit.
-
-        Where there are covariates, a last byte tells their number: without it the length is a multiple of eight.
-        """
-        packed = self.signals.astype("<f8", copy=False).tobytes()
-        return packed + bytes([len(self.covariates)]) if len(self.covariates) else packed
+        """Return its samples as bytes, from which `unpack` restores them bit by bit."""
+        return self.signals.astype("<f8", copy=False).tobytes() + covariate_tail(len(self.covariates))
 
     @classmethod
     def unpack(cls, asset: str, sequence: int, packed: bytes) -> Block:

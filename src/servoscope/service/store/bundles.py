@@ -17,6 +17,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from servoscope.core.arrays import FloatArray
+from servoscope.service.sources.block import covariate_tail
 from servoscope.service.store import tables
 from servoscope.service.store.rows import Row
 
@@ -117,7 +118,7 @@ def pack_samples(signals: FloatArray) -> list[tuple[bytes, bool]]:
     `Block.pack` would have returned, as other blocks are.
     """
     numbers, (count, rows, n) = signals.astype("<f8", copy=False), signals.shape
-    tail = bytes([rows - 4]) if rows > 4 else b""
+    tail = covariate_tail(rows - 4)
     t, first = numbers[:, 0], numbers[:, 0, :1]
     if n < 2:
         return [(one.tobytes() + tail, False) for one in numbers]
