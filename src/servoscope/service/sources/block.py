@@ -35,6 +35,12 @@ def covariate_tail(count: int) -> bytes:
     return bytes([count] * (count > 0))
 
 
+def split_covariate_tail(packed: bytes) -> tuple[bytes, int]:
+    """Return a packed block without what `covariate_tail` has added, and the number of its covariates."""
+    count = packed[-1] if len(packed) % 8 == 1 else 0
+    return packed[:-1] if count else packed, count
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Samples of one asset in the order in which they came."""
@@ -123,8 +129,7 @@ class Block:
     @classmethod
     def unpack(cls, asset: str, sequence: int, packed: bytes) -> Block:
         """Return the block of packed samples; raises RecordingError if they are not whole."""
-        k = packed[-1] if len(packed) % 8 == 1 else 0
-        numbers = packed[:-1] if k else packed
+        numbers, k = split_covariate_tail(packed)
         if len(numbers) % (8 * (4 + k)):
             raise RecordingError(f"{asset}: block {sequence} in the store is torn: restart with --anew {asset}")
         signals = np.frombuffer(numbers, dtype="<f8").astype(np.float64).reshape(4 + k, -1)

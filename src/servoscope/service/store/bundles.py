@@ -17,7 +17,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from servoscope.core.arrays import FloatArray
-from servoscope.service.sources.block import covariate_tail
+from servoscope.service.sources.block import covariate_tail, split_covariate_tail
 from servoscope.service.store import tables
 from servoscope.service.store.rows import Row
 
@@ -132,11 +132,11 @@ def pack_samples(signals: FloatArray) -> list[tuple[bytes, bool]]:
 
 def restore_times(stored: bytes) -> bytes:
     """Return the packed block that `pack_samples` made shorter."""
-    tail = stored[-1:] if len(stored) % 8 == 1 else b""
-    (first, rate), signals = np.frombuffer(stored[:16], dtype="<f8"), stored[16 : len(stored) - len(tail)]
-    n = len(signals) // 8 // (3 + tail[0] if tail else 3)
+    numbers, k = split_covariate_tail(stored)
+    (first, rate), signals = np.frombuffer(numbers[:16], dtype="<f8"), numbers[16:]
+    n = len(signals) // 8 // (3 + k)
     t: FloatArray = first + np.arange(n) / rate
-    return t.astype("<f8").tobytes() + signals + tail
+    return t.astype("<f8").tobytes() + signals + covariate_tail(k)
 
 
 def _write_contents(parts: Sequence[BundlePart]) -> str:
