@@ -131,12 +131,16 @@ def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, BlockS
     return assets, _build_sources(visit, assets)
 
 
-def check_service_file(config: ServiceFile) -> None:
-    """Read all that a service file names but the store; raises ServoscopeError if something cannot be used."""
+def check_service_file(config: ServiceFile) -> list[str]:
+    """Read all that a service file names but the store; return what sources would do, line by line.
+
+    Raises ServoscopeError if something cannot be used.
+    """
     assets = build_assets(config)
     check_actions(config, assets)
-    _build_sources(config, assets)
+    sources = _build_sources(config, assets)
     _build_publishers(config)
+    return [f"[sources] {name}: {line}" for name, source in sources.items() for line in source.preview()]
 
 
 def resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:
@@ -191,7 +195,9 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
         asked = path, point, frozenset(limits.items())
         if asked not in resolved:  # many assets are of one loop
             resolved[asked] = _resolve_limits(shared[path, point][0].loop, limits, name)
-        policy = replace(policy, limits=resolved[asked])
+        pause_s = config.sources[settings.source].pause_s
+        sound = config.quality.model_copy(update={"silent_s": config.quality.silent_s + pause_s})
+        policy = replace(policy, limits=resolved[asked], quality=sound)
         assets[name] = Asset(name, *shared[path, point], policy, settings.group, settings.source)
     known = [fault.name for one in assets.values() for fault in one.baseline.loop.plant.all_faults]
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)

@@ -295,11 +295,13 @@ class Service:
             reception, before, (trouble, of_assets) = self._receptions[name], asset.reception, troubles[source]
             if before is FOLLOWED and name not in of_assets and reception.is_fresh(self._listening_s, fresh_s):
                 continue  # nearly all of them, nearly always
-            patience_s, own = self.config.quality.silent_s, of_assets.get(name)
+            pause_s = self.sources[source].pause_s
+            patience_s, own = max(asset.policy.quality.silent_s, pause_s), of_assets.get(name)
             if not math.isinf(self.sources[source].next_block_s):
                 asset.reception = reception.evaluate(self._listening_s, patience_s, trouble, own)
             silence, result = reception.silence_s(self._listening_s), StepResult([], [])
-            if silence >= HOUSEKEEPING_EVERY_S:
+            is_expected = math.isinf(pause_s) or (silence < pause_s and not asset.heard)
+            if silence >= HOUSEKEEPING_EVERY_S and not is_expected:
                 result = asset.advance_time(silence * self.sources[source].clock_rate)
                 self.handle_result(asset, result)
             if result.rows or asset.reception != before:
