@@ -27,9 +27,9 @@ from servoscope.core.errors import ConfigError, EmptyRecordingError, OutputError
 from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
 from servoscope.models.loop import Loop
+from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.config_types import Seconds
 from servoscope.service.log import log
-from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.signals.readers.recording_file import first_time, read_log

@@ -13,22 +13,22 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import halls
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from brokers import until
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import halls
-from brokers import until
 from servoscope.core.errors import ConfigError
 from servoscope.models.loop import Columns, Loop
 from servoscope.service.sources.base import Rejection, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.folder import FolderSettings, FolderSource
 
-LOOP = Loop.load(halls.LOOP).model_copy(update={"sample_rate": 100.0})
+LOOP = Loop.load(halls.LOOP)  # at 100 Hz
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
 QUICK = {"complete_after_s": 0.05, "poll_s": 0.02, "interval_s": 1.0, "block": 0.5}
 
