@@ -17,8 +17,8 @@ from servoscope.core.settings_errors import suggest_name
 from servoscope.design.operating_limits import LimitKind, OperatingLimit, operating_limits
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.models.loop import Loop
-from servoscope.service.actions import CommandSettings, WebhookSettings, load_secret
-from servoscope.service.actions.settings import Sink
+from servoscope.service.actions import CommandSettings, EmailSettings, WebhookSettings, load_secret
+from servoscope.service.actions.settings import SINKS, Sink
 from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.checkpoint import StreamPosition, unpack_state
 from servoscope.service.assets.examination import compile_examination
@@ -282,8 +282,8 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
     Raises ConfigError if one of them does not exist: alarms would not be sent, which would go unnoticed.
     """
     settings = config.actions.resolve_paths(config.folder)
-    for kind, sinks in (("webhook", settings.webhook), ("command", settings.command), ("mqtt", settings.mqtt)):
-        for name, sink in sinks.items():
+    for kind in SINKS:
+        for name, sink in getattr(settings, kind).items():
             where = f"[actions] {kind}.{name}"
             _check_names(f"{where}.assets", "asset", sink.assets or (), [*assets, config.name])
             _check_names(f"{where}.alarms", "alarm", sink.alarms or (), config.alarms.definitions)
@@ -300,7 +300,7 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
 
 
 def _check_sink(where: str, sink: Sink) -> None:
-    if isinstance(sink, WebhookSettings):
+    if isinstance(sink, WebhookSettings | EmailSettings):
         try:
             load_secret(sink)
         except ValueError as error:
