@@ -143,6 +143,29 @@ def test_a_try_has_a_deadline_even_where_the_server_drips() -> None:
         thread.join()
 
 
+def test_the_deadline_holds_in_the_handshake_too() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def answer() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                for line in (b"220 ready\r\n", b"250-here\r\n250 STARTTLS\r\n", b"220 go ahead\r\n"):
+                    time.sleep(0.25)
+                    connection.sendall(line)
+                    connection.recv(1000)
+                connection.settimeout(5.0)
+                connection.recv(1000)  # no handshake comes back: it ends when the other side does
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        settings = settings_of(host="127.0.0.1", port=listener.getsockname()[1], timeout_s=1.0)
+        begin = time.monotonic()
+        result = deliver(entry(settings), settings, NOW)
+        assert time.monotonic() - begin < 1.4
+        assert "not taken within 1 s" in result.detail
+        thread.join()
+
+
 def test_an_episode_of_an_alarm_is_one_mail() -> None:
     settings = settings_of()
     again = replace(NEW, before=LifecycleState.RETURNED, sequence=9)

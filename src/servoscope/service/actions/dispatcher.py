@@ -60,10 +60,11 @@ class OutboxDispatcher:
     def _run(self) -> None:
         while not self._stop_event.wait(POLL_S):
             busy, now, settings = set(self._busy), self._clock.now(), self._settings
-            held = {sink for sink, until in self._held.items() if until > time.monotonic()}
+            until_by_sink = self._held.copy()
+            held = {sink for sink, until in until_by_sink.items() if until > time.monotonic()}
             try:
                 rows = self._store.due_deliveries(now, MAX_ROWS, self._service, busy | held)
-                for sink in self._held.keys() - held - busy:
+                for sink in until_by_sink.keys() - held - busy:
                     others = settings.sinks.keys() - {sink}
                     rows += self._store.due_deliveries(now, MAX_ROWS_AS_ONE, self._service, others)
             except StoreError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import smtplib
 import socket
-import ssl
 import threading
 import time
 from collections import deque
@@ -47,31 +46,46 @@ class _MailServer(smtplib.SMTP):
     def __init__(self, settings: EmailSettings, timeout_s: float) -> None:
         self._settings = settings
         self._context = settings.create_tls_context(Path(), settings.host) if settings.encryption != "none" else None
+        self._line: socket.socket | None = None  # what lies below any encryption
+        self.is_cut = False
         super().__init__(timeout=timeout_s)
 
     def _get_socket(self, host: str, port: int, timeout: float) -> socket.socket:
         connection = socket.create_connection((self._settings.rules.resolve(host, port), port), timeout)
+        self._line = connection.dup()  # TLS takes the connection over before it shakes hands
+        if self.is_cut:
+            self.cut()
         if self._settings.encryption == "tls" and self._context is not None:
             return self._context.wrap_socket(connection, server_hostname=host)
         return connection
 
-    def hand_over(self, mail: EmailMessage, password: str | None) -> None:
-        """Send a mail; raises OSError, as all errors of smtplib are."""
+    def hand_over(self, mail: EmailMessage, password: str | None) -> list[str]:
+        """Send a mail, and return to whom the server does not take it; raises OSError, as all errors of smtplib are."""
         self._host = self._settings.host  # what a certificate is compared with
         self.connect(self._settings.host, self._settings.port or PORTS[self._settings.encryption])
         if self._settings.encryption == "starttls":
             self.starttls(context=self._context)
         if self._settings.user is not None and password is not None:
+            if not password.isascii():
+                raise ValueError("the password has characters beyond ASCII, which SMTP cannot carry")
             self.login(self._settings.user, password)
-        self.send_message(mail)
+        refused = self.send_message(mail)
         with suppress(OSError):
             self.quit()
+        return sorted(refused)
 
     def cut(self) -> None:
         """End the connection, from another thread."""
-        if self.sock is not None:
+        self.is_cut = True
+        if self._line is not None:
             with suppress(OSError):
-                socket.socket.shutdown(self.sock, socket.SHUT_RDWR)
+                self._line.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Close the connection."""
+        super().close()
+        if self._line is not None:
+            self._line.close()
 
 
 def send_mail(key: str, events: Sequence[dict[str, Any]], settings: EmailSettings, password: str | None) -> str:
@@ -80,20 +94,20 @@ def send_mail(key: str, events: Sequence[dict[str, Any]], settings: EmailSetting
     Raises OSError or ConfigError if it has not taken the mail.
     """
     mail = compose_mail(key, events, settings)
-    server, start = _MailServer(settings, settings.timeout_s), time.monotonic()
+    server = _MailServer(settings, settings.timeout_s)
     deadline = threading.Timer(settings.timeout_s, server.cut)  # a timeout of a socket starts again with each byte
     deadline.daemon = True
     deadline.start()
     try:
-        server.hand_over(mail, password)
+        refused = server.hand_over(mail, password)
     except (OSError, ValueError) as error:
-        if time.monotonic() - start >= settings.timeout_s and not isinstance(error, ssl.SSLError):
+        if server.is_cut or isinstance(error, TimeoutError):
             raise TimeoutError(f"not taken within {settings.timeout_s:g} s") from None
         raise OSError(str(error) or type(error).__name__) from None
     finally:
         deadline.cancel()
         server.close()
-    return "taken by the mail server"
+    return "taken by the mail server" + (f", but not for {', '.join(refused)}" if refused else "")
 
 
 def compose_mail(key: str, events: Sequence[dict[str, Any]], settings: EmailSettings) -> EmailMessage:
@@ -120,10 +134,7 @@ def _describe_event(event: dict[str, Any], address: str | None) -> str:
     lines = [str(text) for text in texts if text]
     lines.append(render(message("service.mail.time", t=event["time"])))
     if address is not None:
-        page = (
-            f"/assets/{quote(event['asset'], safe='')}"
-            if event.get("asset") not in (None, event.get("service"))
-            else "/"
-        )
-        lines.append(address.rstrip("/") + page)
+        asset = event.get("asset")
+        has_page = asset not in (None, event.get("service"))  # the service's own alarms have none
+        lines.append(address.rstrip("/") + (f"/assets/{quote(str(asset), safe='')}" if has_page else "/"))
     return "\n".join(lines)
