@@ -134,6 +134,12 @@ def test_local_times_are_those_of_their_zone_also_in_the_hour_that_comes_twice(t
     assert np.allclose(recording.t, utc - began, rtol=0.0, atol=1e-6)
     aware = json.dumps({"t": "2026-10-25T02:00:00Z", "r": 1, "u": 1, "y": 1}).encode()
     assert mapping.read("plant/press", aware, 0.0).values["press"][0].t == began + 3610.0  # it says its own
+    refused: list[tuple[str, ...]] = []
+    mapping = MessageMapping(mapping.settings, {"press": 2.0}, lambda *one: refused.append(one))
+    assert not mapping.read(
+        "plant/press", rows[0].replace(b"2026-10-25 02:59:50", b"9999-12-31 23:59:59.999999"), 0.0
+    ).values
+    assert refused[0][1] == "times"
     with pytest.raises(ValidationError, match="no zone of the IANA list"):
         settings(time_zone="Europe/Bielefeld")
 

@@ -254,11 +254,10 @@ class MessageMapping:
             moment = datetime.fromisoformat(value)
             if moment.tzinfo is not None:
                 return moment.timestamp()
-            written = moment.replace(tzinfo=UTC).timestamp()
+            written, zone = moment.replace(tzinfo=UTC).timestamp(), self._zones.get(asset)
+            return written if zone is None else written - float(zone.offsets(np.array([written]))[0])
         except (TypeError, ValueError, OverflowError):
             raise MessageError("times", f"{str(value)[:40]!r} is no date") from None
-        zone = self._zones.get(asset)
-        return written if zone is None else written - float(zone.offsets(np.array([written]))[0])
 
     def _number(self, signal: int, value: Any, good: bool) -> float:
         if value is None or not good:
