@@ -3,41 +3,43 @@
 from __future__ import annotations
 
 import errno
-import fnmatch
 import hashlib
 import heapq
 import math
 import os
 import queue
-import re
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
-from zoneinfo import ZoneInfo
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import AwareDatetime, Field
+from pydantic import AwareDatetime
 
-from servoscope.core.errors import ConfigError, EmptyRecordingError, OutputError, RecordingError, ServoscopeError
+from servoscope.core.errors import EmptyRecordingError, OutputError
 from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
-from servoscope.models.loop import Loop
 from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.config_types import Seconds
 from servoscope.service.log import log
-from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
+from servoscope.service.sources.base import BlockSource, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
-from servoscope.signals.readers.recording_file import first_time, read_log
-from servoscope.signals.samples import Samples
+from servoscope.service.sources.log_files import (
+    FileNames,
+    FileRows,
+    FileVersion,
+    FolderNames,
+    IncompleteFile,
+    LogFile,
+    ReadFile,
+    describe_error,
+    find_first_time,
+    parse_file,
+)
 
 DONE, FAILED = "done", "failed"  # subfolders that files are moved to
-TEMPORARY_NAMES = ("*.part", "*.filepart", "*.tmp", "*.crdownload", "~$*", ".*")
-MIN_EPOCH_S = 1e8  # time stamps from 1973 on are dates; smaller ones count from the beginning of a file
 MAX_CLOCK_DIFFERENCE_S = 3600.0  # between the file server and whoever writes the time stamps
 MAX_COMPARED = 1000  # files whose first time stamps are compared with each other
 MAX_REMEMBERED = 10_000  # contents by which a file that comes again is recognised
@@ -45,21 +47,13 @@ MAX_CHANGE_S = 86400.0  # after which a file that was read is not looked at agai
 MAX_ANSWER_S = 30.0  # that a share may take to answer
 IDLE_S = 0.2
 PIECE_BYTES = 1 << 20
-NAME_PARTS = re.compile(r"(\{asset\}|\{time\}|\*)")
-TIME_FORMATS = {8: "%Y%m%d", 10: "%Y%m%d%H", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}  # by how many digits there are
 
 
-class FolderSettings(SourceSettings):
+class FolderSettings(FolderNames):
     """A source of kind ``folder``."""
 
     kind: Literal["folder"]
     path: NonEmptyStr  # the folder, relative to the service file
-    # which files in it: ``*`` stands for anything but ``/``, ``{asset}`` for an asset, ``{time}`` for the date and time
-    # of the first row
-    match: NonEmptyStr = "*"
-    ignore: tuple[NonEmptyStr, ...] = TEMPORARY_NAMES  # names of files that are not complete
-    asset_column: NonEmptyStr | None = None  # the column that names the asset of a row, where files hold several
-    called: dict[NonEmptyStr, NonEmptyStr] = Field(default_factory=dict)  # by asset, what files call it
     complete_after_s: Seconds = 10.0  # without a change for so long, a file is complete [s]
     poll_s: Seconds = 5.0  # time between two looks into the folder [s]
     interval_s: Seconds = 600.0  # longest time between two files of an asset [s]; silence is what lasts longer
@@ -93,85 +87,6 @@ class FolderSettings(SourceSettings):
         return FolderSource(self, assets, folder / self.path)
 
 
-class FileVersion(NamedTuple):
-    """What tells that a file has changed."""
-
-    size: int
-    modified_ns: int
-
-
-class FoundFile(NamedTuple):
-    """A file in the folder whose name matches."""
-
-    name: str  # relative to the folder, with /
-    asset: str  # by its name; empty: a column names assets
-    time: str  # of its first row, by its name; empty: the name does not say
-    version: FileVersion
-    changed_at: float  # when it was written, or put there [UTC s]
-
-    @property
-    def modified_at(self) -> float:
-        """When it was written [UTC s]."""
-        return self.version.modified_ns / 1e9
-
-
-class ChangingFile(NamedTuple):
-    """A file of which nobody knows yet whether it is complete; by the monotonic clock [s]."""
-
-    version: FileVersion
-    unchanged_since: float
-    seen_since: float
-
-
-class AssetRows(NamedTuple):
-    """The rows of an asset in a file."""
-
-    samples: Samples
-    offset: float  # what makes seconds since 1970 of their time stamps [s]
-
-
-@dataclass(eq=False)
-class ReadFile:
-    """A file that was read, until its blocks are stored."""
-
-    file: FoundFile
-    rows: dict[str, AssetRows]
-    is_new: bool  # whether it came while we looked
-    subfolder: str  # where it belongs when they are stored
-    unstored: int = 1  # blocks that were polled and are not stored; one more until all have been polled
-    blocks: Iterator[Block] | None = None  # None: none has been polled
-
-
-class FileNames:
-    """Which files belong to which asset, as `match` says."""
-
-    def __init__(self, settings: FolderSettings, assets: Sequence[str]) -> None:
-        if strange := set(settings.called) - set(assets):
-            raise ConfigError(f"called: there is no asset {min(strange)!r} of this source")
-        self.assets = {settings.called.get(name, name): name for name in assets}
-        if len(self.assets) < len(assets):
-            raise ConfigError("called: two assets of this source are called the same")
-        named, by_column = "{asset}" in settings.match, settings.asset_column is not None
-        if named == by_column and (named or len(assets) > 1):
-            raise ConfigError("match: write {asset} where the name says which asset a file is of, or give asset_column")
-        if settings.match.count("{asset}") > 1 or settings.match.count("{time}") > 1 or settings.match[0] == "/":
-            raise ConfigError("match: a path in the folder, as {asset}/*.csv, with {asset} and {time} once at most")
-        self._only = "" if by_column or not assets else next(iter(assets))
-        called = "|".join(re.escape(name) for name in sorted(self.assets, key=len, reverse=True))
-        parts = {"{asset}": f"(?P<asset>{called})", "{time}": r"(?P<time>\d[\d T_.:-]*)", "*": "[^/]*"}
-        self._regex = re.compile("".join(parts.get(one, re.escape(one)) for one in NAME_PARTS.split(settings.match)))
-        self._ignored = settings.ignore
-        self.depth = settings.match.count("/")  # of folders in the folder
-
-    def match(self, name: str) -> tuple[str, str] | None:
-        """Return the asset and the time that a name says, empty where it says none; None: it is another file's."""
-        match = self._regex.fullmatch(name)
-        if match is None or any(fnmatch.fnmatch(name.rpartition("/")[2], one) for one in self._ignored):
-            return None
-        groups = match.groupdict(default="")
-        return self.assets[groups["asset"]] if "asset" in groups else self._only, groups.get("time", "")
-
-
 class FolderSource(BlockSource):
     """Follows the files of some assets in a folder; a thread looks into it and reads, one file ahead.
 
@@ -182,13 +97,14 @@ class FolderSource(BlockSource):
     def __init__(self, settings: FolderSettings, assets: Mapping[str, SourceAsset], folder: Path) -> None:
         super().__init__()
         self.settings, self._assets, self._folder = settings, assets, folder
+        self._loops = {name: asset.loop for name, asset in assets.items()}
         self._names = FileNames(settings, list(assets))
         self._counted: dict[str, float] = {}  # by asset, up to when its rows are in blocks [UTC s]
         self._resumed: dict[str, float] = {}  # the same when it was opened
         self._sequences = dict.fromkeys(assets, -1)
         # of the thread: files that may still change, those that were dealt with, and those that lay there at first;
         # contents by their digest; first time stamps [UTC s]
-        self._changing: dict[str, ChangingFile] = {}
+        self._changing: dict[str, IncompleteFile] = {}
         self._settled: dict[str, FileVersion] = {}
         self._first_names: set[str] | None = None
         self._digests: dict[bytes, str] = {}
@@ -282,11 +198,11 @@ class FolderSource(BlockSource):
         streams = (self._cut_asset(name, read.rows[name], first) for name, first in firsts.items())
         return heapq.merge(*streams, key=lambda block: float(block.t[-1]))
 
-    def _first_new(self, name: str, rows: AssetRows) -> int:
+    def _first_new(self, name: str, rows: FileRows) -> int:
         half_s = 0.5 / self._assets[name].loop.sample_rate
         return int(np.searchsorted(rows.samples.t, self._counted[name] + half_s - rows.offset, side="right"))
 
-    def _cut_asset(self, name: str, rows: AssetRows, first: int) -> Iterator[Block]:
+    def _cut_asset(self, name: str, rows: FileRows, first: int) -> Iterator[Block]:
         asset, samples = self._assets[name], rows.samples
         size = max(1, round(self.settings.block * asset.loop.sample_rate))
         channels = [samples.channels[covariate] for covariate in asset.covariates]
@@ -325,15 +241,15 @@ class FolderSource(BlockSource):
             lines.append(f"no file of {', '.join(sorted(lacking))}")
         for file in files[:MAX_COMPARED]:
             try:
-                self._parse(file)
+                parse_file(self._folder, file, self._names, self.settings, self._loops)
             except Exception as error:
-                return [*lines, f"{file.name} cannot be read: {_describe_error(error)}"]
+                return [*lines, f"{file.name} cannot be read: {describe_error(error)}"]
         return [*lines, f"all can be read; the first is {files[0].name}"] if files else lines
 
     # What the thread does
 
     def _run(self) -> None:
-        waiting, next_look = deque[FoundFile](), 0.0
+        waiting, next_look = deque[LogFile](), 0.0
         while not self._stop_event.is_set():
             try:
                 if time.monotonic() >= next_look:
@@ -351,7 +267,7 @@ class FolderSource(BlockSource):
             if not waiting:
                 self._stop_event.wait(min(IDLE_S, self.settings.poll_s))
 
-    def _find_files(self) -> Iterator[FoundFile]:
+    def _find_files(self) -> Iterator[LogFile]:
         """Yield the files whose names match, without those that were dealt with; raises OSError."""
         folders = [("", self._names.depth)]
         while folders:
@@ -366,7 +282,7 @@ class FolderSource(BlockSource):
                     elif not depth and entry.is_file(follow_symlinks=False):
                         yield from self._match_entry(name, entry)
 
-    def _match_entry(self, name: str, entry: os.DirEntry[str]) -> Iterator[FoundFile]:
+    def _match_entry(self, name: str, entry: os.DirEntry[str]) -> Iterator[LogFile]:
         says, settled = self._names.match(name), self._settled.get(name)
         if says is None or (settled and time.time() - settled.modified_ns / 1e9 > MAX_CHANGE_S):
             return
@@ -376,19 +292,19 @@ class FolderSource(BlockSource):
             return
         version = FileVersion(about.st_size, about.st_mtime_ns)
         if version != settled:
-            yield FoundFile(name, *says, version, max(about.st_mtime, about.st_ctime))
+            yield LogFile(name, *says, version, max(about.st_mtime, about.st_ctime))
 
-    def _look(self) -> list[FoundFile]:
+    def _look(self) -> list[LogFile]:
         """Return the files that are complete and were not dealt with, in order; raises OSError."""
-        complete, changing, now = list[FoundFile](), dict[str, ChangingFile](), time.monotonic()
+        complete, changing, now = list[LogFile](), dict[str, IncompleteFile](), time.monotonic()
         for file in self._find_files():
             assets = [file.asset] if file.asset else self._assets
             if file.changed_at + MAX_CLOCK_DIFFERENCE_S < min(self._resumed[name] for name in assets):
                 self._settled[file.name] = file.version  # when it came, its rows were counted, or to be left out
                 continue
-            before = self._changing.get(file.name) or ChangingFile(file.version, now, now)
+            before = self._changing.get(file.name) or IncompleteFile(file.version, now, now)
             since = before.unchanged_since if before.version == file.version else now
-            changing[file.name] = ChangingFile(file.version, since, before.seen_since)
+            changing[file.name] = IncompleteFile(file.version, since, before.seen_since)
             is_old = time.time() - file.changed_at > MAX_CLOCK_DIFFERENCE_S
             if is_old or now - since >= self.settings.complete_after_s:
                 complete.append(file)
@@ -399,24 +315,19 @@ class FolderSource(BlockSource):
         self._changing, self._trouble, self._reached_at = changing, "", now
         return ordered
 
-    def _order(self, file: FoundFile) -> tuple[float, str]:
+    def _order(self, file: LogFile) -> tuple[float, str]:
         """Return what files are sorted by: the first time stamp, and the name."""
         key = file.name, file.version
         if key not in self._first_times:
             self._asked_at, loop = time.monotonic(), self._assets[file.asset or next(iter(self._assets))].loop
-            try:
-                first = first_time(self._folder / file.name, loop)
-            except Exception:  # why it cannot be read is told when it is its turn
-                first = math.nan
-            dated = first >= MIN_EPOCH_S
-            self._first_times[key] = first if dated else _named_time(file.time, loop) or file.modified_at
+            self._first_times[key] = find_first_time(self._folder / file.name, file, loop)
         return self._first_times[key], file.name
 
-    def _read(self, file: FoundFile) -> None:
+    def _read(self, file: LogFile) -> None:
         """Read a file that is complete, and hand it over; raises OSError, or OutputError where there is no room."""
         path, assets = self._folder / file.name, [file.asset] if file.asset else list(self._assets)
         self._first_times.pop((file.name, file.version), None)
-        rows, failures = dict[str, AssetRows](), dict[str, str]()
+        rows, failures = dict[str, FileRows](), dict[str, str]()
         try:
             digest = self._digest(path)
         except FileNotFoundError:  # somebody has moved it
@@ -433,13 +344,13 @@ class FolderSource(BlockSource):
         else:
             self._asked_at = math.inf  # how long it takes depends on its size
             try:
-                rows, failures = self._parse(file)
+                rows, failures = parse_file(self._folder, file, self._names, self.settings, self._loops)
             except EmptyRecordingError as error:
                 self.rejections.add(file.asset, "empty", str(error))
             except OutputError:
                 raise
             except Exception as error:  # readers of other packages raise what they like
-                failures = dict.fromkeys(assets, _describe_error(error))
+                failures = dict.fromkeys(assets, describe_error(error))
         about = path.stat()
         if (about.st_size, about.st_mtime_ns) != file.version or (failures and self._digest(path) != digest):
             return  # it has changed meanwhile, and is read when it is complete
@@ -458,30 +369,6 @@ class FolderSource(BlockSource):
                 return self._ready.put(read, timeout=IDLE_S)
             except queue.Full:
                 continue
-
-    def _parse(self, file: FoundFile) -> tuple[dict[str, AssetRows], dict[str, str]]:
-        """Return the rows of a file by asset, and of which assets they cannot be used, and why."""
-        rows, failures, path = dict[str, AssetRows](), dict[str, str](), self._folder / file.name
-        assets = [file.asset] if file.asset else list(self._assets)
-        loops = {self._assets[name].loop.hash(): self._assets[name].loop for name in assets}
-        for key, loop in loops.items():
-            logged = read_log(path, loop, self.settings.asset_column)
-            for called, part in logged.parts.items():
-                name = file.asset or self._names.assets.get(called, "")
-                if not name or self._assets[name].loop.hash() != key:
-                    continue
-                try:
-                    samples = part.samples()
-                except RecordingError as error:
-                    failures[name] = str(error)
-                    continue
-                first, last = samples.t[[0, -1]].tolist()
-                offset = logged.origin
-                if first + offset < MIN_EPOCH_S:  # it says how much time has passed, and not since when
-                    named = _named_time(file.time, loop)
-                    offset = file.modified_at - last if named is None else named - first
-                rows[name] = AssetRows(samples, offset)
-        return rows, failures
 
     def _digest(self, path: Path) -> bytes:
         digest = hashlib.blake2b(digest_size=16)
@@ -509,17 +396,3 @@ class FolderSource(BlockSource):
             except OSError as error:
                 why = f"{path}: cannot be moved ({error.strerror})"
                 self.rejections.add(read.file.asset, "not moved", why)
-
-
-def _named_time(text: str, loop: Loop) -> float | None:
-    """Return the time that a file's name says [UTC s], local where the loop's columns are; None: it says none."""
-    digits = re.sub(r"\D", "", text)[:14]
-    zone = ZoneInfo(loop.columns.time_zone) if loop.columns.time_zone else UTC
-    try:
-        return datetime.strptime(digits, TIME_FORMATS[len(digits)]).replace(tzinfo=zone).timestamp()
-    except (KeyError, ValueError):
-        return None
-
-
-def _describe_error(error: Exception) -> str:
-    return str(error) if isinstance(error, ServoscopeError) else f"{type(error).__name__}: {error}"
