@@ -73,6 +73,19 @@ def test_the_same_content_again_is_skipped_and_counted_and_late_rows_are_told(sh
     ]
 
 
+def test_logs_of_the_same_content_count_where_their_names_say_another_asset_or_time(
+    share: Callable[..., Share],
+) -> None:
+    hall = share("press", "lift", match="{asset}_{time}.csv")
+    at_rest = csv(*((0.01 * k, 0.0, 0.0, 0.0) for k in range(100)))
+    for name in ("press_20260101_000000", "lift_20260101_000000", "press_20260101_000100"):
+        hall.put(f"{name}.csv", at_rest)
+    hall.open()
+    hall.until_rows(100, "lift")
+    hall.until_rows(200, "press")
+    assert not hall.rejections
+
+
 def test_a_file_is_read_when_it_has_not_changed_for_a_while_and_one_that_grows_is_read_again(
     share: Callable[..., Share],
 ) -> None:

@@ -329,7 +329,7 @@ class FolderSource(BlockSource):
         self._first_times.pop((file.name, file.version), None)
         rows, failures = dict[str, FileRows](), dict[str, str]()
         try:
-            digest = self._digest(path)
+            digest = self._digest(file)
         except FileNotFoundError:  # somebody has moved it
             return
         except PermissionError as error:  # it may be open elsewhere: it is tried again
@@ -352,7 +352,7 @@ class FolderSource(BlockSource):
             except Exception as error:  # readers of other packages raise what they like
                 failures = dict.fromkeys(assets, describe_error(error))
         about = path.stat()
-        if (about.st_size, about.st_mtime_ns) != file.version or (failures and self._digest(path) != digest):
+        if (about.st_size, about.st_mtime_ns) != file.version or (failures and self._digest(file) != digest):
             return  # it has changed meanwhile, and is read when it is complete
         self._changing.pop(file.name, None)
         self._settled[file.name], self._digests[digest] = file.version, file.name
@@ -370,10 +370,11 @@ class FolderSource(BlockSource):
             except queue.Full:
                 continue
 
-    def _digest(self, path: Path) -> bytes:
-        digest = hashlib.blake2b(digest_size=16)
-        with path.open("rb") as file:
-            while piece := file.read(PIECE_BYTES):
+    def _digest(self, file: LogFile) -> bytes:
+        """Return what tells a file from others: its content, and what its name says; logs of machines at rest agree."""
+        digest = hashlib.blake2b(f"{file.asset}\0{file.time}\0".encode(), digest_size=16)
+        with (self._folder / file.name).open("rb") as content:
+            while piece := content.read(PIECE_BYTES):
                 self._asked_at = time.monotonic()
                 digest.update(piece)
         return digest.digest()
