@@ -37,7 +37,7 @@ def test_a_service_follows_logs_that_fall_into_a_folder(tmp_path: Path) -> None:
     drop(tmp_path, "healthy.csv", "press_20260101_000000.csv")
     running = Running(halls.service_of(path))
     until(lambda: counted_blocks(path) == 60, 60.0)
-    drop(tmp_path, "leaky.csv", "press_20260101_000100.csv")
+    drop(tmp_path, "leaky.csv", "press_20260101_000110.csv")  # a pause that is none of the data's
     until(lambda: any("leakage" in row[0] for row in asked(path, "SELECT summary FROM diagnoses")), 60.0)
     assert causes(path, "fault") and not causes(path, "data_quality") and not causes(path, "reception")
     (tmp_path / "share/press_20260101_000200.csv").write_text("t,r,u,y\n0,1,2,three\n")

@@ -195,9 +195,7 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
         asked = path, point, frozenset(limits.items())
         if asked not in resolved:  # many assets are of one loop
             resolved[asked] = _resolve_limits(shared[path, point][0].loop, limits, name)
-        pause_s = config.sources[settings.source].pause_s
-        sound = config.quality.model_copy(update={"silent_s": config.quality.silent_s + pause_s})
-        policy = replace(policy, limits=resolved[asked], quality=sound)
+        policy = replace(policy, limits=resolved[asked], pause_s=config.sources[settings.source].pause_s)
         assets[name] = Asset(name, *shared[path, point], policy, settings.group, settings.source)
     known = [fault.name for one in assets.values() for fault in one.baseline.loop.plant.all_faults]
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)

@@ -296,7 +296,7 @@ class Service:
             if before is FOLLOWED and name not in of_assets and reception.is_fresh(self._listening_s, fresh_s):
                 continue  # nearly all of them, nearly always
             pause_s = self.sources[source].pause_s
-            patience_s, own = max(asset.policy.quality.silent_s, pause_s), of_assets.get(name)
+            patience_s, own = self.config.quality.silent_s + pause_s, of_assets.get(name)
             if not math.isinf(self.sources[source].next_block_s):
                 asset.reception = reception.evaluate(self._listening_s, patience_s, trouble, own)
             silence, result = reception.silence_s(self._listening_s), StepResult([], [])

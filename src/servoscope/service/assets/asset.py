@@ -57,6 +57,7 @@ class AssetPolicy:
     residual_every_s: float
     prognosis: PrognosisSettings = field(default_factory=PrognosisSettings)
     limits: AssetLimits = field(default_factory=dict)
+    pause_s: float = 0.0  # how long its source may pause
     assets: int = field(default=1, compare=False)  # of the process: one more changes nothing for the others
 
 
@@ -75,7 +76,7 @@ class Asset(StateHolder):
         self.monitor, self._rate, self._phase = monitor, baseline.loop.sample_rate, examination_phase(name)
         self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
         self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s, source)
-        self._limits = policy.quality.limits(self._rate)
+        self._limits = policy.quality.limits(self._rate, policy.pause_s)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
         self._alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
         self._window = RecentBlocks(name, policy.diagnosis.window_s, self._rate)

@@ -86,7 +86,8 @@ def _check_step(limits: QualityLimits, s: Any, t: float, out: FloatArray, n: int
         n = _write_finding(s, CLOCK, True, t, step, limits.silent_s, out, n)
     else:
         # A stamp that is late makes one step longer and the next one shorter: in whole periods the two make up.
-        s.missing += periods - 1.0
+        if not limits.gap_s < step <= limits.silent_s:  # a log that pauses lacks nothing
+            s.missing += periods - 1.0
         if periods < LATE_SAMPLES:  # a longer step does not tell a rate
             s.span += step
             s.periods += periods

@@ -19,6 +19,7 @@ class QualityLimits(NamedTuple):
 
     period: float  # s
     window: int  # samples
+    gap_s: float  # longest step that is a gap; a longer one is a pause of whoever logs, or silence
     silent_s: float
     frozen: int  # samples
     travel: float  # of y; 0: learned
@@ -45,14 +46,15 @@ class QualitySettings(Settings):
     missing_share: Share = 0.02  # share of samples that may be missing
     rate_error: Share = 0.002  # how far the measured sample rate may be off, relative
 
-    def limits(self, sample_rate: float) -> QualityLimits:
-        """Return the constants for a loop's sample rate [Hz]."""
+    def limits(self, sample_rate: float, pause_s: float = 0.0) -> QualityLimits:
+        """Return the constants for a loop's sample rate [Hz]; `pause_s`: how much longer its log may pause [s]."""
         if not sample_rate > 0.0:
             raise RecordingError(f"sample rate {sample_rate!r} must be greater than 0")
         return QualityLimits(
             period=1.0 / sample_rate,
             window=max(MIN_WINDOW_SAMPLES, round(self.window_s * sample_rate)),
-            silent_s=self.silent_s,
+            gap_s=self.silent_s,
+            silent_s=self.silent_s + pause_s,
             frozen=max(2, round(self.frozen_s * sample_rate)),
             travel=self.frozen_travel or 0.0,
             jitter=self.jitter / sample_rate,
