@@ -34,6 +34,7 @@ def counted_blocks(path: Path) -> int:
 
 def test_a_service_follows_logs_that_fall_into_a_folder(tmp_path: Path) -> None:
     path = hall(tmp_path, ALARMS)
+    path.write_text(path.read_text().replace("interval_s = 20.0", "interval_s = 300.0"))
     drop(tmp_path, "healthy.csv", "press_20260101_000000.csv")
     running = Running(halls.service_of(path))
     until(lambda: counted_blocks(path) == 60, 60.0)
