@@ -6,11 +6,12 @@ import os
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,14 +20,13 @@ from servoscope.cli.arguments import parse_time
 from servoscope.cli.exit import print_json
 from servoscope.cli.options import JsonOption
 from servoscope.cli.output_paths import check_output
-from servoscope.core.errors import ConfigError, StoreError
+from servoscope.core.errors import ConfigError, ObsoleteSettingWarning, StoreError
 from servoscope.core.settings_errors import suggest_name
 
 if TYPE_CHECKING:
     from rich.console import Group
 
     from servoscope.service.config import ServiceFile
-    from servoscope.service.network import NetworkSettings
     from servoscope.service.store import Store
 
 
@@ -85,7 +85,13 @@ def run(
     from servoscope.service.build import build_components, check_service_file
     from servoscope.service.config import ServiceFile
 
-    settings = ServiceFile.load(config)
+    with warnings.catch_warnings():
+        if check:
+            warnings.simplefilter("error", ObsoleteSettingWarning)
+        try:
+            settings = ServiceFile.load(config)
+        except ObsoleteSettingWarning as obsolete:
+            raise ConfigError(f"{config}: {obsolete}") from None
     if online and not check:
         raise ConfigError("--online: give it together with --check, which follows nothing")
     if check:
@@ -225,30 +231,21 @@ def prefix_file_name(config: Path) -> Iterator[None]:
         raise ConfigError(f"{config}: {error}") from None
 
 
-class StoreAddress(NamedTuple):
-    """Where a store is."""
-
-    url: str
-    folder: Path | None = None
-    network: NetworkSettings | None = None
-
-
-def parse_store_address(text: str) -> StoreAddress:
-    """Return where a store is, by a service file or by itself."""
+def parse_store_address(text: str) -> tuple[str, Path | None]:
+    """Return where a store is, and the folder that this is relative to: by a service file or by itself."""
     if not text.endswith(".toml"):
-        return StoreAddress(text)
+        return text, None
     from servoscope.service.config import ServiceFile
 
     config = ServiceFile.load(text)
-    return StoreAddress(config.store.url, config.folder, config.store.rules)
+    return config.store.url, config.folder
 
 
 def open_store(text: str) -> Store:
     """Open a store for reading, by a service file or by itself; a locked one is waited for."""
     from servoscope.service.store import Store
 
-    url, folder, network = parse_store_address(text)
-    return Store.open(url, folder, lock_timeout_s=5.0, network=network)
+    return Store.open(*parse_store_address(text), lock_timeout_s=5.0)
 
 
 def check_assets(store: Store, assets: Sequence[str]) -> None:

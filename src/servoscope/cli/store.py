@@ -35,9 +35,9 @@ def restore(
     from servoscope.service.store.copy import copy_store
     from servoscope.service.store.engine import display_url, parse_store_url
 
-    url, folder, network = parse_store_address(store)
+    url, folder = parse_store_address(store)
     with closing(open_store(str(file))) as opened:
-        counts = copy_store(opened, url, folder, network)
+        counts = copy_store(opened, url, folder)
     _print_counts(display_url(parse_store_url(url, folder or Path())), counts)
 
 

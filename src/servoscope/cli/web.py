@@ -67,8 +67,7 @@ def serve(
     url = service.store.url if service is not None else str(store)
     # a store that exists is only read; one that does not is made, so that files can be diagnosed at once
     missing = "://" not in url and not (here / url).exists()
-    rules = service.store.rules if service is not None else None
-    opened = Store.open(url, here, write=missing, lock_timeout_s=STORE_PATIENCE, network=rules)
+    opened = Store.open(url, here, write=missing, lock_timeout_s=STORE_PATIENCE)
     if missing:
         typer.echo(f"servoscope: {opened.name} is new, and empty until servoscope run follows assets", err=True)
     run_server(settings, opened, service, here, with_parent=with_parent)

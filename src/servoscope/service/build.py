@@ -59,8 +59,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
     if not config.is_shard:  # the whole file was checked
         check_actions(config, assets)
     sources, publishers = _build_sources(config, assets), _build_publishers(config)
-    url, rules = config.store.url, config.store.rules
-    store = Store.open(url, config.folder, write=True, network=rules, has_lock=config.is_shard)
+    store = Store.open(config.store.url, config.folder, write=True, has_lock=config.is_shard)
     try:
         store.acquire_lock([config.name, *assets])
         rows = store.checkpoints([config.name, *assets])

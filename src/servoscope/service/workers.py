@@ -184,7 +184,7 @@ class WorkerPool:
     def run(self, announce: Callable[[], None] = lambda: None) -> None:
         """Run until it is stopped, or all workers have nothing left to do; `announce` is called when all have begun."""
         settings = self.config.store
-        store = Store.open(settings.url, self.config.folder, write=True, network=settings.rules)
+        store = Store.open(settings.url, self.config.folder, write=True)
         try:
             # of a file the workers inherit the lock: it ends with the last of them. A server locks each asset.
             store.acquire_lock(())

@@ -146,7 +146,7 @@ def _checked_request(sink: WebhookSettings) -> _Target:
 
     url = httpx.URL(sink.url)
     verify = sink.create_tls_context(Path(), url.host) if sink.has_certificates else True
-    if not sink.rules.refused:
+    if sink.rules.internal:
         return _Target(url, {}, {}, verify, True)
     address = sink.rules.resolve(url.host, url.port or (443 if url.scheme == "https" else 80))
     name = {"sni_hostname": url.host}  # the certificate is compared with it

@@ -20,7 +20,6 @@ from sqlalchemy.engine import URL, make_url
 
 from servoscope.core.addresses import hide_secrets, show_address
 from servoscope.core.errors import StoreError, StoreUnavailableError
-from servoscope.service.network import NetworkSettings
 
 LOCK_TIMEOUT_S = 0.5  # s: for a locked SQLite file; samples keep coming meanwhile
 TRANSIENT_ERRORS = {  # of SQLite, where a retry may help
@@ -80,9 +79,7 @@ def display_url(url: URL) -> str:
     return show_address(url.set(drivername="postgresql").render_as_string())
 
 
-def create_store_engine(
-    url: URL, network: NetworkSettings | None = None, *, lock_timeout_s: float = LOCK_TIMEOUT_S, write: bool = False
-) -> sa.Engine:
+def create_store_engine(url: URL, *, lock_timeout_s: float = LOCK_TIMEOUT_S, write: bool = False) -> sa.Engine:
     """Return an engine that has opened nothing yet; raises StoreError if the driver is missing."""
     if url.get_backend_name() == "sqlite":
         lies_still = not write and _lies_still(Path(str(url.database)))
@@ -103,8 +100,6 @@ def create_store_engine(
     except ModuleNotFoundError:
         where = display_url(url)
         raise StoreError(f"{where}: the driver psycopg is missing, pip install 'servoscope[service]'") from None
-    if network is not None:
-        sa.event.listen(engine, "do_connect", lambda *given: _resolve_host(network, given[-1]))
     return engine
 
 
@@ -122,13 +117,6 @@ def _lies_still(path: Path) -> bool:
     """
     log = path.with_name(f"{path.name}-wal")
     return not os.access(path.parent, os.W_OK, effective_ids=True) and not (log.exists() and log.stat().st_size)
-
-
-def _resolve_host(network: NetworkSettings, arguments: dict[str, Any]) -> None:
-    """Let PostgreSQL's driver connect to the address that was checked; a folder of sockets is on this machine."""
-    host = str(arguments.get("hostaddr") or arguments.get("host") or "")
-    if network.refused and host and not host.startswith("/"):
-        arguments["hostaddr"] = network.resolve(host, int(arguments.get("port") or 5432))
 
 
 def _set_up_sqlite(connection: sqlite3.Connection, _: object) -> None:
