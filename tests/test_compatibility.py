@@ -43,6 +43,7 @@ TOLERANCE = {"delay_s": 1e-4}
 # A size by the recursion counts the uncertainty of the healthy value only as far as the size has changed: it is some
 # percent narrower than in version 0.1.0. Explanations that were rejected start from these sizes, and end elsewhere.
 RELATIVE = {"/refit/recursive/": 0.05, "/candidates/": 2e-5}
+# But for the errors, which were `servoscope.errors`: their base is `servoscope.ServoscopeError`.
 PUBLIC = (FOLDER / "names.txt").read_text(encoding="utf-8").split()
 WITH_SPARK = ("servoscope.fleet.sinks.start",)
 

@@ -11,8 +11,8 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 from statsmodels.stats.rates import confint_poisson
 
+from servoscope import scoring
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.research import scoring
 
 
 def bools(text: str) -> BoolArray:

@@ -17,7 +17,7 @@ from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, refit_onset, refit_recording
 from servoscope.isolation.ml import find_other_causes
 from servoscope.research.paper.conditions import FAULT_NAMES
-from servoscope.research.scoring import share
+from servoscope.scoring import share
 from servoscope.simulation import FaultEvent
 
 LISTED = 6  # candidates that are kept

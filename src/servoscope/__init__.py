@@ -13,16 +13,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from servoscope.core import aliases
-
 __version__ = "0.1.0"
 
 __all__ = [
     "Baseline",
+    "Columns",
     "Diagnosis",
     "Loop",
     "Monitor",
     "Recording",
+    "ServoscopeError",
     "Trace",
     "__version__",
     "design_study",
@@ -36,9 +36,8 @@ __all__ = [
     "write_report",
 ]
 
-aliases.install()
-
 if TYPE_CHECKING:
+    from servoscope.core.errors import ServoscopeError
     from servoscope.design import design_study
     from servoscope.detection.baseline import Baseline
     from servoscope.detection.result import Diagnosis
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
     from servoscope.diagnosis.novelty import NoveltyDetector as NoveltyDetector
     from servoscope.diagnosis.operating_points import learn
     from servoscope.learning.inspection import inspect
-    from servoscope.models.loop import Loop
+    from servoscope.models.loop import Columns, Loop
     from servoscope.report.diagnosis_page import write_report
     from servoscope.report.plots import plot
     from servoscope.signals.readers import read, read_parts
@@ -57,11 +56,13 @@ if TYPE_CHECKING:
 else:  # hidden from type checkers, which would otherwise accept any name
     _HOMES = {
         "Baseline": "detection.baseline",
+        "Columns": "models.loop",
         "Diagnosis": "detection.result",
         "Loop": "models.loop",
         "Monitor": "diagnosis.monitor",
         "NoveltyDetector": "diagnosis.novelty",  # not in __all__: it needs scikit-learn
         "Recording": "signals.recording",
+        "ServoscopeError": "core.errors",
         "Trace": "detection.trace",
         "design_study": "design",
         "diagnose": "diagnosis.diagnose",
@@ -77,8 +78,6 @@ else:  # hidden from type checkers, which would otherwise accept any name
     def __getattr__(name: str) -> object:
         import importlib
 
-        if f"{__name__}.{name}" in aliases.ALIASES:
-            return importlib.import_module(f"{__name__}.{name}")
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         found = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -10,7 +10,7 @@ from servoscope.core.jit import kernel
 
 @kernel
 def run_cusum(x: FloatArray, k: float, h: float) -> BoolArray:
-    """Return the alarms (N,) of `servoscope.research.scoring.cusum`."""
+    """Return the alarms (N,) of `servoscope.scoring.cusum`."""
     alarm = np.zeros(x.size, dtype=np.bool_)
     up = 0.0
     down = 0.0

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray, IntArray
-from servoscope.research.scoring.intervals import Measured, share
+from servoscope.scoring.intervals import Measured, share
 
 
 def confusion(truth: Sequence[str], said: Sequence[str], labels: Sequence[str]) -> IntArray:

@@ -40,7 +40,7 @@ def cusum(residuals: FloatArray, k: float = 0.5, h: float = 5.0) -> BoolArray:
     k, h
         Reference value and decision interval, in standard deviations.
     """
-    from servoscope.research.scoring.kernels import run_cusum
+    from servoscope.scoring.kernels import run_cusum
 
     return run_cusum(np.ascontiguousarray(residuals, dtype=np.float64), k, h)
 

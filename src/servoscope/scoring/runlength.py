@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.research.scoring.dummies import Detector
-from servoscope.research.scoring.intervals import Measured
+from servoscope.scoring.dummies import Detector
+from servoscope.scoring.intervals import Measured
 
 OVERSHOOT = 1.166
 """By how much a Gaussian walk overshoots two limits, -2 zeta(1/2)/sqrt(2 pi) (Siegmund, 1985, section X.2)."""

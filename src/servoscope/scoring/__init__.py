@@ -1,11 +1,11 @@
 """How good a detector or a diagnosis is: pure functions on arrays, and dummies to put beside the real thing."""
 
-from servoscope.research.scoring.alarms import Detections, alarm_rate, detections, events
-from servoscope.research.scoring.damadics import FaultIndices, fault_indices
-from servoscope.research.scoring.dummies import DUMMIES, Detector, always, cusum, never
-from servoscope.research.scoring.intervals import Measured, coverage, discoveries, share
-from servoscope.research.scoring.isolation import Reliability, accuracy, brier_score, confusion, log_score, reliability
-from servoscope.research.scoring.runlength import (
+from servoscope.scoring.alarms import Detections, alarm_rate, detections, events
+from servoscope.scoring.damadics import FaultIndices, fault_indices
+from servoscope.scoring.dummies import DUMMIES, Detector, always, cusum, never
+from servoscope.scoring.intervals import Measured, coverage, discoveries, share
+from servoscope.scoring.isolation import Reliability, accuracy, brier_score, confusion, log_score, reliability
+from servoscope.scoring.runlength import (
     RunLengths,
     brook_evans,
     lorden_bound,

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.research.scoring.intervals import Measured, share
+from servoscope.scoring.intervals import Measured, share
 
 
 def events(alarm: BoolArray, on_delay: int = 0) -> npt.NDArray[np.int64]:
