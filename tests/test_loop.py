@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from servoscope.core.errors import LoopError, ServoscopeError
+from servoscope.core.errors import LoopError, ObsoleteSettingWarning, ServoscopeError
 from servoscope.models.loop import DEFAULT_FREQUENCIES, Columns, Loop, MonitorSettings
 
 RIG = """
@@ -290,3 +290,11 @@ def test_an_empty_file_is_told(tmp_path: Path) -> None:
 
 def test_one_except_clause_catches_all() -> None:
     assert issubclass(LoopError, ServoscopeError)
+
+
+def test_a_setting_of_an_earlier_version_is_read_with_a_warning(tmp_path: Path) -> None:
+    path = tmp_path / "loop.toml"
+    path.write_text(f'{RIG}sequential_step = "update"\n', encoding="utf-8")
+    with pytest.warns(ObsoleteSettingWarning, match=r"loop\.toml: \[monitor\] sequential_step.*evaluation_rate"):
+        loop = Loop.load(path)
+    assert Loop.from_dict(loop.to_dict()) == loop  # what a baseline keeps brings no warning

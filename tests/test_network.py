@@ -299,7 +299,7 @@ def test_the_files_of_a_broker_of_an_action_lie_beside_the_service_file(tmp_path
             {"internal": False, "allowed": ("10.2.0.7",)},
         ),
         ("[network]\nrefused = []", "internal = false", {}),
-        ('[store]\nnetwork = { refused = ["internal"] }', "sslmode=verify-full", {}),
+        ('[store.network]\nrefused = ["internal"]', "sslmode=verify-full", {}),
     ],
 )
 def test_keys_of_earlier_versions_are_read_with_a_warning_and_refused_by_check(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -16,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from servoscope.core.errors import LoopError
+from servoscope.core.errors import LoopError, ObsoleteSettingWarning
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
 from servoscope.core.settings_errors import describe_error
 from servoscope.core.short_repr import ShortRepr
@@ -117,7 +118,7 @@ class MonitorSettings(Settings):
     rest_speed: NonNegative = 0.0  # speed [output per s] below which the output counts as resting
     evaluation_rate: Positive = 10.0  # how often iFRF, residual and statistic are evaluated [Hz]
     # when the sequential test decides: once per ``evaluation``, by what the updates since the one before sum up to, or
-    # at every ``update`` of the estimator; that takes more time, and alarms come up to an evaluation earlier
+    # at every ``update`` of the estimator, as baselines of earlier versions do; obsolete in loop files
     sequential_step: Literal["update", "evaluation"] = "evaluation"
     # monitored frequencies [Hz]
     frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
@@ -298,9 +299,21 @@ class Loop(ShortRepr, Settings):
         Raises LoopError if the file cannot be read, is not TOML, or a setting in it is wrong.
         """
         path = Path(path)
-        return cls.from_dict(
-            parse_toml(read_toml_text(path, "loop file", LoopError), path, LoopError), source=str(path)
-        )
+        return cls.from_text(read_toml_text(path, "loop file", LoopError), str(path))
+
+    @classmethod
+    def from_text(cls, text: str, source: str) -> Loop:
+        """Return the loop that the text of a loop file describes; error messages call it `source`."""
+        settings = parse_toml(text, source, LoopError)
+        monitor = settings.get("monitor")
+        if isinstance(monitor, Mapping) and "sequential_step" in monitor:
+            warnings.warn(
+                f"{source}: [monitor] sequential_step: is no setting any more, leave it out: the sequential test "
+                "decides once per evaluation, and a higher evaluation_rate makes its alarms faster",
+                ObsoleteSettingWarning,
+                stacklevel=2,
+            )
+        return cls.from_dict(settings, source)
 
     @classmethod
     def from_dict(cls, mapping: Mapping[str, Any], source: str = "loop") -> Loop:

@@ -58,7 +58,7 @@ class BenchmarkResult:
         return {"figures": [asdict(figure) for figure in self.figures], "facts": dict(self.facts)}
 
 
-WHOLE, OFTEN = "everything", "everything, test at each update"
+WHOLE = "everything"
 WARM_UP = 3  # blocks of a fleet before it is measured: until the noise filter is full, fewer samples are tested
 
 
@@ -218,16 +218,14 @@ def _measure_fleet(
     baseline: Baseline, recording: Recording, repeats: int, amount: BenchmarkSize
 ) -> tuple[list[BenchmarkRow], dict[str, float]]:
     from servoscope.diagnosis.monitor import Monitor
-    from servoscope.learning.learn import learn_baseline
 
-    often = learn_baseline(benchmark_loop(sequential_step="update"), [recording])
     rng, total = np.random.default_rng(0), amount.fleet * FLEET_SAMPLES
     begin = rng.integers(0, recording.samples - FLEET_SAMPLES, amount.fleet)
     at = begin[:, None] + np.arange(FLEET_SAMPLES)
     jobs: dict[str, Callable[[], object]] = {}
     for precision, number in (("double", np.float64), ("single", np.float32)):
         signals = [signal[at].astype(number) for signal in (recording.r, recording.u, recording.y)]
-        for what, each in (("bare", _without_cusum(baseline)), (WHOLE, baseline), (OFTEN, often)):
+        for what, each in (("bare", _without_cusum(baseline)), (WHOLE, baseline)):
             monitor = Monitor([each] * amount.fleet, precision=precision)  # type: ignore[arg-type]
             state = monitor.init()
             for _ in range(WARM_UP):
@@ -284,13 +282,8 @@ def _compare_fleet_with_peer(figures: list[BenchmarkRow]) -> dict[str, float]:
     peer = next((each.processor for each in figures if each.name == "Kalman filter, filterpy"), None)
     if peer is None:
         return {}
-    fleets = {
-        what: next(one for one in figures if one.name.endswith(f"double, {what}, 1 core")) for what in (WHOLE, OFTEN)
-    }
-    return {
-        f"filterpy's update over a fleet's sample, {what}, one core": peer / fleet.processor
-        for what, fleet in fleets.items()
-    }
+    fleet = next(row for row in figures if row.name.endswith(f"double, {WHOLE}, 1 core"))
+    return {f"filterpy's update over a fleet's sample, {WHOLE}, one core": peer / fleet.processor}
 
 
 def monte_carlo(baseline: Baseline, count: int, seconds: float = 60.0) -> dict[str, float]:
