@@ -1,13 +1,14 @@
-"""`servoscope bench`: a small run finds all its figures, its peers agree, and what makes no sense is refused."""
+"""`servoscope bench`, and the benchmark of the chain: small runs find all figures, and peers agree."""
 
 from __future__ import annotations
 
 import json
 
 import pytest
+from cases import chain
 
 from commands import run
-from servoscope.research.bench import JobTiming, time_interleaved
+from servoscope.cli.bench import JobTiming, time_interleaved
 
 FIGURES = (
     "log, NumPy",
@@ -17,7 +18,7 @@ FIGURES = (
     *(
         f"fleet of 100, {precision}, {what}{cores}"
         for precision in ("double", "single")
-        for what in ("bare", "everything", "everything, test at each update")
+        for what in ("bare", "everything")
         for cores in ("", ", 1 core")
     ),
     *(f"service, {layer}" for layer in ("decode", "assemble", "quality", "kernel", "judge", "store", "publish")),
@@ -25,6 +26,7 @@ FIGURES = (
     "Kalman filter, numpy loop",
     "least squares, servoscope",
 )
+FILTERPY = "filterpy's update over a fleet's sample, everything, one core"
 FACTS = (
     "peak multiply-adds per ns, one core, double",
     "memory, GB/s read and written, one core",
@@ -35,8 +37,7 @@ FACTS = (
     "scaling of a fleet over cores, share of the ideal",
     "processor time of a fleet on one core, share of that on all",
     "cores",
-    "filterpy's update over a fleet's sample, everything, one core",
-    "filterpy's update over a fleet's sample, everything, test at each update, one core",
+    FILTERPY,
     "100 simulations of 60 s, s",
     "100 simulations followed as a fleet, s",
     "alarms among those with a leak, share",
@@ -44,24 +45,33 @@ FACTS = (
 )
 
 
-@pytest.mark.slow
-def test_a_small_run_finds_every_figure_and_peers_that_agree() -> None:
+def test_the_command_says_what_a_sample_takes() -> None:
     done = run("bench", "--repeats", 1, "--share", 0.01, "--json")
     assert done.code == 0, done.err
-    found = json.loads(done.out)
-    figures = {figure["name"]: figure for figure in found["figures"]}
-    assert set(FIGURES) <= set(figures) and tuple(found["facts"]) == FACTS
+    timings = json.loads(done.out)["ns_per_sample"]
+    fleets = [f"fleet of 100, {precision}" for precision in ("double", "single")]
+    assert list(timings) == ["one log", "one sample at a time", *fleets]
+    assert all(0.0 < timing["low"] <= timing["median"] <= timing["high"] for timing in timings.values())
+    assert "million/s" in run("bench", "--repeats", 1, "--share", 0.01).out
+
+
+@pytest.mark.slow
+def test_a_small_run_of_the_chain_finds_every_figure_and_peers_that_agree() -> None:
+    result = chain.run_benchmarks(1, share=0.01)
+    figures = {figure.name: figure for figure in result.figures}
+    assert set(FIGURES) <= set(figures) and tuple(result.facts) == FACTS
     for name, figure in figures.items():
-        median, low, high = figure["ns"]
-        assert 0.0 < low <= median <= high and figure["processor"] > 0.0, name
-        assert (figure["ratio"] is None) == (figure["to"] == ""), name
-        assert figure["error"] is None or figure["error"] < 1e-9, name
+        median, low, high = figure.ns
+        assert 0.0 < low <= median <= high and figure.processor > 0.0, name
+        assert (figure.ratio is None) == (figure.to == ""), name
+        assert figure.error is None or figure.error < 1e-9, name
     spent = [
-        figures[name]["processor"] for name in ("Kalman filter, filterpy", "fleet of 100, double, everything, 1 core")
+        figures[name].processor for name in ("Kalman filter, filterpy", "fleet of 100, double, everything, 1 core")
     ]
-    assert found["facts"][FACTS[9]] == pytest.approx(spent[0] / spent[1])
-    assert {name for name, figure in figures.items() if figure["error"] is not None} >= {*FIGURES[-3:], FIGURES[1]}
-    assert all(number >= 0.0 for number in found["facts"].values())
+    assert result.facts[FILTERPY] == pytest.approx(spent[0] / spent[1])
+    assert {name for name, figure in figures.items() if figure.error is not None} >= {*FIGURES[-3:], FIGURES[1]}
+    assert all(number >= 0.0 for number in result.facts.values())
+    assert len(result.table().rows) == len(figures)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The commands that need no recording: simulate, design, reproduce, bench, demo; parse, call, print."""
+"""The commands that need no recording: simulate, design, reproduce, demo; parse, call, print."""
 
 from __future__ import annotations
 
@@ -155,27 +155,6 @@ def reproduce(
     else:
         results.print_claims(results.create_console(), [(c.claim, c.measured, c.verdict) for c in paper.claims])
         results.print_written_path(results.create_console(), output)
-
-
-@app.command()
-def bench(
-    repeats: Annotated[int, typer.Option(metavar="N", min=1, help="Of each measurement; medians count.")] = 9,
-    share: Annotated[
-        float, typer.Option(metavar="SHARE", min=0.001, max=1.0, help="Of assets, samples, simulations.")
-    ] = 1.0,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure how fast it is here, beside the machine's own limits and the other libraries that are installed."""
-    from servoscope.cli.progress import show_steps
-    from servoscope.cli.render import results
-    from servoscope.research import bench as benchmark
-
-    with show_steps(10, 1) as steps:
-        result = benchmark.run_benchmarks(repeats, steps.begin, share=share)
-    if as_json:
-        print_json(result.to_dict(), lines=False)
-    else:
-        results.print_benchmark(results.create_console(), result)
 
 
 @app.command()

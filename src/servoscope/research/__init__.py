@@ -1,1 +1,1 @@
-"""The source paper reproduced, benchmarks."""
+"""The source paper reproduced."""

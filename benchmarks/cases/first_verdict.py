@@ -1,6 +1,6 @@
 """What the first command on a fresh machine costs beside the second; prints a Markdown table.
 
-python benchmarks/first_verdict.py [--json]
+python benchmarks/speed.py first_verdict [--json]
 
 Processor time of whole commands, children included, in processes of their own: with an empty cache of compiled code,
 again with what the first has left there, and with an empty cache and without the kernels that come with an
@@ -84,7 +84,3 @@ def main() -> None:
     )
     note = f"Caches empty for the first; load average before {os.getloadavg()[0]:.1f}."
     show([Table("First verdict", note, heads, tuple(rows()))], given.json)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,16 +1,15 @@
 """Compares how fast it is now with what was stored, as ratios within one run, so that another machine tells nothing.
 
-python benchmarks/regression.py [--store] [--repeats 9]
+python benchmarks/speed.py regression [--store] [--repeats 9]
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
-from servoscope.research import bench
+from cases.chain import run_benchmarks
 
 STORED = Path(__file__).with_name("ratios.json")
 SLOWER = 1.3  # times as slow, from which it is said
@@ -22,7 +21,7 @@ def main() -> int:
     command.add_argument("--store", action="store_true", help="keep this run's ratios as what to compare with")
     command.add_argument("--repeats", type=int, default=9)
     given = command.parse_args()
-    found = bench.run_benchmarks(given.repeats)
+    found = run_benchmarks(given.repeats)
     peak = found.facts["peak multiply-adds per ns, one core, double"]
     ours = [x for x in found.figures if x.name.startswith(("log", "fleet")) or "servoscope" in x.name]
     ratios = {figure.name: figure.processor * peak for figure in ours}
@@ -37,7 +36,3 @@ def main() -> int:
             slower += bool(word)
             print(f"{name}: {now:.0f} multiply-adds at the peak, stored {before:.0f} {word}")
     return 1 if slower else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,8 +1,8 @@
 """What a sample costs on its way through the service: over MQTT, blocks of a second; by layer.
 
-    python benchmarks/service.py [--assets 1000] [--rate 100] [--blocks 60 or --seconds 60] [--speed 0]
+    python benchmarks/speed.py service [--assets 1000] [--rate 100] [--blocks 60 or --seconds 60] [--speed 0]
                                  [--format binary] [--workers 1] [--postgres]
-    python benchmarks/service.py --overview [--json]
+    python benchmarks/speed.py service --overview [--json]
 
 `--speed 1` sends in true time, evenly, and shows the latency; 0 sends as fast as the service takes it, never more than
 `AHEAD` blocks of each asset ahead. Broker, sender and PostgreSQL run on the same cores, and are reported apart.
@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from block_sender import GROUPS, OFFSET_S, Feed, SenderReport, send_blocks
 from reliability.servers import Mosquitto, Postgres, mosquitto, programs
 from tables import Table, parser, show
+from tools.block_sender import GROUPS, OFFSET_S, Feed, SenderReport, send_blocks
 
 import servoscope as ss
 from servoscope.diagnosis.monitor import Monitor
@@ -326,7 +326,8 @@ def measure(case: Case) -> Measurement:
     )
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Measure and print."""
     command = parser(__doc__)
     command.add_argument("--assets", type=int, default=1000)
     command.add_argument("--rate", type=float, default=100.0, help="of samples [Hz]")

@@ -1,6 +1,6 @@
 """What features of windows cost beside the recursion, per sample on one core: alone and in a fleet; a Markdown table.
 
-python benchmarks/feature_cost.py [--json]
+python benchmarks/speed.py feature_cost [--json]
 
 A motor axis at 200 Hz, in blocks of a quarter of a second; with and without features in turns, in one run.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from tables import Table, parser, show
 
 import servoscope as ss
-from servoscope.research.bench.timing import time_interleaved
+from servoscope.cli.bench import time_interleaved
 from servoscope.simulation import reference, simulate
 from servoscope.simulation.tutorial import AXIS
 
@@ -56,7 +56,3 @@ def main() -> None:
     )
     note = f"Blocks of {BLOCK} samples, one core, medians of {REPEATS} runs in turns; load average before {LOAD:.1f}."
     show([Table("Cost of features", note, ("assets", "us without", "us with", "ratio"), rows)], given.json)
-
-
-if __name__ == "__main__":
-    main()

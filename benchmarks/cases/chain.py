@@ -1,21 +1,28 @@
-"""All measurements of one run: the chain on one log, sample by sample, as a fleet; peers, limits, many simulations."""
+"""The chain of a sample in one run: one log, single steps, a fleet, the service; beside peers and the machine's limits.
+
+    python benchmarks/speed.py chain [--repeats 9] [--share 1.0] [--json]
+
+About a minute. Jobs take turns, so that a busy moment of the machine meets all of them. Where two lines follow the same
+algorithm, the largest relative difference of their results stands beside them.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from tables import Table, parser, show
+from tools import limits, oracle, peers
+from tools.layers import measure_layers, vector_bits
 
+from servoscope.cli.bench import JobTiming, time_interleaved
 from servoscope.core.errors import ServoscopeError
-from servoscope.research.bench import limits, oracle, peers
-from servoscope.research.bench.layers import measure_layers, vector_bits
-from servoscope.research.bench.timing import BenchmarkRow, JobTiming, time_interleaved
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,6 +53,21 @@ class BenchmarkSize:
 
 
 @dataclass(frozen=True)
+class BenchmarkRow:
+    """One line of the table."""
+
+    name: str
+    ns: tuple[float, float, float]  # nanoseconds per sample: median, lower and upper quartile
+    # nanoseconds of processor time per sample, which other work on the machine does not lengthen much; median
+    processor: float
+    # of the processor time to that of the line that it is compared with, and `to`, the name of that line
+    ratio: float | None = None
+    to: str = ""
+    # largest relative difference between the results of the two, where they follow the same algorithm
+    error: float | None = None
+
+
+@dataclass(frozen=True)
 class BenchmarkResult:
     """What a run found."""
 
@@ -53,9 +75,15 @@ class BenchmarkResult:
     # single numbers: peak and bandwidth, scaling over cores, bytes of state, percentiles of a step, simulations
     facts: Mapping[str, float]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON takes it."""
-        return {"figures": [asdict(figure) for figure in self.figures], "facts": dict(self.facts)}
+    def table(self) -> Table:
+        """Return its lines as a table."""
+        rows = []
+        for row in self.figures:
+            median, low, high = (f"{x:.1f}" if x < 1000.0 else f"{x:.0f}" for x in row.ns)
+            ratio = "" if row.ratio is None else f"{row.ratio:.3g}"
+            rows.append((row.name, median, f"{low} to {high}", ratio, "" if row.error is None else f"{row.error:.0e}"))
+        note = "bare: without the sequential test; times as long as the first of its kind"
+        return Table("Time per sample", note, ("", "ns per sample", "quartiles", "times", "difference"), tuple(rows))
 
 
 WHOLE = "everything"
@@ -70,35 +98,24 @@ def benchmark_loop(**monitor: Any) -> Loop:
     return Loop.from_dict(content | {"monitor": content["monitor"] | monitor})
 
 
-def run_benchmarks(
-    repeats: int = 9, tell: Callable[[str], None] = lambda _: None, *, share: float = 1.0
-) -> BenchmarkResult:
+def run_benchmarks(repeats: int = 9, *, share: float = 1.0) -> BenchmarkResult:
     """Measure everything; about a minute."""
     from servoscope.learning.learn import learn_baseline
     from servoscope.simulation import reference, simulate
 
-    tell("a baseline")
     loop, amount = benchmark_loop(), BenchmarkSize.scaled(share)
     recording, _ = simulate(loop, reference("profile", 60.0, loop.sample_rate), seed=1)
     baseline = learn_baseline(loop, [recording])
-    tell("limits of the machine")
     facts = _measure_machine(repeats)
-    tell("one log")
     figures = _measure_log(baseline, recording, repeats, amount)
-    tell("two stages")
     figures += _measure_two_stage(recording, repeats, amount)
-    tell("one sample at a time")
     facts |= _measure_steps(baseline, recording, amount)
-    tell("a fleet")
     more, scaling = _measure_fleet(baseline, recording, repeats, amount)
     figures += more
     facts |= scaling
-    tell("the service, by layer")
     figures += _measure_layers(baseline, recording, amount)
-    tell("peers")
     figures += _measure_peers(baseline, recording, max(3, repeats // 3), amount)
     facts |= _compare_fleet_with_peer(figures)
-    tell("a thousand simulations")
     facts |= monte_carlo(baseline, amount.simulations)
     return BenchmarkResult(tuple(figures), facts)
 
@@ -310,3 +327,13 @@ def monte_carlo(baseline: Baseline, count: int, seconds: float = 60.0) -> dict[s
         "alarms among those with a leak, share": float(alarms[1::2].mean()),
         "alarms among the healthy, share": float(alarms[::2].mean()),
     }
+
+
+def main() -> None:
+    """Measure and print."""
+    command = parser(__doc__)
+    command.add_argument("--repeats", type=int, default=9)
+    command.add_argument("--share", type=float, default=1.0, help="of assets, samples and simulations")
+    given = command.parse_args()
+    result = run_benchmarks(given.repeats, share=given.share)
+    show([result.table()], given.json, {name: f"{number:.4g}" for name, number in result.facts.items()})

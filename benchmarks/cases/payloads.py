@@ -1,6 +1,6 @@
 """What a sample costs between a plant's message and its block, by form; beside blocks of our own as JSON.
 
-    python benchmarks/payloads.py [--json]
+    python benchmarks/speed.py payloads [--json]
 
 Processor time of this process alone, with everything in it from the bytes of a message to the block, at 100 Hz.
 """
@@ -114,7 +114,3 @@ def main() -> None:
         tuple((WORDS[form], f"{us:.1f}") for form, us in found.items()),
     )
     show([table], given.json, {form: f"{us:.0f}" for form, us in found.items()})
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """How the cost of a sample grows with assets, coefficients, FIR length and frequencies, beside the machine's limits.
 
-python benchmarks/growth.py [-o docs/images/growth.png] [--json]
+python benchmarks/speed.py growth [-o docs/images/growth.png] [--json]
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 from tables import machine, parser
+from tools import limits
 
+from servoscope.cli.bench import time_interleaved
 from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
 from servoscope.estimation.kernel.sample_steps import TILE, SampleSteps
 from servoscope.estimation.recursion import EvaluationConstants, Recursion, RecursionConstants
 from servoscope.estimation.two_stage import StageOneRunner, StageOneTuning
 from servoscope.models.lti import block_diagonal, sample_system, state_variable_filter
-from servoscope.research.bench import limits, time_interleaved
 
 RATE = 100.0
 REPEATS = 9
@@ -99,7 +100,7 @@ def fleet(c: RecursionConstants, assets: int, samples: int) -> tuple[Callable[[]
 
 def fir(n: int) -> tuple[Callable[[], object], int]:
     """Return a job of stage 1 with n taps, and its samples."""
-    from servoscope.research.bench.benchmarks import benchmark_loop
+    from cases.chain import benchmark_loop
 
     loop = benchmark_loop(two_stage="adaptive", stage_one_length=n)
     P_d = np.eye(n) * 1e-3
@@ -184,7 +185,3 @@ def draw(result: dict[str, Any], sweeps: list[str], path: Path) -> None:
         ax.grid(alpha=0.3)
     axes[0, 0].legend()
     figure.savefig(path, dpi=120)
-
-
-if __name__ == "__main__":
-    main()

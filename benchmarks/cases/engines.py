@@ -1,7 +1,7 @@
 """How fast fleets are: one machine, Spark's tasks, DataFrames and streams on the same lake; rows per second.
 
-    python benchmarks/engines.py FOLDER [--assets 8] [--minutes 5] [--rate 1000] [--window 10]
-    python benchmarks/engines.py FOLDER --messages --assets 1000 --minutes 8 --rate 100 [--json]
+    python benchmarks/speed.py engines FOLDER [--assets 8] [--minutes 5] [--rate 1000] [--window 10]
+    python benchmarks/speed.py engines FOLDER --messages --assets 1000 --minutes 8 --rate 100 [--json]
 
 The lake is made in FOLDER unless it is there. Processor time counts all processes, those of Spark included. With
 --messages a stream is measured whose rows are messages of a second, a minute of all assets per micro-batch.
@@ -31,7 +31,7 @@ from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.simulation import reference, simulate
 
-RIG = Path(__file__).parents[1] / "src/servoscope/simulation/reference-rig.toml"
+RIG = Path(__file__).parents[2] / "src/servoscope/simulation/reference-rig.toml"
 DAYS = ("2026-11-01", "2026-11-02")
 
 
@@ -220,7 +220,3 @@ def on_spark(folder: Path, lake: str, rows: int, cores: int, window: float, plan
         descendants,
     )
     session.stop()
-
-
-if __name__ == "__main__":
-    main()

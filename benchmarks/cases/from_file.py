@@ -1,6 +1,6 @@
 """How long `servoscope diagnose` takes from a start, and over a long recording; prints Markdown tables.
 
-python benchmarks/from_file.py [--rows 10000000] [--fault] [--json]
+python benchmarks/speed.py from_file [--rows 10000000] [--fault] [--json]
 """
 
 from __future__ import annotations
@@ -121,7 +121,8 @@ def _run(*words: str, **environment: str) -> tuple[float, float, int]:
     return time.perf_counter() - begin, used.ru_utime + used.ru_stime, memory
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Measure and print."""
     command = parser(__doc__)
     command.add_argument("--rows", type=int, default=10_000_000)
     command.add_argument("--fault", action="store_true", help="with a leak from the middle on")

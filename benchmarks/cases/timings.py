@@ -1,6 +1,6 @@
 """How much processor time commands and a monitor take; prints a Markdown table.
 
-python benchmarks/timings.py [--json]
+python benchmarks/speed.py timings [--json]
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ def _median(job: Callable[[], object]) -> float:
     return sorted(seconds[1:])[REPEATS // 2]
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Measure and print."""
     given = parser(__doc__).parse_args()
     table = timings()
     show([table], given.json, figures(table))

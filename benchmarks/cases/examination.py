@@ -1,6 +1,6 @@
 """What it costs a service to examine two minutes of an asset, and how many it examines at a time; Markdown tables.
 
-python benchmarks/examination.py [--json]
+python benchmarks/speed.py examination [--json]
 
 120 blocks of a second at 100 Hz, warm, one BLAS thread as in the service; the kinds in turns, in one run. The
 verdict is the one of before, as it nearly always is: a new one is stored with its document, which takes longer.
@@ -19,9 +19,9 @@ import numpy as np
 from tables import Table, parser, show
 
 import servoscope as ss
+from servoscope.cli.bench import time_interleaved
 from servoscope.core.arrays import IntArray
 from servoscope.core.blas import with_one_blas_thread
-from servoscope.research.bench.timing import time_interleaved
 from servoscope.service.config import DiagnosisSettings, shard_number
 from servoscope.service.examination import examine_blocks, undetermined
 from servoscope.service.examination_schedule import ExaminationState, examination_phase, update_examination
@@ -140,7 +140,3 @@ def main() -> None:
     header = ("baseline", "healthy, ms", "fault, ms", "10 000 healthy assets every ten minutes, of a core")
     schedule = tabulate_schedule(ms["hydraulic axis", "healthy"])
     show([Table("Cost of an examination", note, header, rows), schedule], given.json)
-
-
-if __name__ == "__main__":
-    main()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.research.bench import oracle
+from tools import oracle
 
 Peer = Callable[[], FloatArray]
 
