@@ -59,10 +59,12 @@ def main() -> None:
     app(prog_name="servoscope")
 
 
-def _format_warning(text: Warning | str, category: type[Warning], *place: Any, **line: Any) -> str:
+def _format_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
     if issubclass(category, ObsoleteSettingWarning):
-        return f"servoscope: warning: {text}\n"
-    return _format_library_warning(text, category, *place, **line)
+        return f"servoscope: warning: {message}\n"
+    return _format_library_warning(message, category, filename, lineno, line)
 
 
 def _print_version(wanted: bool) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,10 @@ from servoscope.cli.options import (
     with_reading_options,
 )
 from servoscope.cli.output_paths import RECORDINGS, REPORTS, check_output
+from servoscope.core.errors import LoopError
+
+if TYPE_CHECKING:
+    from servoscope.design import LearnedStudy
 
 
 @app.command()
@@ -93,37 +97,48 @@ def design(
     as_json: JsonOption = False,
     report: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Write a page with plots.")] = None,
 ) -> None:
-    """Say before deployment which faults can be detected and told apart, at which size, after how long."""
+    """Say which faults can be detected and told apart, from which size on: of a loop file, or of a baseline alone."""
     check_output(report, "--report", REPORTS, [loop, *(healthy or [])])
     arguments.check_reference(reference)
 
     from servoscope.cli.progress import show_steps
     from servoscope.cli.render import design as studies
     from servoscope.cli.render import results
-    from servoscope.design import design_study
+    from servoscope.design import DesignStudy, design_study, study_baseline
+    from servoscope.detection.baseline import Baseline
     from servoscope.models.loop import Loop
     from servoscope.report import plain_values
 
-    settings = Loop.load(loop)
+    baseline = Baseline.load(loop) if loop.suffix.lower() == ".json" else None
+    if baseline is not None and healthy:
+        raise LoopError(f"{loop}: is a baseline, which knows its healthy recordings: leave out the others")
+    settings = Loop.load(loop) if baseline is None else baseline.loop
     arguments.check_length(after, settings.sample_rate)
     reader = RecordingReader.from_options(settings, reading)
-    with show_steps(1, 4 + 2 * len(settings.plant.faults)) as steps:
+    with show_steps(1, 3 + 2 * len(settings.plant.faults)) as steps:
         steps.begin("reading" if healthy else "simulating")
-        recordings = [recording for path in healthy or [] for recording in reader.read(path)]
-        study = design_study(
-            settings,
-            recordings,
-            reference=reference,
-            after_s=after,
-            noise_u_std=noise_u,
-            noise_y_std=noise_y,
-            progress=steps.advance,
-        )
+        study: DesignStudy | LearnedStudy
+        if baseline is not None:
+            study = study_baseline(baseline, reference=reference, after_s=after, progress=steps.advance)
+        else:
+            study = design_study(
+                settings,
+                [recording for path in healthy or [] for recording in reader.read(path)],
+                reference=reference,
+                after_s=after,
+                noise_u_std=noise_u,
+                noise_y_std=noise_y,
+                progress=steps.advance,
+            )
     if as_json:
         print_json(plain_values.to_plain_values(study), lines=False)
-    else:
+    elif isinstance(study, DesignStudy):
         studies.print_study(results.create_console(), study)
+    else:
+        studies.print_learned_study(results.create_console(), study)
     if report is not None:
+        if not isinstance(study, DesignStudy):
+            raise LoopError(f"{loop}: no page without a simulation of the loop: {study.missing}")
         from servoscope.report import design_page as pages
 
         pages.write_design_page(report, study)

@@ -33,7 +33,6 @@ FINE = 0.01  # relative precision of a radius
 SUSPICIOUS = 1.0  # logarithm of a distance relative to what is needed, below which a dip is looked into
 LOOKS = 6  # into a dip
 FAR = 10.0  # stands for a distance beyond all need
-DRAWS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +49,6 @@ class HypothesisDistances:
     def nearest(self) -> str:
         """Name of the closest other fault; empty where there is none."""
         return self.others[int(np.argmin(self.squared))].name if self.others else ""
-
-    def misnaming_probabilities(self, seed: int = 0) -> dict[str, float]:
-        """Return the probability with which each of the others is more likely than the truth and all else.
-
-        Drawn from the joint distribution of the log-likelihood ratios, D^2/2 + D'w each.
-        """
-        root = np.asarray(np.linalg.qr(self.residuals.T, mode="r"), dtype=np.float64).T
-        w = np.random.default_rng(seed).standard_normal((DRAWS, root.shape[1]))
-        against = 0.5 * self.squared + w @ root.T
-        wins = (against < 0.0) & (against <= against.min(axis=1, keepdims=True))
-        return {fault.name: float(share) for fault, share in zip(self.others, wins.mean(axis=0), strict=True)}
 
 
 def hypothesis_distances(scene: Scenario, fault: Fault, x: float) -> HypothesisDistances:

@@ -50,12 +50,7 @@ class Scenario:
         Raises BaselineError, LoopError if the loop cannot be simulated, or not by the exact predictor; raises
         SimulationError if r is no reference, or shorter than `after_s`.
         """
-        require_exact_predictor(baseline.loop)
-        if baseline.exact is None:
-            raise BaselineError(
-                "the baseline has no exact predictor: a study needs a linear plant, a held input, and noise in the "
-                "healthy recordings, without which every change is seen"
-            )
+        require_study(baseline)
         r = check_reference(r)
         after = round(after_s * baseline.loop.sample_rate)
         if not FEWEST <= after <= len(r):
@@ -153,6 +148,16 @@ class Scenario:
         loop = self.loop.model_copy(update={"plant": self.baseline.plant})
         u_std, y_std = self.noise.u_std, self.noise.y_std
         return simulate(loop, self.r, faults=faults, noise_u_std=u_std, noise_y_std=y_std, seed=SEED)[0]
+
+
+def require_study(baseline: Baseline) -> None:
+    """Refuse a baseline whose loop cannot be simulated, or not by the exact predictor."""
+    require_exact_predictor(baseline.loop)
+    if baseline.exact is None:
+        raise BaselineError(
+            "the baseline has no exact predictor: a study needs a linear plant, a held input, and noise in the "
+            "healthy recordings, without which every change is seen"
+        )
 
 
 def require_exact_predictor(loop: Loop) -> None:
