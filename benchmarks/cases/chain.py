@@ -27,7 +27,7 @@ from servoscope.core.errors import ServoscopeError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from servoscope.detection.baseline import Baseline
+    from servoscope.baseline.baseline import Baseline
     from servoscope.models.loop import Loop
     from servoscope.signals import Recording
 

@@ -37,9 +37,9 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from servoscope.baseline.baseline import Baseline
     from servoscope.core.errors import ServoscopeError
     from servoscope.design import design_study
-    from servoscope.detection.baseline import Baseline
     from servoscope.detection.result import Diagnosis
     from servoscope.detection.trace import Trace
     from servoscope.diagnosis.diagnose import diagnose
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from servoscope.simulation import simulate
 else:  # hidden from type checkers, which would otherwise accept any name
     _HOMES = {
-        "Baseline": "detection.baseline",
+        "Baseline": "baseline.baseline",
         "Columns": "models.loop",
         "Diagnosis": "detection.result",
         "Loop": "models.loop",

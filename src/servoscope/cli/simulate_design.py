@@ -101,11 +101,11 @@ def design(
     check_output(report, "--report", REPORTS, [loop, *(healthy or [])])
     arguments.check_reference(reference)
 
+    from servoscope.baseline.baseline import Baseline
     from servoscope.cli.progress import show_steps
     from servoscope.cli.render import design as studies
     from servoscope.cli.render import results
     from servoscope.design import DesignStudy, design_study, study_baseline
-    from servoscope.detection.baseline import Baseline
     from servoscope.models.loop import Loop
     from servoscope.report import plain_values
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from servoscope.baseline.expectation import Expectation, ReferencePath, residual_noise_model
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.design.fisher_information import fisher_matrix
 from servoscope.design.scenario import Scenario
-from servoscope.detection.chi2_test import POWER, whiten
+from servoscope.detection.baseline_run import cusum_constants
 from servoscope.detection.cusum_design import OVERSHOOT, STEP
-from servoscope.detection.expectation import Expectation, ReferencePath, residual_noise_model
+from servoscope.detection.statistic import POWER, whiten
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.kernel.cusum import LAGS, lagged_columns
 from servoscope.estimation.pipeline import Regression
@@ -51,7 +52,7 @@ class AlarmPower:
 
     def _prepare_cusums(self) -> None:
         """Prepare what the CUSUMs are designed for, shape (q, K), their limits, and what the baseline's error does."""
-        watch = self.baseline.cusum_constants(self.pipeline, self.expectation)
+        watch = cusum_constants(self.baseline, self.pipeline, self.expectation)
         self.limits = watch.limits if watch is not None else np.zeros(0)
         if watch is None or self.baseline.loudest is None:
             return

@@ -117,7 +117,7 @@ class MimicStudy(_StudyModel):
     told_apart: float | None
 
 
-class LearnedFault(_StudyModel):
+class FaultPromise(_StudyModel):
     """One fault, by a baseline alone: relative changes from which on it is detected, and named; None: never."""
 
     parameter: str
@@ -132,7 +132,7 @@ class LearnedStudy(_StudyModel):
     loop: str
     missing: str
     false_alarms_per_year: float
-    faults: dict[str, LearnedFault]
+    faults: dict[str, FaultPromise]
     cosines: dict[str, dict[str, float]]
 
 

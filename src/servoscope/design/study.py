@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError, SimulationError
 from servoscope.core.messages import Message, message, text_message
@@ -22,16 +23,15 @@ from servoscope.design.operating_limits import LIMIT_KINDS, LimitKind, Operating
 from servoscope.design.result import (
     DesignStudy,
     DirectionStudy,
+    FaultPromise,
     FaultStudy,
-    LearnedFault,
     LearnedStudy,
     MimicStudy,
     SizePrecision,
     Spans,
 )
 from servoscope.design.scenario import Scenario, require_exact_predictor, require_study
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import required_noncentrality
+from servoscope.detection.statistic import required_noncentrality
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.learning.learn import SHORTEST, learn_baseline
 from servoscope.models.loop import Loop
@@ -295,7 +295,7 @@ def learned_study(baseline: Baseline, missing: str) -> LearnedStudy:
     F = cosine * np.outer(sensitivity, sensitivity)
     alike = np.abs(cosine) - 2.0 * np.eye(len(names))
     faults = {
-        fault.name: LearnedFault(
+        fault.name: FaultPromise(
             parameter=fault.parameter,
             detectable=_finite(changes[i]),
             isolable=_finite(linear_isolability_radius(F, i)) if len(names) > 1 else _finite(changes[i]),

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.workers import Progress
 from servoscope.design import design_study
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis import operating_points
 from servoscope.diagnosis.diagnose import diagnose_with_trace
