@@ -277,8 +277,11 @@ class TestCommand:
         assert fault.sizes[-1].together is None  # input_gain scales both coefficients
         lost = {(one.fault, one.kind): one for one in operating_limits(Loop.load(loop))}
         for name, each in said.faults.items():
-            assert (each.up.tracking, each.down.tracking) == lost[name, "tracking"][2:]
-            assert (each.up.stability, each.down.stability) == lost[name, "stability"][2:]
+            assert [each.up.tracking, each.down.tracking] == [lost[name, "tracking"].up, lost[name, "tracking"].down]
+            assert [each.up.stability, each.down.stability] == [
+                lost[name, "stability"].up,
+                lost[name, "stability"].down,
+            ]
         out = io.StringIO()
         print_study(Console(file=out, width=100), said)
         heavy = fault.up.tracking  # a heavier axis follows worse

@@ -54,13 +54,6 @@ class DirectionStudy(_StudyModel):
         """Smallest ratio at which it is named rightly, though larger ones may be unclear again."""
         return self.unclear[0][1] if self.unclear else 1.0
 
-    @property
-    def times_bound(self) -> float | None:
-        """`first_isolable` against `bound`, as logarithms; None where one of them does not exist."""
-        if self.first_isolable is None or self.bound is None or self.bound == 1.0:
-            return None
-        return math.log(self.first_isolable) / math.log(self.bound)
-
     def clear(self, ratio: float) -> bool:
         """Return whether a fault of this ratio is named rightly."""
         x = abs(math.log(ratio))

@@ -101,10 +101,6 @@ class ArmaNoise:
             gamma.append(float(sum(self.a[i] * gamma[j - 1 - i] for i in range(len(self.a))) + moving))
         return np.array(gamma[: lags + 1])
 
-    def autoregression(self, order: int = AR_ORDER) -> ArmaNoise:
-        """Return the autoregression with the same autocovariance up to its order."""
-        return yule_walker(self.autocovariance(order)) if len(self.b) else self
-
 
 def sample_autocovariance(runs: Sequence[FloatArray], lags: int) -> FloatArray:
     """Return the autocovariance of a zero-mean signal at lags 0 ... lags, over several runs, shape (lags + 1,)."""
