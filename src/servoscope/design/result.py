@@ -63,23 +63,18 @@ class DirectionStudy(_StudyModel):
 class SizePrecision(_StudyModel):
     """Smallest standard deviation of a size, relative, so many seconds after the onset; None: nothing tells it.
 
-    `alone` if nothing else may have changed, `together` if all parameters may; `alone_learned` and `together_learned`
-    with the healthy ones known only as the baseline and the seconds before the onset know them.
+    The healthy parameters are known as the baseline and the seconds before the onset know them.
     """
 
     seconds: float
-    alone: float | None
-    together: float | None
-    alone_learned: float | None
-    together_learned: float | None
+    std: float | None
 
 
 class FaultStudy(_StudyModel):
-    """One fault: `information` is Fisher's about the logarithm of its ratio, per second."""
+    """One fault, by direction, and how precise its size becomes."""
 
     name: str
     parameter: str
-    information: float
     sizes: tuple[SizePrecision, ...]
     up: DirectionStudy
     down: DirectionStudy

@@ -14,7 +14,6 @@ from servoscope.design import mimics
 from servoscope.design.detectability import AlarmPower, detectable_size
 from servoscope.design.fisher_information import (
     cosines,
-    cramer_rao_std,
     fisher_matrix,
     linear_isolability_radius,
 )
@@ -184,9 +183,9 @@ def _fault(
     i = scene.names.index(fault.parameter)
     sizes = []
     for seconds in sorted({min(s, scene.after_s) for s in SECONDS}):
-        exact, learned = (cramer_rao_std(fisher_matrix(scene, seconds, known)) for known in (True, False))
-        values = [_finite(each[i]) for each in (*exact, *learned)]
-        sizes.append(SizePrecision(seconds=seconds, **dict(zip(STDS, values, strict=True))))
+        information = float(fisher_matrix(scene, seconds, exact=False)[i, i])
+        std = _finite(1.0 / np.sqrt(information)) if information > 0.0 else None  # the Cramer-Rao bound
+        sizes.append(SizePrecision(seconds=seconds, std=std))
     sides = []
     for up in (True, False):
         progress(f"{fault.name}, {'up' if up else 'down'}")
@@ -197,14 +196,10 @@ def _fault(
     return FaultStudy(
         name=fault.name,
         parameter=fault.parameter,
-        information=float(fisher_matrix(scene)[i, i]) / scene.after_s,
         sizes=tuple(sizes),
         up=sides[0],
         down=sides[1],
     )
-
-
-STDS = ("alone", "together", "alone_learned", "together_learned")
 
 
 def _side(scene: Scenario, alarms: AlarmPower, fault: Fault, up: bool) -> DirectionStudy:

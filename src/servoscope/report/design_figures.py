@@ -67,10 +67,9 @@ def plot_size_precision(study: DesignStudy) -> Figure:
     ax = figure.subplots()
     for i, fault in enumerate(study.faults.values()):
         tone = TONES[i % len(TONES)]
-        for key, dash, label in (("alone_learned", "-", fault.name), ("together_learned", ":", "")):
-            known = [(each.seconds, std) for each in fault.sizes if (std := getattr(each, key)) is not None]
-            if known:
-                ax.plot(*zip(*known, strict=True), dash, color=tone, marker="." if label else "", label=label)
+        known = [(each.seconds, each.std) for each in fault.sizes if each.std is not None]
+        if known:
+            ax.plot(*zip(*known, strict=True), color=tone, marker=".", label=fault.name)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.xaxis.set_major_formatter("{x:g}")

@@ -139,17 +139,18 @@ class Service:
         """Change to what the service file says now; where that cannot be used, go on as before."""
         notify_systemd("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
-            found = reload_components(self.config.load_again(path), self.config, self._components, self._commit_all)
+            config = self.config.load_again(path)
+            components, changes = reload_components(config, self.config, self._components, self._commit_all)
         except ServoscopeError as error:
             log("error", "reload refused", why=str(error))
             self.writer.add(self.config.name, [audit_row("reload refused", {"why": str(error)})])
             notify_systemd("READY=1", f"STATUS=reload refused: {error}")
             return
         before = self.assets
-        self._take_components(found.config, found.components)
-        self.writer.capacity = found.config.service.buffer
-        set_level(found.config.service.log)
-        self.dispatcher.change(found.config.actions.resolve_paths(found.config.folder))
+        self._take_components(config, components)
+        self.writer.capacity = config.service.buffer
+        set_level(config.service.log)
+        self.dispatcher.change(config.actions.resolve_paths(config.folder))
         # a diagnosis that is still due is asked for again
         jobs = self._diagnosis_jobs.items()
         self._diagnosis_jobs = {key: job for key, job in jobs if self.assets.get(key[0]) is before[key[0]]}
@@ -158,9 +159,9 @@ class Service:
             name: self._receptions.get(name) or ReceptionLog(heard_before=asset.heard, now=self._listening_s)
             for name, asset in self.assets.items()
         }
-        self._add_restarts(found.components)
-        log("info", "reloaded", **found.changes)
-        self.writer.add(self.config.name, [audit_row("reloaded", found.changes)])
+        self._add_restarts(components)
+        log("info", "reloaded", **changes)
+        self.writer.add(self.config.name, [audit_row("reloaded", changes)])
         notify_systemd("READY=1", self._systemd_status)
 
     @property

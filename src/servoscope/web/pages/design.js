@@ -119,6 +119,6 @@ function several(c, named, x, y) {
 }
 
 function sizes(c, faults) {
-  const lines = faults.map((fault) => [plain(fault.name), fault.sizes.filter((one) => one.alone_learned > 0).map((one) => [one.seconds, 100 * one.alone_learned])]);
+  const lines = faults.map((fault) => [plain(fault.name), fault.sizes.map((one) => [one.seconds, 100 * (one.std ?? one.alone_learned)]).filter(([, std]) => std > 0)]);
   return several(c, lines, "time after the onset [s]", "standard deviation [%]");
 }
