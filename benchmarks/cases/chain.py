@@ -20,8 +20,8 @@ import numpy as np
 from tables import Table, parser, show
 from tools import limits, oracle, peers
 from tools.layers import measure_layers, vector_bits
+from tools.timing import JobTiming, time_interleaved
 
-from servoscope.cli.bench import JobTiming, time_interleaved
 from servoscope.core.errors import ServoscopeError
 
 if TYPE_CHECKING:

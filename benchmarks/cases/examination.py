@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 from tables import Table, parser, show
+from tools.timing import time_interleaved
 
 import servoscope as ss
-from servoscope.cli.bench import time_interleaved
 from servoscope.core.arrays import IntArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.service.assets.examination import examine_blocks, undetermined

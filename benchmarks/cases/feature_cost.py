@@ -11,9 +11,9 @@ import os
 
 import numpy as np
 from tables import Table, parser, show
+from tools.timing import time_interleaved
 
 import servoscope as ss
-from servoscope.cli.bench import time_interleaved
 from servoscope.simulation import reference, simulate
 from servoscope.simulation.tutorial import AXIS
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from tables import machine, parser
 from tools import limits
+from tools.timing import time_interleaved
 
-from servoscope.cli.bench import time_interleaved
 from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
 from servoscope.estimation.kernel.sample_steps import TILE, SampleSteps
 from servoscope.estimation.recursion import EvaluationConstants, Recursion, RecursionConstants

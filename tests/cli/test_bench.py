@@ -7,8 +7,7 @@ import json
 import pytest
 from cases import chain
 from commands import run
-
-from servoscope.cli.bench import JobTiming, time_interleaved
+from tools.timing import JobTiming, time_interleaved
 
 FIGURES = (
     "log, NumPy",
@@ -48,10 +47,10 @@ FACTS = (
 def test_the_command_says_what_a_sample_takes() -> None:
     done = run("bench", "--repeats", 1, "--share", 0.01, "--json")
     assert done.code == 0, done.err
-    timings = json.loads(done.out)["ns_per_sample"]
+    ns = json.loads(done.out)["ns_per_sample"]
     fleets = [f"fleet of 100, {precision}" for precision in ("double", "single")]
-    assert list(timings) == ["one log", "one sample at a time", *fleets]
-    assert all(0.0 < timing["low"] <= timing["median"] <= timing["high"] for timing in timings.values())
+    assert list(ns) == ["one log", "one sample at a time", *fleets]
+    assert all(time > 0.0 for time in ns.values())
     assert "million/s" in run("bench", "--repeats", 1, "--share", 0.01).out
 
 

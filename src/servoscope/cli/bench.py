@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -18,40 +18,19 @@ MIN_COUNT = 100  # of samples and assets: an evaluation comes within so many sam
 FILLING_BLOCKS = 3  # blocks of a fleet before it is measured: with its noise filter empty, fewer samples are tested
 
 
-@dataclass(frozen=True)
-class JobTiming:
-    """Times of one job [s]: median, and the quartiles around it; `processor`, the median of what all cores spent."""
-
-    median: float
-    low: float
-    high: float
-    processor: float
-
-    def per_sample(self, samples: int) -> JobTiming:
-        """Return the times of one of its samples [ns]."""
-        return JobTiming(*(1e9 * seconds / samples for seconds in asdict(self).values()))
-
-
-def time_interleaved(jobs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, JobTiming]:
-    """Run all jobs once uncounted, then in turns, so that a busy moment meets all of them; return their times."""
-    for job in jobs.values():
-        job()
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
+def median_time(job: Callable[[], object], repeats: int) -> float:
+    """Run a job once uncounted, then so many times; return the median of its times [s]."""
+    job()
+    times = []
     for _ in range(repeats):
-        for name, job in jobs.items():
-            begin, spent = time.perf_counter(), time.process_time()
-            job()
-            times[name].append((time.perf_counter() - begin, time.process_time() - spent))
-    timings = {}
-    for name, pairs in times.items():
-        walls, processor = (sorted(column) for column in zip(*pairs, strict=True))
-        median, low, high = (walls[round(q * (repeats - 1))] for q in (0.5, 0.25, 0.75))
-        timings[name] = JobTiming(median, low, high, processor[repeats // 2])
-    return timings
+        begin = time.perf_counter()
+        job()
+        times.append(time.perf_counter() - begin)
+    return sorted(times)[repeats // 2]
 
 
-def measure_monitor(repeats: int, share: float) -> dict[str, JobTiming]:
-    """Return times per sample [ns] of the monitor of the reference rig, with all its tests."""
+def measure_monitor(repeats: int, share: float) -> dict[str, float]:
+    """Return the time of a sample [ns] in the monitor of the reference rig, with all its tests."""
     from importlib.resources import files
 
     import numpy as np
@@ -75,20 +54,19 @@ def measure_monitor(repeats: int, share: float) -> dict[str, JobTiming]:
         for r, u, y in samples:
             single.step(state, r, u, y)
 
-    jobs: dict[str, Callable[[], object]] = {
-        "one log": lambda: single.run(single.init(), *long),
-        "one sample at a time": step_all,
+    ns = {
+        "one log": 1e9 * median_time(lambda: single.run(single.init(), *long), repeats) / log,
+        "one sample at a time": 1e9 * median_time(step_all, repeats) / steps,
     }
-    counts = {"one log": log, "one sample at a time": steps}
     blocks = np.broadcast_to(signals[:, None, :FLEET_SAMPLES], (3, assets, FLEET_SAMPLES))
     for precision, number in (("double", np.float64), ("single", np.float32)):
-        monitor, name = Monitor([baseline] * assets, precision=precision), f"fleet of {assets}, {precision}"  # type: ignore[arg-type]
-        fleet, block = monitor.init(), np.ascontiguousarray(blocks, dtype=number)
+        monitor, block = Monitor([baseline] * assets, precision=precision), np.ascontiguousarray(blocks, dtype=number)  # type: ignore[arg-type]
+        fleet = monitor.init()
         for _ in range(FILLING_BLOCKS):
             fleet, _ = monitor.run(fleet, *block)
-        jobs[name] = lambda monitor=monitor, fleet=fleet, block=block: monitor.run(fleet, *block)  # type: ignore[misc]
-        counts[name] = assets * FLEET_SAMPLES
-    return {name: timing.per_sample(counts[name]) for name, timing in time_interleaved(jobs, repeats).items()}
+        spent = median_time(partial(monitor.run, fleet, *block), repeats)
+        ns[f"fleet of {assets}, {precision}"] = 1e9 * spent / (assets * FLEET_SAMPLES)
+    return ns
 
 
 @app.command()
@@ -103,12 +81,9 @@ def bench(
 
     with show_steps(1, 1) as steps:
         steps.begin("measuring")
-        timings = measure_monitor(repeats, share)
+        times = measure_monitor(repeats, share)
     if as_json:
-        print_json({"ns_per_sample": {name: asdict(timing) for name, timing in timings.items()}}, lines=False)
+        print_json({"ns_per_sample": times}, lines=False)
         return
-    rows = [
-        (name, f"{t.median:.1f}", f"{t.low:.1f} to {t.high:.1f}", f"{1e3 / t.median:.3g}")
-        for name, t in timings.items()
-    ]
-    print_table(create_console(), ("", "ns per sample", "quartiles", "million/s"), rows)
+    rows = [(name, f"{ns:.1f}", f"{1e3 / ns:.3g}") for name, ns in times.items()]
+    print_table(create_console(), ("", "ns per sample", "million/s"), rows)
