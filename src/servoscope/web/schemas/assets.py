@@ -106,7 +106,7 @@ class FaultSize(ApiResponse):
     high: float
 
 
-class OutlookRow(Outlook):
+class OutlookRow(Outlook, ApiResponse):
     """When a fault reaches its limit."""
 
     t: float = Field(exclude=True)

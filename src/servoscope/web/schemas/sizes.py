@@ -46,7 +46,7 @@ class NoteList(ApiResponse):
     notes: list[Note]
 
 
-class Forecast(Prognosis):
+class Forecast(Prognosis, ApiResponse):
     """A prognosis of an asset, with its sentences as text."""
 
     asset: str
