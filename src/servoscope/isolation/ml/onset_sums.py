@@ -10,8 +10,6 @@ from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel, subroutine
 from servoscope.isolation.ml.kernels import (
     Array,
-    inverse_std,
-    log_variances,
     run_constant_plant,
     run_drifting_plant,
     samples_since_restart,
@@ -57,7 +55,7 @@ def sum_constant_plants(
     x, x_next, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, N))
     states = np.zeros((N + 1, V, n))
     before, after = np.zeros((N + 1, V, V + m)), np.zeros((N + 1, V, V + m))
-    log_S, by = log_variances(S, 0), inverse_std(S, 0)
+    log_S, by = np.log(S), 1.0 / np.sqrt(S)
     for k in range(N):
         run_constant_plant(A, b, b_late, c, K, by, plants, 0, 0, V, k, k + 1, age, u, y, restart, x, x_next, e, 0)
         states[k + 1], before[k + 1] = x, before[k]
@@ -91,7 +89,7 @@ def sum_over_onsets(
     with themselves and with Q; and volume: sum of log S relative to the healthy plant's, shape (M,).
     """
     V, last, N, M = plants.shape[0], plants.shape[1] - 1, len(y), len(onsets)
-    log_S, by, age = log_variances(S, 0), inverse_std(S, 0), samples_since_restart(restart, K.shape[1])
+    log_S, by, age = np.log(S), 1.0 / np.sqrt(S), samples_since_restart(restart, K.shape[1])
     sums, volume = np.zeros((M, V, V + Q.shape[1])), np.zeros(M)
     x, x_next, e = np.zeros((V, A.shape[1])), np.zeros(A.shape[1]), np.zeros((V, N))
     for i in range(M):
