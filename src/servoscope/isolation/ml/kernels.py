@@ -16,7 +16,7 @@ Array = npt.NDArray[Any]  # float64, or complex128 for complex-step derivatives
 @kernel
 def innovations(
     A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, plants: IntArray, onset: int, duration: int,
-    u: Array, y: Array, restart: BoolArray, known: Array, states: Array,
+    u: Array, y: Array, restart: BoolArray,
 ) -> Array:  # fmt: skip
     """Return e(k) = y(k) - y_hat(k | k-1) in standard deviations, shape (V, N), through changes of the plant.
 
@@ -25,9 +25,6 @@ def innovations(
     samples later on; in between it goes through the others, evenly and in straight lines. The state goes on. All are
     multiplied by one factor, the geometric mean of the deviations relative to the first plant's, so that the sum of
     squares ranks hypotheses as the likelihood does whose noise is known but for a common factor.
-
-    `known` (N,), `states` (N + 1, n): innovations and states of plant 0 all the way, as `run_plant` returns them; empty
-    where they are not known.
     """
     N, V, last = len(y), plants.shape[0], plants.shape[1] - 1
     e, age = np.empty((V, N), A.dtype), samples_since_restart(restart, S.shape[1])
@@ -39,9 +36,6 @@ def innovations(
     for v in range(V):
         if v > 0 and plants[v, 0] == plants[v - 1, 0]:  # up to the change it is the variant before
             e[v, :begin], x[v] = e[v - 1, :begin], x[v - 1]
-            continue
-        if plants[v, 0] == 0 and len(known):
-            e[v, :begin], x[v] = known[:begin], states[begin]
             continue
         run_constant_plant(A, b, b_late, c, K, by, plants, 0, v, v + 1, 0, begin, age, u, y, restart, x, x_next, e, 0)
     run_drifting_plant(
@@ -56,20 +50,6 @@ def innovations(
             volume += log_S[p, age[k]] - log_S[first, age[k]]
         e[v] *= np.exp(0.5 * volume / N)
     return e
-
-
-@kernel
-def run_plant(
-    A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, u: Array, y: Array, restart: BoolArray
-) -> tuple[Array, Array]:
-    """Return innovations of one plant in standard deviations, shape (N,), and the states before them, (N + 1, n)."""
-    N, n = len(y), A.shape[1]
-    x, x_next, e, states = np.zeros((1, n)), np.zeros(n), np.zeros((1, N)), np.zeros((N + 1, n))
-    age, by, plants = samples_since_restart(restart, S.shape[1]), 1.0 / np.sqrt(S), np.zeros((1, 1), np.int64)
-    for k in range(N):
-        run_constant_plant(A, b, b_late, c, K, by, plants, 0, 0, 1, k, k + 1, age, u, y, restart, x, x_next, e, 0)
-        states[k + 1] = x[0]
-    return e[0], states
 
 
 @kernel

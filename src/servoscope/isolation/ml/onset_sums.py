@@ -23,7 +23,7 @@ def prepare_sums(
     variants: PlantVariants, step: float, u: FloatArray, y: FloatArray, restart: BoolArray, Q: FloatArray
 ) -> Callable[[IntArray, IntArray], tuple[FloatArray, FloatArray]]:
     """Return the function from onsets and durations, all of them zero or none, to what `sum_over_onsets` returns."""
-    each, drifting, _ = variants
+    each, drifting = variants
     stepping = np.ascontiguousarray(drifting[:, [0, -1]])
     A, K, c = each.A[stepping[0]], each.K[stepping[0], -1], each.c[stepping[0]]
     slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
