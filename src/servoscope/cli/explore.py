@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from servoscope.learning.axis_structures import AxisStructure
 
-SHOWN = 8  # structures, the supported one first
+MAX_LISTED_STRUCTURES = 8  # structures, the supported one first
 
 
 @app.command()
@@ -114,10 +114,14 @@ def _print(out: Console, found: tuple[AxisStructure, ...], count: int, table: st
     from servoscope.cli.render import results
     from servoscope.report.page import say
 
-    speeds = ["" if each.plant.stribeck_speed is None else f"{each.plant.stribeck_speed:g}" for each in found]
     structures = [
-        (", ".join(each.plant.terms) or "-", speed, f"{each.excess:.1f}", f"{each.excess_std:.1f}")
-        for each, speed in zip(found[:SHOWN], speeds, strict=False)
+        (
+            ", ".join(structure.plant.terms) or "-",
+            "" if structure.plant.stribeck_speed is None else f"{structure.plant.stribeck_speed:g}",
+            f"{structure.excess:.1f}",
+            f"{structure.excess_std:.1f}",
+        )
+        for structure in found[:MAX_LISTED_STRUCTURES]
     ]
     results.print_table(out, ("terms", "Stribeck speed", "worse by", "standard error"), structures)
     best = found[0]

@@ -23,17 +23,17 @@ def prepare_sums(
     variants: PlantVariants, step: float, u: FloatArray, y: FloatArray, restart: BoolArray, Q: FloatArray
 ) -> Callable[[IntArray, IntArray], tuple[FloatArray, FloatArray]]:
     """Return the function from onsets and durations, all of them zero or none, to what `sum_over_onsets` returns."""
-    each, drifting = variants
+    predictor, drifting = variants
     stepping = np.ascontiguousarray(drifting[:, [0, -1]])
-    A, K, c = each.A[stepping[0]], each.K[stepping[0], -1], each.c[stepping[0]]
+    A, K, c = predictor.A[stepping[0]], predictor.K[stepping[0], -1], predictor.c[stepping[0]]
     slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
     settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), len(y))
     signals = (u, y, restart, Q)
-    constant = sum_constant_plants(*each, stepping, step, *signals)
+    constant = sum_constant_plants(*predictor, stepping, step, *signals)
 
     def sums(onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
         plants = drifting if overs.any() else stepping
-        return sum_over_onsets(*each, plants, step, onsets, overs, settle, *signals, *constant)
+        return sum_over_onsets(*predictor, plants, step, onsets, overs, settle, *signals, *constant)
 
     return sums
 

@@ -52,8 +52,8 @@ class Predictor(NamedTuple):
         """
         from servoscope.isolation.ml.kernels import innovations
 
-        each = np.arange(len(self.b))[None] if plants is None else plants
-        e: Array = innovations(*self, each, onset, duration, u, y, restart)
+        rows = np.arange(len(self.b))[None] if plants is None else plants
+        e: Array = innovations(*self, rows, onset, duration, u, y, restart)
         return e[0] if plants is None else e
 
 
