@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from accuracy.axis import AXES, moves, record
 from accuracy.axis import loop as axis_loop
+from public.output_error import fit_output_error
 from scipy.signal import lfilter
 
 import servoscope as ss
@@ -25,7 +26,6 @@ from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import fit_hypothesis
 from servoscope.isolation.ml.window import ChangeProfile
 from servoscope.learning.axis_fit import fit_axis
-from servoscope.learning.output_error import fit_output_error
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.simulation import FaultEvent, simulate
 

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from servoscope.core import outofcore
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray, to_tuples
 from servoscope.estimation.pipeline import Pipeline, RegressionRunner, Tuning
 from servoscope.signals import Recording
 
@@ -192,9 +192,5 @@ def learn_motion(pipeline: Pipeline, recordings: Sequence[Recording]) -> MotionR
     if not found:
         return None
     values = np.concatenate(found)
-    least, most = (_nested(x) for x in (values.min(axis=0), values.max(axis=0)))
+    least, most = (to_tuples(x) for x in (values.min(axis=0), values.max(axis=0)))
     return MotionRange(origin=origin, least=least, most=most)
-
-
-def _nested(x: FloatArray) -> Ranges:
-    return tuple(tuple(tuple(map(float, row)) for row in window) for window in x)

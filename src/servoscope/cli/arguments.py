@@ -7,7 +7,6 @@ import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,20 +51,6 @@ def parse_time(text: str | None, option: str) -> float | None:
 
 
 MOST_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
-
-
-class EngineName(StrEnum):
-    """Engines of ``fleet``."""
-
-    local = "local"
-    spark = "spark"
-
-
-class RigModel(StrEnum):
-    """Models of the rig that ``simulate`` has."""
-
-    linear = "linear"
-    nonlinear = "nonlinear"
 
 
 def parse_healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:

@@ -9,9 +9,8 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -38,24 +37,13 @@ AssetOption = Annotated[list[str] | None, typer.Option(metavar="NAME", help="Onl
 
 EXPORTS = (".csv", ".parquet", ".pq", ".json")
 DEFAULT_ROWS = 50
-
-
-class HistoryKind(StrEnum):
-    """Kinds of rows that ``history`` prints."""
-
-    diagnoses = "diagnoses"
-    alarms = "alarms"
-    audit = "audit"
-    residuals = "residuals"
-    deliveries = "deliveries"
-
-
-COLUMNS = {
-    HistoryKind.diagnoses: ("t", "asset", "grounds", "summary"),
-    HistoryKind.alarms: ("t", "asset", "alarm", "after", "who", "cause"),
-    HistoryKind.audit: ("at", "who", "asset", "what", "document"),
-    HistoryKind.residuals: ("t", "asset", "statistic", "level"),
-    HistoryKind.deliveries: ("created", "sink", "subject", "attempts", "due", "outcome"),
+HistoryKind = Literal["diagnoses", "alarms", "audit", "residuals", "deliveries"]
+COLUMNS: dict[HistoryKind, tuple[str, ...]] = {
+    "diagnoses": ("t", "asset", "grounds", "summary"),
+    "alarms": ("t", "asset", "alarm", "after", "who", "cause"),
+    "audit": ("at", "who", "asset", "what", "document"),
+    "residuals": ("t", "asset", "statistic", "level"),
+    "deliveries": ("created", "sink", "subject", "attempts", "due", "outcome"),
 }
 
 
@@ -172,7 +160,7 @@ def watch(
 @app.command()
 def history(
     store: StoreArgument,
-    kind: Annotated[HistoryKind, typer.Option(help="What to tell.")] = HistoryKind.diagnoses,
+    kind: Annotated[HistoryKind, typer.Option(help="What to tell.")] = "diagnoses",
     asset: AssetOption = None,
     since: Annotated[
         str | None, typer.Option("--from", metavar="TIME", help="From this time on: 2026-01-31T12:00 (UTC), or 8h ago.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -41,9 +41,9 @@ def simulate(
     noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on y, std. dev.")] = 3.162e-4,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the noise.")] = 0,
     rig: Annotated[
-        arguments.RigModel,
+        Literal["linear", "nonlinear"],
         typer.Option(help="nonlinear: an EHA with friction, valve, sensor, limits and warming oil."),
-    ] = arguments.RigModel.linear,
+    ] = "linear",
     as_json: JsonOption = False,
 ) -> None:
     """Simulate a loop, with faults if wanted, and write what a machine would log."""
@@ -63,12 +63,12 @@ def simulate(
     with show_steps(1, 1) as steps:
         steps.begin("simulating")
         r = simulation.reference(reference, duration, settings.sample_rate, amplitude=amplitude)
-        run = simulation.simulate if rig is arguments.RigModel.linear else simulation.simulate_rig
+        run = simulation.simulate if rig == "linear" else simulation.simulate_rig
         recording, truth = run(settings, r, faults=events, noise_u_std=noise_u, noise_y_std=noise_y, seed=seed)
         steps.advance("writing")
         used = writers.write_recording(output, recording, settings.columns)
     if as_json:
-        how = {"reference": reference, "amplitude": amplitude, "seed": seed, "rig": rig.value}
+        how = {"reference": reference, "amplitude": amplitude, "seed": seed, "rig": rig}
         noise = {"noise_u_std": noise_u, "noise_y_std": noise_y}
         facts = plain_values.simulation_summary(recording, truth, used)
         print_json({"recording": str(output), **facts, **how, **noise}, lines=False)

@@ -10,7 +10,7 @@ unlikely enough by chance.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,19 +34,6 @@ POINTS, PER_CONSTANT = 32, 8.0  # of the course that is kept, and how many of th
 LOOK = np.array([1.0, 0.0, 0.0, 1.0])  # what a block sees of x
 
 
-class _Parts(NamedTuple):
-    """Views of the state."""
-
-    head: FloatArray  # samples of the block that runs, last y, blocks since the last point was kept
-    sums: FloatArray  # phi phi', phi eta, losses, samples with losses
-    x: FloatArray  # (4,)
-    P: FloatArray  # (4, 4)
-    onsets: FloatArray  # by block: what a jump there does to x, its information and its score, (ONSETS, 6)
-    course: FloatArray  # (POINTS, 2): w and its standard deviation
-    average: FloatArray
-    filters: FloatArray
-
-
 class WarmUpMonitor(CovariateMonitor):
     """Follows the warm-up of one machine; its state is one array, changed in place."""
 
@@ -63,23 +50,23 @@ class WarmUpMonitor(CovariateMonitor):
         self._limit = float(special.chdtri(1.0, BY_CHANCE / ONSETS))
         self._noncentrality = required_noncentrality(1, self._limit)
         n = self._n = len(baseline.theta)
-        filters = RegressionRunner(self._pipeline).state.size
-        shapes = (
-            (3,),
-            (n * n + n + 2,),
-            (4,),
-            (4, 4),
-            (ONSETS, 6),
-            (POINTS, 2),
-            (self.average.size,),
-            (filters,),
+        self._layout = np.dtype(
+            [
+                ("head", "f8", 3),  # samples of the block that runs, last y, blocks since the last point was kept
+                ("sums", "f8", n * n + n + 2),  # phi phi', phi eta, losses, samples with losses
+                ("x", "f8", 4),
+                ("P", "f8", (4, 4)),
+                ("onsets", "f8", (ONSETS, 6)),  # by block: what a jump there does to x, its information and its score
+                ("course", "f8", (POINTS, 2)),  # w and its standard deviation
+                ("average", "f8", self.average.size),
+                ("filters", "f8", RegressionRunner(self._pipeline).state.size),
+            ]
         )
-        self._shapes, self._ends = shapes, np.cumsum([int(np.prod(shape)) for shape in shapes])
-        self.size = int(self._ends[-1])
+        self.size = self._layout.itemsize // 8
 
-    def _parts(self, state: FloatArray) -> _Parts:
-        pieces = np.split(state, self._ends[:-1])
-        return _Parts(*(piece.reshape(shape) for piece, shape in zip(pieces, self._shapes, strict=True)))
+    def _parts(self, state: FloatArray) -> Any:
+        """Return the state by the names of its parts, which are views."""
+        return state.view(self._layout).view(np.recarray)[0]
 
     def start(self) -> FloatArray:
         """Return the state before the first sample: nothing is known of the warmth."""
@@ -90,12 +77,12 @@ class WarmUpMonitor(CovariateMonitor):
         self._forget(parts)
         return state
 
-    def _forget(self, parts: _Parts) -> None:
+    def _forget(self, parts: Any) -> None:
         """Know nothing of warmth and machine, as at the start: what was believed cannot be."""
         parts.x[:], parts.P[:] = (0.5, 0.5, 0.0, 0.0), np.diag([PRIOR_STD**2] * 3 + [0.0])
         self._begin(parts)
 
-    def _begin(self, parts: _Parts) -> None:
+    def _begin(self, parts: Any) -> None:
         """Begin anew behind a gap, of which nobody knows how long it was: the warmth is unknown, the rest is kept."""
         parts.head[:], parts.sums[:], parts.onsets[:] = (0.0, np.nan, 0.0), 0.0, 0.0
         parts.P[0], parts.P[:, 0] = 0.0, 0.0
@@ -143,7 +130,7 @@ class WarmUpMonitor(CovariateMonitor):
             parts.head[1], k = y[end - 1], end
         return found, start
 
-    def _end_block(self, parts: _Parts) -> None:
+    def _end_block(self, parts: Any) -> None:
         """Take what a block measures, see whether a jump explains the last ones, and go on to the next one."""
         n, sums = self._n, parts.sums
         A, b, (loss, count) = sums[: n * n].reshape(n, n), sums[n * n : -2], sums[-2:]
@@ -175,7 +162,7 @@ class WarmUpMonitor(CovariateMonitor):
         F[0, :3] = self._keep, 1.0 - self._keep, (1.0 - self._keep) * p
         return F, known
 
-    def _measure(self, parts: _Parts, A: FloatArray, b: FloatArray) -> tuple[float, float] | None:
+    def _measure(self, parts: Any, A: FloatArray, b: FloatArray) -> tuple[float, float] | None:
         """Return w + j as a block shows it, and its variance; None where the block shows nothing."""
         x, P, z, variance = parts.x, parts.P, float(LOOK @ parts.x), 0.0
         prior = float(LOOK @ P @ LOOK)
@@ -192,7 +179,7 @@ class WarmUpMonitor(CovariateMonitor):
             w = float(LOOK @ x) + prior / (prior + variance) * (z - float(LOOK @ x))
         return z, variance
 
-    def _update(self, parts: _Parts, z: float, variance: float) -> None:
+    def _update(self, parts: Any, z: float, variance: float) -> None:
         """Correct x by a measurement, and then by a jump where one is needed."""
         x, P, onsets = parts.x, parts.P, parts.onsets
         S = float(LOOK @ P @ LOOK) + variance

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from servoscope.baseline.covariates import CovariateModel, CovariatePath
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.errors import NotEnoughError
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, coloured_covariance, fit_tuning, least_squares
@@ -105,7 +105,8 @@ def learn_covariates(
     dispersion = float(np.einsum("mi,mij,mj->", left, W, left)) / (len(theta) * n - B.size)
     sizes = np.tile(size, p)
     spread = max(dispersion, 1.0) * known[n:, n:] * np.outer(sizes, sizes)
-    return blank.model_copy(update={"slopes": _rows(B.reshape(1 + p, n)[1:] * size), "covariance": _rows(spread)})
+    slopes = to_tuples(B.reshape(1 + p, n)[1:] * size)
+    return blank.model_copy(update={"slopes": slopes, "covariance": to_tuples(spread)})
 
 
 def _stretches(
@@ -145,7 +146,3 @@ def at_origin(
         shift = model.theta(theta, np.clip(path.values, model.low, model.high)) - theta
         referred.append(replace(g, eta=g.eta - np.einsum("ki,ki->k", g.phi, shift)))
     return referred
-
-
-def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in matrix.tolist())

@@ -20,6 +20,7 @@ from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.estimation.window_features import SPEED_TIME, FeatureLayout, Window, WindowFeatures
+from servoscope.learning.inspection.residual import reference_period
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 
@@ -28,7 +29,7 @@ BANDS = 7
 LOWEST = 4.0  # periods of the lowest band in a window
 HIGHEST = 0.45  # of the sample rate: the highest frequency
 MOST_WINDOWS = 2000  # of a recording that are learned from
-MOST_SAMPLES = 1_000_000  # of a recording, in which a period is looked for
+MAX_PERIOD_SEARCH_SAMPLES = 1_000_000  # of a recording, in which a period is looked for
 SHORTEST = 64  # samples of a window
 LONGEST_SPAN = 24  # windows
 EDGES = (1.0 / 32.0, 1.0 / 16.0, 1.0 / 8.0)  # of a period: octaves after a motion began, where friction builds up
@@ -154,30 +155,4 @@ def _period_of(recording: Recording) -> int:
             return int(lengths[0])
     if len(lengths) > 1:
         return 0
-    return _repetition(r[:MOST_SAMPLES])
-
-
-def _repetition(r: FloatArray) -> int:
-    """Return the lag after which a signal repeats: the first at which it has become unlike itself and alike again."""
-    n, x = len(r), r - r.mean()
-    variance = float(x.var())
-    if not variance > 0.0:
-        return 0
-    size = 1 << (2 * n - 1).bit_length()
-    spectrum = np.fft.rfft(x, size)
-    products = np.fft.irfft(spectrum * spectrum.conj(), size)[: n // 2]
-    squares = np.concatenate([[0.0], np.cumsum(x**2)])
-    lags = np.arange(len(products))
-    pairs = n - lags
-    difference = (squares[n - lags] + squares[n] - squares[lags] - 2.0 * products) / pairs
-    unlike = np.flatnonzero(difference > variance)
-    if not len(unlike):
-        return 0
-    alike = np.flatnonzero(difference[unlike[0] :] < REPEATS * variance)
-    if not len(alike):
-        return 0
-    first = unlike[0] + int(alike[0])
-    # the dip is as wide as the motion is smooth: its lowest point is the period
-    after = np.flatnonzero(difference[first:] >= REPEATS * variance)
-    end = first + (int(after[0]) if len(after) else len(difference) - first)
-    return int(first + np.argmin(difference[first:end]))
+    return reference_period(recording.rows(slice(0, MAX_PERIOD_SEARCH_SAMPLES)), 0.5 * REPEATS) or 0

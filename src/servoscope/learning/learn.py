@@ -25,7 +25,7 @@ from servoscope.baseline.plant_fit import (
 from servoscope.baseline.records import BaselineSource, digest
 from servoscope.baseline.sensors import learn_sensors
 from servoscope.baseline.threshold import CalibrationFactors, t2_threshold
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
@@ -350,9 +350,9 @@ def _assemble_baseline(
         hash=digest(loop, [a for rec in recordings for a in (rec.t, rec.r, rec.u, rec.y)]),
         names=pipeline.bank.names,
         theta=tuple(theta),
-        covariance=_rows(covariance),
+        covariance=to_tuples(covariance),
         scale=tuple(tuning.scale),
-        P_d=_rows(tuning.P_d),
+        P_d=to_tuples(tuning.P_d),
         stage_one=pipeline.stage_one,
         R=tuning.R,
         noise_a=tuple(tuning.noise.a),
@@ -362,7 +362,7 @@ def _assemble_baseline(
         noise=noise,
         ratios=ratios,
         ratios_std=ratios_std,
-        ratios_covariance=_rows(ratios_covariance),
+        ratios_covariance=to_tuples(ratios_covariance),
         model_theta=tuple(model_theta),
         dof=fit.dof,
         limit=limit,
@@ -383,14 +383,10 @@ def _assemble_baseline(
         motion=learn_motion(pipeline, recordings),
         axis=axis,
         covariates=covariates,
-        scatter=_rows(own_scatter) if m > 1 else (),
+        scatter=to_tuples(own_scatter) if m > 1 else (),
     )
     progress("predictor")
     predictor = None if covariates is not None else fit_exact_predictor(baseline, recordings)
     if predictor is not None and predictor.misfit > 1.0:
         notes.append(message("learning.no_refit", misfit=predictor.misfit))
     return baseline.model_copy(update={"exact": predictor, "notes": tuple(notes)})
-
-
-def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(float(x) for x in row) for row in matrix)

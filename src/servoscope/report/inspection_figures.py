@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from servoscope.learning.inspection import Inspection
 from servoscope.learning.inspection.inspect import InspectionTraces
+from servoscope.report.diagnosis_figures import plot_signals
 from servoscope.report.format_values import time_axis_unit
 from servoscope.report.plotting import COLOURS, envelope, plot_style, robust_range, visible_spans
 from servoscope.signals import Recording
@@ -40,12 +41,9 @@ def _two_rows(*, share_x: bool) -> tuple[Figure, Axes, Axes]:
 
 @plot_style()
 def _plot_signals(inspection: Inspection, recording: Recording) -> Figure:
-    figure, top, bottom = _two_rows(share_x=True)
+    figure = plot_signals(recording)
+    top, _, bottom = figure.axes
     unit, factor = time_axis_unit(recording.duration_s)
-    t = recording.t / factor
-    for axis, name in ((top, "r"), (top, "y"), (bottom, "u")):
-        line = envelope(t, getattr(recording, name), recording.restart)
-        axis.plot(*line, color=OF[name], linewidth=0.9, label=name)
     limits = inspection.saturation
     for value in (limits.low, limits.high) if limits is not None else ():
         if value is not None:
@@ -55,11 +53,8 @@ def _plot_signals(inspection: Inspection, recording: Recording) -> Figure:
     shown = [defect for defect in recording.defects if defect.kind not in ("clock", "jitter")]
     low = np.array([defect.from_s for defect in shown]) / factor
     high = np.array([max(defect.to_s, defect.from_s + 1e-3) for defect in shown]) / factor
-    for begin, end in visible_spans(t, low, high):
+    for begin, end in visible_spans(recording.t / factor, low, high):
         top.axvspan(begin, end, color=ALARM, alpha=0.25)
-    figure.legend(*top.get_legend_handles_labels(), loc="outside upper left", ncols=2)
-    top.set_ylabel("r, y")
-    bottom.set_ylabel("u")
     bottom.set_xlabel(f"time [{unit}]; red: defects")
     return figure
 

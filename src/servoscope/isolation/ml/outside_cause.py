@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +10,9 @@ import numpy as np
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.isolation.ml.hypothesis import IN_REACH, HypothesisFit, refit_jointly
 from servoscope.isolation.ml.onset import ALIKE, NEGLIGIBLE, OnsetEstimate, onset_posterior
-from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes_at, parameter_cause, parameter_causes
+from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes_at, parameter_cause
 from servoscope.isolation.ml.search import LOOKS, RefitResult
+from servoscope.isolation.ml.start_values import fit_further_parameters
 from servoscope.isolation.ml.timeline import INCONSTANT, bridge_height
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 from servoscope.isolation.posterior import INTERVAL
@@ -71,12 +72,10 @@ def find_outside_onset(refined: RefitResult) -> OnsetEstimate | None:
 
 def _all_causes(refined: RefitResult, causes: CauseWindow, profile: ChangeProfile) -> list[OtherCause]:
     window, best = refined.window, refined.best.fitted
-    others = (
-        list(map(parameter_cause, refined.other_parameters))
-        if profile == best.profile
-        else parameter_causes(window, profile, best, refined.noise_variance)
-    )
-    return [*others, *causes_at(causes, profile.onset + profile.duration // 2)]
+    parameters: Sequence[HypothesisFit] = refined.other_parameters
+    if profile != best.profile:
+        parameters = fit_further_parameters(window, profile, best, refined.noise_variance)
+    return [*map(parameter_cause, parameters), *causes_at(causes, profile.onset + profile.duration // 2)]
 
 
 def _parameter_onset(window: ChangeWindow, fitted: HypothesisFit, latest: int) -> tuple[OnsetEstimate, OtherCause]:

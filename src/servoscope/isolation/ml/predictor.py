@@ -45,41 +45,23 @@ class Predictor(NamedTuple):
         y: FloatArray,
         restart: BoolArray,
         plants: IntArray | None = None,
-        known: HealthyRun | None = None,
     ) -> Array:
         """Return the innovations of a recording in standard deviations under a change of the plant.
 
         Shape (N,), or (V, N) for V variants of the change, the rows of `plants` (V, p): which ones it goes through.
-        `known`: the first plant's run.
         """
         from servoscope.isolation.ml.kernels import innovations
 
-        each = np.arange(len(self.b))[None] if plants is None else plants
-        before = (np.zeros(0), np.zeros((0, 0))) if known is None else (known.e, known.states)
-        e: Array = innovations(*self, each, onset, duration, u, y, restart, *before)
+        rows = np.arange(len(self.b))[None] if plants is None else plants
+        e: Array = innovations(*self, rows, onset, duration, u, y, restart)
         return e[0] if plants is None else e
-
-    def run(self, u: FloatArray, y: FloatArray, restart: BoolArray) -> HealthyRun:
-        """Take the first plant all the way."""
-        from servoscope.isolation.ml.kernels import run_plant
-
-        return HealthyRun(self, *run_plant(*self, u, y, restart))
-
-
-class HealthyRun(NamedTuple):
-    """What a healthy plant predicts all the way: its predictor, innovations (N,), and states (N + 1, n)."""
-
-    predictor: Predictor
-    e: FloatArray
-    states: FloatArray
 
 
 class PlantVariants(NamedTuple):
-    """Variants of a change: predictors in a row, which of them each goes through, (V, p), and the first one's run."""
+    """Variants of a change: predictors in a row, and which of them each goes through, (V, p)."""
 
     predictor: Predictor
     plants: IntArray
-    run: HealthyRun | None  # None where variants differ in their healthy plant
 
 
 @dataclass(frozen=True, eq=False)

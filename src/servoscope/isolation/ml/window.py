@@ -14,7 +14,7 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.kernels import Array
-from servoscope.isolation.ml.predictor import HealthyRun, PlantVariants, Predictor, PredictorFactory
+from servoscope.isolation.ml.predictor import PlantVariants, Predictor, PredictorFactory
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
@@ -224,8 +224,6 @@ class RefitWindow(ChangeWindow):
         d, x = z[:, :m], z[:, m:]
         new = np.append(True, (d[1:] != d[:-1]).any(axis=1))
         own = np.cumsum(new) - 1  # the healthy ones come first
-        run = self._healthy_run(d[0].real) if not own[-1] and not d.imag.any() else None
-        new[0] = run is None
         count = int(new.sum())
         # a column of logarithms for each name, one row per plant
         faulty = (shares[None, :, None] * x[:, None]).reshape(len(z) * len(shares), len(names))
@@ -236,22 +234,7 @@ class RefitWindow(ChangeWindow):
         output_gains = factors.pop(SENSOR_GAIN, np.ones(len(healthy)))
         spaces = self.plant.state_spaces(self.plant.expand_rays(factors), len(healthy))
         after = own[-1] + 1 + np.arange(len(faulty)).reshape(len(z), len(shares))
-        made, plants = self.factory.predictors(spaces, output_gains), np.column_stack([own, after])
-        return PlantVariants(made if run is None else Predictor.concatenate([run.predictor, made]), plants, run)
-
-    @cached_property
-    def _healthy_runs(self) -> dict[bytes, HealthyRun]:
-        return {}
-
-    def _healthy_run(self, d: FloatArray) -> HealthyRun:
-        """Return a healthy plant all the way; the last one is kept, for a search tries many sizes beside it."""
-        key = d.tobytes()
-        if key not in self._healthy_runs:
-            factors = self.plant.expand_rays(dict(zip(self.names, np.exp(d)[:, None], strict=True)))
-            predictor = self.factory.predictors(self.plant.state_spaces(factors, 1), np.ones(1))
-            self._healthy_runs.clear()
-            self._healthy_runs[key] = predictor.run(self.u, self.y, self.restart)
-        return self._healthy_runs[key]
+        return PlantVariants(self.factory.predictors(spaces, output_gains), np.column_stack([own, after]))
 
     def innovations(self, predictor: Predictor, profile: ChangeProfile) -> Array:
         """Return the innovations in standard deviations, shape (N,)."""
@@ -259,8 +242,8 @@ class RefitWindow(ChangeWindow):
 
     def variant_innovations(self, variants: PlantVariants, profile: ChangeProfile) -> Array:
         """Return the innovations of each in standard deviations, shape (V, N)."""
-        predictor, plants, run = variants
-        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart, plants, run)
+        predictor, plants = variants
+        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart, plants)
 
     def disturbance_response(
         self, predictor: Predictor, profile: ChangeProfile, u: FloatArray, y: FloatArray

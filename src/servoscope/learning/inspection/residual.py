@@ -59,10 +59,10 @@ def autocovariance_with_gaps(x: FloatArray, there: BoolArray) -> tuple[FloatArra
     return sums / np.maximum(pairs, 1.0), pairs
 
 
-def reference_period(recording: Recording) -> int | None:
+def reference_period(recording: Recording, tolerance: float = REPEATS) -> int | None:
     """Return the period of r in samples; None if it does not repeat, twice at least.
 
-    The smallest lag at which the structure function E[(r(k+p) - r(k))^2] / (2 var r) comes back to 0.
+    The smallest lag at which the structure function E[(r(k+p) - r(k))^2] / (2 var r) comes back below a tolerance.
     """
     every = np.ones(recording.samples, dtype=bool)
     r, there = to_uniform_grid(recording, recording.r - recording.r.mean(), every)
@@ -80,11 +80,11 @@ def reference_period(recording: Recording) -> int | None:
     left = np.flatnonzero(S > DIFFERS)
     if not left.size:
         return None
-    back = np.flatnonzero(S[left[0] :] < REPEATS)
+    back = np.flatnonzero(S[left[0] :] < tolerance)
     if not back.size:
         return None
     first = int(left[0] + back[0])
-    out = np.flatnonzero(S[first:] >= REPEATS)
+    out = np.flatnonzero(S[first:] >= tolerance)
     last = first + int(out[0]) if out.size else S.size
     return first + int(np.argmin(S[first:last]))
 

@@ -9,6 +9,7 @@ from concurrent.futures import as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".svg")
-FIGURE_COUNT = 17  # figures that are drawn
+DRAWINGS = ("figure-1", "figure-3")  # files of this package: the actuator, and the diagnostic around its loop
+FIGURE_COUNT = 17  # drawings and figures
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 StepCallback = Callable[[str], None]
@@ -87,13 +89,10 @@ def _one_thread_each() -> Iterator[None]:
 def list_figures(found: Reproduction) -> Iterator[tuple[str, Callable[[], Figure]]]:
     """Yield the name of each figure and what draws it: for the paper's method, and for the default on the same data."""
     from servoscope.research.paper import charts, figures
-    from servoscope.research.paper.drawings import figure_1, figure_3
     from servoscope.research.paper.table import table_2_residuals
 
     seed, metrics = found.seeds[0], found.metrics
-    yield "figure-1", figure_1
     yield "figure-2", figures.figure_2
-    yield "figure-3", figure_3
     yield "figure-4", lambda: figures.figure_4(seed)
     for version in figures.METHODS:
         method = figures.METHODS[version][-1]
@@ -117,6 +116,11 @@ def write_reproduction(found: Reproduction, folder: Path, told: StepCallback = l
 
     make_folder(folder)
     written = []
+    for name in DRAWINGS:
+        for suffix in SUFFIXES:
+            written.append(folder / f"{name}{suffix}")
+            atomic_write(written[-1], files(__package__).joinpath(written[-1].name).read_bytes())
+        told(name)
     for name, draw in list_figures(found):
         figure = draw()
         for suffix in SUFFIXES:

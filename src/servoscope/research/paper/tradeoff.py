@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.research.paper import metrics
 from servoscope.research.paper.conditions import FAULT_AT, FREQUENCIES, TRACKING_CASE, OperatingConditions, paper_loop
@@ -84,14 +82,3 @@ def ifrf_rise_time(generator: ResidualGenerator, faulty: ResidualTrace) -> float
     turn = generator.pipeline.bank.E(FREQUENCIES[:1]) @ nominal_theta(loop, fault_plant)
     level = complex(faulty.between(20.0, FAULT_AT).H[:, 0].mean())
     return metrics.rise_time(faulty.t, faulty.H[:, 0], FAULT_AT, level, level * complex(turn[0] / generator.nominal[0]))
-
-
-def best_estimator(
-    medians: dict[str, float], conditions: OperatingConditions, name: str
-) -> tuple[str, dict[str, float]]:
-    """Return which estimator is quietest at equal rise time, and each one's CV relative to the AKF's."""
-    relative = {"akf": 1.0}
-    for other in ESTIMATORS[1:]:
-        relative[other] = 1.0 / cv_ratio(medians, conditions, name, "akf", other)
-    known = {each: value for each, value in relative.items() if np.isfinite(value)}
-    return min(known, key=lambda each: known[each]), relative
