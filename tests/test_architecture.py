@@ -348,6 +348,28 @@ def test_the_structure_is_measured(tmp_path: Path) -> None:
     assert "| 2 (100.0 %) | 2 (100.0 %) |" in house.table(figures, figures)
 
 
+def plant_questions(source: Any) -> Iterator[int]:
+    """Yield the lines that compare the kind of a plant, or ask it for an attribute by name."""
+    for node in ast.walk(source.tree):
+        if isinstance(node, ast.Compare):
+            sides = [ast.unparse(side) for side in (node.left, *node.comparators)]
+            if any(re.search(r"\b(plant|declared)\.kind\b", side) for side in sides):
+                yield node.lineno
+        elif isinstance(node, ast.Call) and re.match(r"(get|has)attr\(([\w.]*[._])?plant,", ast.unparse(node)):
+            yield node.lineno
+
+
+def test_only_plants_ask_what_plant_it_is(tmp_path: Path) -> None:
+    outside = [source for source in SOURCES if source.path.parts[:2] != ("models", "plants")]
+    wrong = [f"{source.path.as_posix()}:{line}" for source in outside for line in plant_questions(source)]
+    assert not wrong, f"a member of `Plant` must say it (models/plants/base.py):{listing(wrong)}"
+    (tmp_path / "a.py").write_text(
+        'if loop.plant.kind == "eha": ...\nx = getattr(self.plant, "a", 0)\ny = (a.kind, plant.kind) != z\n'
+        'text = f"{plant.kind}"\nw = getattr(planted, "a")\n'
+    )
+    assert [line for source in house.read(tmp_path) for line in plant_questions(source)] == [1, 2, 3]
+
+
 def test_nothing_is_left_for_later_and_no_path_is_somebodys_own() -> None:
     paths = [
         *TESTS,

@@ -204,7 +204,7 @@ def fault_directions(
 ) -> dict[str, FloatArray]:
     """Return d theta / d log(parameter) for every parameter of the plant's faults, or others, each of shape (n,)."""
     parameters = plant.parameters if parameters is None else parameters
-    if plant.has_physics and not plant.extras and loop.plant.kind != "polynomial":
+    if plant.has_physics and not plant.extras and not plant.parameters_are_coefficients:
         step = 1e-4
 
         def at(ratio: float, parameter: str) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What to check on the machine: for each fault what its loop file says, or the plant's own words of the catalogue."""
+"""What to check on the machine: for each fault what its loop file says, or its plant."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ def what_to_check(loop: Loop, interval: FaultInterval | None) -> tuple[Message, 
 
 def checks_of_fault(loop: Loop, name: str) -> Iterator[Message]:
     """Yield what to check for one fault; nothing where nobody has said it."""
+    checks = next((fault.checks for fault in loop.plant.faults if fault.name == name), "")
     if name in (loop.checks or {}):
         yield from map(text_message, (loop.checks or {})[name])
+    elif checks:
+        yield message("diagnosis.check", checks=checks)
     elif f"check.{name}" in catalogue():
         yield message(f"check.{name}")

@@ -158,7 +158,7 @@ class AxisSignals:
     def columns(self, plant: AxisPlant) -> FloatArray:
         """Return u and minus what the terms multiply, shape (1 + n, N): times `acceleration_coefficients`, y''."""
         v = np.where(np.abs(self.speed) > plant.sign_speed, self.speed, 0.0)
-        return np.array([self.u, *(-column.value(plant, self.y, v) for column in plant.columns)])
+        return np.array([self.u, *-plant.regressors(self.y, v)])
 
     def moving(self, rest_speed: float, settling: int) -> BoolArray:
         """Return where the axis moves and the filter has forgotten the last rest, reversal and gap, shape (N,).

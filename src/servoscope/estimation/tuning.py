@@ -37,7 +37,7 @@ class TuningFit:
     explained: float  # share of eta's variance that the model explains, 0 to 1
     dof: float  # effective number of independent residuals
     # of the instrument: smallest real part of the eigenvalues of E[phi phi']^-1 E[z phi'], 1 where z is phi. The
-    # recursion diverges where it is negative (THEORY section 5).
+    # recursion diverges where it is negative.
     strength: float
     rms_eta: float  # root mean square of eta
     # white noises of u and y that fit the residual best; None with two stages, where u does not enter

@@ -38,7 +38,7 @@ def learns_instrument(loop: Loop) -> bool:
     """
     monitor = loop.monitor
     suits = monitor.estimator in SUITABLE and monitor.structure == "svf" and monitor.two_stage == "none"
-    linear = loop.plant.kind == "polynomial" and getattr(loop.plant, "friction", "none") == "none"
+    linear = loop.plant.parameters_are_coefficients and loop.plant.affine
     return suits and linear and not can_simulate(loop)
 
 

@@ -143,7 +143,7 @@ def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
     span = max(1, round(SPEED_OVER * loop.sample_rate))
     speeds = []
     for rec in recordings:
-        source = rec.r if getattr(loop.plant, "sign_from", "output") == "reference" else rec.y
+        source = rec.r if loop.plant.velocity_sign.of_reference else rec.y
         stretch = np.cumsum(rec.restart)
         together = stretch[span:] == stretch[:-span]
         moved = source[span:] if loop.plant.derivative else (source[span:] - source[:-span]) * loop.sample_rate / span

@@ -89,7 +89,7 @@ class Population:
             )
         first_name, first = next(iter(baselines.items()))
         for name, other in baselines.items():
-            if (other.names, other.loop.plant.kind) != (first.names, first.loop.plant.kind):
+            if (other.names, type(other.loop.plant)) != (first.names, type(first.loop.plant)):
                 raise BaselineError(
                     f"{name}: its coefficients ({', '.join(other.names)}; plant {other.loop.plant.kind}) are not those "
                     f"of {first_name} ({', '.join(first.names)}; plant {first.loop.plant.kind}): no like machine"

@@ -186,10 +186,8 @@ class Loop(ShortRepr, Settings):
             slow = {"frequencies": frequencies, "evaluation_rate": evaluation}
             kept = {key: value for key, value in slow.items() if key not in monitor.model_fields_set}
             updates["monitor"] = monitor.model_copy(update=kept)
-        if isinstance(plant, plants.Plant) and "sign_cutoff" not in plant.model_fields_set:
-            sign_cutoff = getattr(plant, "sign_cutoff", None)
-            if sign_cutoff is not None and sign_cutoff >= rate / 2:
-                updates["plant"] = plant.model_copy(update={"sign_cutoff": rate / 4})
+        if isinstance(plant, plants.Plant):
+            updates["plant"] = plant.with_sample_rate(rate)
         return {**data, **updates}
 
     @model_validator(mode="after")
@@ -221,7 +219,7 @@ class Loop(ShortRepr, Settings):
         nyquist = self.sample_rate / 2
         checked = [("[monitor] cutoff", self.monitor.cutoff)]
         checked += [("[monitor] frequencies", frequency) for frequency in self.monitor.frequencies]
-        checked += [("[plant] sign_cutoff", getattr(self.plant, "sign_cutoff", None))]
+        checked += [("[plant] sign_cutoff", self.plant.velocity_sign.cutoff)]
         for key, frequency in checked:
             if frequency is not None and frequency >= nyquist:
                 raise ValueError(
@@ -269,7 +267,7 @@ class Loop(ShortRepr, Settings):
     @property
     def needs_reference(self) -> bool:
         """Whether r has a part in the loop; elsewhere u may stand for it in recordings that have none."""
-        of_sign = getattr(self.plant, "sign_from", "output") == "reference"
+        of_sign = self.plant.velocity_sign.of_reference
         return self.controller is not None or self.monitor.two_stage != "none" or of_sign
 
     def _shown_facts(self) -> dict[str, object]:

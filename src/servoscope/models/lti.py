@@ -264,7 +264,7 @@ def sample_system(
 def state_variable_filter(cutoff: float, order: int) -> StateSpace:
     """Build the continuous state-variable filter: outputs ``s^i F(s) w`` for i < order, F = (1 + s/lambda)^-order.
 
-    Source: Young, Garnier and Gilson, direct continuous-time identification; THEORY of this project, section 3.
+    Source: Young, Garnier and Gilson, direct continuous-time identification; how-it-works, "Filter bank".
 
     `cutoff`: lambda / (2 pi) [Hz]; `order`: number of outputs, one more than the highest derivative; returns tuple
     of numpy.ndarray: a, B, C; the state is kept in powers of s/lambda so that all of it is of one size.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from servoscope.core.jit import Bool, dot, fma, maximum, minimum, sine, where
+from servoscope.core.jit import Bool, dot, fma, maximum, minimum, where
 from servoscope.estimation.kernel import sparse_lti
 from servoscope.estimation.kernel.cusum import (
     CLIP,
@@ -22,6 +22,7 @@ from servoscope.estimation.kernel.cusum import (
 )
 from servoscope.estimation.kernel.sparse_lti import SparsityPattern
 from servoscope.estimation.moments import propagate_covariance, propagate_initial_share
+from servoscope.models.plants.columns import SHAPED_COLUMNS, Column, trace_column
 
 # counters at the head of a state row
 ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, STILL, WHITENED, CROSSED = range(8)
@@ -46,7 +47,7 @@ class KernelSizes(NamedTuple):
     states: int
     speed: int
     gated: bool
-    codes: tuple[int, ...]
+    nonlinear: tuple[Column, ...]
     lags: int
     shadow: int
     memory: int
@@ -314,31 +315,12 @@ class SampleSteps:
 
     def _inputs(self, c: Any, r: Any, u: Any, y: Any, speed: Any) -> list[Any]:
         """Return the bank's inputs: r, u within its limits, y, and the columns of friction and offset."""
-        w, shaped = [r, minimum(maximum(u, c[self.at.low]), c[self.at.high]), y], 0
-        for kind in self.size.codes:
-            if kind == 0:
-                w.append(where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0)))
-            elif kind < 3:
-                w.append(maximum(speed, 0.0) if kind == 1 else minimum(speed, 0.0))
-            elif kind == 3:
-                w.append(1.0)
-            else:
-                w.append(self._shaped_input(c, self.at.shapes + 2 * shaped, kind, y, speed))
-                shaped += 1
+        w, k = [r, minimum(maximum(u, c[self.at.low]), c[self.at.high]), y], self.at.shapes
+        for column in self.size.nonlinear:
+            shape = (c[k], c[k + 1]) if column in SHAPED_COLUMNS else ()
+            w.append(trace_column(column, y, speed, lambda: c[self.at.sign_speed], *shape))
+            k += len(shape)
         return w
-
-    def _shaped_input(self, c: Any, k: int, kind: int, y: Any, speed: Any) -> Any:
-        """Return Stribeck friction at a speed scaled by c[k], or the sine of y scaled by c[k] and moved by c[k + 1].
-
-        Friction that grows with a load has the magnitude of that sine, and the sign of the speed.
-        """
-        if kind in (5, 6, 7):
-            return sine(fma(c[k], y, c[k + 1]))
-        sign = where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0))
-        if kind == 4:
-            slow = c[k] * speed
-            return sign / fma(slow, slow, 1.0)
-        return sign * abs(sine(fma(c[k], y, c[k + 1])))
 
     def _mean_square(self, c: Any, s: Any, residual: Any) -> Any:
         return fma(fma(residual, residual, -s[self.to.power]), c[self.at.share], s[self.to.power])

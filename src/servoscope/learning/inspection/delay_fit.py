@@ -25,7 +25,7 @@ from servoscope.learning.inspection.model_order import Regressors, fit_regressio
 from servoscope.models.discretise import split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.lti import settling_samples
-from servoscope.models.plants import Plant
+from servoscope.models.plants import Column, Plant
 from servoscope.signals import Recording
 
 PRIOR = 0.3  # standard deviation of the logarithm of a parameter that the loop file gives
@@ -101,7 +101,7 @@ def fit_delay(loop: Loop, recording: Recording, regressors: Regressors | None = 
 def _initial_plant(loop: Loop, regressors: Regressors | None) -> tuple[Plant, float] | None:
     """Return the plant that the search begins with, and the standard deviation of its logarithms."""
     plant = loop.plant
-    if not plant.linear or set(plant.extras) - {"one"}:
+    if not plant.affine:
         return None
     if plant.has_physics:
         return plant, PRIOR
@@ -153,7 +153,7 @@ class DelaySearch:
             return None
         names = (*(p for p in plant.parameters if p != "input_gain"), *plant.causes)
         names = tuple(name for name in names if name != "offset")
-        offset = float(u.std()) if "one" in plant.extras else 0.0
+        offset = float(u.std()) if Column.CONSTANT in plant.extras else 0.0
         base = loop.model_copy(update={"plant": plant, "delay": 0.0})
         noise = WhiteNoise(u_std=USUAL * float(u.std()), y_std=y_std)
         factory = PredictorFactory.from_input(base, noise, recording.u)
@@ -227,8 +227,8 @@ class DelaySearch:
 
     @property
     def _nominal_offset(self) -> float:
-        coefficients = getattr(self.plant, "coefficients", None) or {}
-        return float(coefficients.get("offset", 0.0)) / self.plant.input_gain
+        nominal = dict(zip(self.plant.names, self.plant.theta(), strict=True)) if self.plant.has_physics else {}
+        return float(nominal.get("offset", 0.0)) / self.plant.input_gain
 
     def _point(self, z: FloatArray) -> _Point:
         if not np.isfinite(z).all():  # LAPACK would say so on the terminal
