@@ -169,7 +169,7 @@ def turned(motors: Path) -> Path:
     """The folder with a baseline of a wheel, and a recording whose bearing runs dry."""
     loop = Loop.from_dict({**WHEEL, "controller": CONTROL})
     nominal_baseline(loop).save(motors / "wheel.json")
-    r = reference("multisine", 60.0, loop.sample_rate)
+    r = 10.0 * reference("multisine", 60.0, loop.sample_rate)
     fault = FaultEvent.parse("friction=1.5@30")
     recording, _ = simulate(loop, r, faults=[fault], seed=1)
     writers.write_recording(motors / "dry.csv", recording)
@@ -207,8 +207,8 @@ def test_the_pages_know_the_words_of_a_plant_of_another_package(turned: Path, mo
         '[assets.wheel]\nbaseline = "wheel.json"\nsource = "line"\nfiles = ["dry.csv"]\n',
         encoding="utf-8",
     )
+    monkeypatch.setenv("PYTHONPATH", str(turned))  # of the processes that diagnose and serve
     service_of(turned / "hall.toml").run()
-    monkeypatch.setenv("PYTHONPATH", str(turned))
     with Served(turned, "serve", "hall.toml") as served, served.client(headers={"Accept-Language": "de"}) as client:
         asset = client.get("/assets/wheel").raise_for_status().json()
         words = client.get(f"{served.url}/static/language.js").raise_for_status().text

@@ -22,7 +22,7 @@ from servoscope.estimation.kernel.cusum import (
 )
 from servoscope.estimation.kernel.sparse_lti import SparsityPattern
 from servoscope.estimation.moments import propagate_covariance, propagate_initial_share
-from servoscope.models.plants.columns import SHAPED_COLUMNS, Column, trace_column
+from servoscope.models.plants.columns import COLUMN_FORMS, Column
 
 # counters at the head of a state row
 ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, STILL, WHITENED, CROSSED = range(8)
@@ -317,8 +317,9 @@ class SampleSteps:
         """Return the bank's inputs: r, u within its limits, y, and the columns of friction and offset."""
         w, k = [r, minimum(maximum(u, c[self.at.low]), c[self.at.high]), y], self.at.shapes
         for column in self.size.nonlinear:
-            shape = (c[k], c[k + 1]) if column in SHAPED_COLUMNS else ()
-            w.append(trace_column(column, y, speed, lambda: c[self.at.sign_speed], *shape))
+            form = COLUMN_FORMS[column]
+            shape = (c[k], c[k + 1]) if form.shaped else ()
+            w.append(form.trace(y, speed, lambda: c[self.at.sign_speed], *shape))
             k += len(shape)
         return w
 

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from servoscope.core.arrays import FloatArray
 from servoscope.models.plants.base import SIGN_CUTOFF, CoefficientPlant, Fault, StateSpace, read_translations
-from servoscope.models.plants.columns import Column, column_values
+from servoscope.models.plants.columns import COLUMN_FORMS, Column
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 LATER = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
@@ -215,11 +215,13 @@ class AxisPlant(CoefficientPlant):
 
     def regressors(self, y: FloatArray, v: FloatArray) -> FloatArray:
         """Return what the coefficients of `columns` multiply, shape (columns, N), of y and y', shapes (N,)."""
-        shapes = self.column_shapes
+        columns, shapes = [term.column for term in self.columns], self.column_shapes
         return np.array(
             [
-                (y, v)[column] if isinstance(column, int) else column_values(column, y, v, *shapes.get(column, (1, 0)))
-                for column in (term.column for term in self.columns)
+                COLUMN_FORMS[column].values(y, v, *shapes.get(column, ()))
+                if isinstance(column, Column)
+                else (y, v)[column]
+                for column in columns
             ]
         )
 

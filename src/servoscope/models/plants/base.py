@@ -128,7 +128,7 @@ class Plant(BaseModel, abc.ABC):
 
     @property
     def column_shapes(self) -> Mapping[Column, tuple[float, float]]:
-        """By column of `SHAPED_COLUMNS`: factor on y' or on y, and phase."""
+        """By column that is shaped (`COLUMN_FORMS`): factor on y' or on y, and phase."""
         return {}
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from servoscope.core.jit import fma, maximum, minimum, sine, where
 
 
 class Column(StrEnum):
-    """A function of y and y'; those of `SHAPED_COLUMNS` have a factor and a phase (`Plant.column_shapes`)."""
+    """A function of y and y'; `COLUMN_FORMS` has its arithmetic."""
 
     SIGN = "sign_v"  # sign(y')
     FORWARD = "forward_v"  # max(y', 0)
@@ -26,50 +26,40 @@ class Column(StrEnum):
     LOAD = "load_v"  # |sin(factor y + phase)| sign(y')
 
 
-SHAPED_COLUMNS = frozenset({Column.STRIBECK, Column.SINE, Column.COGGING_SIN, Column.COGGING_COS, Column.LOAD})
+class ColumnForm(NamedTuple):
+    """The arithmetic of a column, once for each of those who compute it.
 
-
-def trace_column(
-    column: Column, y: Any, speed: Any, dead_speed: Callable[[], Any], factor: Any = 1.0, phase: Any = 0.0
-) -> Any:
-    """Return a column of one sample, of numbers or of symbols (see `core.jit`).
-
-    `dead_speed` is the speed up to which the sign of y' is 0: a function, so that no code reads it in vain.
+    `trace` takes y, y' and a function that returns the speed up to which the sign of y' is 0, of one sample: numbers,
+    or symbols that become code (see `core.jit`). `values` takes y and y' of N samples; y' is 0 where its sign is not
+    trusted. Both take the factor and the phase of `Plant.column_shapes` too where the column is `shaped`.
     """
-    match column:
-        case Column.SIGN:
-            return _sign(speed, dead_speed())
-        case Column.FORWARD:
-            return maximum(speed, 0.0)
-        case Column.BACKWARD:
-            return minimum(speed, 0.0)
-        case Column.CONSTANT:
-            return 1.0
-        case Column.STRIBECK:
-            slow = factor * speed
-            return _sign(speed, dead_speed()) / fma(slow, slow, 1.0)
-        case Column.LOAD:
-            return _sign(speed, dead_speed()) * abs(sine(fma(factor, y, phase)))
-    return sine(fma(factor, y, phase))
+
+    trace: Callable[..., Any]
+    values: Callable[..., FloatArray]
+    shaped: bool = False
 
 
-def _sign(speed: Any, dead_speed: Any) -> Any:
-    return where(abs(speed) <= dead_speed, 0.0, where(speed > 0.0, 1.0, -1.0))
+def _sign(speed: Any, dead_speed: Callable[[], Any]) -> Any:
+    return where(abs(speed) <= dead_speed(), 0.0, where(speed > 0.0, 1.0, -1.0))
 
 
-def column_values(column: Column, y: FloatArray, v: FloatArray, factor: float, phase: float) -> FloatArray:
-    """Return a column of N samples of y and y', shape (N,); `v` is 0 where its sign is not trusted."""
-    match column:
-        case Column.SIGN:
-            return np.sign(v)
-        case Column.FORWARD:
-            return np.maximum(v, 0.0)
-        case Column.BACKWARD:
-            return np.minimum(v, 0.0)
-        case Column.CONSTANT:
-            return np.ones_like(y)
-        case Column.STRIBECK:
-            return np.asarray(np.sign(v) / (1.0 + (factor * v) ** 2))
-        case Column.LOAD:
-            return np.asarray(np.abs(np.sin(factor * y + phase)) * np.sign(v))
-    return np.sin(factor * y + phase)
+_WAVE = ColumnForm(lambda y, v, dead, a, b: sine(fma(a, y, b)), lambda y, v, a, b: np.sin(a * y + b), True)
+COLUMN_FORMS = {
+    Column.SIGN: ColumnForm(lambda y, v, dead: _sign(v, dead), lambda y, v: np.sign(v)),
+    Column.FORWARD: ColumnForm(lambda y, v, dead: maximum(v, 0.0), lambda y, v: np.maximum(v, 0.0)),
+    Column.BACKWARD: ColumnForm(lambda y, v, dead: minimum(v, 0.0), lambda y, v: np.minimum(v, 0.0)),
+    Column.CONSTANT: ColumnForm(lambda y, v, dead: 1.0, lambda y, v: np.ones_like(y)),
+    Column.STRIBECK: ColumnForm(
+        lambda y, v, dead, a, b: _sign(v, dead) / fma(a * v, a * v, 1.0),
+        lambda y, v, a, b: np.sign(v) / (1.0 + (a * v) ** 2),
+        True,
+    ),
+    Column.SINE: _WAVE,
+    Column.COGGING_SIN: _WAVE,
+    Column.COGGING_COS: _WAVE,
+    Column.LOAD: ColumnForm(
+        lambda y, v, dead, a, b: _sign(v, dead) * abs(sine(fma(a, y, b))),
+        lambda y, v, a, b: np.abs(np.sin(a * y + b)) * np.sign(v),
+        True,
+    ),
+}
