@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from tables import Table, show
 
 from servoscope import fleet
-from servoscope.detection.baseline import Baseline
+from servoscope.baseline.baseline import Baseline
 from servoscope.fleet import Lake, Plan
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop

@@ -22,9 +22,9 @@ import servoscope as ss
 from servoscope.core.arrays import IntArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.research.bench.timing import time_interleaved
+from servoscope.service.assets.examination import examine_blocks, undetermined
+from servoscope.service.assets.examination_schedule import ExaminationState, examination_phase, update_examination
 from servoscope.service.config import DiagnosisSettings, shard_number
-from servoscope.service.examination import examine_blocks, undetermined
-from servoscope.service.examination_schedule import ExaminationState, examination_phase, update_examination
 from servoscope.service.sources.block import Block
 from servoscope.simulation import FaultEvent, reference, simulate
 from servoscope.simulation.nonlinear_eha import Rig, simulate_rig

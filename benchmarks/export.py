@@ -23,8 +23,8 @@ import numpy.typing as npt
 from tables import Table, parser, show
 
 from servoscope import learn
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import apply_alarm_delays, consecutive_exceedances
+from servoscope.baseline.baseline import Baseline
+from servoscope.detection.statistic import apply_alarm_delays, consecutive_exceedances
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.export import NAME, CMonitor, export_c, unpack_image
 from servoscope.export.golden import frozen_signals

@@ -20,7 +20,8 @@ from tables import Table, parser, show
 
 import servoscope as ss
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.chi2_test import apply_alarm_delays
+from servoscope.detection.baseline_run import cusum_constants
+from servoscope.detection.statistic import apply_alarm_delays
 from servoscope.models.loop import MonitorSettings
 from servoscope.research.bench.timing import time_interleaved
 from servoscope.simulation import FaultEvent, reference, simulate
@@ -112,7 +113,7 @@ def false_alarms(hours: int) -> Table:
 def raised(baseline: ss.Baseline, recording: ss.Recording) -> int:
     """Return how many alarms the sequential test raises."""
     pipeline = baseline.pipeline()
-    estimates = pipeline.estimate(baseline.tuning, recording, baseline.cusum_constants(pipeline))
+    estimates = pipeline.estimate(baseline.tuning, recording, cusum_constants(baseline, pipeline))
     alarm = apply_alarm_delays(estimates.level >= 1.0, *pipeline.delays)
     return int(np.sum(alarm[1:] & ~alarm[:-1]))
 

@@ -12,9 +12,9 @@ from accuracy.draws import PARAMETERS, SECONDS, TABLE_2, between
 from accuracy.rig import FAULT_AT, SEEDS_PER_UNIT, loop
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import baseline_rows, told
+from servoscope.baseline.expectation import Expectation, reference_path
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
-from servoscope.detection.expectation import Expectation, reference_path
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.noise_model import largest_autocorrelation
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow

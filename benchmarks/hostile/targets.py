@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 from hostile.damage import refitted
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import MessageError
-from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.learning.learn import nominal_baseline
 from servoscope.models.loop import Columns, Loop
 from servoscope.service.alarms import AlarmSettings
-from servoscope.service.asset import Asset, AssetPolicy
-from servoscope.service.checkpoint import pack_state, unpack_state
+from servoscope.service.assets.asset import Asset, AssetPolicy
+from servoscope.service.assets.checkpoint import pack_state, unpack_state
 from servoscope.service.config import DiagnosisSettings, ServiceFile
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings

@@ -25,7 +25,7 @@ from tables import Table, parser, show
 
 import servoscope as ss
 from public.pitch_turbine import DYNAMICS, ONSET_S, RAMP_S, RATE, SENSOR_KINDS, SENSORS, measure, ray
-from servoscope.detection.sensors import find_sensor_deviation
+from servoscope.baseline.sensors import find_sensor_deviation
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.diagnosis.sensor_check import wrong_sensor

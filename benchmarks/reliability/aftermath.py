@@ -11,7 +11,7 @@ import sqlalchemy as sa
 from reliability.checks import NUMBERED, numbers_of, opened
 from reliability.fleet import Fleet
 from reliability.plc import tape
-from servoscope.service.checkpoint import unpack_state
+from servoscope.service.assets.checkpoint import unpack_state
 from servoscope.service.store import Store
 from servoscope.service.store.tables import audit
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from servoscope.detection.baseline import Baseline
+from servoscope.baseline.baseline import Baseline
 from servoscope.learning.learn import nominal_baseline
 from servoscope.models.loop import Loop
 from servoscope.service.sources.replay import ReplayStream

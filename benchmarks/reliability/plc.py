@@ -2,8 +2,9 @@
 
     python benchmarks/reliability/plc.py SETTINGS
 
-One is asyncua's (this file), one node-opcua's (`tests/opcua_server/blocks.js`), both with the same settings, a JSON
-file. Which block is written depends on the clock alone, so that those of the time while it is dead are never written.
+One is asyncua's (this file), one node-opcua's (`tests/support/opcua_server/blocks.js`), both with the same settings,
+a JSON file. Which block is written depends on the clock alone, so that those of the time while it is dead are never
+written.
 What was written is noted in the file `written` of the settings, line by line: asset and number.
 """
 
@@ -32,7 +33,7 @@ __all__ = ["STACKS", "Plc", "tape"]
 
 REMEMBERED = 60  # blocks of each asset in the server's history, which dies with it
 STACKS = {"asyncua": 2, "node": 1}  # and the namespace of its nodes
-SCRIPT = BENCHMARKS.parent / "tests" / "opcua_server" / "blocks.js"
+SCRIPT = BENCHMARKS.parent / "tests" / "support" / "opcua_server" / "blocks.js"
 
 
 def tape(fleet: Fleet) -> ReplayStream:

@@ -39,8 +39,8 @@ __all__ = [
 aliases.install()
 
 if TYPE_CHECKING:
+    from servoscope.baseline.baseline import Baseline
     from servoscope.design import design_study
-    from servoscope.detection.baseline import Baseline
     from servoscope.detection.result import Diagnosis
     from servoscope.detection.trace import Trace
     from servoscope.diagnosis.diagnose import diagnose
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from servoscope.simulation import simulate
 else:  # hidden from type checkers, which would otherwise accept any name
     _HOMES = {
-        "Baseline": "detection.baseline",
+        "Baseline": "baseline.baseline",
         "Diagnosis": "detection.result",
         "Loop": "models.loop",
         "Monitor": "diagnosis.monitor",

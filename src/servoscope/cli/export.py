@@ -38,8 +38,8 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write the monitor of a baseline for a drive or a simulator: the same results as on the server."""
+    from servoscope.baseline.baseline import Baseline
     from servoscope.cli.render import results
-    from servoscope.detection.baseline import Baseline
     from servoscope.export import UNSEEN_MOTION, export_c, export_fmu, save_st
 
     if c is None and fmu is None and st is None:

@@ -129,9 +129,9 @@ def learn(
     alike = arguments.expand_baselines(population or [])
     check_output(output, "-o", (), [loop, *files, *alike, *filter(None, [compare])])
 
+    from servoscope.baseline.baseline import Baseline
     from servoscope.cli.progress import show_steps
     from servoscope.cli.render import results
-    from servoscope.detection.baseline import Baseline
     from servoscope.diagnosis import operating_points
     from servoscope.learning.learn import nominal_baseline
     from servoscope.models.loop import Loop
@@ -203,9 +203,9 @@ def diagnose(
     check_output(report, "--report", REPORTS, inputs, folder=True)
     check_output(trace, "--trace", TRACES, inputs, folder=True)
 
+    from servoscope.baseline.baseline import Baseline
     from servoscope.cli.progress import show_steps
     from servoscope.cli.render import diagnosis, results
-    from servoscope.detection.baseline import Baseline
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
     from servoscope.diagnosis.diagnose import diagnose_with_trace
     from servoscope.diagnosis.verify import provenance
@@ -266,9 +266,9 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Repeat a diagnosis from its file and say whether the verdict is the same; if not, exit with 1."""
+    from servoscope.baseline.baseline import Baseline
     from servoscope.cli.render import results
     from servoscope.core.errors import RecordingError
-    from servoscope.detection.baseline import Baseline
     from servoscope.diagnosis import verify as verification
     from servoscope.report import plain_values
     from servoscope.report.page import say

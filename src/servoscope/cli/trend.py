@@ -101,8 +101,8 @@ def _find_limit(text: str, path: Path | None, series: SizeSeries, source: str, a
         except ValueError:
             raise typer.BadParameter(f"--limit {text}: give a number, tracking or stability") from None
 
+    from servoscope.baseline.baseline import Baseline
     from servoscope.design.operating_limits import operating_limits
-    from servoscope.detection.baseline import Baseline
     from servoscope.models.loop import Loop
 
     if path is not None:

@@ -7,15 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoscope.baseline.expectation import Expectation, ReferencePath, residual_noise_model
+from servoscope.baseline.plant_fit import fault_directions
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.core.jit import kernel
 from servoscope.design.fisher_information import fisher_matrix
 from servoscope.design.scenario import Scenario
-from servoscope.detection.chi2_test import POWER, apply_alarm_delays, whiten
+from servoscope.detection.baseline_run import cusum_constants
 from servoscope.detection.cusum_design import STEP
-from servoscope.detection.expectation import Expectation, ReferencePath, residual_noise_model
-from servoscope.detection.plant_fit import fault_directions
+from servoscope.detection.statistic import POWER, apply_alarm_delays, whiten
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.kernel.cusum import CLIP, LAGS, lagged_columns
 from servoscope.estimation.pipeline import Regression
@@ -164,7 +165,7 @@ class AlarmSimulator:
 
     def _prepare_cusums(self, recordings: Sequence[Recording], errors: FloatArray) -> None:
         """Prepare the CUSUMs: what they listen for, their limits, and the residual of a healthy loop."""
-        watch = self.baseline.cusum_constants(self.pipeline, self.expectation)
+        watch = cusum_constants(self.baseline, self.pipeline, self.expectation)
         self.limits = watch.limits if watch is not None else np.zeros(0)
         if watch is None or self.baseline.loudest is None:
             return

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoscope.baseline.plant_fit import fault_directions
 from servoscope.core.arrays import FloatArray
 from servoscope.design.scenario import Scenario
-from servoscope.detection.plant_fit import fault_directions
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.frequency_response import frequency_response
 

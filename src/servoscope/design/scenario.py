@@ -13,9 +13,9 @@ from typing import Self
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError, SimulationError
-from servoscope.detection.baseline import Baseline
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.least_squares import orthonormal_basis
 from servoscope.isolation.ml.predictor import Predictor

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.core.messages import Message, message, text_message
@@ -37,8 +38,7 @@ from servoscope.design.result import (
     Spans,
 )
 from servoscope.design.scenario import Scenario, require_exact_predictor
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import POWER
+from servoscope.detection.statistic import POWER
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.learning.learn import SHORTEST, learn_baseline
 from servoscope.models.loop import Loop

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.covariates import CovariateAverage, CovariateModel
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import message
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import t2_statistic
-from servoscope.detection.covariates import CovariateAverage, CovariateModel
+from servoscope.detection.statistic import t2_statistic
 from servoscope.detection.trace import Trace
 from servoscope.estimation.frequency_response import frequency_response
 

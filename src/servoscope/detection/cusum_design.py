@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from servoscope.baseline.expectation import Expectation, residual_noise_model
+from servoscope.baseline.hypothesis import CusumHypothesis
+from servoscope.baseline.threshold import SECONDS_PER_YEAR
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError, SimulationError
-from servoscope.detection.chi2_test import SECONDS_PER_YEAR
-from servoscope.detection.expectation import Expectation, residual_noise_model
 from servoscope.estimation.filter_bank import closed_loop_system, nominal_theta
 from servoscope.estimation.kernel.cusum import (
     LAGS,
@@ -47,31 +48,6 @@ STEP = 1e-3  # of the logarithm of a parameter, for derivatives
 FEWEST = 500  # updates with less of which a reference says nothing
 LONGEST = 60.0  # s of a healthy recording by which the test is designed
 ROUNDING = 1e-6  # of a level, by which limits that stand in its weights may change it
-HARDEST = 1.3  # a limit raised by more than this for the baseline's own uncertainty is not worth having
-
-
-@dataclass(frozen=True)
-class CusumHypothesis:
-    """One expected change, and what its CUSUM would do to a healthy loop."""
-
-    parameter: str  # parameter, ratio: what changes, and to how many times its healthy value
-    ratio: float
-    # weights of the shadow's columns (see `servoscope.estimation.kernel.cusum.columns`) that it looks like
-    change: tuple[float, ...]
-    rate: float  # false alarms per year at a limit of zero, to be divided by exp(limit)
-    drift: float  # variance of the drift that an error of the baseline causes, in units of the drift under the change
-
-    def limit(self, false_alarms_per_year: float) -> float:
-        """Return where the CUSUM alarms; infinity where the baseline is too uncertain for so small a change.
-
-        The limit solves rate exp(-h + 2 h^2 drift) = budget: averaged over the baseline's error, which is Gaussian,
-        false alarms grow by the second term.
-        """
-        level = float(np.log(max(self.rate / false_alarms_per_year, np.e)))
-        if 8.0 * self.drift * level >= 1.0:
-            return np.inf
-        h = 2.0 * level / (1.0 + float(np.sqrt(1.0 - 8.0 * self.drift * level)))
-        return h if h <= HARDEST * level else np.inf
 
 
 def sure_level(members: Sequence[CusumHypothesis], false_alarms_per_year: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.chi2_test import t2_statistic
+from servoscope.detection.statistic import t2_statistic
 
 BY_CHANCE = 1e-3  # probability with which recordings of one plant may be called different
 SCATTER_BY_CHANCE = 0.01  # probability of such scatter by noise alone, below which few recordings are believed

@@ -6,9 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.detection.chi2_test import t2_statistic
-from servoscope.detection.motion import (
+from servoscope.baseline.motion import (
     MOMENTS,
     SIGNALS,
     WINDOWS,
@@ -19,6 +17,8 @@ from servoscope.detection.motion import (
     motion_excess,
     motion_pipelines,
 )
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.detection.statistic import t2_statistic
 from servoscope.estimation.pipeline import Pipeline, RegressionRunner, Tuning
 
 MEMORIES, _ = WINDOWS[0]  # of the window that ends at an evaluation: a stream knows no later samples

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, computed_field, model_validator
 
+from servoscope.baseline.learned_fault import SEVERITY
 from servoscope.core.messages import Message, MessageField, MessageText, message, read_messages, render, text_message
 from servoscope.core.short_repr import ShortRepr
 from servoscope.signals import Defect
@@ -14,7 +15,6 @@ from servoscope.signals import Defect
 Verdict = Literal["healthy", "fault", "undetermined"]
 UNKNOWN = "unknown"
 VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
-SEVERITY = "severity"  # the parameter of a fault that was learned from labelled recordings
 
 
 class _ResultModel(BaseModel):

@@ -8,17 +8,18 @@ The factor is counted where alarms are frequent, and holds where they are rare.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from servoscope.baseline.expectation import Expectation, ReferencePath
+from servoscope.baseline.hypothesis import CusumHypothesis
+from servoscope.baseline.threshold import SECONDS_PER_YEAR, SEQUENTIAL_SHARE, CalibrationFactors, threshold
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.chi2_test import SECONDS_PER_YEAR, apply_alarm_delays, t2_statistic, threshold
-from servoscope.detection.cusum_design import CusumHypothesis, build_cusum_constants, choose_cusum_hypotheses
-from servoscope.detection.expectation import Expectation, ReferencePath
+from servoscope.detection.cusum_design import build_cusum_constants, choose_cusum_hypotheses
+from servoscope.detection.statistic import apply_alarm_delays, t2_statistic
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 from servoscope.simulation import simulate
@@ -33,30 +34,6 @@ REHEARSALS = (
     4  # where the sequential test steps once per evaluation: one alone leaves its limits off by a third in rate
 )
 UNLIKELY = 1e-3  # chance of an alarm during the healthy recordings from which noise is not believed to raise it
-FEATURES = 0.1  # share of the budget of false alarms that is the features', where there are any
-SEQUENTIAL = 0.5  # share of the budget of false alarms that is the sequential test's
-
-
-@dataclass(frozen=True)
-class CalibrationFactors:
-    """Alarms that were counted, divided by those that theory expects: of T^2 and of the CUSUMs."""
-
-    statistic: float = 1.0
-    cusum: float = 1.0
-
-    def sequential_budget(self, loop: Loop) -> float:
-        """Return how many false alarms per year of a loop theory may expect of the CUSUMs."""
-        return SEQUENTIAL * loop.monitor.false_alarms_per_year / self.cusum
-
-
-def t2_threshold(
-    loop: Loop, n: int, dof: float, calibration: CalibrationFactors, sequential: bool, features: bool = False
-) -> float:
-    """Return the threshold of T^2 for its share of the loop's budget: what sequential test and features leave of it."""
-    monitor = loop.monitor
-    share = 1.0 - (SEQUENTIAL if sequential else 0.0) - (FEATURES if features else 0.0)
-    budget = monitor.false_alarms_per_year * share
-    return threshold(n, monitor.evaluation_rate, monitor.memory, budget, dof, calibration.statistic)
 
 
 def calibrate_thresholds(
@@ -114,7 +91,7 @@ def design_sequential_test(
     pipeline = first.pipeline
     # the recordings are short: they speak where an alarm during them would have a chance of one in a thousand
     years = sum(rec.duration_s for rec in recordings) / SECONDS_PER_YEAR
-    budget = max(SEQUENTIAL * pipeline.loop.monitor.false_alarms_per_year, UNLIKELY / years) / calibration.cusum
+    budget = max(SEQUENTIAL_SHARE * pipeline.loop.monitor.false_alarms_per_year, UNLIKELY / years) / calibration.cusum
     test = build_cusum_constants(pipeline, plant, largest_noise, tuning.scale, hypotheses, budget)
     highest = max(float(pipeline.estimate(tuning, rec, test).level.max(initial=0.0)) for rec in recordings)
     if test is None or highest >= 1.0:

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from servoscope.baseline.covariates import CovariateModel, CovariatePath, WarmUp
 from servoscope.core.arrays import FloatArray, IntArray
-from servoscope.detection.chi2_test import required_noncentrality
-from servoscope.detection.covariates import CovariateModel, CovariatePath, WarmUp
+from servoscope.detection.statistic import required_noncentrality
 from servoscope.estimation.pipeline import Pipeline, RegressionRunner
 from servoscope.signals import Recording
 

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.covariates import CovariateModel, WarmUp
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import required_noncentrality
 from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
-from servoscope.detection.covariates import CovariateModel, WarmUp
+from servoscope.detection.statistic import required_noncentrality
 from servoscope.detection.warm_up import BLOCK, BY_CHANCE, JUMP, NAME, PRIOR_STD, STD, STEP, UNSEEN
 from servoscope.estimation.pipeline import RegressionRunner
 

@@ -6,15 +6,15 @@ import contextlib
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.expectation import Expectation, reference_path
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import Onset
-from servoscope.detection.expectation import Expectation, reference_path
-from servoscope.detection.signature import Signature
+from servoscope.detection.onset import Onset
 from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.instrumental_fit import InstrumentalFit, fit_with_instrument
 from servoscope.estimation.tuning import fit_tuning
+from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import fault_signatures
 
 LONGEST = 500_000  # samples of a stretch; more of them add nothing

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoscope.baseline.expectation import Expectation
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
-from servoscope.detection.chi2_test import Onset
-from servoscope.detection.expectation import Expectation
+from servoscope.detection.onset import Onset
 from servoscope.detection.result import UNKNOWN, VIBRATION, Candidate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import Onset, estimate_onset
+from servoscope.detection.onset import Onset, estimate_onset
 from servoscope.detection.result import (
     UNKNOWN,
     Candidate,

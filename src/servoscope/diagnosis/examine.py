@@ -16,21 +16,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.covariates import CovariatePath
+from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
+from servoscope.baseline.motion import RecordedMotion
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.detection import cusum_design
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import apply_alarm_delays, t2_statistic
-from servoscope.detection.covariates import CovariatePath
-from servoscope.detection.expectation import (
-    BaselineRun,
-    Expectation,
-    ReferencePath,
-    reference_path,
-    residual_noise_model,
-)
-from servoscope.detection.motion import RecordedMotion
+from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants
+from servoscope.detection.statistic import apply_alarm_delays, t2_statistic
 from servoscope.detection.trace import UNSEEN, Statistic, any_exceeded, detection_statistics
 from servoscope.detection.warm_up import follow_warm_up
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
@@ -288,7 +283,7 @@ def _reference_piece(recording: Recording, rows: slice, first: int) -> Reference
 
 def _run_quickly(baseline: Baseline, recording: Recording) -> Examination | None:
     """Return what `_run_recursion` does, with the baseline's own limits; None where others might raise an alarm."""
-    run = baseline.baseline_run
+    run = baseline_run(baseline)
     exam = _run_recursion(baseline, recording, baseline.pipeline(), run=run)
     quiet = exam.estimates.level.max(initial=0.0) < run.sure_level
     return exam if quiet and exam.statistic.max(initial=0.0) <= baseline.limit else None
@@ -312,11 +307,11 @@ def _run_recursion(
     if run is not None:
         walk = None if run.mean is None else run.mean.again()
     elif noise is None:
-        watch = baseline.cusum_constants(pipeline)
+        watch = cusum_constants(baseline, pipeline)
     else:
         beginning = recording.rows(slice(0, round(cusum_design.design_duration_s(pipeline) * recording.sample_rate)))
         expectation = Expectation(pipeline, tuning, noise, reference_path(beginning))
-        watch = baseline.cusum_constants(pipeline, expectation, growth)
+        watch = cusum_constants(baseline, pipeline, expectation, growth)
         walk = expectation.propagator(np.array(baseline.model_theta), baseline.plant)
 
     def healthy(rows: slice) -> FloatArray:

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
+from servoscope.baseline.feature_model import FeatureModel, FeatureName, SpanFeatures
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.feature_model import FeatureModel, FeatureName, SpanFeatures
 from servoscope.detection.feature_monitor import FeatureMonitor, SpanScore, hold, smallest_in_a_row
 from servoscope.signals import Recording
 

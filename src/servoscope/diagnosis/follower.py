@@ -11,9 +11,9 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray, IndexArray
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import consecutive_exceedances
+from servoscope.detection.statistic import consecutive_exceedances
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.signals.samples import Samples

@@ -9,11 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.learned_fault import LearnedFault
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, NotEnoughError
 from servoscope.core.messages import Message, message
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.learned_fault import LearnedFault
+from servoscope.detection.homogeneity import scatter
 from servoscope.detection.result import UNKNOWN
 from servoscope.diagnosis.batch_estimate import estimate_batch_deviation, stretch_begin
 from servoscope.diagnosis.diagnose import diagnose_examination
@@ -22,6 +23,7 @@ from servoscope.isolation.isolate import misfit_limit
 from servoscope.signals import Recording
 
 DISTINCT = 2.0  # times the limit of a misfit: less means that the direction is known to worse than 35 degrees
+RANK_ONE_ROUNDS = 50  # of the alternation between direction and shares; five are usual
 LIKELY = 0.05  # probability from which another explanation of a labelled recording is noted
 
 LabelledRecordings = Mapping[str, Sequence[Recording]]
@@ -70,9 +72,7 @@ def _fault_deviation(exam: Examination) -> tuple[FloatArray, FloatArray]:
 
 def _learn_fault(name: str, faulty: Sequence[Examination], healthy: FloatArray) -> LearnedFault:
     deviations, covariances = map(np.array, zip(*map(_fault_deviation, faulty), strict=True))
-    found = LearnedFault.from_recordings(
-        name, [exam.recording.name for exam in faulty], deviations, covariances, healthy
-    )
+    found = fit_learned_fault(name, [exam.recording.name for exam in faulty], deviations, covariances, healthy)
     if min(found.shares) <= 0.0:
         odd = found.recordings[int(np.argmin(found.shares))]
         raise NotEnoughError(f"{odd} moves theta the other way than the other recordings of {name}: two labels?")
@@ -82,6 +82,39 @@ def _learn_fault(name: str, faulty: Sequence[Examination], healthy: FloatArray) 
             "change would look like it: give them different labels, or record more"
         )
     return found
+
+
+def fit_learned_fault(
+    name: str, recordings: Sequence[str], deviations: FloatArray, covariances: FloatArray, healthy: FloatArray
+) -> LearnedFault:
+    """Learn a direction from recordings that may differ in severity: d_j = a_j s, with a mean of 1 over a_j.
+
+    Direction s and shares a_j minimise the sum of (d_j - a_j s)' (C_j + C)^-1 (d_j - a_j s), a weighted
+    approximation of rank one (Gabriel and Zamir, 1979). What is left beside the severities counts as scatter
+    between recordings, by the rule for healthy ones.
+
+    `deviations, covariances`: d_j, theta of each recording minus its healthy expectation, shape (m, n), and C_j
+    of their noise, (m, n, n); `healthy`: c, the covariance of a healthy recording around the baseline, shape
+    (n, n).
+    """
+    C = covariances + healthy
+    size = np.sqrt(np.diagonal(C, axis1=1, axis2=2).mean(axis=0))
+    d, W = deviations / size, np.linalg.inv(C / np.outer(size, size))
+    s, a = d.mean(axis=0), np.ones(len(d))
+    for _ in range(RANK_ONE_ROUNDS):
+        a = np.einsum("a,jab,jb->j", s, W, d) / np.einsum("a,jab,b->j", s, W, s)
+        known = np.linalg.inv(np.einsum("j,jab->ab", a**2, W))
+        s = known @ np.einsum("j,jab,jb->a", a, W, d)
+        s, a, known = s * a.mean(), a / a.mean(), known * a.mean() ** 2
+    own = known * np.outer(size, size)
+    between = scatter(deviations - a[:, None] * (s * size), C)
+    return LearnedFault(
+        name=name,
+        deviation=tuple(float(x) for x in s * size),
+        covariance=tuple(tuple(float(x) for x in row) for row in own + between),
+        recordings=tuple(recordings),
+        shares=tuple(float(x) for x in a),
+    )
 
 
 def _undetected_message(name: str, exams: Sequence[Examination]) -> str:

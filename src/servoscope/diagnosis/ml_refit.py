@@ -10,7 +10,7 @@ import numpy as np
 
 from servoscope.core.messages import message
 from servoscope.core.number_format import ratio_digits
-from servoscope.detection.chi2_test import Onset
+from servoscope.detection.onset import Onset
 from servoscope.detection.result import (
     UNKNOWN,
     VIBRATION,

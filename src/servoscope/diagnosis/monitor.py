@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, RecordingError
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key, deduplicate

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.baseline import Baseline
+from servoscope.detection.baseline_run import cusum_constants
 from servoscope.diagnosis.side_monitors import SideMonitors
 from servoscope.estimation import frequency_response
 from servoscope.estimation.frequency_response import FrequencyResponse
@@ -49,7 +50,7 @@ class MonitorConstants:
         E = pipeline.bank.E(frequencies)
         response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
         evaluation = EvaluationConstants(baseline.covariance_array(), expected, response, baseline.loop.sample_rate)
-        constants = pipeline.constants(baseline.tuning, baseline.cusum_constants(pipeline), evaluation)
+        constants = pipeline.constants(baseline.tuning, cusum_constants(baseline, pipeline), evaluation)
         healthy = frequency_response.frequency_response(
             pipeline.bank, frequencies, expected, baseline.covariance_array()
         )

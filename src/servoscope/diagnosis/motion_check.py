@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from servoscope.baseline.motion import QUANTITIES
+from servoscope.baseline.plant_fit import saturated_share
 from servoscope.core.messages import Message, message
-from servoscope.detection.motion import QUANTITIES
-from servoscope.detection.plant_fit import saturated_share
 from servoscope.detection.result import DiagnosisWarning
 from servoscope.detection.trace import UNSEEN
 from servoscope.diagnosis.examine import Examination

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError, NotEnoughError
 from servoscope.core.messages import Message, message
-from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis import learn_faults
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.diagnosis.learn_faults import LabelledRecordings

@@ -8,7 +8,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
-from servoscope.detection.chi2_test import Onset
+from servoscope.detection.onset import Onset
 from servoscope.diagnosis.batch_estimate import estimate_batch_deviation
 from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.instrument import InstrumentTuning, instrument_model

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import message
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import DiagnosisWarning
 from servoscope.diagnosis.examine import Examination
 

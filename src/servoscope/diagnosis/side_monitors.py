@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import BaselineError
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
 from servoscope.detection.feature_monitor import FeatureLanes, FeatureMonitor, FeatureValues
 from servoscope.detection.motion_monitor import MotionEvidence, MotionMonitor

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import Message
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import Diagnosis, DiagnosisWarning
 from servoscope.detection.signal_defects import SignalDefect, find_corrections
 from servoscope.diagnosis.examine import Examination

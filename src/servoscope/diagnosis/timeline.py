@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from servoscope.detection.chi2_test import Onset
+from servoscope.detection.onset import Onset
 from servoscope.detection.result import UNKNOWN, Candidate, FaultInterval
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, summarise_refit

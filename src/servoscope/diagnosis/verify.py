@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import Diagnosis, Provenance
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.signals import Recording

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from servoscope.baseline.plant_fit import MOST_SATURATED, saturated_share
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.chi2_test import noncentrality, required_noncentrality, t2_statistic
-from servoscope.detection.plant_fit import MOST_SATURATED, saturated_share
 from servoscope.detection.result import Candidate, DiagnosisWarning
 from servoscope.detection.signal_defects import find_switched_off
+from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
 from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
 from servoscope.learning.plausibility import negative_coefficients
 

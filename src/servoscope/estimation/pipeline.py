@@ -249,7 +249,7 @@ class Pipeline:
 
     @cached_property
     def noise_models(self) -> dict[tuple[str, WhiteNoise], ArmaNoise]:
-        """Models of v by plant (as JSON) and noise; see `servoscope.detection.expectation.residual_noise_model`."""
+        """Models of v by plant (as JSON) and noise; see `servoscope.baseline.expectation.residual_noise_model`."""
         return {}
 
     @cached_property

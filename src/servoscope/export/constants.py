@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from servoscope import __version__
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
-from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.monitor_constants import MonitorConstants
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.kernel.sample_steps import ARMED, SAMPLE, KernelSpec

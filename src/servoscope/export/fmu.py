@@ -14,9 +14,9 @@ from pathlib import Path
 from xml.etree import ElementTree as Xml
 
 from servoscope import __version__
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
-from servoscope.detection.baseline import Baseline
 from servoscope.export.c_monitor import NAME, CMonitor, export_c, fill_template
 
 __all__ = ["export_fmu"]

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import apply_alarm_delays, consecutive_exceedances
+from servoscope.detection.statistic import apply_alarm_delays, consecutive_exceedances
 from servoscope.estimation.recursion import Recursion
 from servoscope.signals.quality import QualityLimits, QualitySettings, check_block, init_state
 

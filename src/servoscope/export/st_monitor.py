@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.jit.st_source import st_literal
-from servoscope.detection.baseline import Baseline
 from servoscope.estimation.kernel.sample_steps import HEADER_SIZE
 from servoscope.export.c_monitor import NAME, fill_template, wrapped
 from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError
-from servoscope.detection.baseline import Baseline
 from servoscope.fleet.day_monitor import DayMonitor
 
 MAX_CACHED_MONITORS = 4096  # per process; one takes some tens of milliseconds to make, and some tens of kilobytes

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.plant_fit import fault_directions
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.chi2_test import whiten
-from servoscope.detection.plant_fit import fault_directions
+from servoscope.detection.statistic import whiten
 from servoscope.detection.trace import Trace
 
 ACCEPTANCE_PROBABILITY = 0.95  # probability from which a common cause is named and its members are explained

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import ServoscopeError
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.covariate_monitor import fill_channels
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.follower import DiagnosisSchedule, Evaluations, Follower, FollowerState

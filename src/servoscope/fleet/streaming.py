@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import LoopError, RecordingError
-from servoscope.detection.baseline import Baseline
 from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.day_monitor import WINDOW
 from servoscope.fleet.rows import MICRO, required_columns

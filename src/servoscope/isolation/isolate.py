@@ -10,8 +10,8 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.detection.result import UNKNOWN, Candidate, FaultEstimate
-from servoscope.detection.signature import Signature
 from servoscope.isolation.posterior import Posterior
+from servoscope.isolation.signature import Signature
 
 GRID = 17  # points along a signature before the minimum is refined
 MISFIT = 1e-3  # probability with which the true fault may fit worse than the limit

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.expectation import Expectation
+from servoscope.baseline.learned_fault import SEVERITY, LearnedFault
+from servoscope.baseline.plant_fit import fault_directions
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.expectation import Expectation
-from servoscope.detection.plant_fit import fault_directions
-from servoscope.detection.signature import Signature, coefficient_signature, parameter_signature
 from servoscope.estimation.filter_bank import nominal_theta
-from servoscope.models.plants import FaultRay
+from servoscope.isolation.signature import Signature, coefficient_signature, parameter_signature
+from servoscope.models.plants import Fault, FaultRay
 from servoscope.signals import Recording
 
 Shift = Callable[[str, float], FloatArray]  # parameter of a fault and its ratio -> change of theta_hat, shape (n,)
 
+SEVERITY_RANGE = (0.05, 10.0)  # of the labelled severity that is searched
 MAX_CACHED_SHIFTS = 10_000  # points of signatures, of this process
 _shift_cache: dict[tuple[object, ...], FloatArray] = {}
 
@@ -32,7 +35,22 @@ def fault_signatures(
     needed = not settled and (expectation is None or bool(baseline.learned))
     taken_up = _change_uptake(baseline, recording, onset) if needed else np.eye(len(baseline.theta))
     known = _plant_signatures(baseline, expectation, onset, taken_up)
-    return known + [fault.signature(taken_up) for fault in baseline.learned]
+    return known + [learned_signature(fault, taken_up) for fault in baseline.learned]
+
+
+def learned_signature(fault: LearnedFault, taken_up: FloatArray) -> Signature:
+    """Return the ray along which theta_hat moves as the share of the labelled severity grows.
+
+    The scatter of the direction grows with the share. Along the ray the misfit of a deviation that points elsewhere
+    then tends to `distinct`, however large it is.
+
+    `taken_up`: share of a change that theta_hat has taken up by now, I - Psi, shape (n, n).
+    """
+    moved = taken_up @ np.array(fault.deviation)
+    C = taken_up @ np.array(fault.covariance) @ taken_up.T
+    words = Fault(fault.name, SEVERITY, SEVERITY_RANGE, fault.name)
+    ray = parameter_signature(words, lambda share: share * moved)
+    return replace(ray, scatter=lambda x: float(np.exp(2.0 * x)) * C)
 
 
 def _plant_signatures(

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoscope.baseline.axis_model import AxisModel
+from servoscope.baseline.feature_model import score_limit
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message
-from servoscope.detection.axis_model import AxisModel
-from servoscope.detection.feature_model import score_limit
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals, axis_stride
 from servoscope.estimation.tuning import sum_covariance
 from servoscope.isolation.ml.axis_scan import NEAR, largest_changes, scan_limit

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoscope.baseline.covariates import CovariateModel, CovariatePath
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
-from servoscope.detection.covariates import CovariateModel, CovariatePath
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, coloured_covariance, fit_tuning, least_squares
 from servoscope.signals import Recording

@@ -6,16 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from servoscope.baseline.records import DetectableChange
+from servoscope.baseline.threshold import SECONDS_PER_YEAR, threshold
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.baseline_parts import DetectableChange
-from servoscope.detection.chi2_test import (
-    SECONDS_PER_YEAR,
-    noncentrality,
-    required_noncentrality,
-    t2_statistic,
-    threshold,
-)
+from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
 from servoscope.estimation.filter_bank import FilterBank, filter_cutoff
 from servoscope.estimation.pipeline import Estimates, Pipeline
 from servoscope.estimation.tuning import TuningFit

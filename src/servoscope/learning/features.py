@@ -6,10 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servoscope.core import outofcore
-from servoscope.core.arrays import FloatArray
-from servoscope.core.messages import Message, message
-from servoscope.detection.feature_model import (
+from servoscope.baseline.feature_model import (
     SLACK,
     WIDER,
     FeatureModel,
@@ -19,6 +16,9 @@ from servoscope.detection.feature_model import (
     score_limit,
     spans_in_a_row,
 )
+from servoscope.core import outofcore
+from servoscope.core.arrays import FloatArray
+from servoscope.core.messages import Message, message
 from servoscope.estimation.window_features import SPEED_TIME, FeatureLayout, Window, WindowFeatures
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording

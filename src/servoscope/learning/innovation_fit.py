@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servoscope.baseline.plant_fit import PRIOR
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.plant_fit import PRIOR
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.estimation.tuning import sandwich_covariance, sum_covariance
 from servoscope.isolation.ml.kernels import Array

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from servoscope.baseline.plant_fit import can_simulate
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.plant_fit import can_simulate
 from servoscope.estimation.instrument import Source, unbroken
 from servoscope.estimation.instrumental_fit import (
     LARGEST_DEVIATION,

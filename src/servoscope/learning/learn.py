@@ -7,19 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.blas import with_one_blas_thread
-from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
-from servoscope.core.messages import Message, message
-from servoscope.detection import homogeneity
-from servoscope.detection.axis_model import AxisModel
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.baseline_parts import BaselineSource, digest
-from servoscope.detection.covariates import CovariateModel, CovariatePath
-from servoscope.detection.cusum_design import CusumHypothesis
-from servoscope.detection.expectation import Expectation, reference_path, residual_noise_model, residual_system
-from servoscope.detection.motion import learn_motion
-from servoscope.detection.plant_fit import (
+from servoscope.baseline.axis_model import AxisModel
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.covariates import CovariateModel, CovariatePath
+from servoscope.baseline.expectation import Expectation, reference_path, residual_noise_model, residual_system
+from servoscope.baseline.hypothesis import CusumHypothesis
+from servoscope.baseline.motion import learn_motion
+from servoscope.baseline.plant_fit import (
     MOST_SATURATED,
     can_simulate,
     describe_healthy_plant,
@@ -28,25 +22,27 @@ from servoscope.detection.plant_fit import (
     saturated_share,
     split_residual_noise,
 )
-from servoscope.detection.sensors import learn_sensors
+from servoscope.baseline.records import BaselineSource, digest
+from servoscope.baseline.sensors import learn_sensors
+from servoscope.baseline.threshold import CalibrationFactors, t2_threshold
+from servoscope.core.arrays import FloatArray
+from servoscope.core.blas import with_one_blas_thread
+from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
+from servoscope.core.messages import Message, message
+from servoscope.detection import homogeneity
 from servoscope.detection.signal_defects import describe_misfit, find_signal_defect, find_switched_off
-from servoscope.detection.threshold_calibration import CalibrationFactors, design_sequential_test, t2_threshold
+from servoscope.detection.threshold_calibration import design_sequential_test
 from servoscope.estimation import estimators, two_stage
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.noise_model import AR_ORDER, fit_white_noise, sample_autocovariance, yule_walker
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, fit_tuning, prefers_white_noise
 from servoscope.isolation.ml.validity import fit_exact_predictor
+from servoscope.learning import detectability
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.covariates import fit_covariates
 from servoscope.learning.delay import check_delay
-from servoscope.learning.detectability import (
-    WORTH_A_LOOK,
-    baseline_misfit,
-    detectable_changes,
-    noise_notes,
-    supported_budget,
-)
+from servoscope.learning.detectability import detectable_changes, noise_notes, supported_budget
 from servoscope.learning.features import learn_features
 from servoscope.learning.innovation_fit import FILE_ERROR, fit_innovations
 from servoscope.learning.instrument import learn_instrument, learns_instrument
@@ -336,11 +332,11 @@ def _assemble_baseline(
     factor, left_out = homogeneity.leave_one_out(paths, deviations_between, told, theta_covariance + error, limit)
     covariance = theta_covariance + factor * between + error
     notes += noise_notes(pipeline, fit, estimates, can_simulate(loop))
-    excess, suggestion = baseline_misfit(estimates, deviations, covariance, fit)
+    excess, suggestion = detectability.baseline_misfit(estimates, deviations, covariance, fit)
     if fit.explained < LEAST_EXPLAINED:
         notes.append(message("learning.hardly_explained", share=fit.explained))
     duration = sum(rec.duration_s for rec in recordings)
-    if excess > WORTH_A_LOOK and loop.monitor.model_error < suggestion:
+    if excess > detectability.WORTH_A_LOOK and loop.monitor.model_error < suggestion:
         notes.append(message("learning.model_error", excess=excess, model_error=suggestion))
     if duration < (least := SHORTEST * loop.monitor.memory):
         notes.append(message("learning.short", duration_s=duration, memory_s=loop.monitor.memory, least_s=least))

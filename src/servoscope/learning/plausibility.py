@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.baseline import Baseline
 from servoscope.learning.inspection.rules import LEAST_EXPLAINED
 from servoscope.signals import Recording
 from servoscope.signals.readers.wrap import find_wrap

@@ -8,13 +8,13 @@ from typing import Self
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.feature_model import shrink
+from servoscope.baseline.plant_fit import PRIOR
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.core.messages import Message, message
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.feature_model import shrink
 from servoscope.detection.homogeneity import prediction_factor
-from servoscope.detection.plant_fit import PRIOR
 
 FEWEST = 5  # machines: of fewer, the scatter between them is mostly chance
 FLOOR = 0.01  # of the uncertainty of a coefficient: less scatter than that is none

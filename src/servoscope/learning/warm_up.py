@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoscope.baseline.covariates import CovariateModel, WarmUp
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import NotEnoughError
-from servoscope.detection.covariates import CovariateModel, WarmUp
 from servoscope.detection.warm_up import BLOCK, NAME, BlockSums, WarmUpFit, fit_course
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit

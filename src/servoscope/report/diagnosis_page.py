@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import translate
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.checks import checks_of_fault

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from servoscope.detection.baseline import Baseline
+    from servoscope.baseline.baseline import Baseline
     from servoscope.models.loop import Columns
     from servoscope.signals import Recording
     from servoscope.signals.readers import ChannelInfo

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.result import Diagnosis
 from servoscope.detection.trace import Trace
 from servoscope.estimation.filter_bank import filter_cutoff

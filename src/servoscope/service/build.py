@@ -11,23 +11,23 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError, ConfigError, LoopError
 from servoscope.core.settings_errors import suggest_name
 from servoscope.design.operating_limits import LimitKind, OperatingLimit, operating_limits
-from servoscope.detection.baseline import Baseline
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.models.loop import Loop
 from servoscope.service.actions import CommandSettings, WebhookSettings, load_secret
 from servoscope.service.actions.settings import Sink
-from servoscope.service.asset import Asset, AssetPolicy
-from servoscope.service.asset_groups import AssetGroups
-from servoscope.service.checkpoint import StreamPosition, unpack_state
+from servoscope.service.assets.asset import Asset, AssetPolicy
+from servoscope.service.assets.checkpoint import StreamPosition, unpack_state
+from servoscope.service.assets.examination import compile_examination
+from servoscope.service.assets.groups import AssetGroups
+from servoscope.service.assets.outlook import AssetLimits
+from servoscope.service.assets.reception import UNHEARD
 from servoscope.service.config import ServiceFile
-from servoscope.service.examination import compile_examination
 from servoscope.service.notifications import Notifier
-from servoscope.service.outlook import AssetLimits
 from servoscope.service.publishers.base import StatusPublisher
-from servoscope.service.reception import UNHEARD
 from servoscope.service.sources.base import BlockSource, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.store import CheckpointRow, Store

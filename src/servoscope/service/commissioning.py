@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from servoscope.core.messages import message, render
+from servoscope.service.assets.reception import Reception, ReceptionLog
 from servoscope.service.build import build_visit
 from servoscope.service.config import ServiceFile
-from servoscope.service.reception import Reception, ReceptionLog
 from servoscope.service.sources.block import Block
 
 POLL_S = 0.05

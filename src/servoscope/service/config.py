@@ -14,11 +14,11 @@ from servoscope.core.settings import NonEmptyStr, NonNegative, Settings
 from servoscope.service.access import WebSettings
 from servoscope.service.actions import ActionSettings
 from servoscope.service.alarms import AlarmSettings
+from servoscope.service.assets.outlook import PrognosisSettings, SizeLimit
 from servoscope.service.config_types import Address, FileSettings, Name, Seconds
 from servoscope.service.kinds import PUBLISHERS, SOURCES, parse_tables
 from servoscope.service.network import ConnectionSettings, NetworkSettings, apply_network
 from servoscope.service.opcua.settings import OpcuaNodes
-from servoscope.service.outlook import PrognosisSettings, SizeLimit
 from servoscope.service.publishers.base import PublisherSettings
 from servoscope.service.sources.base import SourceSettings
 from servoscope.signals.quality import QualitySettings

@@ -8,14 +8,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.workers import Worker, WorkerError
 from servoscope.design.operating_limits import OperatingLimit
-from servoscope.detection.baseline import Baseline
 from servoscope.prognosis.forecast import Prognosis
-from servoscope.service.checkpoint import AssetState
-from servoscope.service.examination import StoredDiagnosis, diagnose_blocks, undetermined
+from servoscope.service.assets.checkpoint import AssetState
+from servoscope.service.assets.examination import StoredDiagnosis, diagnose_blocks, undetermined
+from servoscope.service.assets.outlook import AssetLimits, DuePrognosis, current_outlook, single_fault
 from servoscope.service.log import log
-from servoscope.service.outlook import AssetLimits, DuePrognosis, current_outlook, single_fault
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
 from servoscope.service.store.series import last_renewal, query_sizes
@@ -23,7 +23,7 @@ from servoscope.service.store.series import last_renewal, query_sizes
 LATEST_BASELINES = 64  # that the process keeps parsed: a hall may have one for each of thousands of assets
 MAX_ATTEMPTS = 2  # of a diagnosis that takes its process down with it
 TASK = "servoscope.service.diagnosis_worker:diagnose_packed_blocks"
-PROGNOSIS_TASK = "servoscope.service.outlook:prognose_in_worker"
+PROGNOSIS_TASK = "servoscope.service.assets.outlook:prognose_in_worker"
 
 
 class DiagnosisWorker:

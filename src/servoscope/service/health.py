@@ -15,7 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from servoscope.core.errors import ConfigError
-from servoscope.service.asset_status import AssetStatus
+from servoscope.service.assets.status import AssetStatus
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric

@@ -10,13 +10,13 @@ from typing import Protocol
 from servoscope.core.errors import AlarmError, StoreUnavailableError
 from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.alarms import LifecycleEvent, OperatorCommand
-from servoscope.service.asset import Asset
+from servoscope.service.assets.asset import Asset
+from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile
 from servoscope.service.log import log
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.notifications import Notifier
-from servoscope.service.records import StepResult, audit_row
 from servoscope.service.retention import delete_old_rows
 from servoscope.service.sources.base import BlockSource, RejectionCounter
 from servoscope.service.store import CommandOutcome, CommandRow, Store

@@ -11,8 +11,8 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import ConfigError
-from servoscope.service.asset import Asset
-from servoscope.service.asset_metrics import write_asset_series
+from servoscope.service.assets.asset import Asset
+from servoscope.service.assets.metrics import write_asset_series
 from servoscope.service.health import alarm_gauge
 from servoscope.service.layer_times import LayerTimes
 from servoscope.service.sources.base import BlockSource, Rejection

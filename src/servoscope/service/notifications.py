@@ -27,8 +27,8 @@ from servoscope.service.alarms import (
     notify_transition,
     step_alarm,
 )
-from servoscope.service.examination import StoredDiagnosis
-from servoscope.service.records import StepResult, TableRow, audit_row, transition_row
+from servoscope.service.assets.examination import StoredDiagnosis
+from servoscope.service.assets.records import StepResult, TableRow, audit_row, transition_row
 
 VERSION = 1
 NO_NOTIFICATION_STATES = (

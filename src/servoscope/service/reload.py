@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from servoscope.core.errors import ServoscopeError
-from servoscope.service.asset import Asset
-from servoscope.service.asset_groups import AssetGroups
+from servoscope.service.assets.asset import Asset
+from servoscope.service.assets.checkpoint import unpack_state
+from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.build import (
     ServiceComponents,
     build_assets,
@@ -18,7 +19,6 @@ from servoscope.service.build import (
     resume_positions,
     source_assets,
 )
-from servoscope.service.checkpoint import unpack_state
 from servoscope.service.config import ServiceFile
 from servoscope.service.log import log
 from servoscope.service.notifications import Notifier

@@ -15,20 +15,20 @@ from servoscope.core.errors import ServoscopeError, StoreUnavailableError
 from servoscope.core.messages import message, render
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.actions.dispatcher import OutboxDispatcher
-from servoscope.service.asset import Asset
-from servoscope.service.asset_groups import QuietBlocks
+from servoscope.service.assets.asset import Asset
+from servoscope.service.assets.examination import StoredDiagnosis
+from servoscope.service.assets.examination_schedule import PendingDiagnosis
+from servoscope.service.assets.groups import QuietBlocks
+from servoscope.service.assets.reception import FOLLOWED, ReceptionLog
+from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.build import ServiceComponents
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile
 from servoscope.service.diagnosis_worker import DiagnosisWorker, find_due_prognosis
-from servoscope.service.examination import StoredDiagnosis
-from servoscope.service.examination_schedule import PendingDiagnosis
 from servoscope.service.housekeeping import Housekeeping
 from servoscope.service.log import log, set_level
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.publishers.base import publisher_trouble
-from servoscope.service.reception import FOLLOWED, ReceptionLog
-from servoscope.service.records import StepResult, audit_row
 from servoscope.service.reload import reload_components
 from servoscope.service.sources.base import BlockSource
 from servoscope.service.sources.block import Block

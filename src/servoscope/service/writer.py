@@ -10,9 +10,9 @@ from itertools import islice
 from typing import Any
 
 from servoscope.core.errors import StoreUnavailableError
-from servoscope.service.asset import Asset
-from servoscope.service.checkpoint import pack_state
-from servoscope.service.records import TableRow
+from servoscope.service.assets.asset import Asset
+from servoscope.service.assets.checkpoint import pack_state
+from servoscope.service.assets.records import TableRow
 from servoscope.service.store import Batch, Store
 from servoscope.service.store.bundles import SampleBlock
 

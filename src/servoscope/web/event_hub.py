@@ -18,7 +18,7 @@ import sqlalchemy as sa
 from pydantic_core import to_json
 
 from servoscope.core.errors import StoreError
-from servoscope.service.asset_status import AssetStatus, ServiceStatus
+from servoscope.service.assets.status import AssetStatus, ServiceStatus
 from servoscope.service.store import Row, Store, tables
 from servoscope.web.schemas.assets import AssetRow, ServiceRow, TransitionRow
 from servoscope.web.schemas.responses import DiagnosisRow

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from servoscope.service.asset_status import AssetStatus, ServiceStatus, read_status
+from servoscope.service.assets.status import AssetStatus, ServiceStatus, read_status
 from servoscope.service.store import Store
 
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from servoscope.cli.render.results import print_facts, print_notes, print_result_table, print_table, print_title
 from servoscope.design.result import SIZES
-from servoscope.detection.chi2_test import POWER
+from servoscope.detection.statistic import POWER
 from servoscope.report import design_page
 from servoscope.report.format_values import format_change, format_duration, format_number, format_percent
 from servoscope.report.page import say

@@ -21,7 +21,7 @@ from servoscope.report.page import say
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from servoscope.detection.baseline import Baseline
+    from servoscope.baseline.baseline import Baseline
     from servoscope.learning.inspection import Inspection
     from servoscope.models.loop import Columns
     from servoscope.report.page import ResultTable

@@ -38,7 +38,7 @@ CHECKS = {
     "contracts": "P approaches P_d along excited directions and stays there, eq. (12)",
     "covariance": "K is all that `moments.propagate_covariance` needs to carry the covariance of theta_hat",
     "mean": "from P = P_d on its gain is that of the AKF, which the expectation (`moments.mean_path`) follows",
-    "textbook": "it computes the same as its obvious version in tests/naive.py",
+    "textbook": "it computes the same as its obvious version in tests/support/naive.py",
     "converges": "without noise theta_hat reaches theta",
     "memory": "N updates leave 1/e of what was true before",
     "memory in weak directions": "the same in directions that are hardly excited, where P_d = (R/N) R_phi^-1",

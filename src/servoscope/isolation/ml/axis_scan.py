@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from servoscope.baseline.axis_model import AxisModel
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.axis_model import AxisModel
-from servoscope.detection.baseline import Baseline
 from servoscope.isolation.ml.axis_vibration import BANDS, LEAST, AxisVibration, find_vibration
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis

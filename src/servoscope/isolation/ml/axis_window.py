@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from servoscope.baseline.axis_model import AxisModel
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel
-from servoscope.detection.axis_model import AxisModel
-from servoscope.detection.baseline import Baseline
 from servoscope.estimation.axis_filter import AxisFilter, AxisSignals
 from servoscope.estimation.noise_model import sample_autocovariance
 from servoscope.isolation.ml.kernels import Array

@@ -8,8 +8,8 @@ from itertools import combinations
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.baseline import Baseline
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.goodness_of_fit import GoodnessOfFit, misspecification_columns, score_test
 from servoscope.isolation.ml.hypothesis import (

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.detection.baseline import Baseline
-from servoscope.detection.baseline_parts import ExactPredictorFit
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.records import ExactPredictorFit
 from servoscope.estimation.noise_model import LIKELIHOOD_DROP, WhiteNoise
 from servoscope.isolation.ml.goodness_of_fit import misspecification_columns, score_test
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow

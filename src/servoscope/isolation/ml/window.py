@@ -10,8 +10,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.detection.baseline import Baseline
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.kernels import Array
 from servoscope.isolation.ml.predictor import HealthyRun, PlantVariants, Predictor, PredictorFactory

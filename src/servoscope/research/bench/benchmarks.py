@@ -20,7 +20,7 @@ from servoscope.research.bench.timing import BenchmarkRow, JobTiming, time_inter
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from servoscope.detection.baseline import Baseline
+    from servoscope.baseline.baseline import Baseline
     from servoscope.models.loop import Loop
     from servoscope.signals import Recording
 

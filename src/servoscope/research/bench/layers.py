@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from servoscope.detection.baseline import Baseline
+    from servoscope.baseline.baseline import Baseline
     from servoscope.signals import Recording
 
 WARM_ASSETS = 16

@@ -8,7 +8,7 @@ from typing import Literal
 
 from servoscope.core.messages import message, render
 from servoscope.service.alarms.settings import AlarmDefinition
-from servoscope.service.reception import Reception
+from servoscope.service.assets.reception import Reception
 from servoscope.signals import quality
 
 Condition = Literal["normal", "abnormal", "unknown"]

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 from servoscope.core.messages import message, render
 from servoscope.core.settings import Finite, NonNegative, Positive, Settings
 from servoscope.core.settings_errors import describe_error
-from servoscope.service.reception import ALARMED_STATES, STATES
+from servoscope.service.assets.reception import ALARMED_STATES, STATES
 from servoscope.signals.quality import KINDS
 
 StrictText = Annotated[str, Field(strict=True)]

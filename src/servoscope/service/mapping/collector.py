@@ -15,9 +15,9 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import MessageError
 from servoscope.core.messages import message, render
+from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.mapping.rows import MessageMapping, SignalValue
 from servoscope.service.mapping.settings import PayloadSettings
-from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
 from servoscope.service.sources.base import BlockSource, RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition

@@ -19,6 +19,7 @@ from servoscope.core.addresses import show_address
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
+from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.config_types import Seconds, read_password
 from servoscope.service.log import log
 from servoscope.service.network import ConnectionSettings
@@ -38,7 +39,6 @@ from servoscope.service.opcua.settings import (
     import_asyncua,
 )
 from servoscope.service.opcua.subscriptions import QUEUE_MARGIN, ArraySubscription, ScalarSubscription, timestamp
-from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
 from servoscope.service.sources.block import Block, ResumePosition
 

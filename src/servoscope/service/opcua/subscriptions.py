@@ -13,8 +13,8 @@ import numpy as np
 
 from servoscope.core.errors import MessageError
 from servoscope.core.messages import message, render
+from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.opcua.monitored_items import ItemGrant
-from servoscope.service.reception import AssetTrouble
 from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import MAX_TIME_S, Block, ResumePosition

@@ -15,10 +15,10 @@ from pydantic import PrivateAttr
 
 from servoscope.core.settings import Settings
 from servoscope.models.loop import Loop
-from servoscope.service.reception import AssetTrouble
+from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.sources.block import Block, ResumePosition
 
-CHECKS = {  # what every source guarantees; tests/test_source_contract.py runs them for each kind
+CHECKS = {  # what every source guarantees; tests/service/test_source_contract.py runs them for each kind
     "numbering": "the blocks of an asset are numbered 0, 1, 2 ... without holes",
     "limit": "`poll` returns at most as many blocks as it was asked for, and each block once",
     "idle": "`poll` and `next_block_s` return at once where there is nothing",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from servoscope.service.checkpoint import StreamPosition
-from servoscope.service.records import TableRow, audit_row
+from servoscope.service.assets.checkpoint import StreamPosition
+from servoscope.service.assets.records import TableRow, audit_row
 from servoscope.service.sources.block import Block
 
 

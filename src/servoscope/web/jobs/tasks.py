@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import LoopError, RecordingError
 from servoscope.core.settings import parse_toml
 from servoscope.core.workers import Progress
 from servoscope.design import design_study
-from servoscope.detection.baseline import Baseline
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis import operating_points
 from servoscope.diagnosis.diagnose import diagnose_with_trace

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 from servoscope.core.errors import LoopError, StoreError, StoreUnavailableError
 from servoscope.design.operating_limits import OperatingLimit, operating_limits
 from servoscope.prognosis.forecast import prognose
-from servoscope.service.asset_status import AssetStatus
+from servoscope.service.assets.status import AssetStatus
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store, tables
 from servoscope.service.store.queries import query_downsampled, query_history

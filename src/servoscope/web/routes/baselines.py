@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.status import HTTP_201_CREATED, HTTP_202_ACCEPTED, HTTP_204_NO_CONTENT
 
-from servoscope.detection.baseline import Baseline
+from servoscope.baseline.baseline import Baseline
 from servoscope.models.loop import Loop
 from servoscope.report import plain_values
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer

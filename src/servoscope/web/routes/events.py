@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import StreamingResponse
 
 from servoscope.core.errors import StoreError
-from servoscope.service.asset_status import AssetStatus
+from servoscope.service.assets.status import AssetStatus
 from servoscope.web.dependencies import VIEWER, Context, ContextDep
 from servoscope.web.event_hub import format_sse
 from servoscope.web.middleware import authenticate

@@ -16,7 +16,7 @@ from servoscope.prognosis.forecast import Outlook as OutlookKind
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
 from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
-from servoscope.service.asset_status import AlarmStatus, AssetStatus, FloodCounts, ServiceStatus
+from servoscope.service.assets.status import AlarmStatus, AssetStatus, FloodCounts, ServiceStatus
 from servoscope.web.schemas.requests import CommandName
 from servoscope.web.schemas.responses import ApiResponse, DiagnosisRow, NullableFloats, SignalColumns
 

@@ -1,0 +1,1 @@
+"""What healthy looks like: the baseline and its records, and what a healthy loop is expected to show."""

@@ -1,0 +1,370 @@
+"""What healthy looks like: learned from recordings or computed from nominal parameters; one JSON file, versioned."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
+
+from servoscope.baseline.axis_model import AxisModel
+from servoscope.baseline.covariates import CovariateModel
+from servoscope.baseline.feature_model import FeatureModel
+from servoscope.baseline.hypothesis import CusumHypothesis
+from servoscope.baseline.learned_fault import LearnedFault
+from servoscope.baseline.motion import MotionRange
+from servoscope.baseline.plant_fit import fault_directions, match_ratios
+from servoscope.baseline.records import (
+    BaselineMemory,
+    BaselineSource,
+    DetectableChange,
+    ExactPredictorFit,
+    parse_stored_loop,
+)
+from servoscope.baseline.sensors import SensorModel
+from servoscope.baseline.threshold import CalibrationFactors, t2_threshold
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import BaselineError, LoopError
+from servoscope.core.files import atomic_write
+from servoscope.core.messages import MessageText
+from servoscope.core.short_repr import ShortRepr
+from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.estimation.instrument import InstrumentTuning
+from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
+from servoscope.estimation.pipeline import Pipeline, Tuning
+from servoscope.estimation.two_stage import StageOneTuning
+from servoscope.models.loop import Loop
+from servoscope.models.plants import Plant
+
+FORMAT = "servoscope-baseline"
+VERSION = 2
+LATER = "motion", "axis", "covariates", "scatter"  # what earlier versions did not know
+
+Vector = tuple[float, ...]
+Matrix = tuple[Vector, ...]
+
+
+class Baseline(ShortRepr, BaselineMemory):
+    """What a healthy loop looks like to the monitor; everything that `diagnose` needs.
+
+    Parameters
+    ----------
+    loop, sources, hash
+        The loop, as in its file, and what it was learned from.
+    names, theta, covariance
+        The n coefficients: names, healthy values (n,), and the covariance (n, n) of a further healthy recording's mean
+        around them: noise of the baseline, scatter between recordings and model error.
+    scale, P_d, R, noise_a, noise_b, noise_gamma, noise_variance, stage_one
+        The recursion's tuning (see `servoscope.estimation.pipeline.Tuning`), and that of stage 1 of two stages.
+    noise, ratios, ratios_std, ratios_covariance, model_theta
+        n_u and n_y; healthy parameters relative to the loop file's nominal values, standard deviations and covariance
+        (m, m) of their logarithms; the coefficients that they lead to. Without a controller or physics None or empty.
+    dof, limit, explained
+        Effective number of independent residuals; threshold of T^2; share of eta's variance that the model explains.
+    still_speed
+        Speed below which the axis stands still [output per s]; 0 where rest is part of what is expected.
+    delay_s
+        Delay that the recordings show [s]; None where they do not show it.
+    loudest
+        The largest noise that the recordings allow; None where white noises on u and y do not explain the residual.
+    rehearsed, members
+        Counted false alarms over those of theory; the hypotheses of the sequential test, empty where there is none.
+    promises
+        Smallest changes that are detected with 90 % probability within the baseline's own excitation.
+    exact
+        What the exact predictor says of the healthy recordings; None where there is none.
+    notes, learned
+        Warnings of `learn`; faults known from labelled recordings.
+    sensors
+        How the sensors of the output disagree; None where it has one.
+    instrument
+        The model behind the instrument of a loop without a controller, if any.
+    features, left_out
+        What healthy recordings show besides coefficients; the largest T^2 of each over its limit when learned without
+        it. None and empty where there are fewer than four recordings.
+    motion
+        The motion that the recordings hold; None in baselines of earlier versions, and where they are very short.
+    axis
+        The healthy motor axis that the refit starts from, for that kind of plant.
+    covariates
+        How coefficients move with covariates, if any; theta is theirs in the middle of the learned range.
+    scatter
+        Covariance (n, n) of the coefficients between the recordings beyond their noise; earlier versions wrote its
+        diagonal (n,). Empty where there was only one recording.
+    point, others
+        Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
+        others is itself that of the first point.
+    """
+
+    loop_settings: dict[str, Any] = Field(alias="loop")
+    sources: tuple[BaselineSource, ...]
+    hash: str
+    names: tuple[str, ...]
+    theta: Vector
+    covariance: Matrix
+    scale: Vector
+    P_d: Matrix
+    R: float
+    noise_a: Vector
+    noise_b: Vector
+    noise_gamma: Vector
+    noise_variance: float
+    stage_one: StageOneTuning | None = None
+    noise: WhiteNoise | None
+    ratios: dict[str, float]
+    ratios_std: dict[str, float]
+    ratios_covariance: Matrix
+    model_theta: Vector
+    dof: float
+    limit: float
+    explained: float
+    still_speed: float
+    delay_s: float | None
+    suggested_model_error: float
+    supported_false_alarms_per_year: float
+    loudest: WhiteNoise | None
+    rehearsed: CalibrationFactors
+    members: tuple[CusumHypothesis, ...]
+    promises: tuple[DetectableChange, ...]
+    notes: tuple[MessageText, ...]
+    exact: ExactPredictorFit | None = None
+    learned: tuple[LearnedFault, ...] = ()
+    sensors: SensorModel | None = None
+    instrument: InstrumentTuning | None = None
+    features: FeatureModel | None = None
+    left_out: Vector = ()
+    motion: MotionRange | None = None
+    axis: AxisModel | None = None
+    covariates: CovariateModel | None = None
+    scatter: Matrix | Vector = ()
+    point: str = ""
+    others: tuple[Baseline, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> Self:
+        n, p = len(self.names), len(self.noise_a)
+        for name in ("theta", "scale"):
+            if len(getattr(self, name)) != n:
+                raise ValueError(f"{name} must have {n} values, one per coefficient")
+        for name in ("covariance", "P_d"):
+            rows = getattr(self, name)
+            if len(rows) != n or any(len(row) != n for row in rows):
+                raise ValueError(f"{name} must be {n} by {n}")
+        if len(self.noise_gamma) != p or not p or not (self.noise_gamma[0] > 0.0 and self.noise_variance > 0.0):
+            raise ValueError("noise_a and noise_gamma must have the same length, and a positive variance")
+        if len(self.model_theta) not in (0, n):
+            raise ValueError(f"model_theta must be empty or have {n} values")
+        if not (n and self.R > 0.0 and self.limit > 0.0 and min(self.scale) > 0.0):
+            raise ValueError("names, R, limit and scale must be positive")
+        C, size = np.array(self.covariance), np.sqrt(np.abs(np.diag(self.covariance)))
+        scaled = C / np.outer(size, size) if size.all() else C
+        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
+            raise ValueError("covariance must be symmetric and positive")
+        if any(len(fault.deviation) != n for fault in self.learned):
+            raise ValueError(f"learned must have deviations of {n} values, one per coefficient")
+        if len({fault.name for fault in self.learned}) < len(self.learned):
+            raise ValueError("learned must have names of their own")
+        if self.others and (not all(self.points) or len(set(self.points)) < len(self.points)):
+            raise ValueError("point must be a name of its own at every operating point")
+        if any(other.others for other in self.others):
+            raise ValueError("others must have no others")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_nothing(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what is `LATER`, where there is none: files of earlier versions are written as they were."""
+        fields: dict[str, Any] = write(self)
+        return {name: value for name, value in fields.items() if value or name not in LATER}
+
+    @cached_property
+    def loop(self) -> Loop:
+        """The loop."""
+        return parse_stored_loop(self.loop_settings)
+
+    @property
+    def logged_covariates(self) -> tuple[str, ...]:
+        """Names of the channels that a recording must have beside r, u and y; a warm-up that nobody logs is none."""
+        return () if self.covariates is None or self.covariates.warm_up is not None else self.covariates.names
+
+    @property
+    def points(self) -> tuple[str, ...]:
+        """Names of the operating points; none where none was declared."""
+        return (self.point, *(other.point for other in self.others)) if self.point or self.others else ()
+
+    @property
+    def per_point(self) -> tuple[Baseline, ...]:
+        """One baseline per operating point; itself where none was declared."""
+        return (self.model_copy(update={"others": ()}), *self.others)
+
+    def at(self, point: str | Mapping[str, float]) -> Baseline:
+        """Return the baseline of one operating point: its name, or values of the covariates, ``{"temperature": 47.0}``.
+
+        Raises
+        ------
+        BaselineError
+            If there is no such point, or a covariate is missing or outside of what was learned.
+        """
+        if not isinstance(point, str):
+            return self._at_covariates(point)
+        for one in self.per_point:
+            if point and one.point == point:
+                return one
+        known = f"choose from {', '.join(self.points)}" if self.points else "the baseline has none"
+        raise BaselineError(f"there is no operating point {point!r}: {known}")
+
+    def _at_covariates(self, values: Mapping[str, float]) -> Baseline:
+        model = self.covariates
+        if model is None or set(values) != set(model.names):
+            known = f"give {', '.join(model.names)}" if model is not None else "the baseline has none"
+            raise BaselineError(f"there are no covariates {', '.join(values)}: {known}")
+        c = np.array([float(values[name]) for name in model.names])
+        if (outside := model.describe_outside(c[None])) is not None:
+            raise BaselineError(str(outside))
+        theta = model.theta(origin := np.array(self.theta), c)
+        covariance = self.covariance_array() + model.theta_covariance(origin, c)
+        update: dict[str, Any] = {"theta": tuple(theta.tolist()), "covariance": tuple(map(tuple, covariance.tolist()))}
+        update["covariates"] = None
+        if self.model_theta:
+            update["model_theta"] = tuple((np.array(self.model_theta) + theta - origin).tolist())
+        if self.ratios:
+            wanted = nominal_theta(self.loop, self.plant) + theta - origin
+            update["ratios"] = match_ratios(self.loop, self.ratios, wanted, covariance)
+        if self.axis is not None:
+            shift = dict(zip(self.names, (theta - origin).tolist(), strict=True))
+            moved = {name: value + shift.get(name, 0.0) for name, value in self.axis.coefficients.items()}
+            update["axis"] = self.axis.model_copy(update={"coefficients": moved})
+        return self.model_copy(update=update)
+
+    @property
+    def plant(self) -> Plant:
+        """The plant with its healthy parameters as learned."""
+        return self.loop.plant.scaled(self.ratios) if self.ratios else self.loop.plant
+
+    @property
+    def tuning(self) -> Tuning:
+        """What the recursion takes."""
+        theta, scale, P_d = map(np.array, (self.theta, self.scale, self.P_d))
+        a, b, gamma = map(np.array, (self.noise_a, self.noise_b, self.noise_gamma))
+        return Tuning(theta, scale, P_d, self.R, ArmaNoise(a, b, gamma, self.noise_variance))
+
+    @property
+    def extrapolates(self) -> bool:
+        """Whether the model holds under a motion that the recordings do not hold.
+
+        So it does where the plant of the loop file explains them down to their noise as it stands. A plant that is not
+        linear, or a file that is wrong, asks for further parameters, or leaves no sequential test.
+        """
+        exact = self.exact is not None and self.exact.misfit <= 1.0
+        as_it_stands = set(self.ratios) <= set(self.loop.plant.parameters)
+        # a baseline of nominal parameters has no ratios, and its motion was simulated
+        return as_it_stands and (bool(self.members) or (exact and not self.ratios))
+
+    @property
+    def limited_motion(self) -> MotionRange | None:
+        """The motion outside of which the model is not known to hold; None where it is, or nothing was stored."""
+        return None if self.extrapolates else self.motion
+
+    def pipeline(self) -> Pipeline:
+        """Return the loop's chain of constant matrices."""
+        return self._pipeline
+
+    @cached_property
+    def _pipeline(self) -> Pipeline:
+        return Pipeline.of(self.loop, self.stage_one, self.still_speed, self.instrument)
+
+    @cached_property
+    def fault_directions(self) -> dict[str, FloatArray]:
+        """What a relative change of each parameter adds to the healthy coefficients, each of shape (n,)."""
+        return fault_directions(self.loop, self.plant, np.array(self.theta))
+
+    @cached_property
+    def bias(self) -> FloatArray:
+        """What the biases of the regression add to the healthy coefficients, shape (n,)."""
+        if not self.model_theta or self.loop.monitor.structure != "svf":
+            return np.zeros(len(self.theta))
+        return np.array(self.model_theta) - nominal_theta(self.loop, self.plant)
+
+    def shared(self, assets: int) -> Self:
+        """Return the baseline of one among many assets that share its budget of false alarms.
+
+        Each asset gets an equal part: whatever they have in common, all together raise at most the budget's alarms
+        (Bonferroni).
+
+        Raises BaselineError if there is not at least one asset.
+        """
+        if assets < 1:
+            raise BaselineError(f"a budget cannot be shared by {assets} assets, give at least 1")
+        monitor = self.loop.monitor
+        budget = monitor.false_alarms_per_year / assets
+        loop = self.loop.model_copy(update={"monitor": monitor.model_copy(update={"false_alarms_per_year": budget})})
+        features = self.features.shared(budget) if self.features is not None else None
+        tests = bool(self.members), features is not None
+        limit = t2_threshold(loop, len(self.names), self.dof, self.rehearsed, *tests)
+        others = tuple(other.shared(assets) for other in self.others)
+        return self.model_copy(
+            update={"loop_settings": loop.to_dict(), "limit": limit, "features": features, "others": others}
+        )
+
+    def covariance_array(self) -> FloatArray:
+        """Return `covariance` as an array (n, n)."""
+        return np.array(self.covariance)
+
+    def save(self, path: str | Path) -> None:
+        """Write the baseline as JSON; nothing half-written stays behind.
+
+        Raises OutputError if the file cannot be written.
+        """
+        content = {"format": FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
+        atomic_write(Path(path), (json.dumps(content, indent=1) + "\n").encode())
+
+    def _shown_facts(self) -> dict[str, object]:
+        healthy = ", ".join(f"{name} {value:.4g}" for name, value in zip(self.names, self.theta, strict=True))
+        return {"loop": self.loop.name, "recordings": len(self.sources), "healthy": healthy, "hash": self.hash}
+
+    @classmethod
+    def of(cls, source: Baseline | str | Path) -> Baseline:
+        """Return a baseline as it is, or read it from a path; raises TypeError if it is neither."""
+        if isinstance(source, Baseline):
+            return source
+        if not isinstance(source, str | Path):
+            raise TypeError(f"a baseline is a Baseline or the path of one, not {type(source).__name__}")
+        return cls.load(source)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a baseline.
+
+        Raises BaselineError if the file is missing, is no baseline, or is one of another version.
+        """
+        path = Path(path)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise BaselineError(f"{path}: no such file; make a baseline with servoscope learn") from None
+        except OSError as error:
+            raise BaselineError(f"{path}: cannot be read ({error.strerror or error})") from None
+        except (ValueError, RecursionError):
+            raise BaselineError(
+                f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
+            ) from None
+        if not isinstance(content, Mapping) or content.get("format") != FORMAT:
+            raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
+        if content.get("version") != VERSION:
+            raise BaselineError(
+                f"{path}: baseline of version {content.get('version')!r}, this program reads {VERSION}: learn it again"
+            )
+        fields = {key: value for key, value in content.items() if key not in ("format", "version")}
+        try:
+            baseline = cls.model_validate(fields)
+            _ = [one.loop for one in baseline.per_point]
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise BaselineError(f"{path}: damaged baseline, {where}: {first['msg'].lower()}; learn it again") from None
+        except LoopError as error:
+            raise BaselineError(f"{path}: damaged baseline, {error}; learn it again") from None
+        return baseline

@@ -1,0 +1,50 @@
+"""Faults known from labelled recordings: where theta_hat goes under one, how sure that is, and its signature."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, model_validator
+
+SEVERITY = "severity"  # the parameter of a fault that was learned from labelled recordings
+
+
+class LearnedFault(BaseModel):
+    """What a baseline knows of a fault from labelled recordings of it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str
+    deviation: tuple[float, ...]  # by how much theta differs from healthy at the labelled severity, shape (n,)
+    # of the deviation of a further recording of that severity around it, the noise of its own estimate aside: noise
+    # of the labelled recordings, and what they differ by beside their severity, shape (n, n)
+    covariance: tuple[tuple[float, ...], ...]
+    # recordings, shares: names of the labelled recordings, and the severity of each relative to their mean
+    recordings: tuple[str, ...]
+    shares: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> Self:
+        n, C = len(self.deviation), self.covariance
+        if not any(self.deviation):
+            raise ValueError(f"{self.name}: deviation must not be zero")
+        if len(C) != n or any(len(row) != n for row in C):
+            raise ValueError(f"{self.name}: covariance must be {n} by {n}")
+        size = np.sqrt(np.maximum(np.diag(C), 0.0))
+        scaled = np.array(C) / np.outer(size, size) if size.all() else -np.eye(n)
+        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
+            raise ValueError(f"{self.name}: covariance must be symmetric and positive")
+        if not self.recordings or len(self.shares) != len(self.recordings):
+            raise ValueError(f"{self.name}: shares must have one value per recording")
+        return self
+
+    @property
+    def distinctness(self) -> float:
+        """Squared distance of the deviation from healthy in units of its own covariance: how clear the direction is.
+
+        A direction is told from another at an angle phi where ``distinct * tan(phi)**2`` exceeds the limit of a misfit.
+        """
+        size = np.sqrt(np.diag(self.covariance))
+        s = np.array(self.deviation) / size
+        return float(s @ np.linalg.solve(np.array(self.covariance) / np.outer(size, size), s))

@@ -1,0 +1,215 @@
+"""Which noise and which plant would say what the healthy recordings say; and where theta goes when it ails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope.baseline.expectation import Expectation, residual_system
+from servoscope.core import outofcore
+from servoscope.core.arrays import FloatArray
+from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise, sample_autocovariance
+from servoscope.estimation.pipeline import Pipeline, Regression
+from servoscope.estimation.tuning import TuningFit
+from servoscope.models.loop import Loop
+from servoscope.models.lti import autocovariances, solve_scaled
+from servoscope.models.plants import Plant
+from servoscope.signals import Recording
+
+FREE = 1.0  # standard deviation of how far covariates may move the logarithm of a parameter
+FARTHEST = 3.0  # how far they move it at most
+NEWTON_STEPS, NEARBY, SETTLED = 20, 1e-6, 1e-9  # of the search for it: steps, and lengths in the logarithm
+PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
+
+
+MOST_SATURATED = 0.5  # share of rows with u at a limit, from which u says nothing
+
+
+@dataclass(frozen=True, eq=False)
+class HealthyPlant:
+    """The plant that the healthy recordings show."""
+
+    ratios: dict[str, float]  # parameters relative to the loop file's
+    covariance: FloatArray  # of the ratios' logarithms, shape (m, m)
+    # theta, theta_covariance: coefficients that the plant leads to under the recordings' references, shapes (n,) and
+    # (n, n)
+    theta: FloatArray
+    theta_covariance: FloatArray
+    # of these to the coefficients of least squares: chi-square with n degrees of freedom when the loop file is right
+    misfit: float
+    true_theta: FloatArray  # coefficients of the plant itself, shape (n,)
+    # what is left of v = eta - phi' true when a simulated loop's is taken off, one array per recording
+    residuals: list[FloatArray]
+
+    def std(self) -> dict[str, float]:
+        """Return the standard deviations of the ratios' logarithms by parameter."""
+        return dict(zip(self.ratios, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+
+def saturated_share(loop: Loop, recording: Recording) -> float:
+    """Return the share of samples with u at or beyond a limit of the loop."""
+    if loop.input_limits is None:
+        return 0.0
+    low, high = loop.input_limits
+    count = 0
+    for rows in outofcore.iter_chunks(0, recording.samples):
+        u = recording.u[rows]
+        count += int(((u <= low) | (u >= high)).sum())
+    return count / recording.samples
+
+
+def can_simulate(loop: Loop) -> bool:
+    """Return whether the loop can be simulated as a linear closed loop, which expectations and signatures need."""
+    return loop.controller is not None and loop.plant.has_physics and not loop.plant.extras
+
+
+def split_residual_noise(pipeline: Pipeline, found: TuningFit, regressions: Sequence[Regression]) -> WhiteNoise:
+    """Split the residual into n_u and n_y; with two stages its autocovariance is a non-negative mixture of theirs."""
+    from scipy.optimize import nnls
+
+    if found.noises is not None:
+        return found.noises.noise
+
+    lags = 20
+    system = residual_system(pipeline, pipeline.loop.plant)
+    columns = [autocovariances(system.input(one[:, None]), lags, pipeline.stride)[:, 0, 0] for one in np.eye(2)]
+    measured = sample_autocovariance([(g.eta - g.phi @ found.tuning.theta)[g.ok] for g in regressions], lags)
+    size = np.array([column[0] for column in columns])
+    shares, _ = nnls(np.column_stack(columns) / size, measured)
+    u_std, y_std = np.sqrt(shares / size).tolist()
+    return WhiteNoise(u_std=u_std, y_std=y_std)
+
+
+def fit_healthy_plant(
+    expectations: Sequence[Expectation],
+    regressions: Sequence[Regression],
+    found: TuningFit,
+    theta: FloatArray,
+    noise: ArmaNoise,
+    prior: float = PRIOR,
+) -> HealthyPlant:
+    """Fit the plant's parameters to the healthy recordings, held near the loop file's by a prior.
+
+    Maximum a posteriori by Gauss and Newton on the whitened residual: v = eta - phi' theta with theta fixed has the
+    mean that a simulated loop has under the same reference, and a colour that is known. Nothing of the intersample
+    behaviour and of the noise in phi is left in it (prediction errors; Ljung, 1999, section 7.4).
+    """
+    from scipy.optimize import least_squares as minimise
+
+    plant = expectations[0].pipeline.loop.plant
+    measured = [(g.eta - g.phi @ theta)[g.ok] for g in regressions]
+
+    def ratios(x: FloatArray) -> dict[str, float]:
+        return dict(zip(plant.parameters, np.exp(x).tolist(), strict=True))
+
+    def misfit(x: FloatArray) -> FloatArray:
+        changed = plant.with_ratios(ratios(x))
+        parts = [
+            noise.whiten(v - e.mean_residual(changed, theta, g.ok))
+            for v, e, g in zip(measured, expectations, regressions, strict=True)
+        ]
+        return np.concatenate([*parts, x / prior])
+
+    start = np.zeros(len(plant.parameters))
+    found_x = minimise(misfit, start, x_scale=prior, diff_step=[1e-4], max_nfev=12, bounds=(-1.5, 1.5))
+    slope = np.asarray(found_x.jac)
+    return describe_healthy_plant(
+        expectations, regressions, found, plant.parameters, np.asarray(found_x.x), np.linalg.inv(slope.T @ slope)
+    )
+
+
+def describe_healthy_plant(
+    expectations: Sequence[Expectation],
+    regressions: Sequence[Regression],
+    found: TuningFit,
+    names: Sequence[str],
+    x: FloatArray,
+    C: FloatArray,
+) -> HealthyPlant:
+    """Return what m parameters mean for the recursion: logarithms x (m,) of their ratios and covariance C (m, m)."""
+    plant = expectations[0].pipeline.loop.plant
+
+    def ratios(x: FloatArray) -> dict[str, float]:
+        return dict(zip(names, np.exp(x).tolist(), strict=True))
+
+    def expected(x: FloatArray) -> FloatArray:
+        changed = plant.scaled(ratios(x))
+        A, b = zip(*(e.normal_equations(changed) for e in expectations), strict=True)
+        return solve_scaled(np.sum(A, axis=0), np.sum(b, axis=0))  # each reference weighs what it tells, as in the fit
+
+    step = 1e-3
+    J = np.array([expected(x + step * e) - expected(x - step * e) for e in np.eye(len(x))]).T
+    J /= 2.0 * step
+    limit = expected(x)
+    size = np.sqrt(np.diag(found.covariance))
+    off = (found.tuning.theta - limit) / size
+    covariance = found.covariance / np.outer(size, size) + 1e-9 * np.eye(len(size))
+    final = plant.scaled(ratios(x))
+    true = nominal_theta(expectations[0].pipeline.loop, final)
+    return HealthyPlant(
+        ratios=ratios(x),
+        covariance=C,
+        theta=limit,
+        theta_covariance=J @ C @ J.T,
+        misfit=float(off @ np.linalg.solve(covariance, off)),
+        true_theta=true,
+        residuals=[
+            (g.eta - g.phi @ true)[g.ok] - e.mean_residual(final, true, g.ok)
+            for g, e in zip(regressions, expectations, strict=True)
+        ],
+    )
+
+
+def match_ratios(
+    loop: Loop, ratios: Mapping[str, float], theta: FloatArray, covariance: FloatArray
+) -> dict[str, float]:
+    """Return the ratios of the same parameters at which the plant has other coefficients theta (n,), about known ones.
+
+    Least squares weighted by the covariance (n, n) of theta; a parameter that theta does not tell stays where it is.
+    """
+    before = np.log(list(ratios.values()))
+    size = np.sqrt(np.diag(covariance))
+    white = np.linalg.inv(np.linalg.cholesky(covariance / np.outer(size, size))) / size
+
+    def misfit(x: FloatArray) -> FloatArray:
+        plant = loop.plant.scaled(dict(zip(ratios, np.exp(before + x).tolist(), strict=True)))
+        return np.concatenate([white @ (nominal_theta(loop, plant) - theta), x / FREE])
+
+    x = _minimise_squares(misfit, len(before))
+    return dict(zip(ratios, np.exp(before + x).tolist(), strict=True))
+
+
+def _minimise_squares(misfit: Callable[[FloatArray], FloatArray], parameters: int) -> FloatArray:
+    """Return where the sum of squares is least, near 0 and within `FARTHEST`."""
+    x = np.zeros(parameters)
+    for _ in range(NEWTON_STEPS):  # a window of a service moves a few parameters a little: three or four steps
+        now = misfit(x)
+        slopes = [(misfit(x + NEARBY * e) - now) / NEARBY for e in np.eye(parameters)]
+        step = np.linalg.lstsq(np.stack(slopes, axis=1), -now, rcond=None)[0]
+        x = x + step
+        if not np.abs(x).max() < FARTHEST:
+            break
+        if np.abs(step).max() < SETTLED:
+            return x
+    from scipy.optimize import least_squares  # several times as slow near 0, and sure of its way
+
+    return np.asarray(least_squares(misfit, np.zeros(parameters), bounds=(-FARTHEST, FARTHEST)).x)
+
+
+def fault_directions(
+    loop: Loop, plant: Plant, theta: FloatArray, parameters: Sequence[str] | None = None
+) -> dict[str, FloatArray]:
+    """Return d theta / d log(parameter) for every parameter of the plant's faults, or others, each of shape (n,)."""
+    parameters = plant.parameters if parameters is None else parameters
+    if plant.has_physics and not plant.extras and not plant.parameters_are_coefficients:
+        step = 1e-4
+
+        def at(ratio: float, parameter: str) -> FloatArray:
+            return nominal_theta(loop, plant.scaled({parameter: ratio}))
+
+        return {p: (at(np.exp(step), p) - at(np.exp(-step), p)) / (2.0 * step) for p in parameters}
+    names = plant.names
+    return {p: np.where(np.array(names) == p, theta, 0.0) if p in names else np.array(theta) for p in parameters}

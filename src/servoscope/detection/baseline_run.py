@@ -1,0 +1,57 @@
+"""What runs over each recording of one baseline: the recursion, its sequential test, and the healthy expectation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.expectation import NO_REFERENCE, Expectation, MeanPropagator
+from servoscope.detection.cusum_design import build_cusum_constants, sure_level, worst_case_hypotheses
+from servoscope.estimation.pipeline import EstimationRunner, Pipeline
+
+if TYPE_CHECKING:
+    from servoscope.estimation.kernel.cusum import CusumConstants
+
+
+class BaselineRun(NamedTuple):
+    """What runs over each recording of one baseline, at the first sample: go on with `again` of each."""
+
+    estimates: EstimationRunner  # with the sequential test as the baseline has it
+    mean: MeanPropagator | None  # None where the loop cannot be simulated
+    # of the test's level, up to which the same test with limits fitted to whatever reference raises no alarm either
+    sure_level: float
+
+
+def baseline_run(baseline: Baseline) -> BaselineRun:
+    """Return what runs over each recording; computed once, for a service examines thousands of windows an hour."""
+    return baseline.remember("baseline_run", _make_run)
+
+
+def _make_run(baseline: Baseline) -> BaselineRun:
+    pipeline, tuning, mean = baseline.pipeline(), baseline.tuning, None
+    if baseline.noise is not None:
+        expectation = Expectation(pipeline, tuning, baseline.noise, NO_REFERENCE)
+        mean = expectation.propagator(np.array(baseline.model_theta), baseline.plant)
+    estimates = EstimationRunner(pipeline, tuning, cusum_constants(baseline, pipeline))
+    budget = baseline.rehearsed.sequential_budget(baseline.loop)
+    return BaselineRun(estimates, mean, sure_level(baseline.members, budget))
+
+
+def cusum_constants(
+    baseline: Baseline, pipeline: Pipeline, expectation: Expectation | None = None, growth: float = 1.0
+) -> CusumConstants | None:
+    """Return the sequential test beside a pipeline's recursion; None where the baseline has none.
+
+    `expectation` is that of a recording, to whose reference the limits are then fitted, instead of that of the
+    baseline; `growth` is that of the noise's variance.
+    """
+    if baseline.loudest is None or not baseline.members:
+        return None
+    noise, plant, hypotheses = baseline.loudest.times(np.sqrt(growth)), baseline.plant, baseline.members
+    if expectation is not None:
+        covariance = np.array(baseline.ratios_covariance)
+        hypotheses = worst_case_hypotheses(expectation, plant, baseline.loudest, covariance, hypotheses)
+    budget = baseline.rehearsed.sequential_budget(baseline.loop)
+    return build_cusum_constants(pipeline, plant, noise, np.array(baseline.scale), hypotheses, budget)

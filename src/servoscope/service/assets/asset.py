@@ -1,0 +1,398 @@
+"""One asset of the service: blocks in, rows for the store out; all it remembers is its state and its window."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from servoscope.baseline.baseline import Baseline
+from servoscope.core.errors import StateError
+from servoscope.core.messages import message, render
+from servoscope.diagnosis.follower import DiagnosisSchedule
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.prognosis.forecast import Prognosis
+from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCommand
+from servoscope.service.assets.alarms import AssetAlarms
+from servoscope.service.assets.block_lanes import BlockLanes, LaneOutput
+from servoscope.service.assets.checkpoint import AssetState, StreamPosition, evolve
+from servoscope.service.assets.examination import StoredDiagnosis, carry_covariates, examine_blocks
+from servoscope.service.assets.examination_schedule import (
+    ExaminationState,
+    PendingDiagnosis,
+    accept_diagnosis,
+    examination_phase,
+    fault_names,
+    is_at_rest,
+    rest_period,
+    schedule_full_diagnosis,
+    update_examination,
+)
+from servoscope.service.assets.outlook import AssetLimits, Outlook, PrognosisSettings, single_fault
+from servoscope.service.assets.recent_blocks import PackedBlock, RecentBlocks
+from servoscope.service.assets.reception import FOLLOWED, Reception
+from servoscope.service.assets.records import REPEATABLE, BlockRefusal, StepResult, TableRow, transition_row
+from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
+from servoscope.service.assets.status import AssetStatus, asset_metadata, asset_status
+from servoscope.service.config import DiagnosisSettings
+from servoscope.service.sources.block import Block
+from servoscope.service.sources.continuity import NextBlock, check_continuity
+from servoscope.service.store.bundles import pack_samples
+from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
+from servoscope.signals import quality
+
+
+@dataclass(frozen=True)
+class AssetPolicy:
+    """How assets are followed: the sections of the service file that each of them needs."""
+
+    diagnosis: DiagnosisSettings
+    quality: quality.QualitySettings
+    alarms: AlarmSettings
+    residual_every_s: float
+    prognosis: PrognosisSettings = field(default_factory=PrognosisSettings)
+    limits: AssetLimits = field(default_factory=dict)
+    assets: int = field(default=1, compare=False)  # of the process: one more changes nothing for the others
+
+
+class Asset(StateHolder):
+    """Follows one asset.
+
+    `baseline`: of one operating point; `monitor`: of this baseline, shared by all assets that have it; `group`: what
+    the asset belongs to; `source`: what it comes from; both for users.
+    """
+
+    def __init__(
+        self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "", source: str = ""
+    ) -> None:
+        super().__init__()
+        self.name, self.baseline, self.policy, self.source = name, baseline, policy, source
+        self.monitor, self._rate, self._phase = monitor, baseline.loop.sample_rate, examination_phase(name)
+        self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
+        self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s, source)
+        self._limits = policy.quality.limits(self._rate)
+        self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
+        self._alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
+        self._window = RecentBlocks(name, policy.diagnosis.window_s, self._rate)
+        self._result = StepResult([], [])
+        self._reception = FOLLOWED
+        self._ticked = False  # whether silence has changed the state since the last block
+
+    def move_state(self, states: AssetStates, row: int) -> None:
+        """Let the state be a row of `states`, until it is taken or another one is set."""
+        state = self.take_state()
+        since, until = rest_period(state.examination)
+        from_s, to_s = self._alarms.standstill(state, self.reception)
+        undisturbed = self.reception == FOLLOWED and not self._ticked
+        rest = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
+        self._move_to(states.put(row, state, rest if undisturbed else rest._replace(until=-math.inf)))
+
+    @property
+    def reception(self) -> Reception:
+        """How its samples come in."""
+        return self._reception
+
+    @reception.setter
+    def reception(self, reception: Reception) -> None:
+        if reception is not self._reception and self._state is not None:
+            self.take_state()  # what its next block leads to is no longer what it was
+        self._reception = reception
+
+    def compile_kernels(self) -> None:
+        """Compile what blocks need, so that the first one does not wait for it."""
+        nothing, monitor = np.full(2, np.nan), self.monitor
+        monitor.run(monitor.init(), *(nothing,) * 3, channels=dict.fromkeys(self.baseline.logged_covariates, nothing))
+        quality.check_block(self._limits, quality.init_state(), np.arange(2.0), nothing, nothing, nothing)
+
+    def resume(self, state: AssetState, stored: Iterable[Block]) -> list[Block]:
+        """Continue from a checkpoint; `stored`: the blocks in the store, under the store's numbers.
+
+        Returns those that were counted after the checkpoint, for `process`: they lead to nothing but the state after
+        them. Raises StateError if it belongs to another baseline or layout.
+        """
+        other = "belongs to another baseline" if state.baseline != self.baseline.hash else "is of another servoscope"
+        if state.baseline != self.baseline.hash or state.monitor.shape != self.monitor.init().shape:
+            raise StateError(
+                f"{self.name}: its saved state {other} ({state.baseline}, now {self.baseline.hash}): "
+                f"run --anew {self.name} begins with a new state, behind the samples counted"
+            )
+        t = state.position.t
+        alarms = self._alarms.begin(self.name, t, state.alarms)
+        self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
+        position, blocks = state.position, list(stored)
+        counted = [one for one in blocks if one.sequence < position.blocks]
+        self._window = RecentBlocks(self.name, self.policy.diagnosis.window_s, self._rate, counted)
+        ahead = position.sequence - position.blocks + 1  # of the sender's numbers; all are of one stream
+        return [
+            replace(one, sequence=one.sequence + ahead, stream=position.stream)
+            for one in blocks
+            if one.sequence >= position.blocks
+        ]
+
+    def begin(self, position: StreamPosition) -> None:
+        """Begin with a new state, before the first sample or behind those that were counted."""
+        before = {} if self.heard or self.state is None else self.state.alarms_now
+        standing = {name: one for name, one in before.items() if one.sequence}
+        self.state = AssetState(
+            asset=self.name,
+            baseline=self.baseline.hash,
+            position=position,
+            monitor=self.monitor.init(),
+            quality=quality.init_state(),
+            examination=ExaminationState.begin(position.t, self.policy.diagnosis, self._phase, self.policy.assets),
+            # those that stand since before the first block go on
+            alarms=self._alarms.begin(self.name, position.t, standing),
+        )
+
+    def expect(self, now: float) -> None:
+        """Wait for the first block from `now` [UTC s] on: an asset that was never heard has a state too."""
+        self.begin(StreamPosition(now, now, rows=self.state.position.rows if self.state is not None else 0))
+
+    def status(self, state: AssetState) -> AssetStatus:
+        """Return what users see of a state."""
+        return asset_status(state, self._alarms.definitions, self._metadata, self.reception)
+
+    def standing_alarms(self, state: AssetState) -> list[tuple[str, str, str]]:
+        """Return name, priority and state of each alarm that is not normal."""
+        return self._alarms.standing(state.alarms)
+
+    @property
+    def first_needed_sequence(self) -> int:
+        """The number of the first block of the window: earlier ones are no longer needed."""
+        first = self._window.first_sequence
+        return self._current.position.blocks if first is None else first
+
+    def process(self, block: Block, latest: float = math.inf) -> StepResult:
+        """Process a block; one that was counted before has no effect, nor has one that is later than `latest` [UTC s].
+
+        Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
+        """
+        accepted = self.accept(block, latest)
+        return accepted if isinstance(accepted, StepResult) else self.conclude(accepted, self.follow(accepted))
+
+    def accept(self, block: Block, latest: float = math.inf) -> NextBlock | StepResult:
+        """Begin to process a block, as `process` does: return what is to be followed and concluded, or no effect."""
+        start, credible = block.start_time(), block.until(latest)
+        if credible is None:
+            return self._leave_out(block, "future", ahead_s=start - latest)
+        block, start = credible, start if credible is block else credible.start_time()
+        continuity = check_continuity(self.take_state().position if self.heard else None, block, latest)
+        if not self.heard:
+            rows = self._state.position.rows if self._state is not None else 0
+            self.begin(StreamPosition(start, start, stream=block.stream, rows=rows))
+        if continuity is None:
+            position = self._current.position
+            # its sender sends it again by design, or it is one of the last minutes
+            if block.retained or self._window.begins_with(block.t[0]):
+                self.state = replace(self._current, position=replace(position, repeated=position.repeated + 1))
+                return StepResult([], [])
+            return self._leave_out(block, "late", behind_s=position.t - start)
+        return NextBlock(block, continuity)
+
+    def follow(self, accepted: NextBlock) -> LaneOutput:
+        """Follow an accepted block alone."""
+        block, restart = accepted.block, accepted.continuity.is_broken
+        return self.lanes.follow(self.monitor, self._current, block.signals, restart=restart)
+
+    def conclude(self, accepted: NextBlock, followed: LaneOutput) -> StepResult:
+        """Take what an accepted block has led to."""
+        before = self.take_state()
+        self._count(accepted, followed)
+        self._examine()
+        self._advance_alarms(self._current.position.t)
+        self._window.trim(self._current.position.t, self._current.pending_diagnoses)
+        after, undisturbed, self._ticked = self._current, self.reception == FOLLOWED and not self._ticked, False
+        nothing_else = after.alarms is before.alarms and after.examination is before.examination
+        repeatable = nothing_else and undisturbed and REPEATABLE.issuperset(row.table for row in self._result.rows)
+        return self._result._replace(repeatable=repeatable)
+
+    def keep(self, block: PackedBlock) -> None:
+        """Keep the samples of a quiet block whose state is there."""
+        self._window.append(block)
+        self._window.trim(block[2], self.pending_diagnoses)
+
+    def _leave_out(self, block: Block, kind: Literal["late", "future"], **seconds: float) -> StepResult:
+        """Count a block that is left out for its time stamps; its place in its stream has passed."""
+        refusal = BlockRefusal(kind, render(message(f"service.reception.{kind}", **seconds)))
+        if self.state is not None:
+            position = replace(self.state.position, **{kind: getattr(self.state.position, kind) + 1})
+            if kind == "future" and self.heard and block.stream == position.stream:
+                lost = max(0, block.sequence - position.sequence - 1)
+                sequence = max(block.sequence, position.sequence)
+                position = replace(position, sequence=sequence, lost=position.lost + lost)
+            self.state = replace(self.state, position=position)
+        return StepResult([], [], refusal)
+
+    def advance_time(self, elapsed_s: float) -> StepResult:
+        """Advance the asset's clock without a block: after a while, silence is an alarm."""
+        self._result = StepResult([], [])
+        if not self.has_state:
+            return self._result
+        state = self.take_state()
+        now = state.position.t + elapsed_s
+        # before its first block it waits: that is told by its reception, and not as the silence of a sensor
+        quality_state, changed = state.quality, tuple[quality.QualityFinding, ...]()
+        if self.heard:
+            quality_state, changed = quality.tick(self._limits, state.quality, now)
+            self._ticked |= bool(changed)
+        self.state = replace(state, quality=quality_state)
+        if changed or not self.heard or "silent" in quality.active_findings(quality_state):
+            self._advance_alarms(now)
+        return self._result
+
+    def execute(self, alarm: str, command: OperatorCommand) -> StepResult:
+        """Execute an operator's command.
+
+        Raises AlarmError if there is no such alarm, or the command has no meaning in its state.
+        """
+        self._result = StepResult([], [])
+        self.state, transitions = self._alarms.execute(self._current, alarm, command)
+        self._add_transitions(transitions)
+        return self._result
+
+    def due_diagnoses(
+        self, *, ended: bool = False, started: Container[tuple[str, PendingDiagnosis]] = ()
+    ) -> list[tuple[PendingDiagnosis, Sequence[Block]]]:
+        """Return the full diagnoses whose windows are complete, or end here, with their samples.
+
+        `started`: asset and window of those that are not asked for again.
+        """
+        t, after_s, pending = self.t, self._schedule.after, self.pending_diagnoses
+        # complete, or never to be because the clock was set back
+        ready = [window for window in pending if ended or not window.until - after_s <= t < window.until]
+        return [
+            (window, self._carry_covariates(self._window.within(window)))
+            for window in ready
+            if (self.name, window) not in started
+        ]
+
+    def _carry_covariates(self, blocks: Sequence[Block]) -> Sequence[Block]:
+        state = self._current
+        history = self.monitor.covariate_history(state.monitor)
+        return carry_covariates(self.baseline, blocks, history, state.position.t)
+
+    def is_news(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> bool:
+        """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
+        names, known = fault_names(diagnosis.document.get("faults", [])), fault_names(self._current.examination.faults)
+        return self._is_first_diagnosis(window) or bool(names and names != known)
+
+    def _is_first_diagnosis(self, window: PendingDiagnosis) -> bool:
+        return window.until <= self._schedule.end(self._current.examination.since)
+
+    def apply_prognosis(self, found: Prognosis) -> StepResult:
+        """Keep a prognosis, and advance the alarms by it."""
+        state, self._result = self._current, StepResult([], [])
+        self.state = replace(state, outlook=Outlook.from_prognosis(found, state.position.t))
+        self._advance_alarms(state.position.t)
+        return self._result
+
+    def apply_diagnosis(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> StepResult:
+        """Store the result of one of `due_diagnoses`; a second result for it has no effect."""
+        state = self._current
+        if window not in state.pending_diagnoses:
+            return StepResult([], [])
+        examination, diagnosis = accept_diagnosis(
+            state.examination, window, diagnosis, first=self._is_first_diagnosis(window)
+        )
+        pending = tuple(one for one in state.pending_diagnoses if one != window)
+        self.state = replace(state, examination=examination, pending_diagnoses=pending)
+        values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
+        self._window.trim(self._current.position.t, self._current.pending_diagnoses)
+        named = fault_rows(window.until, "full", diagnosis.document.get("faults", []))
+        return StepResult([TableRow("diagnoses", values), *(TableRow("sizes", row) for row in named)], [])
+
+    @property
+    def _current(self) -> AssetState:
+        return self.take_state()
+
+    def _next_row_number(self) -> int:
+        position = self._current.position
+        self.state = replace(self._current, position=replace(position, rows=position.rows + 1))
+        return position.rows + 1
+
+    def _add_row(self, table: str, **values: Any) -> None:
+        self._result.rows.append(TableRow(table, {"number": self._next_row_number(), **values}))
+
+    def _add_sizes(self, rows: Iterable[dict[str, Any]]) -> None:
+        self._result.rows.extend(TableRow("sizes", row) for row in rows)
+
+    def _count(self, accepted: NextBlock, followed: LaneOutput) -> None:
+        """Keep a block and the state after it."""
+        (block, continuity, packed), state = accepted, self._current
+        position, (samples, regular) = state.position, packed or pack_samples(block.signals[None])[0]
+        # stored under a number of our own, because the sender's may begin anew
+        self._window.append((position.blocks, block.t.item(0), block.t.item(-1), block.t.size, samples, regular))
+        stored = {"sequence": position.blocks, "samples": samples, "regular": regular}
+        self._result = StepResult([TableRow("recent", stored)], [])
+        if continuity.is_broken:
+            self._result.rows.append(continuity.audit_row(position, block))
+        self.state = evolve(
+            state,
+            monitor=followed.monitor,
+            samples=followed.samples,
+            quality=followed.quality,
+            history=followed.history,
+            evaluation=followed.evaluation or state.evaluation,
+            last_t=followed.last_t,
+            position=evolve(
+                position,
+                t=position.t if followed.last_t is None else followed.last_t,
+                sequence=block.sequence,
+                stream=block.stream,
+                blocks=position.blocks + 1,
+                samples=position.samples + block.t.size,
+                lost=position.lost + continuity.lost,
+                digest=zlib.crc32(block.pack(), position.digest),
+            ),
+        )
+        for row in followed.rows:
+            self._add_row("residuals", **row)
+        evaluation = self._current.evaluation
+        if evaluation.t is not None and period_number(evaluation.t) != period_number(state.evaluation.t):
+            self._add_sizes(coefficient_rows(evaluation.t, evaluation.status.parameters))
+
+    def _examine(self) -> None:
+        """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
+        state, settings = self._current, self.policy.diagnosis
+        t, known = state.position.t, state.examination
+        details = state.evaluation.features, single_fault(known.faults), known.verdict
+        if is_at_rest(known, t, state.evaluation.exceeded):
+            return
+        recent = partial(self._window.after, t - settings.window_s)
+        examination, result = update_examination(
+            state.examination,
+            settings,
+            t,
+            state.evaluation.exceeded,
+            lambda: examine_blocks(self.baseline, self.name, self._carry_covariates(recent()), *details),
+            self._phase,
+            sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
+        )
+        if examination is not state.examination:
+            self.state = replace(state, examination=examination)
+        if result is None:
+            return
+        if result.size is not None:
+            self._add_sizes(fault_rows(t, "live", [result.size.model_dump(mode="json")]))
+        if result.verdict != state.examination.verdict:
+            self._add_row("diagnoses", t=t, grounds="examination", **result.columns())
+        examination, in_full = schedule_full_diagnosis(examination, self._schedule, t)
+        if in_full:
+            window = PendingDiagnosis(self._next_row_number(), recent()[0].sequence, self._schedule.end(t), "full")
+            pending = (*self._current.pending_diagnoses, window)
+            self.state = replace(self._current, examination=examination, pending_diagnoses=pending)
+
+    def _advance_alarms(self, t: float) -> None:
+        """Update the alarms at time `t` [UTC s]."""
+        self.state, transitions = self._alarms.advance(self._current, self.reception, t)
+        self._add_transitions(transitions)
+
+    def _add_transitions(self, transitions: Sequence[AlarmTransition]) -> None:
+        self._result.transitions.extend(transitions)
+        for one in transitions:
+            self._add_row("transitions", **transition_row(one, self._alarms.definitions[one.alarm]))

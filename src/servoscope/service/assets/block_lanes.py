@@ -1,0 +1,199 @@
+"""Accepted blocks through time base, monitor and data quality: of one asset, or of several side by side.
+
+Both ways lead to the same bits, so that nothing depends on which assets happen to be ready at the same time.
+"""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
+from servoscope.detection.trace import Trace
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.assets.checkpoint import AssetState
+from servoscope.service.assets.residual_history import (
+    HistoryState,
+    LastEvaluations,
+    LatestEvaluation,
+    history_row,
+    ifrf_residual,
+    known_excess,
+    residual_rows,
+    update_history,
+)
+from servoscope.service.layer_times import LayerTimes
+from servoscope.signals import quality
+from servoscope.signals.timebase import MAX_TIME_S, Timebase
+
+
+class LaneOutput(NamedTuple):
+    """What a block has led to."""
+
+    monitor: FloatArray
+    quality: FloatArray
+    samples: int  # that the monitor has processed so far
+    last_t: float | None  # time of the last one [UTC s]
+    history: HistoryState
+    rows: list[dict[str, Any]]  # of the history that are complete
+    evaluation: LatestEvaluation | None  # None: the block has none
+
+
+class LaneEvaluations:
+    """The evaluations of a block of each of several assets, at `times` [UTC s], shape (assets, K), K > 0.
+
+    What is judged of them, of each asset: `exceeded`, whether the last one is above a limit; `peaks`, of the whole
+    block, shape (3, assets); `t`, time of the last one [UTC s]; `periods` of the history in which they lie, shape
+    (assets, K).
+    """
+
+    def __init__(self, trace: Trace, times: FloatArray, every_s: float) -> None:
+        self._trace, self._times, self._every_s = trace, times, every_s
+        self.exceeded, self.peaks, self.t = trace.exceeded[:, -1], _peaks(trace), times[:, -1]
+        self.periods = np.floor(times / every_s)
+        self._last = cache(partial(LastEvaluations, trace))  # most are replaced before anybody looks
+
+    def latest(self, lane: int) -> LatestEvaluation:
+        """Return the newest one of an asset."""
+        excess, level, _ = self.peaks[:, lane].tolist()
+        t, features, last = float(self.t[lane]), self._trace.features, self._last
+        learned = None if features is None else float(features[lane, -1])
+        return LatestEvaluation(bool(self.exceeded[lane]), (excess, level), learned, t, lambda: last().status(lane, t))
+
+    def update_history(self, lane: int, state: HistoryState) -> tuple[HistoryState, list[dict[str, Any]]]:
+        """Add those of an asset to its history, as `residual_history.update_history` does."""
+        return update_history(state, self._trace.lane(lane), self._times[lane], self._every_s)
+
+    def count_periods(self, before: FloatArray) -> IndexArray:
+        """Return how many periods of the history begin with them; `before`: those under way, shape (assets,)."""
+        return np.asarray(np.count_nonzero(np.diff(self.periods, prepend=before[:, None]), axis=1))
+
+    def update_histories(
+        self, lanes: IndexArray, period: FloatArray, peaks: FloatArray
+    ) -> tuple[FloatArray, IndexArray, list[dict[str, Any]]]:
+        """Add those of some assets to their histories, as `update_history` does, where no more than one row is due.
+
+        `period`: under way, shape (lanes,); `peaks`: its largest statistics, shape (2, lanes). Returns the peaks of the
+        period that is under way then, in which of the lanes a row is due, and these rows.
+        """
+        begins, largest = np.diff(self.periods[lanes], prepend=period[:, None]) != 0.0, self.peaks[[2, 1]][:, lanes]
+        due, after = np.flatnonzero(begins.any(axis=1)), np.where(largest > peaks, largest, peaks)
+        if not due.size:
+            return after, due, []
+        own, place = lanes[due], begins[due].argmax(axis=1)
+        found = np.stack([known_excess(self._trace)[own], self._trace.level[own]])
+        is_before = np.arange(found.shape[-1]) <= place[:, None]
+        until, since = (np.where(side, found, 0.0).max(axis=-1) for side in (is_before, ~is_before))
+        until, after[:, due] = np.where(until > peaks[:, due], until, peaks[:, due]), np.where(since > 0.0, since, 0.0)
+        residuals = map(residual_rows, ifrf_residual(self._trace, (own, place)))
+        rows = zip(self._times[own, place].tolist(), *until.tolist(), residuals, strict=True)
+        return after, due, [history_row(*row) for row in rows]
+
+
+class LanesOutput(NamedTuple):
+    """What a block of each of several assets has led to."""
+
+    monitor: FloatArray  # shape (assets, size)
+    quality: FloatArray  # shape (assets, size)
+    t: FloatArray  # time of the last sample, shape (assets,) [UTC s]
+    size: int  # samples of each block
+    evaluations: LaneEvaluations | None  # None: the blocks have none
+
+    def lane(self, lane: int, state: AssetState) -> LaneOutput:
+        """Return that of one asset, with the state before it."""
+        history, rows, latest = state.history, list[dict[str, Any]](), None
+        if self.evaluations is not None:
+            history, rows = self.evaluations.update_history(lane, history)
+            latest = self.evaluations.latest(lane)
+        # copies: an asset that falls silent must not hold the arrays of all others
+        new, seen = self.monitor[lane].copy(), self.quality[lane].copy()
+        return LaneOutput(new, seen, state.samples + self.size, float(self.t[lane]), history, rows, latest)
+
+
+class BlockLanes:
+    """Follows blocks of assets that have one sample rate and the same limits of data quality."""
+
+    def __init__(self, rate: float, limits: quality.QualityLimits, residual_every_s: float) -> None:
+        self._rate, self._limits, self._residual_every_s = rate, limits, residual_every_s
+        self._timebase = Timebase(1.0 / rate)
+
+    def follow(self, monitor: Monitor, state: AssetState, block: FloatArray, *, restart: bool) -> LaneOutput:
+        """Follow a block of one asset, in whatever order its samples are.
+
+        `block`: t, r, u, y and covariates, shape (4 + k, N); `restart`: whether samples before it are missing.
+        """
+        last = np.nan if state.last_t is None else state.last_t
+        order = self._timebase.order_block(block[0], last)
+        order.restart[:1] |= restart
+        t, signals = block[0, order.rows], block[1:, order.rows]
+        r, u, y, *covariates = np.where(np.isfinite(signals), signals, np.nan)
+        channels = dict(zip(monitor.baselines[0].logged_covariates, covariates, strict=False))
+        new, trace = monitor.run(state.monitor, r, u, y, order.restart, channels=channels)
+        checked, _ = quality.check_block(self._limits, state.quality, *block[:4, order.order])
+        last_t = order.t if np.isfinite(order.t) else None
+        checked, _ = quality.tick(self._limits, checked, state.position.t if last_t is None else last_t)
+        times = t[self._evaluated_samples(trace, state.samples)]
+        history, rows = update_history(state.history, trace, times, self._residual_every_s)
+        evaluation = None
+        if times.size:
+            excess, level, _ = _peaks(trace).tolist()
+            evaluation = LatestEvaluation.from_trace(trace, float(times[-1]), (excess, level))
+        return LaneOutput(new, checked, state.samples + len(t), last_t, history, rows, evaluation)
+
+    def are_regular(self, t: FloatArray, last: FloatArray) -> BoolArray:
+        """Tell which of some blocks, with times `t` (blocks, N), need no sorting, nor a second look at what was `last`.
+
+        `last`: time of the last sample before each, shape (blocks,), NaN: there was none [UTC s].
+        """
+        return self._timebase.is_regular(t, last)
+
+    def begin_regularly(self, t: FloatArray) -> BoolArray:
+        """Tell which of some first blocks, with times `t` (blocks, N), need no sorting."""
+        return self.are_regular(t, t[:, 0] - self._timebase.period) & (np.abs(t[:, [0, -1]]) < MAX_TIME_S).all(axis=1)
+
+    def follow_lanes(
+        self,
+        fleet: Monitor,
+        before: tuple[FloatArray, FloatArray],
+        samples: int,
+        signals: FloatArray,
+        layers: LayerTimes,
+        *,
+        begins: bool = False,
+    ) -> LanesOutput:
+        """Follow regular blocks of the assets of a fleet, of one length and one phase, side by side.
+
+        `before`: states of monitor and data quality, shape (blocks, ...) each; `samples`: that the monitor of the first
+        asset has processed; `signals`: of the blocks, shape (blocks, 4 + k, N); `begins`: whether nothing came before.
+        """
+        t, given = signals[:, 0], signals[:, 1:4]
+        known = np.isfinite(given)
+        used = given if known.all() else np.where(known, given, np.nan)
+        layers.enter("kernel")
+        restart = None
+        if begins:
+            restart = np.zeros(t.shape, dtype=np.bool_)
+            restart[:, 0] = True
+        monitors, trace = fleet.run(before[0], used[:, 0], used[:, 1], used[:, 2], restart)
+        layers.enter("quality")
+        checked = quality.check_lanes(self._limits, before[1], t, given)
+        layers.enter("judge")
+        times = t[:, self._evaluated_samples(trace, samples)]
+        evaluations = LaneEvaluations(trace, times, self._residual_every_s) if times.shape[1] else None
+        return LanesOutput(monitors, checked, t[:, -1].copy(), t.shape[1], evaluations)
+
+    def _evaluated_samples(self, trace: Trace, samples: int) -> npt.NDArray[np.int64]:
+        """Return at which of a block's samples the evaluations are; `samples` were processed before it."""
+        return np.rint(trace.t * self._rate).astype(np.int64) - samples
+
+
+def _peaks(trace: Trace) -> FloatArray:
+    """Return the largest T^2 of a block, over its limit, the largest sequential test, and T^2 for the history.
+
+    Shape (3, ...). The history counts T^2 only where the estimator has learned something.
+    """
+    excess = np.nan_to_num(trace.statistic / trace.threshold).max(axis=-1)
+    return np.array([excess, trace.level.max(axis=-1), known_excess(trace).max(axis=-1, initial=0.0)])

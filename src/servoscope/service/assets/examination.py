@@ -1,0 +1,216 @@
+"""The last minutes as a recording: examined in milliseconds while samples come in, diagnosed in full beside them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.covariates import hold_last
+from servoscope.core.errors import RecordingError, ServoscopeError
+from servoscope.core.messages import Message, message, render
+from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
+from servoscope.detection.result import FaultEstimate, Verdict
+from servoscope.detection.warm_up import FOLLOWED
+from servoscope.service.sources.block import Block
+from servoscope.signals import Recording, clean
+
+if TYPE_CHECKING:  # its kernels are loaded when something is examined
+    from servoscope.diagnosis.examine import Examination
+
+
+KERNEL_SAMPLES = 400  # that bring all kernels of an examination to work
+
+
+class StoredDiagnosis(BaseModel):
+    """What the store keeps of an examination or a full diagnosis."""
+
+    model_config = ConfigDict(frozen=True)
+
+    verdict: Verdict  # at the end of the window
+    headline: Message
+    onset: float | None = None  # of the fault [UTC s]
+    document: dict[str, Any] = {}  # of a diagnosis: as `diagnose --json` prints it
+    # whether an alarm has gone that is still in the window: until it has left it, the window proves nothing
+    recovering: bool = False
+    size: FaultEstimate | None = None  # of the fault that was named before, as it is now; None: not known
+
+    @property
+    def summary(self) -> str:
+        """The headline as text."""
+        return render(self.headline)
+
+    def columns(self) -> dict[str, Any]:
+        """Return its columns in the table of diagnoses."""
+        return {"verdict": self.verdict, "summary": self.summary, "onset": self.onset, "document": self.document}
+
+    def with_onset(self, onset: float | None) -> StoredDiagnosis:
+        """Return it with the onset [UTC s] that an earlier window has found, if its own window begins after that."""
+        if onset is not None and self.headline.key == "diagnosis.timeline":
+            return self._with_timeline_from(onset)
+        since = self.headline.values.get("since")
+        if onset is None or since is None or since.key != "diagnosis.since_start_date":
+            return self
+        values = {**self.headline.values, "since": message("diagnosis.since_date", t=onset, growth=None)}
+        return self.model_copy(update={"headline": message(self.headline.key, **values), "onset": onset})
+
+    def _with_timeline_from(self, onset: float) -> StoredDiagnosis:
+        first, *others = self.headline.values["stretches"]
+        when = first.values["when"]
+        if when.key == "diagnosis.stretch_until_date":
+            when = message("diagnosis.stretch_when_date", from_s=onset, to_s=when.values["to_s"])
+        elif when.key == "diagnosis.stretch_start_date":
+            when = message("diagnosis.stretch_since_date", from_s=onset)
+        else:
+            return self
+        first = first.model_copy(update={"values": {**first.values, "when": when}})
+        values = {**self.headline.values, "stretches": (first, *others)}
+        return self.model_copy(update={"headline": message(self.headline.key, **values), "onset": onset})
+
+
+def undetermined(key: str, **values: Any) -> StoredDiagnosis:
+    """Return that nothing could be determined, for the reason in a message of the section `service.examination`."""
+    return StoredDiagnosis(verdict="undetermined", headline=message(f"service.examination.{key}", **values))
+
+
+def examine_blocks(
+    baseline: Baseline,
+    name: str,
+    blocks: Sequence[Block],
+    features: float | None = None,
+    fault: str | None = None,
+    known: Verdict | None = None,
+) -> StoredDiagnosis:
+    """Examine the last minutes with the reference that was applied in them, without a refit.
+
+    `features`: their score in the monitor, as a multiple of its limit. It has seen more spans than the last minutes
+    hold, so its word counts where the coefficients are healthy. `fault`: the one that was named, to follow its size.
+    `known`: the verdict that the store has already: the same one again has no document, which takes as long as the rest
+    of the diagnosis.
+
+    Where the samples cannot be used, the verdict is ``undetermined`` and the headline has the reason.
+    """
+    from servoscope.diagnosis.diagnose import diagnose_examination, judge_without_alarm
+    from servoscope.diagnosis.examine import Examination
+
+    try:
+        recording, start = blocks_to_recording(baseline, name, blocks)
+        exam = Examination.from_recording(baseline, recording, quick=True)
+    except ServoscopeError as error:
+        return undetermined("unusable", error=str(error))
+    if exam.along is not None and (outside := exam.along.outside) is not None:
+        return undetermined("unusable", error=outside)
+    if not exam.alarm.any():
+        if features is not None and features > 1.0:
+            headline = message("service.examination.features", excess=features)
+            return StoredDiagnosis(verdict="fault", headline=headline, onset=None)
+        if known is not None:
+            verdict, headline, _ = judge_without_alarm(exam)
+            if verdict == known:
+                return StoredDiagnosis(verdict=verdict, headline=headline)
+        diagnosis, _ = diagnose_examination(exam)
+        document = diagnosis.model_dump(mode="json")
+        return StoredDiagnosis(verdict=diagnosis.verdict, headline=diagnosis.headline, document=document)
+    if not exam.alarm[-1]:
+        return undetermined("recovering").model_copy(update={"recovering": True})
+    first = 0 if exam.alarm.all() else len(exam.alarm) - int(np.argmin(exam.alarm[::-1]))
+    crossed = int(exam.estimates.crossed[first]) - 1
+    onset = start + float(recording.t[crossed if crossed >= 0 else int(exam.estimates.index[first])])
+    excess = float((exam.statistic / baseline.limit)[first:].max())
+    level = message("service.examination.level", level=float(exam.estimates.level[first:].max()))
+    headline = message("service.examination.fault", excess=excess, level=level if baseline.members else None)
+    size = _follow_size(exam, fault, first) if fault is not None else None
+    return StoredDiagnosis(verdict="fault", headline=headline, onset=onset, size=size)
+
+
+def compile_examination(baseline: Baseline) -> None:
+    """Examine some noise, so that samples do not wait for the compiler while an asset is first examined."""
+    t = np.arange(KERNEL_SAMPLES) / baseline.loop.sample_rate
+    covariates = np.zeros((0, 1)) if baseline.covariates is None else baseline.covariates.origin[:, None]
+    signals = np.random.default_rng(0).normal(size=(3, t.size))
+    held = np.tile(covariates[: len(baseline.logged_covariates)], t.size)
+    with contextlib.suppress(ArithmeticError, np.linalg.LinAlgError):  # of numbers that mean nothing
+        examine_blocks(baseline, "", [Block.from_signals("", 0, np.concatenate([t[None], signals, held]))])
+
+
+def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | None:
+    """Return the size of a fault at the end of the window, by the recursion; the alarm began at evaluation `first`.
+
+    None where the coefficients are not where this fault alone would have moved them: then it has no size.
+    """
+    from servoscope.detection.onset import Onset
+    from servoscope.diagnosis.batch_estimate import isolation_inputs
+    from servoscope.isolation.isolate import isolate
+
+    begin = int(exam.estimates.index[first]) if first else 0
+    t = float(exam.recording.t[begin])
+    onset = Onset(t, t, t, begin)
+    try:
+        signatures, deviation, covariance = isolation_inputs(exam, onset, exam.evaluations - 1)
+        own = [signature for signature in signatures if signature.fault.name == fault]
+        best = isolate(own, deviation, covariance)[0]
+    except (ServoscopeError, np.linalg.LinAlgError, ArithmeticError):
+        return None
+    return best.faults[0] if best.name == fault else None
+
+
+def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
+    """Diagnose a window, refit included, which takes seconds.
+
+    The motion signature before and after the onset is the document's key ``signature``. Times in the document count
+    from the beginning of the window, its key ``began``; those of the headline are dates,
+    because months later nobody knows when the window began.
+    """
+    from servoscope.diagnosis.diagnose import diagnose
+    from servoscope.diagnosis.motion_signature import signature_columns
+
+    try:
+        recording, start = blocks_to_recording(baseline, name, blocks)
+        diagnosis = diagnose(baseline, recording)
+    except ServoscopeError as error:
+        return undetermined("unusable", error=str(error))
+    since = diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
+    onset = start + since if since is not None else None
+    signature = signature_columns(recording, baseline.loop, since)
+    document = {"began": start, "signature": signature, **diagnosis.model_dump(mode="json")}
+    headline = diagnosis.dated_headline(start)
+    return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
+
+
+def carry_covariates(
+    baseline: Baseline, blocks: Sequence[Block], history: CovariateHistory, now: float
+) -> Sequence[Block]:
+    """Return blocks with what a monitor knows at `now` [UTC s] of covariates of which they have no value themselves."""
+    if not history or not blocks:
+        return blocks
+    t, _, _, _, *rows = np.concatenate([block.signals for block in blocks], axis=1)
+    filled = fill_channels(dict(zip(baseline.logged_covariates, rows, strict=True)), t - now, history)
+    columns = np.split(np.array(list(filled.values())), np.cumsum([one.t.size for one in blocks])[:-1], axis=1)
+    return [replace(block, covariates=own) for block, own in zip(blocks, columns, strict=True)]
+
+
+def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) -> tuple[Recording, float]:
+    """Return blocks as a recording, whose time begins at 0, and the time of its beginning [UTC s].
+
+    Raises RecordingError if they cannot be used as one.
+    """
+    t, r, u, y, *covariates = np.concatenate([block.signals for block in blocks], axis=1)
+    names = baseline.logged_covariates if baseline.covariates is None or baseline.logged_covariates else FOLLOWED
+    told = {name: np.where(np.isfinite(c), c, np.nan) for name, c in zip(names, covariates, strict=False)}
+    hold_s, rate = baseline.loop.monitor.covariate_hold_s, baseline.loop.sample_rate
+    if (
+        baseline.covariates is not None
+        and (stale := baseline.covariates.describe_stale(told, hold_s, rate)) is not None
+    ):
+        raise RecordingError(str(stale))
+    # a thermometer may tell less often than the motion is sampled
+    channels = {name: hold_last(c[:, None], c[~np.isnan(c)][:1])[:, 0] for name, c in told.items()}
+    loop, start = baseline.loop, float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0
+    limits = loop.input_limits
+    found = clean(t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=limits, channels=channels or None)
+    return found, start

@@ -1,0 +1,225 @@
+"""The blocks of one turn: those of assets of one structure go through the kernels together, the others alone."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from itertools import repeat
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray, IndexArray
+from servoscope.core.errors import ServoscopeError
+from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.assets.asset import Asset
+from servoscope.service.assets.recent_blocks import PackedBlock
+from servoscope.service.assets.records import StepResult, TableRow
+from servoscope.service.assets.states import AssetStates
+from servoscope.service.layer_times import LayerTimes
+from servoscope.service.sources.block import Block
+from servoscope.service.sources.continuity import NextBlock
+from servoscope.service.store.bundles import pack_samples
+
+
+class BlockResult(NamedTuple):
+    """What a block has led to, or why it is none."""
+
+    block: Block
+    result: StepResult | ServoscopeError
+
+
+class QuietBlocks(NamedTuple):
+    """Blocks, at most one of each asset, that have led to nothing but states and rows that are due at their times."""
+
+    assets: list[Asset]
+    blocks: list[Block]
+    packed: list[PackedBlock]  # their samples, under their numbers, as the store has them
+    history: list[tuple[int, TableRow]]  # each row with which of the blocks it is of
+
+
+class _Fleet(NamedTuple):
+    """Assets of one structure, and all baselines that they have."""
+
+    monitor: Monitor
+    states: AssetStates
+
+
+class _Place(NamedTuple):
+    """Of an asset in a fleet: the fleet's number, which of its baselines is its own, and its row among the states."""
+
+    asset: Asset
+    fleet: int
+    baseline: int
+    row: int
+
+
+_PlacedBlock: TypeAlias = tuple[_Place, Block]
+
+
+class AssetGroups:
+    """Follows the blocks of several assets, each as if it were alone, to the last bit."""
+
+    def __init__(self, assets: Mapping[str, Asset], layers: LayerTimes | None = None) -> None:
+        self._assets, self.layers = assets, layers or LayerTimes()
+        monitors: dict[Hashable, dict[int, Monitor]] = defaultdict(dict)
+        kinds: dict[int, Hashable | None] = {}  # of the monitors, which assets share
+        for monitor in {id(asset.monitor): asset.monitor for asset in assets.values()}.values():
+            kinds[id(monitor)] = key = monitor.lane_key
+            if key is not None:
+                monitors[key][id(monitor)] = monitor
+        members: dict[Hashable, list[str]] = defaultdict(list)
+        for name, asset in assets.items():
+            members[kinds[id(asset.monitor)]].append(name)
+        self._fleets, self._places = list[_Fleet](), dict[str, _Place]()  # of assets that have company
+        for key, own in monitors.items():
+            if len(names := members[key]) > 1:
+                size = len(assets[names[0]].monitor.init())
+                baselines = {each: i for i, each in enumerate(own)}
+                for row, name in enumerate(names):
+                    asset = assets[name]
+                    self._places[name] = _Place(asset, len(self._fleets), baselines[id(asset.monitor)], row)
+                self._fleets.append(_Fleet(Monitor.join(list(own.values())), AssetStates(len(names), size)))
+
+    def process(self, blocks: Iterable[Block], latest: float = np.inf) -> Iterator[BlockResult | QuietBlocks]:
+        """Process blocks of any assets, those of one asset in their order; yield what they have led to.
+
+        `latest`: the last time that can be true [UTC s].
+        """
+        waiting = list(blocks)
+        while waiting:
+            self.layers.enter("assemble")
+            turn, later = dict[str, Block](), list[Block]()  # a round has at most one block of each asset
+            for one in waiting:
+                if one.asset in turn:
+                    later.append(one)
+                else:
+                    turn[one.asset] = one
+            waiting = later
+            yield from self._process_round(turn.values(), latest)
+
+    def _process_round(self, turn: Iterable[Block], latest: float) -> Iterator[BlockResult | QuietBlocks]:
+        together: dict[tuple[int, tuple[int, ...]], list[_PlacedBlock]] = defaultdict(list)
+        alone = list[Block]()
+        for block in turn:
+            place = self._places.get(block.asset)
+            try:
+                shape = block.shape
+            except ServoscopeError as error:  # one asset's trouble must not stop the others
+                yield BlockResult(block, error)
+                continue
+            if place is None:
+                alone.append(block)
+            else:
+                together[place.fleet, shape].append((place, block))
+        for (fleet, shape), placed in together.items():
+            # in C order, which digests and kernels need: where each block is in Fortran order, the joined array is too
+            joined = np.ascontiguousarray(np.concatenate([block.signals for _, block in placed]))
+            signals = joined.reshape(len(placed), *shape)
+            yield from self._process_together(self._fleets[fleet], placed, signals, latest, alone)
+        for block in alone:
+            yield BlockResult(block, self._process_alone(block, latest))
+
+    def _process_alone(self, block: Block, latest: float) -> StepResult | ServoscopeError:
+        asset = self._assets[block.asset]
+        self.layers.enter("judge")
+        try:
+            accepted = asset.accept(block, latest)
+        except ServoscopeError as error:
+            return error
+        if isinstance(accepted, StepResult):
+            return accepted
+        self.layers.enter("kernel")
+        followed = asset.follow(accepted)
+        self.layers.enter("judge")
+        return asset.conclude(accepted, followed)
+
+    def _process_first(
+        self, fleet: _Fleet, placed: Sequence[_PlacedBlock], signals: FloatArray, latest: float, alone: list[Block]
+    ) -> Iterator[BlockResult]:
+        """Process the first blocks of assets, of one shape; those that must go `alone` are added there.
+
+        One by one they take twice as long, and all assets of a plant may begin at once.
+        """
+        self.layers.enter("assemble")
+        lanes, t = placed[0][0].asset.lanes, signals[:, 0]
+        begins = lanes.begin_regularly(t) & ~(t[:, -1] > latest)
+        begins &= np.array([not block.stream or not block.sequence for _, block in placed])
+        chosen = np.flatnonzero(begins)
+        own = [placed[i] for i in chosen.tolist()]
+        alone += [placed[i][1] for i in np.flatnonzero(~begins).tolist()]
+        if not own:
+            return
+        self.layers.enter("judge")
+        accepted = [place.asset.accept(block, latest) for place, block in own]
+        states = [place.asset.take_state() for place, _ in own]
+        before = np.stack([one.monitor for one in states]), np.stack([one.quality for one in states])
+        part = fleet.monitor.select(np.array([place.baseline for place, _ in own]))
+        found = lanes.follow_lanes(part, before, 0, signals[chosen], self.layers, begins=True)
+        packed = pack_samples(signals[chosen])
+        for i, ((place, block), one) in enumerate(zip(own, accepted, strict=True)):
+            assert isinstance(one, NextBlock), "nothing came before it, and it is not of the future"
+            result = place.asset.conclude(one._replace(packed=packed[i]), found.lane(i, states[i]))
+            yield BlockResult(block, result)
+
+    def _process_together(
+        self, fleet: _Fleet, placed: Sequence[_PlacedBlock], signals: FloatArray, latest: float, alone: list[Block]
+    ) -> Iterator[BlockResult | QuietBlocks]:
+        """Process blocks of one shape, with these `signals`; those that must go `alone` are added there."""
+        self.layers.enter("assemble")
+        states, t = fleet.states, signals[:, 0]
+        rows = np.array([place.row for place, _ in placed])
+        is_begun = np.ones(len(rows), dtype=np.bool_)
+        for i in np.flatnonzero(~states.columns["is_here"][rows]).tolist():
+            place, _ = placed[i]
+            if place.asset.heard:
+                place.asset.move_state(states, place.row)
+            else:
+                is_begun[i] = False
+        if not is_begun.all():
+            first = np.flatnonzero(~is_begun)
+            yield from self._process_first(fleet, [placed[i] for i in first.tolist()], signals[first], latest, alone)
+            self.layers.enter("assemble")
+        monitors, lanes = states.monitor[rows], placed[0][0].asset.lanes
+        follows = states.are_next(rows, [block.sequence for _, block in placed], [block.stream for _, block in placed])
+        follows &= is_begun & lanes.are_regular(t, states.columns["last_t"][rows]) & ~(t[:, -1] > latest)
+        phases = fleet.monitor.phase(monitors)
+        for phase in [-1, *np.unique(phases[follows]).tolist()]:
+            chosen = np.flatnonzero(follows & (phases == phase) if phase >= 0 else is_begun & ~follows)
+            group = placed if chosen.size == len(placed) else [placed[i] for i in chosen.tolist()]
+            if phase < 0 or len(group) == 1:
+                alone += [block for _, block in group]
+            elif group is placed:
+                yield from self._process_lanes(fleet, group, rows, monitors, signals)
+            else:
+                yield from self._process_lanes(fleet, group, rows[chosen], monitors[chosen], signals[chosen])
+
+    def _process_lanes(
+        self,
+        fleet: _Fleet,
+        placed: Sequence[_PlacedBlock],
+        rows: IndexArray,
+        monitors: FloatArray,
+        signals: FloatArray,
+    ) -> Iterator[BlockResult | QuietBlocks]:
+        """Process regular blocks, whose assets are of one phase; their states are in these rows."""
+        self.layers.enter("assemble")
+        assets, blocks, states = [place.asset for place, _ in placed], [block for _, block in placed], fleet.states
+        part = fleet.monitor.select(np.array([place.baseline for place, _ in placed]))
+        before, samples = (monitors, states.quality[rows]), int(states.columns["samples"][rows[0]])
+        found = assets[0].lanes.follow_lanes(part, before, samples, signals, self.layers)
+        are_quiet, packed = states.are_quiet(rows, found), pack_samples(signals)
+        for i in np.flatnonzero(~are_quiet).tolist():
+            accepted = NextBlock(blocks[i], packed=packed[i])
+            followed = found.lane(i, assets[i].take_state())
+            yield BlockResult(blocks[i], assets[i].conclude(accepted, followed))
+        quiet = np.flatnonzero(are_quiet)
+        if quiet.size:
+            chosen = quiet.tolist()
+            own, theirs = [packed[i] for i in chosen], [assets[i] for i in chosen]
+            numbers, history = states.advance(rows[quiet], found, quiet, signals)
+            times = signals[quiet, 0][:, [0, -1]].T.tolist()
+            kept = list(zip(numbers, *times, repeat(found.size, quiet.size), *zip(*own, strict=True), strict=True))
+            for asset, block in zip(theirs, kept, strict=True):
+                asset.keep(block)
+            yield QuietBlocks(theirs, [blocks[i] for i in chosen], kept, history)

@@ -1,0 +1,230 @@
+"""What users see of an asset and of the service: the status that is stored beside each checkpoint.
+
+`model_validate` reads a stored status, of any version; `to_json` returns what is stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from servoscope.baseline.baseline import Baseline
+from servoscope.core.messages import message, render
+from servoscope.detection.result import FaultEstimate
+from servoscope.service.alarms import (
+    FAULT_ALARM,
+    AlarmDefinition,
+    AssetSnapshot,
+    LifecycleState,
+    Ne107,
+    Priority,
+    evaluate_ne107,
+)
+from servoscope.service.assets.checkpoint import AssetState, StreamPosition
+from servoscope.service.assets.examination_schedule import ExaminationState
+from servoscope.service.assets.outlook import Outlook, OutlookWord, current_outlook
+from servoscope.service.assets.reception import FOLLOWED, Reception, ReceptionState
+from servoscope.service.assets.residual_history import EvaluationStatus
+from servoscope.signals import quality
+
+
+class _StatusRecord(BaseModel):
+    model_config = ConfigDict(frozen=True, populate_by_name=True)
+
+
+class AlarmStatus(_StatusRecord):
+    """An alarm; the service's own ones have no priority and no cause."""
+
+    state: LifecycleState
+    since: float  # [UTC s]
+    priority: Priority | None = None
+    cause: str = ""
+    until: float | None = None  # end of its shelving [UTC s]
+
+
+class AssetMetadata(_StatusRecord):
+    """What never changes of an asset, and is needed to read its numbers."""
+
+    group: str = ""
+    source: str = ""  # its name in the service file
+    loop: str | None = None
+    plant: str | None = None
+    baseline: str | None = None  # its hash
+    point: str | None = None  # its operating point
+    sample_rate_hz: float | None = None
+    units: tuple[str, ...] = ()  # of y and u
+    coefficient_units: tuple[str, ...] = ()
+    faults: dict[str, str] = {}  # what their names mean
+    window_s: float | None = None  # what an examination covers
+
+
+class AssetStatus(EvaluationStatus):
+    """An asset as users see it, with its newest evaluation."""
+
+    verdict: Literal["healthy", "fault", "undetermined"]
+    summary: str
+    since: float  # since when the verdict holds [UTC s]
+    onset: float | None  # of the fault [UTC s]
+    faults: tuple[FaultEstimate, ...] = ()  # by the last full diagnosis
+    examined: float | None  # when it was examined last [UTC s]
+    ne107: Ne107
+    reasons: tuple[str, ...]  # for the status after NE 107
+    quality: dict[str, float]  # findings of data quality that hold now, and since when [UTC s]
+    alarms: dict[str, AlarmStatus]  # those that are not normal
+    pending_diagnoses: tuple[int, ...] = Field((), alias="awaited")  # numbers of their rows
+    reception: ReceptionState = "followed"  # how its samples come in
+    # when sound data last showed the fault, and the end of the window that named it [UTC s]
+    fault_at: float | None = None
+    diagnosed: float | None = None
+    # size, sized: of the fault by the newest examination, and when that was [UTC s]; None: by the full diagnosis alone
+    size: FaultEstimate | None = None
+    sized: float | None = None
+    outlook: Outlook | None = None  # when the fault reaches its limit; None: it has none, or nothing is known yet
+    position: StreamPosition = Field(alias="counted")
+    metadata: AssetMetadata = Field(AssetMetadata(), alias="about")
+
+    @property
+    def newest_sizes(self) -> tuple[tuple[FaultEstimate, ...], float | None]:
+        """The newest sizes of its faults, and when they were found [UTC s], None where that is not known."""
+        follows = self.size is not None and [self.size.name] == [fault.name for fault in self.faults]
+        if follows and self.size is not None and (self.sized or 0.0) >= (self.diagnosed or 0.0):
+            return (self.size,), self.sized
+        return self.faults, self.diagnosed
+
+
+class FloodCounts(_StatusRecord):
+    """A flood of alarms: since when [UTC s], how many alarms there were, and how many are held back."""
+
+    since: float | None
+    counted: int
+    held: int
+
+
+class ServiceStatus(_StatusRecord):
+    """The service itself as users see it."""
+
+    service: Literal[True] = True
+    flood: FloodCounts
+    alarms: dict[str, AlarmStatus]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as stored."""
+        return {"service": True, **self.model_dump(mode="json", exclude_unset=True)}
+
+
+def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:
+    """Return a stored status as the record that it is."""
+    return (ServiceStatus if stored.get("service") else AssetStatus).model_validate(stored)
+
+
+def asset_metadata(baseline: Baseline, group: str, window_s: float, source: str = "") -> AssetMetadata:
+    """Return the metadata of an asset with this baseline."""
+    loop = baseline.loop
+    return AssetMetadata(
+        group=group,
+        source=source,
+        loop=loop.name,
+        plant=loop.plant.kind,
+        baseline=baseline.hash,
+        point=baseline.point or None,
+        sample_rate_hz=loop.sample_rate,
+        units=tuple(loop.plant.units),
+        coefficient_units=tuple(loop.plant.coefficient_units),
+        faults={fault.name: fault.words for fault in loop.plant.all_faults},
+        window_s=window_s,
+    )
+
+
+def asset_summary(examination: ExaminationState, findings: Iterable[str], reception: Reception = FOLLOWED) -> str:
+    """Return the last examination's sentence, unless data quality or what is wrong with the reception overrules it."""
+    if reception.sentence:
+        return reception.sentence
+    if quality.limit_verdict(examination.verdict, findings) == examination.verdict:
+        return examination.summary
+    return render(message("service.examination.data_quality", findings=quality.describe_findings(findings)))
+
+
+def asset_verdict(examination: ExaminationState, findings: Iterable[str], reception: Reception) -> str:
+    """Return the verdict that holds, with what data quality and the reception leave of the last examination's."""
+    verdict = quality.limit_verdict(examination.verdict, findings)
+    if verdict == "healthy" and reception != FOLLOWED:
+        verdict = "undetermined"  # nobody knows what it does now
+    if verdict == "undetermined" and examination.fault_at is not None:
+        verdict = "fault"  # it was seen on sound data, and nothing has shown since that it has gone
+    return verdict
+
+
+def asset_snapshot(
+    state: AssetState, findings: tuple[str, ...], reception: Reception, outlook: OutlookWord
+) -> AssetSnapshot:
+    """Return what the asset's alarms go by."""
+    statistic, level = state.evaluation.peaks
+    current = current_outlook(state.outlook, state.examination.faults)
+    return AssetSnapshot(
+        verdict=quality.limit_verdict(state.examination.verdict, findings),
+        quality=findings,
+        statistic=statistic,
+        level=level,
+        reception=reception,
+        cause=asset_summary(state.examination, findings),
+        outlook=outlook,
+        outlook_cause=current.summary if current is not None else "",
+    )
+
+
+def asset_status(
+    state: AssetState,
+    definitions: Mapping[str, AlarmDefinition],
+    metadata: AssetMetadata,
+    reception: Reception = FOLLOWED,
+) -> AssetStatus:
+    """Return the status of an asset."""
+    examination, findings = state.examination, quality.active_findings(state.quality)
+    now = quality.limit_verdict(examination.verdict, findings)
+    ne107 = evaluate_ne107(now, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
+    named, evaluation = examination.named, state.evaluation.status
+    verdict = asset_verdict(examination, findings, reception)
+    summary = named if now == "fault" and named else asset_summary(examination, findings, reception)
+    if verdict == "fault" and now != "fault":
+        fault = named or render(message("service.examination.seen"))
+        summary = render(message("service.examination.stands", fault=fault, t=examination.fault_at, since=summary))
+    return AssetStatus.model_construct(  # its values are checked where it is read
+        **{
+            "verdict": verdict,
+            "summary": summary,
+            "since": examination.since,
+            "onset": examination.onset,
+            "faults": tuple(map(FaultEstimate.model_validate, examination.faults)),
+            "examined": examination.examined,
+            "ne107": ne107.ne107,
+            "reasons": ne107.reasons,
+            "quality": findings,
+            "alarms": {
+                name: AlarmStatus(
+                    state=alarm.state,
+                    since=alarm.since,
+                    priority=definitions[name].priority,
+                    # the cause at the last sample would be, once the fault has gone, that all is well
+                    cause=named if name == FAULT_ALARM and named else alarm.cause,
+                    until=alarm.shelved_until,
+                )
+                for name, alarm in state.alarms.items()
+                if alarm.state is not LifecycleState.NORMAL
+            },
+            "pending_diagnoses": tuple(window.number for window in state.pending_diagnoses),
+            "position": state.position,
+            "metadata": metadata,
+            **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
+            **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
+            **(
+                {"size": FaultEstimate.model_validate(examination.size), "sized": examination.sized}
+                if examination.size
+                else {}
+            ),
+            **({} if (outlook := current_outlook(state.outlook, examination.faults)) is None else {"outlook": outlook}),
+            **({} if reception == FOLLOWED else {"reception": reception.state}),
+            **{key: getattr(evaluation, key) for key in evaluation.model_fields_set},
+        }
+    )

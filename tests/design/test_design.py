@@ -1,0 +1,294 @@
+"""Studies before deployment: information against oracles and golden numbers, radii against simulated recordings."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import one_line, run
+from rich.console import Console
+from scipy import linalg
+
+import servoscope as ss
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.records import ExactPredictorFit
+from servoscope.cli.render.design import print_study
+from servoscope.core.errors import LoopError, SimulationError
+from servoscope.design import DesignStudy, explanation_distances, study
+from servoscope.design.detection_delay import AlarmSimulator, detectability_radius
+from servoscope.design.fisher_information import (
+    MISNAMED,
+    cramer_rao_std,
+    fisher_matrix,
+    linear_isolability_radius,
+    misnaming_probability,
+)
+from servoscope.design.isolability import ambiguous_sizes, hypothesis_distances
+from servoscope.design.mimics import match_mimic, mimic_causes
+from servoscope.design.operating_limits import operating_limits
+from servoscope.design.scenario import Scenario
+from servoscope.diagnosis.examine import Examination
+from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.isolation.ml.hypothesis import fit_hypothesis
+from servoscope.isolation.ml.window import RefitWindow
+from servoscope.learning.learn import nominal_baseline
+from servoscope.models.loop import Loop
+from servoscope.report import design_page
+from servoscope.simulation import FaultEvent, reference, simulate
+
+AXIS = """
+name = "axis"
+sample_rate = 100.0
+
+[plant]
+kind = "polynomial"
+order = 2
+coefficients = { viscous_friction = 20.0, inertia = 2.0 }
+
+[controller]
+kind = "pi"
+k_p = 150.0
+k_i = 10.0
+"""
+NOISE = ("--noise-u", "0.01", "--noise-y", "1e-5")
+
+
+@pytest.fixture(scope="module")
+def learned() -> Baseline:
+    from importlib.resources import files
+
+    loop = Loop.load(Path(str(files("servoscope").joinpath("simulation", "reference-rig.toml"))))
+    return ss.learn(loop, [simulate(loop, reference("profile", 60.0, 100.0), seed=1)[0]])
+
+
+@pytest.fixture(scope="module")
+def scene(learned: Baseline) -> Scenario:
+    return Scenario.from_baseline(learned, reference("profile", 90.0, 100.0), 30.0)
+
+
+@pytest.fixture(scope="module")
+def alarms(scene: Scenario) -> AlarmSimulator:
+    return AlarmSimulator(scene)
+
+
+def recorded(scene: Scenario, parameter: str, x: float, seed: int) -> ss.Recording:
+    """Simulate one of the loops that the baseline may have been learned from, with a fault."""
+    b = scene.baseline
+    off = np.random.default_rng(seed).multivariate_normal(np.zeros(len(b.ratios)), np.array(b.ratios_covariance))
+    true = b.plant.with_ratios(dict(zip(b.plant.parameters, np.exp(off).tolist(), strict=True)))
+    return simulate(
+        b.loop.model_copy(update={"plant": true}),
+        scene.r,
+        faults=[FaultEvent(parameter, float(np.exp(x)), scene.onset / b.loop.sample_rate)],
+        noise_u_std=scene.noise.u_std,
+        noise_y_std=scene.noise.y_std,
+        seed=seed,
+    )[0]
+
+
+class TestInformation:
+    def test_golden_bounds(self, rig: dict[str, Any]) -> None:
+        """Relative standard deviations for 10 s of the profile at the paper's noise, computed elsewhere."""
+        baseline = nominal_baseline(Loop.from_dict(rig))
+        baseline = baseline.model_copy(
+            update={"exact": ExactPredictorFit(noise=WhiteNoise(1e-4, float(np.sqrt(1e-7))), misfit=0.0)}
+        )
+        F = fisher_matrix(Scenario.from_baseline(baseline, reference("profile", 20.0, 100.0), 10.0))
+        alone, together = cramer_rao_std(F)
+        assert alone == pytest.approx([0.0007, 0.0006, 0.059, 0.022], rel=0.12)
+        assert together == pytest.approx([0.0065, 0.0033, 0.41, 0.027], rel=0.05)
+
+    def test_against_a_kalman_filter_and_differences(self, scene: Scenario) -> None:
+        b, window, rate = scene.baseline, scene.healthy, scene.loop.sample_rate
+        scale = np.array([1e-2, 1.0, 1e6])  # m, m/s, Pa
+
+        def innovations(ratios: dict[str, float]) -> np.ndarray:
+            models = []
+            for plant in (b.plant, b.plant.with_ratios(ratios)):
+                A, B, C = plant.state_space()
+                both = linalg.expm(
+                    np.block([[A * scale / scale[:, None], B / scale[:, None]], [np.zeros((1, 4))]]) / rate
+                )
+                Ad, Bd, Cd = both[:3, :3], both[:3, 3:], C * scale
+                Q = scene.noise.u_std**2 * Bd @ Bd.T
+                P = linalg.solve_discrete_are(Ad.T, Cd.T, Q, [[scene.noise.y_std**2]])
+                S = float((Cd @ P @ Cd.T)[0, 0]) + scene.noise.y_std**2
+                models.append((Ad, Bd[:, 0], Cd[0], (Ad @ P @ Cd.T)[:, 0] / S, S))
+            x, e = np.zeros(3), []
+            for k in range(window.samples):
+                Ad, Bd, c, K, S = models[int(k >= scene.lead_samples)]
+                e.append((window.y[k] - c @ x) / np.sqrt(S))
+                x = Ad @ x + Bd * window.u[k] + K * (window.y[k] - c @ x)
+            return np.array(e[scene.lead_samples :])
+
+        h = 1e-4
+        slow = np.array(
+            [(innovations({p: np.exp(h)}) - innovations({p: np.exp(-h)})) / (2.0 * h) for p in ("C_ie", "beta")]
+        )
+        assert fisher_matrix(scene)[np.ix_([1, 3], [1, 3])] == pytest.approx(slow @ slow.T, rel=2e-3, abs=20.0)
+
+    def test_what_is_not_known_beforehand_costs(self, scene: Scenario) -> None:
+        exact, uncertain = fisher_matrix(scene), fisher_matrix(scene, exact=False)
+        assert np.linalg.eigvalsh(exact - uncertain)[0] > 0.0
+        assert fisher_matrix(scene, 10.0)[0, 0] < exact[0, 0]
+
+    def test_two_changes_that_are_one_have_no_size(self) -> None:
+        F = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 4.0]])
+        alone, together = cramer_rao_std(F)
+        assert alone == pytest.approx([1.0, 1.0, 0.5])
+        assert np.isinf(together).tolist() == [True, True, False]
+        assert linear_isolability_radius(F, 0) == np.inf
+
+
+class TestIsolability:
+    def test_small_changes_are_as_far_apart_as_information_says(self, scene: Scenario) -> None:
+        F, x = fisher_matrix(scene), 2e-3
+        found = hypothesis_distances(scene, scene.loop.plant.faults[1], x)
+        linear = x**2 * (F[1, 1] - F[1, [0, 2, 3]] ** 2 / np.diag(F)[[0, 2, 3]])
+        assert found.squared_if_certain == pytest.approx(linear, rel=0.03)
+        assert np.all(found.squared < found.squared_if_certain)
+
+    def test_radius_is_close_to_the_bound(self, scene: Scenario) -> None:
+        fault = scene.loop.plant.faults[1]
+        found = ambiguous_sizes(scene, fault, up=True)
+        ((begin, end),) = found.spans
+        assert begin == 0.0
+        assert (
+            linear_isolability_radius(fisher_matrix(scene), 1)
+            < end
+            < 1.3 * linear_isolability_radius(fisher_matrix(scene), 1)
+        )
+        assert found.spans_if_certain[0][1] < end
+        assert misnaming_probability(hypothesis_distances(scene, fault, end).squared) == pytest.approx(
+            MISNAMED, rel=0.2
+        )
+
+    def test_wrong_names_are_as_frequent_as_predicted(self, scene: Scenario) -> None:
+        """Thirty recordings of a pump fault: which of the two closest hypotheses fits better."""
+        faults, x, runs, wrong = scene.loop.plant.faults, 1.5e-3, 30, 0
+        predicted = hypothesis_distances(scene, faults[0], x)
+        expected = predicted.misnaming_probabilities()["friction"]
+        assert 0.1 < expected < 0.25
+        size = float(predicted.sizes[1])
+        for seed in range(runs):
+            recording = recorded(scene, "p_s", x, seed)
+            window = RefitWindow.from_recording(
+                scene.baseline, recording, scene.onset - scene.lead_samples, recording.samples
+            )
+            window = replace(window, prior=scene.prior)
+            nothing = np.zeros(window.nuisance_count)
+            J = [
+                fit_hypothesis(window, [fault], scene.profile, nothing, [np.array([start])], free=True).cost
+                for fault, start in ((faults[0], x), (faults[2], size))
+            ]
+            wrong += J[1] < J[0]
+        assert abs(wrong / runs - expected) < 3.0 * np.sqrt(expected * (1.0 - expected) / runs)
+
+    def test_pairs_stand_apart_from_all_that_does_not_contain_them(self, scene: Scenario) -> None:
+        found = explanation_distances(scene, {"p_s": 0.8, "C_ie": 1.2})
+        assert len(found) == 4 + 6 - 1  # single faults, and pairs but the pair itself
+        assert "pump + leakage" not in found
+        assert misnaming_probability(np.array(list(found.values()))) < MISNAMED
+
+
+class TestDetectability:
+    def test_nine_of_ten_are_announced_at_the_radius(self, scene: Scenario, alarms: AlarmSimulator) -> None:
+        fault, runs, seen = scene.loop.plant.faults[0], 30, []
+        x = detectability_radius(alarms, fault, up=True)
+        promised = alarms.delays(fault, x)
+        assert 0.9 <= promised.probability() < 0.96
+        for seed in range(runs):
+            found = Examination.from_recording(scene.baseline, recorded(scene, fault.parameter, x, seed))
+            t = found.t(slice(None))
+            alarm = found.alarm & (t >= 60.0)
+            seen.append(t[alarm.argmax()] - 60.0 if alarm.any() else np.inf)
+        assert np.mean(np.isfinite(seen)) > 0.9 - 3.0 * np.sqrt(0.09 / runs)
+        assert np.median(seen) == pytest.approx(promised.quantile(0.5), rel=0.4)
+
+    def test_larger_changes_are_announced_sooner(self, scene: Scenario, alarms: AlarmSimulator) -> None:
+        fault = scene.loop.plant.faults[1]
+        times = [alarms.delays(fault, x).quantile(0.5) for x in (0.005, 0.01, 0.05)]
+        assert times == sorted(times, reverse=True)
+        assert times[-1] < 3.0
+
+
+class TestMimics:
+    def test_what_is_known_to_look_alike(self, scene: Scenario) -> None:
+        found = {
+            cause.name: (scene.names[i.fault], i) for cause in mimic_causes(scene) for i in [match_mimic(scene, cause)]
+        }
+        name, gain = found["gain of u"]  # K_q goes with the root of p_s
+        assert (name, gain.distinguishable_from) == ("p_s", np.inf)
+        assert gain.size == pytest.approx(2.0, rel=1e-6)
+        assert found["gain of y"][0] == "p_s"
+        name, spring = found["k_p"]  # theta_0 = C_ie k_p
+        assert name == "C_ie"
+        assert spring.cosine[1] == pytest.approx(1.0, abs=1e-3)
+        assert found["delay"][1].distinguishable_from < 0.1
+        assert found["A_p"][1].distinguishable_from < 0.1
+
+
+class TestCommand:
+    @pytest.mark.slow
+    def test_prints_and_writes(self, tmp_path: Path) -> None:
+        loop, page = tmp_path / "axis.toml", tmp_path / "page.html"
+        loop.write_text(AXIS)
+        done = run("design", loop, *NOISE, "--after", 5, "--json", "--report", page)
+        assert done.code == 0, done.err
+        said = DesignStudy.model_validate(json.loads(done.out))
+        assert said.after_s == 5.0
+        fault = said.faults["inertia"]
+        assert fault.up.detectable is not None
+        assert fault.up.isolable is not None
+        assert 1.0 < fault.up.isolable < 1.01
+        assert fault.up.clear(1.05)
+        assert not fault.up.clear(1.0001)
+        assert fault.down.isolable is not None
+        assert fault.down.isolable < 1.0
+        assert fault.sizes[-1].together is None  # input_gain scales both coefficients
+        assert [each.share for each in said.dither] == [0.0, 0.01, 0.05]
+        lost = {(one.fault, one.kind): one for one in operating_limits(Loop.load(loop))}
+        for name, each in said.faults.items():
+            assert (each.up.tracking, each.down.tracking) == lost[name, "tracking"][2:]
+            assert (each.up.stability, each.down.stability) == lost[name, "stability"][2:]
+        out = io.StringIO()
+        print_study(Console(file=out, width=100), said)
+        heavy = fault.up.tracking  # a heavier axis follows worse
+        assert heavy is not None and f"inertia up {heavy:g}" in " ".join(out.getvalue().split())
+        html = page.read_text(encoding="utf-8")
+        assert html == design_page.render_design_page(said)
+        assert html.count("<svg") == 3
+        assert "http" not in html.replace("http-equiv", "")
+
+    @pytest.mark.parametrize(
+        ("old", "new", "told"),
+        [
+            ("[controller]", "[monitor]\ncutoff = 5.0\n", "[controller]"),
+            ("order = 2", 'order = 2\nfriction = "coulomb"', "linear plant"),
+        ],
+    )
+    def test_refuses_in_one_line(self, old: str, new: str, told: str, tmp_path: Path) -> None:
+        loop = tmp_path / "axis.toml"
+        text = (
+            AXIS.split("[controller]")[0]
+            if old == "[controller]"
+            else AXIS.replace("inertia = 2.0", "inertia = 2.0, coulomb_friction = 1.0")
+        )
+        loop.write_text(text.replace(old, new))
+        one_line(run("design", loop), told)
+
+
+def test_refuses_a_reference_that_is_too_short(learned: Baseline) -> None:
+    with pytest.raises(SimulationError, match="at most 10 s"):
+        study(learned, reference("profile", 10.0, 100.0), 20.0)
+
+
+def test_refuses_a_plant_without_values() -> None:
+    loop = Loop.from_dict({"sample_rate": 100.0, "plant": {"kind": "polynomial", "order": 2}})
+    with pytest.raises(LoopError, match="nominal values"):
+        ss.design_study(loop)

@@ -1,0 +1,80 @@
+"""Signals that are not what the loop file says: told in their own words with the remedy, and never a fault's name."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+import servoscope as ss
+from servoscope.core.errors import RecordingError
+from servoscope.detection.signal_defects import find_signal_defect
+from servoscope.models.loop import Loop
+from servoscope.simulation import FaultEvent, reference, simulate
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+from accuracy.signal_defects import DEFECTS, LOOPS, baseline, healthy, stuck
+from accuracy.signal_defects import loop as loop_of
+
+Recording = ss.Recording
+
+
+@pytest.fixture(scope="module")
+def machines() -> dict[str, tuple[ss.Baseline, Recording]]:
+    """A baseline and a further healthy recording of each loop."""
+    return {name: (baseline(name), healthy(name, 2)) for name in LOOPS}
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_diagnosis_says_what_is_wrong_and_names_no_fault(
+    machines: dict[str, tuple[ss.Baseline, Recording]], name: str, defect: str
+) -> None:
+    learned, recording = machines[name]
+    spoil, text = DEFECTS[defect]
+    diagnosis = ss.diagnose(learned, spoil(recording))
+    assert diagnosis.verdict == "undetermined" and not diagnosis.faults
+    assert text in str(diagnosis.headline)
+    assert diagnosis.warnings[-1].kind == "signals"
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_sound_signals_have_no_defect(machines: dict[str, tuple[ss.Baseline, Recording]], name: str) -> None:
+    learned, recording = machines[name]
+    assert find_signal_defect(recording) is None
+    assert ss.diagnose(learned, recording).verdict == "healthy"
+
+
+def test_a_fault_before_a_sensor_sticks_keeps_its_name(machines: dict[str, tuple[ss.Baseline, Recording]]) -> None:
+    learned, _ = machines["rig"]
+    loop = learned.loop
+    r = reference("multisine", 40.0, loop.sample_rate)
+    faulty, _ = simulate(loop, r, faults=[FaultEvent("leakage", 1.3, 5.0)], seed=3)
+    diagnosis = ss.diagnose(learned, stuck("y", faulty))
+    assert [fault.name for fault in diagnosis.faults] == ["leakage"]
+    assert "stays exactly the same" in str(diagnosis.warnings[-1].description)
+
+
+@pytest.mark.parametrize(
+    ("defect", "words"),
+    [
+        ("y in mm", "y is in another unit: times 0.001"),
+        ("r and y in mm", "u times 1000, or r and y times 0.001, fit the plant"),
+        ("u in mA", "u times 0.001, or r and y times 1000, fit the plant"),
+        ("r and y exchanged", "r and y are exchanged"),
+        ("u and y exchanged", "u and y are exchanged"),
+        ("y stuck", "y stays exactly the same"),
+        ("a counter that wraps", "a counter wraps"),
+    ],
+)
+def test_learn_refuses_them(defect: str, words: str) -> None:
+    with pytest.raises(RecordingError, match=words):
+        ss.learn(loop_of("rig"), [DEFECTS[defect][0](healthy("rig", 1))])
+
+
+@pytest.mark.parametrize("folder", ["qube", "emps", "eha_pump"])
+def test_measured_signals_are_sound(folder: str, shared_data: Path) -> None:
+    loop = Loop.load(Path(__file__).parents[2] / "examples" / f"{folder.replace('_', '-')}.toml")
+    for file in sorted((shared_data / "real" / folder).glob("*.csv"))[:6]:
+        assert find_signal_defect(ss.read(file, loop)) is None, file.name

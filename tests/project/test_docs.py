@@ -1,0 +1,171 @@
+"""The reference pages are complete: each command, option, loop-file key and public name has its line.
+
+The names come from the code, so a new one fails here until it is documented. A line counts when it names the
+thing in backticks, in the section that it belongs to.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import typing
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+import typer.main
+from pydantic import BaseModel
+
+import servoscope
+
+REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
+
+
+@cache
+def page(name: str) -> str:
+    path = REFERENCE / name
+    assert path.is_file(), f"docs/reference/{name} is missing"
+    return path.read_text(encoding="utf-8")
+
+
+def sections(name: str) -> dict[str, str]:
+    """Split a page at its headings of any depth: heading -> text; what stands before the first is ""."""
+    parts = re.split(r"^#+ +(.*)$", "\n" + page(name), flags=re.MULTILINE)
+    return {"": parts[0], **dict(zip(parts[1::2], parts[2::2], strict=True))}
+
+
+def section(name: str, *patterns: str) -> str | None:
+    """Return the section whose heading, without its backticks, has all the patterns, or None."""
+    found = [
+        text
+        for heading, text in sections(name).items()
+        if all(re.search(pattern, heading.replace("`", "")) for pattern in patterns)
+    ]
+    assert len(found) <= 1, f"docs/reference/{name} has {len(found)} headings with {' and '.join(patterns)}"
+    return found[0] if found else None
+
+
+def has_line(text: str, name: str) -> bool:
+    """Tell whether a name, perhaps with its arguments or its short form beside it, stands in backticks."""
+    return re.search(rf"`(?:[^`\n]*[\s,./])?{re.escape(name)}(?![\w-])[^`\n]*`", text) is not None
+
+
+def commands() -> Iterator[tuple[str, typing.Any]]:
+    """Yield each command as it is typed, without the program's name, and what it takes."""
+    import servoscope.cli
+
+    apps = [value for value in vars(servoscope.cli).values() if isinstance(value, typer.Typer)]
+    assert apps, "servoscope.cli has no typer.Typer"
+    # The outermost one is that which no other contains.
+    inner = {id(group.typer_instance) for app in apps for group in app.registered_groups}
+    (top,) = {id(app): app for app in apps if id(app) not in inner}.values()
+
+    def walk(command: typing.Any, words: tuple[str, ...]) -> Iterator[tuple[str, typing.Any]]:
+        children = getattr(command, "commands", None)
+        if children is None:
+            yield " ".join(words), command
+            return
+        for name, child in children.items():
+            if not child.hidden:
+                yield from walk(child, (*words, name))
+
+    return walk(typer.main.get_command(top), ())
+
+
+def models_in(annotation: object) -> list[type[BaseModel]]:
+    if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for argument in typing.get_args(annotation) for model in models_in(argument)]
+
+
+def keys_of_loop_file() -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield the words of a section's heading, none for "Top level", and a key in it."""
+    from servoscope.models import plants
+    from servoscope.models.loop import Loop
+
+    for key, field in Loop.model_fields.items():
+        models = models_in(field.annotation)
+        if any(issubclass(model, plants.Plant) for model in models):
+            for kind in plants.plant_kinds():
+                yield from (((f"[{key}]", kind), inside) for inside in plants.plant_class(kind).model_fields)
+        elif models:
+            yield from (((f"[{key}]",), inside) for model in models for inside in model.model_fields)
+        else:
+            yield (), key
+
+
+def test_every_command_and_option_is_documented() -> None:
+    missing = []
+    for name, command in commands():
+        text = section("cli.md", rf"^servoscope {name}(?![\w-])")
+        if text is None:
+            missing.append(f"a heading 'servoscope {name}'")
+            continue
+        for parameter in command.params:
+            if parameter.param_type_name == "option" and not parameter.hidden:
+                long = [option for option in parameter.opts if option.startswith("--")]
+                missing += [
+                    f"servoscope {name} {option}" for option in long or parameter.opts if not has_line(text, option)
+                ]
+    assert not missing, f"not in docs/reference/cli.md: {', '.join(missing)}"
+
+
+def test_every_key_of_the_loop_file_is_documented() -> None:
+    missing = []
+    for words, key in keys_of_loop_file():
+        text = section("loop-file.md", *(re.escape(word) for word in words or ("Top level",)))
+        if text is None or not has_line(text, key):
+            missing.append(" ".join([*words, key]))
+    assert not missing, f"not in docs/reference/loop-file.md: {', '.join(missing)}"
+
+
+def test_every_key_of_the_service_file_is_documented() -> None:
+    from servoscope.service.access.oidc import OidcSettings
+    from servoscope.service.config import ServiceFile
+    from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
+    from servoscope.service.mapping.settings import PayloadSettings
+
+    kinds = {"sources": find_kinds(SOURCES), "outlets": find_kinds(PUBLISHERS)}
+    elsewhere = ("quality", "alarms", "actions")
+    missing = []
+    for key, field in ServiceFile.model_fields.items():
+        models = [each.load() for each in kinds[key].values()] if key in kinds else models_in(field.annotation)
+        text = section("service-file.md", rf"\[{key}(\.NAME)?\]" if models else "Top level") or ""
+        inside = [name for model in models for name in model.model_fields] if models else [key]
+        if key not in elsewhere:
+            missing += [f"{key}: {name}" for name in inside if not has_line(text, name)]
+    text = section("service-file.md", r"\[sources\.NAME\.payload\]") or ""
+    missing += [f"payload: {name}" for name in PayloadSettings.model_fields if not has_line(text, name)]
+    text = section("service-file.md", r"\[web\.oidc\]") or ""
+    missing += [f"web.oidc: {name}" for name in OidcSettings.model_fields if not has_line(text, name)]
+    assert not missing, f"not in docs/reference/service-file.md: {', '.join(missing)}"
+
+
+def test_every_key_of_alarms_data_quality_and_actions_is_documented() -> None:
+    from servoscope.service import actions, alarms
+    from servoscope.signals import quality
+
+    text = (REFERENCE.parent / "alarms.md").read_text() + (REFERENCE.parent / "how-to" / "actions.md").read_text()
+    models = [alarms.AlarmDefinition, alarms.FloodSettings, quality.QualitySettings, actions.RetrySettings]
+    models += [actions.WebhookSettings, actions.CommandSettings, actions.FaultToleranceSettings]
+    keys = {key for model in models for key in model.model_fields}
+    missing = [key for key in sorted(keys) if not re.search(rf"[`\n ]{key}( = [^`\n]*)?[`\n]|`{key}`", text)]
+    assert not missing, f"not in docs/alarms.md or docs/how-to/actions.md: {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("name", servoscope.__all__)
+def test_every_public_name_is_documented(name: str) -> None:
+    assert has_line(page("python.md"), name), f"{name} is not in docs/reference/python.md"
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    root = REFERENCE.parent.parent
+    pages = [*sorted(root.glob("*.md")), *sorted((root / "docs").rglob("*.md"))]
+    broken = [
+        f"{path.relative_to(root)} -> {target}"
+        for path in pages
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", path.read_text(encoding="utf-8"))
+        if not re.match(r"\w+:", target) and not (path.parent / target).exists()
+    ]
+    assert not broken

@@ -1,0 +1,138 @@
+"""Figures in documents stand between markers, and a page that says something else than was measured fails."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def figures() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("figures", PROJECT / "scripts" / "figures.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["figures"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """Return a copy of the documents and of the stored results."""
+    for name in ("README.md", "docs", "benchmarks/figures", "benchmarks/figures.toml"):
+        source, target = PROJECT / name, tmp_path / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        (shutil.copytree if source.is_dir() else shutil.copy)(source, target)
+    return tmp_path
+
+
+def test_every_page_says_what_was_measured(figures: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    assert figures.main([]) == 0, capsys.readouterr().out
+
+
+def test_a_changed_number_is_found(figures: ModuleType, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = copy / "docs" / "results.md"
+    text = page.read_text(encoding="utf-8")
+    begin = text.index("cranfield-40: 40.false -->") + len("cranfield-40: 40.false -->")
+    page.write_text(text[:begin] + "5 of 5" + text[text.index("<!-- end -->", begin) :], encoding="utf-8")
+    assert figures.main([], copy) == 1
+    line = text.count("\n", 0, begin) + 1
+    assert capsys.readouterr().out.startswith(f"docs/results.md:{line}: value cranfield-40: 40.false has '5 of 5'")
+
+
+def test_a_changed_cell_of_a_table_is_found(figures: ModuleType, copy: Path) -> None:
+    page = copy / "docs" / "results.md"
+    page.write_text(
+        page.read_text(encoding="utf-8").replace("| viscous_friction | 203.5", "| viscous_friction | 204.5")
+    )
+    assert figures.main([], copy) == 1
+
+
+def test_what_depends_on_the_machine_is_compared_in_form_only(figures: ModuleType, copy: Path) -> None:
+    page = copy / "docs" / "results.md"
+    text = page.read_text(encoding="utf-8")
+    row = next(line for line in text.splitlines() if line.startswith("| profile_healthy_1 "))
+    slower = row.rsplit("|", 2)[0] + "| 99.99 s |"
+    page.write_text(text.replace(row, slower), encoding="utf-8")
+    assert figures.main([], copy) == 0
+    page.write_text(text.replace(row, slower.replace(" s |", " minutes |")), encoding="utf-8")
+    assert figures.main([], copy) == 1
+
+
+def test_written_pages_agree(figures: ModuleType, copy: Path) -> None:
+    stored = copy / "benchmarks" / "figures" / "cranfield-40.json"
+    results = json.loads(stored.read_text(encoding="utf-8"))
+    results["values"]["40.false"] = "4 of 5"
+    stored.write_text(json.dumps(results), encoding="utf-8")
+    assert figures.main([], copy) == 1
+    assert [path.name for path in figures.write(copy, {"cranfield-40": results})] == ["results.md"]
+    assert figures.main([], copy) == 0
+
+
+@pytest.mark.parametrize(
+    ("marker", "message"),
+    [
+        ("<!-- value nobody: x -->1<!-- end -->", "no program 'nobody' in benchmarks/figures.toml"),
+        ("<!-- value recordings: nothing -->1<!-- end -->", "no value 'nothing'"),
+        ("<!-- table recordings: Nothing -->1<!-- end -->", "no table 'Nothing'"),
+    ],
+)
+def test_a_marker_of_nothing_is_one_line(
+    figures: ModuleType, copy: Path, capsys: pytest.CaptureFixture[str], marker: str, message: str
+) -> None:
+    (copy / "docs" / "new.md").write_text(f"# New\n\n{marker}\n", encoding="utf-8")
+    assert figures.main([], copy) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and told.startswith("docs/new.md:3: ") and message in told
+
+
+def test_a_program_that_fails_is_one_line(figures: ModuleType, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (copy / "benchmarks" / "figures.toml").write_text("[broken]\ncommand = \"-c 'raise SystemExit(3)'\"\n")
+    assert figures.main(["--run"], copy) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("broken: `-c")
+
+
+def test_programs_that_count_the_same_agree() -> None:
+    """The ball screw at 40 kgf is counted by four programs: results of other days must not contradict each other."""
+    stored = {
+        name: json.loads((PROJECT / "benchmarks" / "figures" / f"{name}.json").read_text(encoding="utf-8"))
+        for name in ("recordings", "settings", "cranfield", "cranfield-40")
+    }
+
+    def rows(program: str, title: str) -> dict[str, list[str]]:
+        table = next(one for one in stored[program]["tables"] if one["title"] == title)
+        return {row[0]: row[1:] for row in table["rows"]}
+
+    load = rows("recordings", "Cranfield ball screw")["40 kgf"]
+    dry = {
+        "recordings": load[4].split(" (")[0],
+        "settings": rows("settings", "Cutoff: Cranfield")["1 Hz"][1],
+        **{name: stored[name]["values"]["40.lackLubrication1"] for name in ("cranfield", "cranfield-40")},
+    }
+    assert len(set(dry.values())) == 1, dry
+    assert load[1] == stored["cranfield"]["values"]["40.false"] == stored["cranfield-40"]["values"]["40.false"]
+
+
+def test_the_picture_of_the_benchmarks_is_that_of_the_stored_results(tmp_path: Path) -> None:
+    drawn = tmp_path / "benchmarks.svg"
+    command = [sys.executable, "benchmarks/public/overview.py", "--picture", str(drawn)]
+    subprocess.run(command, cwd=PROJECT, check=True, capture_output=True)
+    assert drawn.read_text(encoding="utf-8") == (PROJECT / "docs" / "images" / "benchmarks.svg").read_text("utf-8")
+
+
+@pytest.mark.slow
+def test_quick_programs_print_what_the_pages_say(shared_data: Path) -> None:
+    """Measured again, on this machine: an alarm more or less among five healthy runs would show."""
+    done = subprocess.run(
+        [sys.executable, "scripts/figures.py", "--quick"], cwd=PROJECT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr

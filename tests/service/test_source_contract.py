@@ -1,0 +1,279 @@
+"""What all sources and publishers guarantee, checked for every built-in kind; and the recipes for new ones."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import halls
+import numpy as np
+import pytest
+from brokers import Sender, kafka_brokers, kafka_cluster, started_broker, until
+from brokers import block as mqtt_block
+from commands import one_line, run
+from test_opcua import NODES, RATE, STATUS, Plant, free_port
+
+from servoscope.models.loop import Loop
+from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
+from servoscope.service.opcua.settings import OpcuaNodes
+from servoscope.service.sources.base import CHECKS, BlockSource, SourceAsset
+from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.signals import clean, writers
+
+# asyncua leaves sockets of connections that were cut to the garbage collector
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+BLOCKS = 8
+AT_ONCE_S = 1.0  # for twenty calls on a busy machine
+
+
+class Harness:
+    """Makes sources of one kind, of which each has `BLOCKS` blocks of the asset press at least, now or soon."""
+
+    def __init__(self, kind: str, settings: dict[str, Any], asset: SourceAsset, folder: Path) -> None:
+        self.settings = find_kinds(SOURCES)[kind].load().model_validate({"kind": kind, **settings})
+        self.asset, self.folder = asset, folder
+
+    def create(self) -> BlockSource:
+        source = self.settings.create("hall.contract", {"press": self.asset}, self.folder)
+        assert isinstance(source, BlockSource)
+        return source
+
+    def open(self, last: Block | None = None) -> BlockSource:
+        """Return an open source that continues behind a block."""
+        source = self.create()
+        start = ResumePosition(last.sequence, self.start, last.stream, float(last.t[-1])) if last is not None else None
+        source.open({} if start is None else {"press": start})
+        return source
+
+    start = 0.0
+
+
+def collect(source: BlockSource, blocks: int, limit: int = 100) -> list[Block]:
+    """Poll until there are so many blocks; return these."""
+    found: list[Block] = []
+
+    def enough() -> bool:
+        polled = source.poll(min(limit, blocks - len(found)))
+        assert len(polled) <= limit
+        found.extend(polled)
+        return len(found) >= blocks
+
+    until(enough, 60.0)
+    return found
+
+
+@pytest.fixture
+def replay(tmp_path: Path) -> Iterator[Harness]:
+    signals = np.random.default_rng(5).normal(size=(3, 1000))
+    writers.write_recording(
+        tmp_path / "press.csv", clean(0.01 * np.arange(1000), *signals, name="press", sample_rate=100.0)
+    )
+    asset = SourceAsset(Loop.load(halls.LOOP), ("press.csv",))
+    yield Harness("replay", {"speed": 0.0, "block": 0.5, "start": "2026-01-01T00:00:00Z"}, asset, tmp_path)
+
+
+@pytest.fixture
+def mqtt(tmp_path: Path) -> Iterator[Harness]:
+    server = started_broker(tmp_path)
+    harness = Harness("mqtt", {"host": "127.0.0.1", "port": server.port}, SourceAsset(LOOP_STUB, None), tmp_path)  # type: ignore[arg-type]
+    first = harness.open()  # the broker keeps what is sent from now on
+    until(lambda: first.connected)
+    time.sleep(0.2)
+    first.close()
+    sender = Sender(server.port)
+    sender.send(*(mqtt_block(k) for k in range(BLOCKS)))
+    sender.close()
+    yield harness
+    server.stop()
+
+
+TIMES = 1767225600.0 + 0.01 * np.arange(50 * (BLOCKS + 1))
+PAYLOAD = {"topics": ["line/{asset}"], "time": {"t": "s"}, "block": 0.5}
+LOOP_STUB = SimpleNamespace(columns=SimpleNamespace(covariates={}))  # of a source that reads no more of it
+AXIS = SourceAsset(SimpleNamespace(sample_rate=100.0), None)  # type: ignore[arg-type]
+
+
+def rows() -> list[bytes]:
+    """Return messages of one sample each."""
+    return [json.dumps({"t": t, "r": k, "u": k + 1, "y": k + 2}).encode() for k, t in enumerate(TIMES.tolist())]
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Harness]:
+    """A source of kind mqtt that reads a plant's own messages."""
+    server = started_broker(tmp_path)
+    harness = Harness("mqtt", {"host": "127.0.0.1", "port": server.port, "payload": PAYLOAD}, AXIS, tmp_path)
+    first = harness.open()
+    until(lambda: first.connected)
+    time.sleep(0.2)
+    first.close()
+    sender = Sender(server.port)
+    for one in rows():
+        last = sender.client.publish("line/press", one, qos=1)
+    last.wait_for_publish(30.0)
+    sender.close()
+    yield harness
+    server.stop()
+
+
+@pytest.fixture
+def kafka(tmp_path: Path) -> Iterator[Harness]:
+    """A source of kind kafka, beside the cluster that the client library simulates."""
+    producer = kafka_cluster()
+    for one in rows():
+        producer.produce("line", key=b"press", value=one)
+    producer.flush(30.0)
+    yield Harness(
+        "kafka", {"brokers": kafka_brokers(producer), "start": "beginning", "payload": PAYLOAD}, AXIS, tmp_path
+    )
+    producer.flush(1.0)
+
+
+@pytest.fixture
+def opcua(tmp_path: Path) -> Iterator[Harness]:
+    plant = Plant("history")
+    nodes = OpcuaNodes(r=NODES["r"], u=NODES["u"], y=NODES["y"])
+    settings = {"url": f"opc.tcp://127.0.0.1:{plant.port}/plant", "block": 0.25, "heartbeat_s": 3.0}
+    yield Harness("opcua", settings, SourceAsset(SimpleNamespace(sample_rate=RATE), nodes), tmp_path)  # type: ignore[arg-type]
+    plant.close()
+
+
+def check_numbering(harness: Harness) -> None:
+    source = harness.open()
+    assert [block.sequence for block in collect(source, BLOCKS)] == list(range(BLOCKS))
+    source.close()
+
+
+def check_limit(harness: Harness) -> None:
+    source = harness.open()
+    assert source.poll(0) == []
+    assert [block.sequence for block in collect(source, 4, limit=1)] == [0, 1, 2, 3]
+    source.close()
+
+
+def check_idle(harness: Harness) -> None:
+    source = harness.open()
+    begin = time.monotonic()
+    for _ in range(20):
+        source.poll(100)
+        assert source.next_block_s >= 0.0
+    assert time.monotonic() - begin < AT_ONCE_S
+    source.close()
+
+
+def check_repetition(harness: Harness) -> None:
+    source = harness.open()
+    first = collect(source, 4)
+    source.acknowledge("press", 2)
+    time.sleep(0.2)
+    source.close()
+    source = harness.open(first[1])
+    for before, again in zip(first[2:], collect(source, 2), strict=True):
+        assert before.sequence == again.sequence and np.allclose(before.signals, again.signals, rtol=0.0, atol=1e-6)
+    source.close()
+
+
+def check_resumption(harness: Harness) -> None:
+    source = harness.open()
+    first = collect(source, 3)
+    source.acknowledge("press", 3)
+    time.sleep(0.2)
+    source.close()
+    source = harness.open(first[2])
+    (following,) = collect(source, 1)
+    assert following.sequence == 3 and following.t[0] > first[2].t[-1]
+    source.close()
+
+
+def check_closing(harness: Harness) -> None:
+    for source in (harness.create(), harness.open()):
+        source.close()
+        source.close()
+
+
+@pytest.mark.parametrize("check", CHECKS)
+@pytest.mark.parametrize("kind", sorted([*find_kinds(SOURCES), "plant"]))
+def test_a_source_keeps_its_contract(kind: str, check: str, request: pytest.FixtureRequest) -> None:
+    harness: Harness = request.getfixturevalue(kind)
+    harness.start = time.time() if kind != "replay" else harness.settings.start.timestamp()
+    checks: dict[str, Callable[[Harness], None]] = {name: globals()[f"check_{name}"] for name in CHECKS}
+    checks[check](harness)
+
+
+@pytest.mark.parametrize("kind", sorted(find_kinds(PUBLISHERS)))
+def test_publishing_neither_raises_nor_blocks_and_closing_twice_is_no_error(kind: str, tmp_path: Path) -> None:
+    port = free_port()
+    keys = {"mqtt": {"host": "127.0.0.1", "port": port, "every_s": 0.0}, "opcua": {"listen": f"127.0.0.1:{port}"}}[kind]
+    settings = find_kinds(PUBLISHERS)[kind].load().model_validate({"kind": kind, **keys})
+    publisher = settings.create("hall.contract", tmp_path)
+    publisher.open({"press": STATUS, "hall": {"service": True}})  # nobody listens, no broker is there
+
+    def publish() -> None:
+        begin = time.monotonic()
+        for k in range(20):
+            publisher.publish({"press": {**STATUS, "statistic": float(k)}, "hall": {"service": True}})
+        assert time.monotonic() - begin < AT_ONCE_S
+
+    publish()
+    publisher.close()
+    publisher.close()
+    publish()
+
+
+RECIPE_FILE = re.compile(r"^`([\w.-]+)`:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def follow(tmp_path: Path, project: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """Follow a recipe of CONTRIBUTING.md: write the files of its package, and install it as `pip install .` would."""
+
+    def write(title: str) -> Path:
+        text = (project / "CONTRIBUTING.md").read_text(encoding="utf-8")
+        section = text.split(f"\n## {title}\n")[1].split("\n## ")[0]
+        files = {name: content for name, content in RECIPE_FILE.findall(section)}
+        assert len(files) == 3
+        for name, content in files.items():
+            (tmp_path / name).write_text(content, encoding="utf-8")
+        made = tomllib.loads(files["pyproject.toml"])["project"]
+        groups = made["entry-points"]
+        info = tmp_path / f"{made['name'].replace('-', '_')}-{made['version']}.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {made['name']}\nVersion: {made['version']}\n")
+        lines = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in each.items()) for group, each in groups.items()]
+        (info / "entry_points.txt").write_text("\n\n".join(lines))
+        monkeypatch.syspath_prepend(str(tmp_path))
+        importlib.invalidate_caches()
+        halls.files(tmp_path)
+        return tmp_path
+
+    return write
+
+
+def test_the_recipe_for_a_source_works(follow: Callable[[str], Path]) -> None:
+    folder = follow("Add a source")
+    assert run("run", folder / "hall.toml", "--check").code == 0
+    assert run("run", folder / "hall.toml").code == 0
+    assert halls.asked(folder / "hall.toml", "SELECT asset, sequence FROM checkpoints WHERE asset = 'press'") == [
+        ("press", 9)
+    ]
+    text = (folder / "hall.toml").read_text().replace('"sine"', '"sin"')
+    (folder / "wrong.toml").write_text(text)
+    one_line(
+        run("run", folder / "wrong.toml", "--check"),
+        "[sources] line.kind: 'sin' is unknown, choose from kafka, mqtt, opcua, replay, sine",
+    )
+    (folder / "wrong.toml").write_text(text.replace('"sin"', '"sine"').replace("blocks", "block"))
+    one_line(run("run", folder / "wrong.toml", "--check"), "[sources] line.block: unknown key, did you mean 'blocks'?")
+
+
+def test_the_recipe_for_a_publisher_works(follow: Callable[[str], Path]) -> None:
+    folder = follow("Add a publisher")
+    assert run("run", folder / "hall.toml").code == 0
+    assert "press: " in (folder / "board.txt").read_text()
