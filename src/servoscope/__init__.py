@@ -41,12 +41,12 @@ aliases.install()
 if TYPE_CHECKING:
     from servoscope.baseline.baseline import Baseline
     from servoscope.design import design_study
-    from servoscope.detection.result import Diagnosis
     from servoscope.detection.trace import Trace
     from servoscope.diagnosis.diagnose import diagnose
     from servoscope.diagnosis.monitor import Monitor
     from servoscope.diagnosis.novelty import NoveltyDetector as NoveltyDetector
     from servoscope.diagnosis.operating_points import learn
+    from servoscope.diagnosis.result import Diagnosis
     from servoscope.learning.inspection import inspect
     from servoscope.models.loop import Loop
     from servoscope.report.diagnosis_page import write_report
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 else:  # hidden from type checkers, which would otherwise accept any name
     _HOMES = {
         "Baseline": "baseline.baseline",
-        "Diagnosis": "detection.result",
+        "Diagnosis": "diagnosis.result",
         "Loop": "models.loop",
         "Monitor": "diagnosis.monitor",
         "NoveltyDetector": "diagnosis.novelty",  # not in __all__: it needs scikit-learn

@@ -10,7 +10,7 @@ import pytest
 from scipy import integrate
 
 from servoscope.core.errors import SimulationError
-from servoscope.detection.result import UNKNOWN, Candidate
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.isolate import SYSTEMATIC, isolate
 from servoscope.isolation.signature import Signature, coefficient_signature, parameter_signature
 from servoscope.models.plants import Fault

@@ -203,7 +203,8 @@ def test_the_words_of_a_plant_of_another_package_reach_the_reader(
 def test_the_pages_know_the_words_of_a_plant_of_another_package(turned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (turned / "hall.toml").write_text(
         'name = "hall"\n[service]\nlisten = ""\nlog = "error"\n[store]\nurl = "hall.sqlite"\n'
-        '[web]\nlisten = "127.0.0.1:0"\n[diagnosis]\nwindow_s = 40.0\nevery_s = 30.0\n[sources.line]\nkind = "replay"\nspeed = 0.0\n'
+        '[web]\nlisten = "127.0.0.1:0"\n[diagnosis]\nwindow_s = 40.0\nevery_s = 30.0\n'
+        '[sources.line]\nkind = "replay"\nspeed = 0.0\n'
         '[assets.wheel]\nbaseline = "wheel.json"\nsource = "line"\nfiles = ["dry.csv"]\n',
         encoding="utf-8",
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from servoscope.core.messages import Message, catalogue, message, text_message
-from servoscope.detection.result import FaultInterval
+from servoscope.diagnosis.result import FaultInterval
 from servoscope.models.loop import Loop
 
 LIKELY = 0.05  # probability from which an explanation is worth a look where none is certain

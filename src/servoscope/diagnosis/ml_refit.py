@@ -11,18 +11,10 @@ import numpy as np
 from servoscope.core.messages import message
 from servoscope.core.number_format import ratio_digits
 from servoscope.detection.onset import Onset
-from servoscope.detection.result import (
-    UNKNOWN,
-    VIBRATION,
-    Candidate,
-    DiagnosisWarning,
-    FaultEstimate,
-    FaultInterval,
-    Mimic,
-    RefitSummary,
-)
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, Mimic, RefitSummary
 from servoscope.diagnosis.warnings import warning_throughout
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.plants import Fault, Plant
 
 if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before

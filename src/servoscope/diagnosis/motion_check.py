@@ -7,9 +7,9 @@ import numpy as np
 from servoscope.baseline.motion import QUANTITIES
 from servoscope.baseline.plant_fit import saturated_share
 from servoscope.core.messages import Message, message
-from servoscope.detection.result import DiagnosisWarning
 from servoscope.detection.trace import UNSEEN
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import DiagnosisWarning
 from servoscope.diagnosis.warnings import warning_throughout
 
 SATURATED = 0.05  # share of the samples with u at a limit that is worth telling

@@ -8,10 +8,11 @@ from servoscope.baseline.plant_fit import MOST_SATURATED, saturated_share
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.result import Candidate, DiagnosisWarning
 from servoscope.detection.signal_defects import find_switched_off
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
 from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
+from servoscope.diagnosis.result import DiagnosisWarning
+from servoscope.isolation.candidate import Candidate
 from servoscope.learning.plausibility import negative_coefficients
 
 AT_ONCE = 4096  # evaluations

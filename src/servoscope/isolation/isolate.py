@@ -9,7 +9,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
-from servoscope.detection.result import UNKNOWN, Candidate, FaultEstimate
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.isolation.posterior import Posterior
 from servoscope.isolation.signature import Signature
 

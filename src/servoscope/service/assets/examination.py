@@ -15,8 +15,9 @@ from servoscope.baseline.covariates import hold_last
 from servoscope.core.errors import RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
-from servoscope.detection.result import FaultEstimate, Verdict
 from servoscope.detection.warm_up import FOLLOWED
+from servoscope.diagnosis.result import Verdict
+from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
 
