@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
@@ -142,3 +144,124 @@ def test_the_exceptions_among_names_are_needed() -> None:
     idle = [word for word in EXCEPTIONS if not word.endswith(("ing", "ed"))]
     assert not idle, f"no exceptions, these would not be counted anyway: {idle}"
     assert not IRREGULAR & set(EXCEPTIONS)
+
+
+# Adjectives, superlatives and participles that say nothing of what they bound.
+VAGUE = set(
+    [
+        "absurd",
+        "ahead",
+        "alike",
+        "as",
+        "beside",
+        "between",
+        "clearer",
+        "closer",
+        "coarse",
+        "counted",
+        "distinct",
+        "enough",
+        "explained",
+        "far",
+        "farthest",
+        "fastest",
+        "few",
+        "fewest",
+        "filled",
+        "follow",
+        "followed",
+        "forgotten",
+        "free",
+        "furthest",
+        "hopeless",
+        "impossible",
+        "inconstant",
+        "largest",
+        "later",
+        "least",
+        "likely",
+        "long",
+        "longest",
+        "lost",
+        "loud",
+        "loudest",
+        "many",
+        "moved",
+        "near",
+        "nearby",
+        "nearly",
+        "negative",
+        "negligible",
+        "noisy",
+        "odd",
+        "often",
+        "other",
+        "others",
+        "quiet",
+        "rare",
+        "relevant",
+        "remembered",
+        "rough",
+        "said",
+        "same",
+        "settled",
+        "sharp",
+        "shortest",
+        "significant",
+        "silent",
+        "slowest",
+        "small",
+        "smallest",
+        "smoother",
+        "some",
+        "steady",
+        "still",
+        "strong",
+        "suitable",
+        "tiny",
+        "tried",
+        "unasked",
+        "unlikely",
+        "unseen",
+        "weak",
+        "weakest",
+        "whole",
+        "wide",
+        "wider",
+        "widest",
+    ]
+)
+OF_A_BOUND = {"most", "least", "fewest", "largest", "longest", "shortest", "smallest", "slowest", "fastest", "weakest"}
+CONSTANTS_BOUND = "models", "signals"  # packages whose constants say what they bound
+
+
+def constants_of(tree: ast.Module) -> Iterator[str]:
+    """Yield the names of a module's constants."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = (each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name))
+            yield from (name for name in names if name.isupper())
+
+
+def is_vague(constant: str) -> bool:
+    """Tell whether a constant is an adjective alone, or begins with a superlative in the place of MIN or MAX."""
+    words = constant.lower().strip("_").split("_")
+    return words[0] in OF_A_BOUND or (len(words) == 1 and words[0] in VAGUE)
+
+
+@pytest.mark.parametrize("package", CONSTANTS_BOUND)
+def test_a_constant_says_what_it_bounds(package: str) -> None:
+    vague = [
+        f"{source.path.as_posix()}: {name}"
+        for source in SOURCES
+        if source.path.parts[0] == package
+        for name in constants_of(source.tree)
+        if is_vague(name)
+    ]
+    assert not vague, f"name the quantity: MIN_SAMPLES, DELAY_TOLERANCE, NOISE_SHARE:{listing(vague)}"
+
+
+def test_constants_that_bound_are_told_from_vague_ones() -> None:
+    names = constants_of(ast.parse("FEW = 1\nMOST_ROWS, MAX_ROWS = 1, 2\nSETTLED: int = 3\nSETTLED_SHARE = x = 4"))
+    assert [name for name in names if is_vague(name)] == ["FEW", "MOST_ROWS", "SETTLED"]

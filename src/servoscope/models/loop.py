@@ -26,7 +26,7 @@ DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
 FEATURE_FALSE_ALARMS = 0.005
 COVARIATE_HOLD_S = 600.0  # a thermometer may tell rarely, and only what has changed
 RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # names that mean something else
-LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a rule
+MAX_DELAY_SAMPLES = 100  # samples; a longer one is a delay in ms given as s, as a rule
 
 Interval = tuple[Finite, Finite]
 
@@ -247,8 +247,8 @@ class Loop(ShortRepr, Settings):
                 '[monitor] rest_speed: missing, update_when = "moving" needs the speed below which the axis rests '
                 "(inspect tells one), or input_deadzone"
             )
-        if self.delay * self.sample_rate > LONGEST_DELAY:
-            raise ValueError(f"delay: {self.delay:g} s is more than {LONGEST_DELAY} samples, give it in seconds")
+        if self.delay * self.sample_rate > MAX_DELAY_SAMPLES:
+            raise ValueError(f"delay: {self.delay:g} s is more than {MAX_DELAY_SAMPLES} samples, give it in seconds")
         for key, interval in (("input_limits", self.input_limits), ("input_deadzone", self.input_deadzone)):
             if interval is not None and interval[0] >= interval[1]:
                 raise ValueError(f"{key}: [{interval[0]:g}, {interval[1]:g}] must be [lo, hi] with lo below hi")

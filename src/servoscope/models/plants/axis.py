@@ -14,7 +14,7 @@ from servoscope.models.plants.base import SIGN_CUTOFF, CoefficientPlant, Fault, 
 from servoscope.models.plants.columns import COLUMN_FORMS, Column
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-LATER = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
+NOT_DUMPED = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 TermName = Literal[
     "stiffness",
@@ -108,7 +108,7 @@ PAYLOAD_FAULTS = {
         MOVED_MASS_CHECKS,
     ),
 }
-EARTH = 9.81  # m/s^2
+GRAVITY_ACCELERATION = 9.81  # m/s^2
 
 
 def _as_tuple(value: Any) -> Any:
@@ -132,9 +132,9 @@ class AxisPlant(CoefficientPlant):
     # output at which the load of the term ``gravity`` hangs, in rad
     hanging_at: Finite = 0.0
     # distance of a payload from the joint [m], with input_gain u in N m; 1 on a linear axis, with input_gain u in N
-    payload_arm: Annotated[Positive | None, LATER] = None
+    payload_arm: Annotated[Positive | None, NOT_DUMPED] = None
     # what the output is: a position, or a speed, as drives log it; then no term can depend on the position
-    y: Annotated[Literal["position", "speed"], LATER] = "position"
+    y: Annotated[Literal["position", "speed"], NOT_DUMPED] = "position"
     # speed [output per s] below which sign(y') is not trusted and set to 0
     sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
     # where the sign of the recursion comes from: the measured output, or the reference where y is noisy or slow
@@ -276,7 +276,7 @@ class AxisPlant(CoefficientPlant):
         """
         assert self.payload_arm is not None
         own = coefficients["gravity"]
-        weight = np.sign(np.real(own)) * inertia * EARTH / self.payload_arm
+        weight = np.sign(np.real(own)) * inertia * GRAVITY_ACCELERATION / self.payload_arm
         coefficients["inertia"] += inertia
         coefficients["gravity"] += weight
         if "load_friction" in coefficients:
