@@ -151,7 +151,7 @@ VAGUE = set(
     re.findall(
         r"\w+",
         """
-        absurd ahead alike as beside between clearer closer coarse counted distinct enough explained far
+        absurd ahead alike as beside clearer closer coarse counted distinct enough explained far
         farthest fastest few fewest filled follow followed forgotten free furthest hopeless impossible
         inconstant largest later least likely long longest lost loud loudest many moved near nearby nearly
         negative negligible noisy odd often other others quiet rare relevant remembered rough said same
@@ -161,7 +161,7 @@ VAGUE = set(
     )
 )
 OF_A_BOUND = {"most", "least", "fewest", "largest", "longest", "shortest", "smallest", "slowest", "fastest", "weakest"}
-CONSTANTS_BOUND = "models", "signals"  # packages whose constants say what they bound
+CONSTANTS_BOUND = "models", "signals", "estimation"  # packages whose constants say what they bound
 
 
 def constants_of(tree: ast.Module) -> Iterator[str]:

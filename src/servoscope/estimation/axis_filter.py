@@ -20,7 +20,7 @@ from servoscope.models.plants.axis import AxisPlant
 
 TARGET_RATE = 200.0  # Hz; what an axis does faster than that is not its rigid body
 SPEED_SAMPLES = 5  # over which a parabola gives the speed
-FORGOTTEN = 1e-2  # share of its state that the filter may still hold
+MAX_REMAINING_SHARE = 1e-2  # share of its state that the filter may still hold
 RELATIVE_FLOOR = 1e-12  # of y's noise, relative to what the force does to y within a sample
 DOUBLINGS = 30  # of the samples that the steady state is computed over
 
@@ -79,7 +79,7 @@ class AxisFilter:
         numerator, poles = ss2tf(F, inputs, C, np.zeros((1, 2)), 0)
         from_y, _ = ss2tf(F, inputs, C, np.zeros((1, 2)), 1)
         slowest = float(np.abs(np.linalg.eigvals(F)).max())
-        settling = int(np.ceil(np.log(FORGOTTEN) / np.log(min(max(slowest, 0.01), 0.999))))
+        settling = int(np.ceil(np.log(MAX_REMAINING_SHARE) / np.log(min(max(slowest, 0.01), 0.999))))
         # kernels take three poles, of which that of a position may be missing
         to_acceleration, to_y, poles = (
             np.pad(one, (0, derivative)) for one in (numerator[0], poles - from_y[0], poles)

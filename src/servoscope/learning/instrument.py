@@ -12,7 +12,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.estimation.instrument import Source, unbroken
 from servoscope.estimation.instrumental_fit import (
-    LARGEST_DEVIATION,
+    MAX_RELATIVE_STD,
     InstrumentalFit,
     fit_with_instrument,
     has_feedback,
@@ -62,7 +62,7 @@ def learn_instrument(
     if not found.settled:
         return None, [message("learning.instrument_unsettled")]
     if not found.trusted:
-        values = {"coefficient": found.weakest, "deviation": found.deviation, "limit": LARGEST_DEVIATION}
+        values = {"coefficient": found.weakest, "deviation": found.deviation, "limit": MAX_RELATIVE_STD}
         return None, [message("learning.instrument_refused", **values)]
     return found, []
 

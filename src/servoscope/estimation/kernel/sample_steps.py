@@ -32,8 +32,8 @@ CUSUM_BATCH = 8  # the number of CUSUMs is rounded up to this, so that few kerne
 MISSING, HELD, USED, BETWEEN = -1.0, 0.0, 1.0, 2.0
 # Of the speed of a reference, as shares of the parts that cancel in it: what rounding leaves, and where it counts as
 # standing still. The differentiator's tail falls to no less than a fifth from sample to sample: it cannot jump the gap.
-ROUNDING, STANDING = 1e-14, 1e-12
-LEAST_SPEED = 1e-30  # below, a reference that rests at 0 stands still
+ROUNDING_SHARE, STANDSTILL_SHARE = 1e-14, 1e-12
+MIN_SPEED = 1e-30  # below, a reference that rests at 0 stands still
 MAX_PHYSICAL = 1e100  # larger is no physical signal; its square would overflow and stay in the state for ever
 TILE = 16  # largest number of samples that are fetched together
 
@@ -167,7 +167,7 @@ class SampleSteps:
                 s[self.to.velocity + j] = c[self.at.velocity + 9 + j] * source
             speed, parts = self._speed(c, s, source)
             if self.size.speed == 2:
-                speed = where(abs(speed) <= ROUNDING * parts, 0.0, speed)
+                speed = where(abs(speed) <= ROUNDING_SHARE * parts, 0.0, speed)
         w = self._inputs(c, r, u, y, speed)
         for k in range(self.size.states):
             s[self.to.x + k] = dot([c[self.at.steady + k * len(w) + j] for j in range(len(w))], w)
@@ -193,9 +193,9 @@ class SampleSteps:
             if self.size.speed == 2:
                 # a reference stands still exactly: the filter is stopped before the sign of its tail, that of the last
                 # motion, is lost in rounding, which differs from machine to machine; without a motion it is 0
-                stands = abs(speed) <= STANDING * parts + LEAST_SPEED
+                stands = abs(speed) <= STANDSTILL_SHARE * parts + MIN_SPEED
                 ahead = [where(stands, old, new) for old, new in zip(x, ahead, strict=True)]
-                speed = where(abs(speed) <= ROUNDING * parts, 0.0, speed)
+                speed = where(abs(speed) <= ROUNDING_SHARE * parts, 0.0, speed)
             for j in range(2):
                 s[self.to.velocity + j] = ahead[j]
         w = self._inputs(c, r, u, y, speed)
