@@ -15,7 +15,7 @@ from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
 from servoscope.detection.onset import Onset, estimate_onset
 from servoscope.detection.signal_defects import find_signal_defect
-from servoscope.detection.trace import UNSEEN, Trace
+from servoscope.detection.trace import UNSEEN_EXCESS, Trace
 from servoscope.diagnosis import ml_refit
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
@@ -281,7 +281,7 @@ def _explain_alarm(
     # the refit takes the model for exact, but that of an axis follows the recording
     seen = exam.change is not None or (
         not exam.drifts
-        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
+        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
     )
     refined = ml_refit.refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):

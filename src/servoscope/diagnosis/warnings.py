@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from servoscope.baseline.plant_fit import MOST_SATURATED, saturated_share
+from servoscope.baseline.plant_fit import MAX_SATURATED_SHARE, saturated_share
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
@@ -76,7 +76,7 @@ def warm_up_warnings(exam: Examination) -> list[DiagnosisWarning]:
 
 def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]) -> list[DiagnosisWarning]:
     """Return warnings about what this recording could not have shown although the baseline promises it."""
-    if (share := saturated_share(exam.baseline.loop, exam.recording)) > MOST_SATURATED:
+    if (share := saturated_share(exam.baseline.loop, exam.recording)) > MAX_SATURATED_SHARE:
         reasons = [message("warning.saturated", share=share)]
     elif not detectable:
         reasons = [message("warning.no_promise")]

@@ -14,7 +14,7 @@ from servoscope.baseline.expectation import Expectation, reference_path, residua
 from servoscope.baseline.hypothesis import CusumHypothesis
 from servoscope.baseline.motion import learn_motion
 from servoscope.baseline.plant_fit import (
-    MOST_SATURATED,
+    MAX_SATURATED_SHARE,
     can_simulate,
     describe_healthy_plant,
     fault_directions,
@@ -84,7 +84,7 @@ def learn_baseline(
     progress("regressors")
     for rec in recordings:
         _check_signals(loop, rec)
-        if (share := saturated_share(loop, rec)) > MOST_SATURATED:
+        if (share := saturated_share(loop, rec)) > MAX_SATURATED_SHARE:
             raise NotEnoughError(
                 f"{rec.name}: u is at a limit in {share:.0%} of the rows: lower the demand, or check input_limits"
             )

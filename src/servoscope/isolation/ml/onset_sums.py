@@ -18,7 +18,7 @@ from servoscope.isolation.ml.kernels import (
 )
 from servoscope.isolation.ml.predictor import PlantVariants
 
-FORGOTTEN = 1e-3  # share of its state from before a change that a predictor may still hold
+MAX_REMAINING_SHARE = 1e-3  # share of its state from before a change that a predictor may still hold
 LANES = 32  # changes side by side
 VECTOR = 8  # lanes that the processor takes at once; their number is rounded up to it
 
@@ -31,7 +31,7 @@ def prepare_sums(
     stepping = np.ascontiguousarray(drifting[:, [0, -1]])
     A, K, c = each.A[stepping[0]], each.K[stepping[0], -1], each.c[stepping[0]]
     slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
-    settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), len(y))
+    settle = min(int(np.ceil(np.log(MAX_REMAINING_SHARE) / np.log(max(min(slowest, 0.9999), 1e-3)))), len(y))
     signals = (u, y, restart, Q)
     constant = sum_constant_plants(*each, stepping, step, *signals)
 

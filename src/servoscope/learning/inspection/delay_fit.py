@@ -18,7 +18,7 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.estimation.tuning import sum_covariance
-from servoscope.isolation.ml.predictor import LONGEST, PredictorFactory
+from servoscope.isolation.ml.predictor import MAX_GAIN_SAMPLES, PredictorFactory
 from servoscope.isolation.ml.window import plant_input
 from servoscope.learning.inspection.delay import LATEST, LATEST_S
 from servoscope.learning.inspection.model_order import Regressors, fit_regression
@@ -223,7 +223,7 @@ class DelaySearch:
     def age(self) -> IndexArray:
         """Samples since a restart, as far as the gains change with them, shape (N,)."""
         at = np.arange(len(self.y))
-        return np.minimum(at - np.maximum.accumulate(np.where(self.restart, at, 0)), LONGEST - 1)
+        return np.minimum(at - np.maximum.accumulate(np.where(self.restart, at, 0)), MAX_GAIN_SAMPLES - 1)
 
     @property
     def _nominal_offset(self) -> float:
