@@ -14,7 +14,7 @@ from accuracy.rig import FAULT_AT, baseline, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import is_named, is_right, percent, seen, told
 from servoscope.design import DirectionStudy
-from servoscope.detection.result import UNKNOWN
+from servoscope.isolation.candidate import UNKNOWN
 from servoscope.scoring import Reliability, reliability, share
 from servoscope.simulation import FaultEvent
 

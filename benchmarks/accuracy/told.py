@@ -11,10 +11,10 @@ import numpy as np
 import servoscope as ss
 from accuracy.rig import FAULT_AT
 from accuracy.scenario import Numbers, Row
-from servoscope.detection.result import UNKNOWN, Candidate
 from servoscope.diagnosis.diagnose import SURE, first_alarm
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, refit_onset, refit_recording
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.ml import find_other_causes
 from servoscope.research.paper.conditions import FAULT_NAMES
 from servoscope.scoring import share

@@ -40,12 +40,12 @@ if TYPE_CHECKING:
     from servoscope.baseline.baseline import Baseline
     from servoscope.core.errors import ServoscopeError
     from servoscope.design import design_study
-    from servoscope.detection.result import Diagnosis
     from servoscope.detection.trace import Trace
     from servoscope.diagnosis.diagnose import diagnose
     from servoscope.diagnosis.monitor import Monitor
     from servoscope.diagnosis.novelty import NoveltyDetector as NoveltyDetector
     from servoscope.diagnosis.operating_points import learn
+    from servoscope.diagnosis.result import Diagnosis
     from servoscope.learning.inspection import inspect
     from servoscope.models.loop import Columns, Loop
     from servoscope.report.diagnosis_page import write_report
@@ -57,7 +57,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
     _HOMES = {
         "Baseline": "baseline.baseline",
         "Columns": "models.loop",
-        "Diagnosis": "detection.result",
+        "Diagnosis": "diagnosis.result",
         "Loop": "models.loop",
         "Monitor": "diagnosis.monitor",
         "NoveltyDetector": "diagnosis.novelty",  # not in __all__: it needs scikit-learn

@@ -17,7 +17,7 @@ import servoscope as ss
 from golden.results import FOLDER
 from servoscope.core import messages
 from servoscope.core.messages import JOINS, Message, catalogue, message, read_messages, render, text_message
-from servoscope.detection.result import Diagnosis, DiagnosisWarning, Mimic
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, Mimic
 
 SOURCES = sorted((Path(__file__).parents[2] / "src" / "servoscope").rglob("*.py"))
 TEMPLATES = sorted((Path(__file__).parents[2] / "src" / "servoscope").rglob("templates/*.html"))

@@ -26,6 +26,7 @@ from servoscope.core.errors import BaselineError, StateError
 from servoscope.detection.baseline_run import cusum_constants
 from servoscope.detection.statistic import apply_alarm_delays
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.estimation import estimators
 from servoscope.export import export_c, pack_image, unpack_image
 from servoscope.export.golden import frozen_signals, golden_signals
 from servoscope.learning.learn import learn_baseline, nominal_baseline
@@ -34,6 +35,11 @@ from servoscope.signals.quality import QualitySettings
 from servoscope.simulation import FaultEvent, reference, simulate
 
 AXIS: dict[str, Any] = {"kind": "polynomial", "order": 2, "coefficients": {"viscous_friction": 200.0, "inertia": 90.0}}
+WITH_COVARIANCE = [
+    name
+    for name in estimators.estimator_names()
+    if not hasattr(estimators.load_estimator(name), "steady_gain") and name != "sliding-window"  # which is refused
+]
 RIG = Path(str(files("servoscope").joinpath("simulation", "reference-rig.toml")))
 
 
@@ -112,7 +118,7 @@ def test_delays_of_the_alarm(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("estimator", ["iv-akf", "kf", "rls", "rls-reset", "dfrls", "nlms"])
+@pytest.mark.parametrize("estimator", WITH_COVARIANCE)
 def test_estimators_with_a_covariance_of_their_own(tmp_path: Path, estimator: str) -> None:
     baseline = fresh(altered(demo(), estimator=estimator))
     same(Drive.built(baseline, tmp_path), baseline, 20_000)

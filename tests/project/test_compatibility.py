@@ -61,6 +61,12 @@ SAME_MACHINE = results.arithmetic() == FROZEN["arithmetic"]
 EXACT, ITERATED = (1e-9, 1e-6) if SAME_MACHINE else (1e-4, 1e-4)
 
 
+def named(records: list[Any]) -> dict[str, Any]:
+    """Return records by their names; empty if they have none, or one stands twice."""
+    by_name = {each["name"]: each for each in records if isinstance(each, dict) and "name" in each}
+    return by_name if len(by_name) == len(records) else {}
+
+
 def differences(found: Any, expected: Any, rel: float, where: str = "") -> list[str]:
     """Return where two JSON documents differ: in keys, numbers, or strings with a meaning."""
     key = where.rpartition("/")[2]
@@ -73,6 +79,9 @@ def differences(found: Any, expected: Any, rel: float, where: str = "") -> list[
     if isinstance(expected, list) and isinstance(found, list):
         if all(isinstance(each, str) for each in (*expected, *found)) and key not in WORDS:
             return []  # sentences
+        ours, theirs = named(found), named(expected)
+        if ours and theirs:  # a fault that came later may be among ours
+            return differences({name: ours[name] for name in ours.keys() & theirs.keys()}, theirs, rel, where)
         if len(found) != len(expected):
             return [f"{where}: {len(found)} entries, not {len(expected)}"]
         pairs = enumerate(zip(found, expected, strict=True))

@@ -58,7 +58,7 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
 
 
 def test_what_swells_when_unpacked_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(archives, "LEAST_BYTES", 1000)
+    monkeypatch.setattr(archives, "MIN_UNPACKED_LIMIT_BYTES", 1000)
     path = tmp_path / "x.csv.gz"
     path.write_bytes(gzip.compress(b"1,2\n" * 5_000_000))
     with pytest.raises(RecordingError, match="MB when unpacked, unpack it yourself"):

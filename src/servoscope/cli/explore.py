@@ -77,14 +77,12 @@ def explore(
 
 def plant_table(structure: AxisStructure) -> str:
     """Return the section of a loop file; the constant force joins, which every recording has of its own."""
-    from servoscope.models.plants.axis import AxisPlant
-
     plant = structure.plant
     terms = ", ".join(f'"{term}"' for term in (*plant.terms, "offset"))
     lines = ["[plant]", 'kind = "axis"', f"terms = [{terms}]", f"input_gain = {plant.input_gain!r}"]
-    for key in ("stribeck_speed", "hanging_at", "payload_arm", "y"):
-        if (value := getattr(plant, key)) != AxisPlant.model_fields[key].default:
-            lines.append(f"{key} = {json.dumps(value)}")
+    keys = {"stribeck_speed", "hanging_at", "payload_arm", "y"}
+    settings = plant.model_dump(include=keys, exclude_defaults=True)
+    lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
     return "\n".join(lines) + "\n"
 
 

@@ -12,12 +12,13 @@ from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.detection.onset import Onset
-from servoscope.detection.result import UNKNOWN, VIBRATION, Candidate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import VIBRATION
 from servoscope.estimation import frequency_response
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.models.plants import Plant
 
 AT_ONCE = 4096  # evaluations whose responses are computed together

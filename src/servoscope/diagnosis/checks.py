@@ -1,11 +1,11 @@
-"""What to check on the machine: for each fault what its loop file says, or the plant's own words of the catalogue."""
+"""What to check on the machine: for each fault what its loop file says, or its plant."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from servoscope.core.messages import Message, catalogue, message, text_message
-from servoscope.detection.result import FaultInterval
+from servoscope.diagnosis.result import FaultInterval
 from servoscope.models.loop import Loop
 
 LIKELY = 0.05  # probability from which an explanation is worth a look where none is certain
@@ -22,7 +22,10 @@ def what_to_check(loop: Loop, interval: FaultInterval | None) -> tuple[Message, 
 
 def checks_of_fault(loop: Loop, name: str) -> Iterator[Message]:
     """Yield what to check for one fault; nothing where nobody has said it."""
+    checks = next((fault.checks for fault in loop.plant.faults if fault.name == name), "")
     if name in (loop.checks or {}):
         yield from map(text_message, (loop.checks or {})[name])
+    elif checks:
+        yield message("diagnosis.check", checks=checks)
     elif f"check.{name}" in catalogue():
         yield message(f"check.{name}")

@@ -14,18 +14,8 @@ from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
 from servoscope.detection.onset import Onset, estimate_onset
-from servoscope.detection.result import (
-    UNKNOWN,
-    Candidate,
-    Diagnosis,
-    DiagnosisWarning,
-    FaultInterval,
-    FinalCoefficient,
-    ResponsePoint,
-    Verdict,
-)
 from servoscope.detection.signal_defects import find_signal_defect
-from servoscope.detection.trace import UNSEEN, Trace
+from servoscope.detection.trace import UNSEEN_EXCESS, Trace
 from servoscope.diagnosis import ml_refit
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
@@ -35,6 +25,14 @@ from servoscope.diagnosis.explanation import build_headline, build_reasons, unwa
 from servoscope.diagnosis.motion_check import motion_warnings
 from servoscope.diagnosis.output_onset import refine_onset
 from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
+from servoscope.diagnosis.result import (
+    Diagnosis,
+    DiagnosisWarning,
+    FaultInterval,
+    FinalCoefficient,
+    ResponsePoint,
+    Verdict,
+)
 from servoscope.diagnosis.sensor_check import check_sensors
 from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
 from servoscope.diagnosis.timeline import trace_timeline
@@ -48,6 +46,7 @@ from servoscope.diagnosis.warnings import (
     warning_throughout,
 )
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.isolate import isolate
 from servoscope.signals import MIN_SAMPLES, Recording
 from servoscope.signals.readers import as_recording
@@ -282,7 +281,7 @@ def _explain_alarm(
     # the refit takes the model for exact, but that of an axis follows the recording
     seen = exam.change is not None or (
         not exam.drifts
-        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
+        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
     )
     refined = ml_refit.refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):

@@ -26,7 +26,7 @@ from servoscope.core.errors import RecordingError
 from servoscope.detection import cusum_design
 from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants
 from servoscope.detection.statistic import apply_alarm_delays, t2_statistic
-from servoscope.detection.trace import UNSEEN, Statistic, any_exceeded, detection_statistics
+from servoscope.detection.trace import UNSEEN_EXCESS, Statistic, any_exceeded, detection_statistics
 from servoscope.detection.warm_up import follow_warm_up
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
@@ -182,7 +182,7 @@ class Examination:
             C = self.covariance(at) + self.model_error(at)
             T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
             # the sequential test knows no model error
-            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN))
+            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
         exceeded &= any_exceeded(self._of_coefficients)
         return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
 

@@ -10,19 +10,11 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
 from servoscope.core.messages import Message, message
 from servoscope.core.number_format import ratio_digits
-from servoscope.detection.result import (
-    UNKNOWN,
-    VIBRATION,
-    Candidate,
-    DiagnosisWarning,
-    FaultEstimate,
-    FaultInterval,
-    RefitSummary,
-    Verdict,
-)
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, RefitSummary, Verdict
 from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.plants import Plant
 
 MIN_CHANGE_STD = 3.0  # standard deviations from which a value has changed

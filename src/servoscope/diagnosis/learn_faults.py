@@ -15,10 +15,10 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.detection.homogeneity import scatter
-from servoscope.detection.result import UNKNOWN
 from servoscope.diagnosis.batch_estimate import estimate_batch_deviation, stretch_begin
 from servoscope.diagnosis.diagnose import diagnose_examination
 from servoscope.diagnosis.examine import Examination
+from servoscope.isolation.candidate import UNKNOWN
 from servoscope.isolation.isolate import misfit_limit
 from servoscope.signals import Recording
 

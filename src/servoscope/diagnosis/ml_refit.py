@@ -11,18 +11,10 @@ import numpy as np
 from servoscope.core.messages import message
 from servoscope.core.number_format import ratio_digits
 from servoscope.detection.onset import Onset
-from servoscope.detection.result import (
-    UNKNOWN,
-    VIBRATION,
-    Candidate,
-    DiagnosisWarning,
-    FaultEstimate,
-    FaultInterval,
-    Mimic,
-    RefitSummary,
-)
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, Mimic, RefitSummary
 from servoscope.diagnosis.warnings import warning_throughout
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.plants import Fault, Plant
 
 if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
@@ -51,19 +43,19 @@ def refit_recording(
 
 def vibration_interval(exam: Examination, found: AxisVibration) -> FaultInterval:
     """Return the interval of an axis that swings or rattles: no coefficient changed, so nothing is refitted."""
-    from servoscope.isolation.ml.search import OUTSIDE
+    from servoscope.isolation.ml.search import OUTSIDE_PRIOR
 
     t = exam.recording.t
     low, likely, high = (float(t[k]) for k in found.onset)
     fault = FaultEstimate(name=VIBRATION, parameter=VIBRATION, ratio=found.ratio, interval=found.interval)
-    named = Candidate(name=VIBRATION, probability=1.0 - OUTSIDE, faults=(fault,))
+    named = Candidate(name=VIBRATION, probability=1.0 - OUTSIDE_PRIOR, faults=(fault,))
     assert exam.change is not None
     return FaultInterval(
         detected_at_s=float(t[exam.change.detected]),
         onset_s=(low, likely, high),
         probability=named.probability,
         faults=(fault,),
-        candidates=(named, Candidate(name=UNKNOWN, probability=OUTSIDE)),
+        candidates=(named, Candidate(name=UNKNOWN, probability=OUTSIDE_PRIOR)),
     )
 
 

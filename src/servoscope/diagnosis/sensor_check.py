@@ -9,7 +9,7 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.sensors import find_sensor_deviation, without_sensor
-from servoscope.detection.result import DiagnosisWarning
+from servoscope.diagnosis.result import DiagnosisWarning
 from servoscope.signals import Recording
 
 WORSE = 2.0  # times the residual power of the other sensor, from which the plant says that a sensor is wrong

@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.result import Diagnosis, Provenance
 from servoscope.diagnosis.diagnose import diagnose
+from servoscope.diagnosis.result import Diagnosis, Provenance
 from servoscope.signals import Recording
 
 __all__ = ["Verification", "load_diagnosis", "provenance", "verify"]

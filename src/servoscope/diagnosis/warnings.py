@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from servoscope.baseline.plant_fit import MOST_SATURATED, saturated_share
+from servoscope.baseline.plant_fit import MAX_SATURATED_SHARE, saturated_share
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.result import Candidate, DiagnosisWarning
 from servoscope.detection.signal_defects import find_switched_off
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
 from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
+from servoscope.diagnosis.result import DiagnosisWarning
+from servoscope.isolation.candidate import Candidate
 from servoscope.learning.plausibility import negative_coefficients
 
 AT_ONCE = 4096  # evaluations
@@ -75,7 +76,7 @@ def warm_up_warnings(exam: Examination) -> list[DiagnosisWarning]:
 
 def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]) -> list[DiagnosisWarning]:
     """Return warnings about what this recording could not have shown although the baseline promises it."""
-    if (share := saturated_share(exam.baseline.loop, exam.recording)) > MOST_SATURATED:
+    if (share := saturated_share(exam.baseline.loop, exam.recording)) > MAX_SATURATED_SHARE:
         reasons = [message("warning.saturated", share=share)]
     elif not detectable:
         reasons = [message("warning.no_promise")]

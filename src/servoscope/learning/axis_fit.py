@@ -14,7 +14,7 @@ from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals, axis_stride
 from servoscope.estimation.tuning import sum_covariance
-from servoscope.isolation.ml.axis_scan import NEAR, largest_changes, scan_limit
+from servoscope.isolation.ml.axis_scan import HEALTHY_MARGIN, largest_changes, scan_limit
 from servoscope.isolation.ml.axis_vibration import BANDS
 from servoscope.isolation.ml.axis_window import LONG_RUN_S, axis_signals
 from servoscope.models.loop import Loop
@@ -194,7 +194,9 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     ):
         most = max(own)
         # the machine does what the terms do not know, and chance alone is no longer what a change has to exceed
-        limit = score_limit([max(one, LEAST_GAIN) for one in own], FALSE_ALARMS) if NEAR * most > usual else 0.0
+        limit = (
+            score_limit([max(one, LEAST_GAIN) for one in own], FALSE_ALARMS) if HEALTHY_MARGIN * most > usual else 0.0
+        )
         if limit > usual:
             limits[key] = limit
             notes.append(message(key_message, name=recordings[own.index(most)].name, times=limit / usual))

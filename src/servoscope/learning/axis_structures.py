@@ -24,6 +24,7 @@ from servoscope.learning.axis_fit import (
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.models.plants.axis import AxisPlant
+from servoscope.models.plants.base import CoefficientPlant
 from servoscope.signals import Recording
 
 CURVED = 0.5  # half of the range of y [rad], from which a sine differs from a straight line
@@ -63,7 +64,7 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
     """
     if len(recordings) < 2:
         raise NotEnoughError("structures are compared between recordings: give two or more")
-    if loop.plant.kind not in ("axis", "polynomial"):
+    if not isinstance(loop.plant, CoefficientPlant):
         raise LoopError(f'{loop.name}: structures are those of a motor axis, set kind = "axis" in [plant]')
     stride = axis_stride(loop.sample_rate)
     signals = [axis_signals(loop, one, stride) for one in recordings]

@@ -29,7 +29,7 @@ def check_delay(
 ) -> tuple[float | None, list[Message]]:
     """Estimate the delay from the longest recording; refuse one that is out of step with the loop file.
 
-    One sample at 100 Hz that the model does not know costs 63 % at 10 Hz (THEORY section 6), so half of it matters.
+    One sample at 100 Hz that the model does not know costs 63 % at 10 Hz, so half of it matters.
     Only the likelihood of y can refuse: least squares with noise in its regressors dates y late, by a sample or more
     under smooth motion. Where the likelihood cannot be written down, as with friction, nothing is refused; nor where
     it tells that there is a delay, but not closely enough to set it.

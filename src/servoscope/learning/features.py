@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoscope.baseline.feature_model import (
-    SLACK,
-    WIDER,
+    MIN_WIDENING,
+    WIDENING_SHARE,
     FeatureModel,
     GroupStatistic,
     SpanFeatures,
@@ -94,7 +94,7 @@ def _motion_range(spans: Sequence[Sequence[SpanFeatures]]) -> tuple[FloatArray, 
     seen = np.array([span.motion for each in spans for span in each])
     seen = np.where(np.isfinite(seen), seen, np.nanmean(np.where(np.isfinite(seen), seen, 0.0), axis=0))
     low, high = seen.min(axis=0), seen.max(axis=0)
-    wider = WIDER * (high - low) + SLACK
+    wider = WIDENING_SHARE * (high - low) + MIN_WIDENING
     return low - wider, high + wider
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoscope.baseline.plant_fit import PRIOR
+from servoscope.baseline.plant_fit import PRIOR_STD
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.estimation.tuning import sandwich_covariance, sum_covariance
@@ -73,7 +73,7 @@ def fit_innovations(loop: Loop, recordings: Sequence[Recording], noise: WhiteNoi
     u_std = max(noise.u_std, LEAST * float(np.mean([rec.u.std() for rec in recordings])))
     begin = WhiteNoise(u_std=u_std, y_std=noise.y_std)
     windows = [RefitWindow.of_healthy(loop, plant, begin, rec).cut(0, min(rec.samples, MOST)) for rec in recordings]
-    near = np.full(len(plant.parameters), PRIOR)
+    near = np.full(len(plant.parameters), PRIOR_STD)
     found = _InnovationSearch(windows, begin, plant.parameters, near).run()
     if found is None or found.is_likely(near, DOUBTFUL):
         return found

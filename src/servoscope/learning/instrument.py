@@ -12,7 +12,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.estimation.instrument import Source, unbroken
 from servoscope.estimation.instrumental_fit import (
-    LARGEST_DEVIATION,
+    MAX_RELATIVE_STD,
     InstrumentalFit,
     fit_with_instrument,
     has_feedback,
@@ -38,7 +38,7 @@ def learns_instrument(loop: Loop) -> bool:
     """
     monitor = loop.monitor
     suits = monitor.estimator in SUITABLE and monitor.structure == "svf" and monitor.two_stage == "none"
-    linear = loop.plant.kind == "polynomial" and getattr(loop.plant, "friction", "none") == "none"
+    linear = loop.plant.parameters_are_coefficients and loop.plant.affine
     return suits and linear and not can_simulate(loop)
 
 
@@ -62,7 +62,7 @@ def learn_instrument(
     if not found.settled:
         return None, [message("learning.instrument_unsettled")]
     if not found.trusted:
-        values = {"coefficient": found.weakest, "deviation": found.deviation, "limit": LARGEST_DEVIATION}
+        values = {"coefficient": found.weakest, "deviation": found.deviation, "limit": MAX_RELATIVE_STD}
         return None, [message("learning.instrument_refused", **values)]
     return found, []
 

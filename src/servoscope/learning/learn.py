@@ -14,7 +14,7 @@ from servoscope.baseline.expectation import Expectation, reference_path, residua
 from servoscope.baseline.hypothesis import CusumHypothesis
 from servoscope.baseline.motion import learn_motion
 from servoscope.baseline.plant_fit import (
-    MOST_SATURATED,
+    MAX_SATURATED_SHARE,
     can_simulate,
     describe_healthy_plant,
     fault_directions,
@@ -84,7 +84,7 @@ def learn_baseline(
     progress("regressors")
     for rec in recordings:
         _check_signals(loop, rec)
-        if (share := saturated_share(loop, rec)) > MOST_SATURATED:
+        if (share := saturated_share(loop, rec)) > MAX_SATURATED_SHARE:
             raise NotEnoughError(
                 f"{rec.name}: u is at a limit in {share:.0%} of the rows: lower the demand, or check input_limits"
             )
@@ -139,7 +139,7 @@ def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
     span = max(1, round(SPEED_OVER * loop.sample_rate))
     speeds = []
     for rec in recordings:
-        source = rec.r if getattr(loop.plant, "sign_from", "output") == "reference" else rec.y
+        source = rec.r if loop.plant.velocity_sign.of_reference else rec.y
         stretch = np.cumsum(rec.restart)
         together = stretch[span:] == stretch[:-span]
         moved = source[span:] if loop.plant.derivative else (source[span:] - source[:-span]) * loop.sample_rate / span

@@ -10,7 +10,7 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.feature_model import shrink
-from servoscope.baseline.plant_fit import PRIOR
+from servoscope.baseline.plant_fit import PRIOR_STD
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.core.messages import Message, message
@@ -89,7 +89,7 @@ class Population:
             )
         first_name, first = next(iter(baselines.items()))
         for name, other in baselines.items():
-            if (other.names, other.loop.plant.kind) != (first.names, first.loop.plant.kind):
+            if (other.names, type(other.loop.plant)) != (first.names, type(first.loop.plant)):
                 raise BaselineError(
                     f"{name}: its coefficients ({', '.join(other.names)}; plant {other.loop.plant.kind}) are not those "
                     f"of {first_name} ({', '.join(first.names)}; plant {first.loop.plant.kind}): no like machine"
@@ -149,7 +149,7 @@ class Population:
         """Return names, logarithms and covariance of parameters with the population's; None where it has others."""
         if self.ratios is None or self.ratios.names != tuple(names):
             return None
-        return self.ratios.names, *self.ratios.combine(x, C, PRIOR)
+        return self.ratios.names, *self.ratios.combine(x, C, PRIOR_STD)
 
 
 def _common_scatter(each: Sequence[Baseline], n: int) -> tuple[FloatArray, float]:

@@ -10,7 +10,7 @@ import numpy as np
 from servoscope.baseline.covariates import CovariateModel, WarmUp
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import NotEnoughError
-from servoscope.detection.warm_up import BLOCK, NAME, BlockSums, WarmUpFit, fit_course
+from servoscope.detection.warm_up import BLOCK_MEMORIES, NAME, BlockSums, WarmUpFit, fit_course
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit
 from servoscope.learning.covariates import CLEAR, STRETCH, refer_to_covariates
@@ -58,7 +58,7 @@ def _principal_direction(sums: Sequence[BlockSums], fit: TuningFit) -> tuple[Flo
     """Return the coefficients in the middle of what the stretches show, and a straight line through them."""
     found, whose = [], []
     for i, each in enumerate(sums):
-        blocks = max(round(STRETCH / BLOCK), 1)
+        blocks = max(round(STRETCH / BLOCK_MEMORIES), 1)
         for first in range(0, len(each.first) - blocks + 1, blocks):
             A, b = each.normal[first : first + blocks].sum(axis=0), each.moment[first : first + blocks].sum(axis=0)
             if np.linalg.matrix_rank(A / np.sqrt(np.outer(np.diag(A), np.diag(A)))) == len(A):

@@ -27,7 +27,7 @@ DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
 FEATURE_FALSE_ALARMS = 0.005
 COVARIATE_HOLD_S = 600.0  # a thermometer may tell rarely, and only what has changed
 RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # names that mean something else
-LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a rule
+MAX_DELAY_SAMPLES = 100  # samples; a longer one is a delay in ms given as s, as a rule
 
 Interval = tuple[Finite, Finite]
 
@@ -187,10 +187,8 @@ class Loop(ShortRepr, Settings):
             slow = {"frequencies": frequencies, "evaluation_rate": evaluation}
             kept = {key: value for key, value in slow.items() if key not in monitor.model_fields_set}
             updates["monitor"] = monitor.model_copy(update=kept)
-        if isinstance(plant, plants.Plant) and "sign_cutoff" not in plant.model_fields_set:
-            sign_cutoff = getattr(plant, "sign_cutoff", None)
-            if sign_cutoff is not None and sign_cutoff >= rate / 2:
-                updates["plant"] = plant.model_copy(update={"sign_cutoff": rate / 4})
+        if isinstance(plant, plants.Plant):
+            updates["plant"] = plant.with_sample_rate(rate)
         return {**data, **updates}
 
     @model_validator(mode="after")
@@ -222,7 +220,7 @@ class Loop(ShortRepr, Settings):
         nyquist = self.sample_rate / 2
         checked = [("[monitor] cutoff", self.monitor.cutoff)]
         checked += [("[monitor] frequencies", frequency) for frequency in self.monitor.frequencies]
-        checked += [("[plant] sign_cutoff", getattr(self.plant, "sign_cutoff", None))]
+        checked += [("[plant] sign_cutoff", self.plant.velocity_sign.cutoff)]
         for key, frequency in checked:
             if frequency is not None and frequency >= nyquist:
                 raise ValueError(
@@ -250,8 +248,8 @@ class Loop(ShortRepr, Settings):
                 '[monitor] rest_speed: missing, update_when = "moving" needs the speed below which the axis rests '
                 "(inspect tells one), or input_deadzone"
             )
-        if self.delay * self.sample_rate > LONGEST_DELAY:
-            raise ValueError(f"delay: {self.delay:g} s is more than {LONGEST_DELAY} samples, give it in seconds")
+        if self.delay * self.sample_rate > MAX_DELAY_SAMPLES:
+            raise ValueError(f"delay: {self.delay:g} s is more than {MAX_DELAY_SAMPLES} samples, give it in seconds")
         for key, interval in (("input_limits", self.input_limits), ("input_deadzone", self.input_deadzone)):
             if interval is not None and interval[0] >= interval[1]:
                 raise ValueError(f"{key}: [{interval[0]:g}, {interval[1]:g}] must be [lo, hi] with lo below hi")
@@ -270,7 +268,7 @@ class Loop(ShortRepr, Settings):
     @property
     def needs_reference(self) -> bool:
         """Whether r has a part in the loop; elsewhere u may stand for it in recordings that have none."""
-        of_sign = getattr(self.plant, "sign_from", "output") == "reference"
+        of_sign = self.plant.velocity_sign.of_reference
         return self.controller is not None or self.monitor.two_stage != "none" or of_sign
 
     def _shown_facts(self) -> dict[str, object]:

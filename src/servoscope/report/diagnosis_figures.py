@@ -12,9 +12,10 @@ from matplotlib.patches import Patch
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.messages import translate
-from servoscope.detection.result import Candidate, Diagnosis, FaultEstimate
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.result import Diagnosis
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, FrequencyResponse
+from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.report.format_values import axis_scale, text_symbol, time_axis_unit
 from servoscope.report.plotting import COLOURS, envelope, plot_style, robust_range, visible_spans
 from servoscope.signals import Recording

@@ -10,12 +10,13 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import translate
-from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.checks import checks_of_fault
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
 from servoscope.diagnosis.motion_signature import SignatureWidth, compare_signatures
+from servoscope.diagnosis.result import Diagnosis, RefitSummary, ResponsePoint
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.loop import Loop
 from servoscope.report.format_values import (
     describe_candidate,

@@ -20,7 +20,7 @@ NEIGHBOURS = 20  # samples on either side that define what is normal
 STEP_SHARE = 0.02  # of the reference's range: smaller steps do not make u kick
 REACTION_SAMPLES = 3  # samples in which u may kick after a step of r
 PASSES = 30
-FEW = 500  # samples that are enough to guess two levels
+LEVEL_SAMPLES = 500  # samples that are enough to guess two levels
 CHUNK_PLACES = 512  # that are looked at together: each of them brings the pages around it into memory
 _NO_ROWS = np.empty(0, dtype=np.intp)
 
@@ -86,7 +86,7 @@ def _is_quiet(x: FloatArray, run: npt.NDArray[np.int32], share: float) -> bool:
     """
     if not 2 * NEIGHBOURS <= x.size <= outofcore.CHUNK_ROWS:
         return False
-    some = x[:: max(1, x.size // FEW)]
+    some = x[:: max(1, x.size // LEVEL_SAMPLES)]
     place = some.size // 20
     low, high = np.partition(some, [place, some.size - 1 - place])[[place, some.size - 1 - place]].tolist()
     enough, span = 0.01 * x.size + 1.0, high - low

@@ -12,7 +12,8 @@ from rich.text import Text
 from servoscope.cli.render.results import COLOURS, INDENT, print_facts, print_notes, print_table, print_title
 from servoscope.core.messages import translate, translate_range
 from servoscope.core.number_format import format_ratios, format_short
-from servoscope.detection.result import Candidate, Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary
+from servoscope.isolation.candidate import Candidate
 from servoscope.report.format_values import format_duration, format_probability
 from servoscope.report.page import say
 

@@ -37,6 +37,7 @@ __all__ = [
     "Message",
     "MessageField",
     "MessageText",
+    "add_words",
     "catalogue",
     "current_language",
     "languages",
@@ -52,6 +53,7 @@ __all__ = [
 
 FOLDER = files("servoscope.core.messages")
 SETTING = "SERVOSCOPE_LANGUAGE"
+WORD_SOURCES: list[Callable[[str], Mapping[str, str]]] = []
 PLAIN_TEXT = "text"  # the key of a message that is its text: from outside, or of a file of an earlier version
 
 
@@ -288,7 +290,15 @@ def translate_range(cell: str) -> str:
 @functools.cache
 def catalogue(language: str = "en") -> Mapping[str, str]:
     """Return the templates of a language by key."""
-    return dict(_flatten(tomllib.loads(FOLDER.joinpath(f"{language}.toml").read_text(encoding="utf-8"))))
+    own = tomllib.loads(FOLDER.joinpath(f"{language}.toml").read_text(encoding="utf-8"))
+    words = {f"word.{english}": text for source in WORD_SOURCES for english, text in source(language).items()}
+    return {**words, **dict(_flatten(own))}
+
+
+def add_words(source: Callable[[str], Mapping[str, str]]) -> None:
+    """Let a function return further words of a language by their English; where it knows a word itself, that counts."""
+    WORD_SOURCES.append(source)
+    catalogue.cache_clear()
 
 
 def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:

@@ -16,7 +16,7 @@ from servoscope.isolation.ml.kernels import (
 )
 from servoscope.isolation.ml.predictor import PlantVariants
 
-FORGOTTEN = 1e-3  # share of its state from before a change that a predictor may still hold
+MAX_REMAINING_SHARE = 1e-3  # share of its state from before a change that a predictor may still hold
 
 
 def prepare_sums(
@@ -27,7 +27,7 @@ def prepare_sums(
     stepping = np.ascontiguousarray(drifting[:, [0, -1]])
     A, K, c = predictor.A[stepping[0]], predictor.K[stepping[0], -1], predictor.c[stepping[0]]
     slowest = float(np.abs(np.linalg.eigvals(A - K[:, :, None] * c[:, None, :])).max())
-    settle = min(int(np.ceil(np.log(FORGOTTEN) / np.log(max(min(slowest, 0.9999), 1e-3)))), len(y))
+    settle = min(int(np.ceil(np.log(MAX_REMAINING_SHARE) / np.log(max(min(slowest, 0.9999), 1e-3)))), len(y))
     signals = (u, y, restart, Q)
     constant = sum_constant_plants(*predictor, stepping, step, *signals)
 

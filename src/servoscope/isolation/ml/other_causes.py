@@ -16,7 +16,7 @@ from servoscope.isolation.ml.least_squares import minimise_from_grid, solve_leas
 from servoscope.isolation.ml.predictor import Predictor
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow, delayed, speed_sign
 
-TRIED = 9  # delays up to one further sample, before the best is refined
+DELAY_COUNT = 9  # delays up to one further sample, before the best is refined
 UNITS = {"delay": "s", "backlash": "of y", "sensor_offset": "of y", "coulomb_friction": "of u", "input_offset": "of u"}
 
 
@@ -105,7 +105,7 @@ class CauseWindow:
             return float(left @ left)
 
         latest = 1.0 - factory.fractional_delay_s * rate
-        return minimise_from_grid(cost, np.linspace(0.0, latest, TRIED), 1e-4) / rate
+        return minimise_from_grid(cost, np.linspace(0.0, latest, DELAY_COUNT), 1e-4) / rate
 
     def _later_input(self, onset: int, later_s: float) -> FloatArray:
         window = self.window

@@ -19,9 +19,9 @@ from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
-LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
-PIECES = 8  # of a drift, within which the predictor changes in straight lines
-TINY = 1e-30  # complex step
+MISSED_LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
+DRIFT_PIECES = 8  # of a drift, within which the predictor changes in straight lines
+COMPLEX_STEP = 1e-30  # complex step
 SENSOR_GAIN = "sensor_gain"
 """What stands among the parameters for a factor on y as measured."""
 
@@ -39,7 +39,7 @@ class ChangeProfile:
     @property
     def shares(self) -> FloatArray:
         """Shares of the change that the plants after the healthy one have, shape (p - 1,); in between it is linear."""
-        return np.arange(1, PIECES + 1) / PIECES if self.duration else np.ones(1)
+        return np.arange(1, DRIFT_PIECES + 1) / DRIFT_PIECES if self.duration else np.ones(1)
 
 
 DRIFT = ChangeProfile(0, 1)  # whenever it comes, however long it takes
@@ -112,7 +112,7 @@ class ChangeWindow(abc.ABC):
         added to u; offsets of both.
         """
         moving, ones = delayed(speed_sign(self.y), 1), np.ones(self.samples)
-        lagged = [delayed(x, lag) for x in (self.u, self.y) for lag in range(1, LAGS + 1)]
+        lagged = [delayed(x, lag) for x in (self.u, self.y) for lag in range(1, MISSED_LAGS + 1)]
         return [*lagged, moving, ones], [moving, ones]
 
     def cut(self, first: int, end: int) -> Self:
@@ -167,10 +167,10 @@ class ChangeWindow(abc.ABC):
 
         By complex steps: no difference is taken, so nothing is lost by rounding (Squire and Trapp, 1998).
         """
-        moved = (z + 1j * TINY * np.eye(len(z)))[by]
+        moved = (z + 1j * COMPLEX_STEP * np.eye(len(z)))[by]
         if not len(moved):
             return np.zeros((self.samples + self.nuisance_count, 0))
-        return np.asarray(self.residuals(moved, names, profile).imag.T / TINY)
+        return np.asarray(self.residuals(moved, names, profile).imag.T / COMPLEX_STEP)
 
 
 @dataclass(frozen=True, eq=False)

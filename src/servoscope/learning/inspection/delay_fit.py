@@ -18,14 +18,14 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.estimation.tuning import sum_covariance
-from servoscope.isolation.ml.predictor import LONGEST, PredictorFactory
+from servoscope.isolation.ml.predictor import MAX_GAIN_SAMPLES, PredictorFactory
 from servoscope.isolation.ml.window import plant_input
 from servoscope.learning.inspection.delay import LATEST, LATEST_S
 from servoscope.learning.inspection.model_order import Regressors, fit_regression
 from servoscope.models.discretise import split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.lti import settling_samples
-from servoscope.models.plants import Plant
+from servoscope.models.plants import Column, Plant
 from servoscope.signals import Recording
 
 PRIOR = 0.3  # standard deviation of the logarithm of a parameter that the loop file gives
@@ -101,7 +101,7 @@ def fit_delay(loop: Loop, recording: Recording, regressors: Regressors | None = 
 def _initial_plant(loop: Loop, regressors: Regressors | None) -> tuple[Plant, float] | None:
     """Return the plant that the search begins with, and the standard deviation of its logarithms."""
     plant = loop.plant
-    if not plant.linear or set(plant.extras) - {"one"}:
+    if not plant.affine:
         return None
     if plant.has_physics:
         return plant, PRIOR
@@ -153,7 +153,7 @@ class DelaySearch:
             return None
         names = (*(p for p in plant.parameters if p != "input_gain"), *plant.causes)
         names = tuple(name for name in names if name != "offset")
-        offset = float(u.std()) if "one" in plant.extras else 0.0
+        offset = float(u.std()) if Column.CONSTANT in plant.extras else 0.0
         base = loop.model_copy(update={"plant": plant, "delay": 0.0})
         noise = WhiteNoise(u_std=USUAL * float(u.std()), y_std=y_std)
         factory = PredictorFactory.from_input(base, noise, recording.u)
@@ -223,12 +223,12 @@ class DelaySearch:
     def age(self) -> IndexArray:
         """Samples since a restart, as far as the gains change with them, shape (N,)."""
         at = np.arange(len(self.y))
-        return np.minimum(at - np.maximum.accumulate(np.where(self.restart, at, 0)), LONGEST - 1)
+        return np.minimum(at - np.maximum.accumulate(np.where(self.restart, at, 0)), MAX_GAIN_SAMPLES - 1)
 
     @property
     def _nominal_offset(self) -> float:
-        coefficients = getattr(self.plant, "coefficients", None) or {}
-        return float(coefficients.get("offset", 0.0)) / self.plant.input_gain
+        nominal = dict(zip(self.plant.names, self.plant.theta(), strict=True)) if self.plant.has_physics else {}
+        return float(nominal.get("offset", 0.0)) / self.plant.input_gain
 
     def _point(self, z: FloatArray) -> _Point:
         if not np.isfinite(z).all():  # LAPACK would say so on the terminal

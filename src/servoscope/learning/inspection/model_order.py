@@ -13,6 +13,7 @@ from servoscope.estimation.pipeline import Pipeline
 from servoscope.estimation.tuning import sandwich_covariance
 from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.models.loop import Loop, MonitorSettings
+from servoscope.models.plants import Column
 from servoscope.models.plants.polynomial import FrictionKind, PolynomialPlant
 from servoscope.signals import Recording
 
@@ -129,7 +130,7 @@ def fit_regression(
 def column_indices(g: Regressors, order: int, friction: FrictionKind, stiffness: bool = True) -> IndexArray:
     """Return which columns of the most general inverse belong to a smaller one."""
     n_powers = len(g.bank.powers)
-    extras = [i + n_powers for i, extra in enumerate(g.bank.extras) if friction == "coulomb" or extra != "sign_v"]
+    extras = [i + n_powers for i, extra in enumerate(g.bank.extras) if friction == "coulomb" or extra != Column.SIGN]
     return np.array([*range(0 if stiffness else 1, order + 1), *extras], dtype=np.intp)
 
 

@@ -1,4 +1,4 @@
-"""Electrohydraulic actuator: voice-coil current [A] to load displacement [m], THEORY section 1."""
+"""Electrohydraulic actuator: voice-coil current [A] to load displacement [m]."""
 
 from __future__ import annotations
 
@@ -12,15 +12,35 @@ from pydantic import Field
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.settings import NonNegative
-from servoscope.models.plants.base import Fault, Plant, StateSpace, matrices
+from servoscope.models.plants.base import Fault, Plant, StateSpace, matrices, read_translations
 
 PlausiblePositive = Annotated[float, Field(gt=1e-30, lt=1e30, allow_inf_nan=False)]  # SI values beyond are typos
 
 FAULTS = (
-    Fault("pump", "p_s", (0.3, 3.0), "pump or valve gain (p_s cannot be told from K_m, C_d, W, rho)"),
-    Fault("leakage", "C_ie", (0.3, 5.0), "internal leakage"),
-    Fault("friction", "b_p", (0.2, 100.0), "friction"),
-    Fault("contamination", "beta", (0.001, 30.0), "oil contamination (bulk modulus)"),
+    Fault(
+        "pump",
+        "p_s",
+        (0.3, 3.0),
+        "pump or valve gain (p_s cannot be told from K_m, C_d, W, rho)",
+        "supply pressure and filter; valve and its amplifier: zero, current, contamination",
+    ),
+    Fault(
+        "leakage",
+        "C_ie",
+        (0.3, 5.0),
+        "internal leakage",
+        "piston seal and valve edges: warm cylinder, drift under load with the valve shut, oil return flow",
+    ),
+    Fault(
+        "friction", "b_p", (0.2, 100.0), "friction", "rod seal, guide and bearing: alignment, lubrication, side load"
+    ),
+    Fault(
+        "contamination",
+        "beta",
+        (0.001, 30.0),
+        "oil contamination (bulk modulus)",
+        "oil: air in it, foam, water, age; oil level and suction line",
+    ),
 )
 
 OTHER_CAUSES = {"m_p": "another mass", "k_p": "another stiffness of the load", "A_p": "another piston area"}
@@ -42,6 +62,7 @@ class EHA(Plant):
     has_physics: ClassVar[bool] = True
     faults: ClassVar[tuple[Fault, ...]] = FAULTS
     causes: ClassVar[Mapping[str, str]] = OTHER_CAUSES
+    translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
 
     kind: Literal["eha"] = "eha"
     m_p: PlausiblePositive  # mass [kg]
@@ -72,6 +93,14 @@ class EHA(Plant):
     def linear(self) -> bool:
         """Whether `state_space` says all: no square root, no Coulomb friction."""
         return self.valve_law == "linear" and self.coulomb == 0.0
+
+    @property
+    def load_pressure(self) -> tuple[float, float, float] | None:
+        """By the balance of forces p_L = (m_p y'' + b_p y' + k_p y)/A_p."""
+        if self.valve_law == "linear":
+            return None
+        k, b, m = (value / (self.A_p * self.p_s) for value in (self.k_p, self.b_p, self.m_p))
+        return k, b, m
 
     @property
     def flow_gain(self) -> float:

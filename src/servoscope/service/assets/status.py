@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import message, render
-from servoscope.detection.result import FaultEstimate
+from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import (
     FAULT_ALARM,
     AlarmDefinition,

@@ -18,12 +18,12 @@ COMMENTS = ("#", "%", "//")
 DELIMITERS = (";", "\t", ",", "|", " ")
 HEAD_BYTES = 1 << 16  # that tell the layout
 HEAD_LINES = 400
-LONGEST_LINE = 1 << 16
+MAX_LINE_BYTES = 1 << 16
 LINE_ENDS = ";%"  # that stand behind each row in files of some programs
 CHUNK_BYTES = 1 << 23  # bytes that are read at a time
 SINGLE_BLOCK_BYTES = 1 << 20  # bytes that Arrow parses as one block anyway
 MAX_BROKEN_SHARE = 0.01  # share of rows that may not fit the columns
-CHINESE = re.compile("[一-鿿]")
+CHINESE_CHARACTER = re.compile("[一-鿿]")
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ def _detect_encoding(head: bytes) -> str:
     except UnicodeDecodeError:
         # two bytes of Chinese are two letters of Latin: words that names of columns have tell
         told = lines.decode("gb18030", errors="replace")
-        words = (word for each in WORDS.values() for word in each if CHINESE.search(word))
+        words = (word for each in WORDS.values() for word in each if CHINESE_CHARACTER.search(word))
         return "gb18030" if any(word in told for word in words) else "latin-1"
     return "utf-8-sig"
 
@@ -276,7 +276,7 @@ def _split_cells(line: str, delimiter: str) -> list[str]:
         cells = line.split()
     else:
         try:
-            cells = next(csv.reader([line[:LONGEST_LINE]], delimiter=delimiter, skipinitialspace=True), [])
+            cells = next(csv.reader([line[:MAX_LINE_BYTES]], delimiter=delimiter, skipinitialspace=True), [])
         except csv.Error:
             cells = line.split(delimiter)
     return [cell.strip().strip("'\"") for cell in cells]

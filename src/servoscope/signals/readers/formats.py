@@ -89,7 +89,12 @@ MAGIC = {
     b"\x89MCAP0\r\n": "MCAP",
     b"ULog\x01": "ULog",
 }
-SAME = {("MAT", "HDF5"), ("Excel", "ZIP archive or Excel workbook"), ("Excel", "Excel workbook"), ("HDF5", "MAT")}
+COMPATIBLE_KINDS = {
+    ("MAT", "HDF5"),
+    ("Excel", "ZIP archive or Excel workbook"),
+    ("Excel", "Excel workbook"),
+    ("HDF5", "MAT"),
+}
 
 
 def readable_suffixes() -> list[str]:
@@ -161,7 +166,7 @@ def _recognise(head: bytes) -> str | None:
 
 def _check_format(path: Path, head: bytes, wanted: str) -> None:
     found = _recognise(head)
-    if found == wanted or (wanted, found) in SAME or (wanted == "CSV" and found in (None, "LVM")):
+    if found == wanted or (wanted, found) in COMPATIBLE_KINDS or (wanted == "CSV" and found in (None, "LVM")):
         return
     suffix = next((suffix for suffix, reader in BUILT_IN.items() if reader.format == found), None)
     advice = {

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 from pydantic import Field
 
-from servoscope.detection.result import Verdict
+from servoscope.diagnosis.result import Verdict
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107

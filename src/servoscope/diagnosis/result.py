@@ -5,70 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, computed_field, model_validator
+from pydantic import computed_field, model_validator
 
-from servoscope.baseline.learned_fault import SEVERITY
 from servoscope.core.messages import Message, MessageField, MessageText, message, read_messages, render, text_message
 from servoscope.core.short_repr import ShortRepr
+from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
 from servoscope.signals import Defect
 
 Verdict = Literal["healthy", "fault", "undetermined"]
-UNKNOWN = "unknown"
 VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
 
 
-class _ResultModel(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class FaultEstimate(_ResultModel):
-    """A fault with its size: `ratio` of `parameter` to its healthy value, and the 95 % interval of it.
-
-    The parameter of a fault learned from labelled recordings is ``severity``: there `ratio` is to the labelled one.
-    """
-
-    name: str
-    parameter: str
-    ratio: float
-    interval: tuple[float, float]
-    # of a payload at a place that the loop file knows: its mass [kg] and the 95 % interval of it
-    mass_kg: tuple[float, float, float] | None = Field(default=None, exclude_if=lambda value: value is None)
-
-    @property
-    def learned(self) -> bool:
-        """Whether it is known from labelled recordings, so that `ratio` is a share of their severity."""
-        return self.parameter == SEVERITY
-
-    @property
-    def change(self) -> float:
-        """How far from healthy it is: of the parameter's healthy value, or of the labelled severity."""
-        return self.ratio if self.learned else abs(self.ratio - 1.0)
-
-
-class Candidate(_ResultModel):
-    """One explanation of a detected change; ``unknown`` carries no faults."""
-
-    name: str
-    probability: float
-    faults: tuple[FaultEstimate, ...] = ()
-    misfit: float | None = None  # squared standard deviations by which it fits worse than the best; None for unknown
-    covariance: tuple[tuple[float, ...], ...] | None = None  # of a pair: of the logarithms of its ratios, shape (k, k)
-    # Of a fault learned from labelled recordings: of the angle between the deviation and its direction, in units of
-    # the misfit's covariance; 1 is the same way, 0 elsewhere, -1 the opposite way.
-    cosine: float | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of its faults, of which `name` is made; ``unknown`` where there are none."""
-        return tuple(fault.name for fault in self.faults) or (self.name,)
-
-    @property
-    def is_learned(self) -> bool:
-        """Whether it is a fault learned from labelled recordings."""
-        return any(fault.learned for fault in self.faults)
-
-
-class Mimic(_ResultModel):
+class Mimic(ResultModel):
     """A cause outside the list of faults that explains the recording as well, or better where the answer is unknown."""
 
     name: str
@@ -96,7 +44,7 @@ class Mimic(_ResultModel):
         return message("diagnosis.mimic_size", value=self.value, unit=unit.get(self.unit, self.unit))
 
 
-class RefitSummary(_ResultModel):
+class RefitSummary(ResultModel):
     """The refit of the seconds around the onset, from which onset and candidates of a diagnosis come."""
 
     from_s: float  # from_s, to_s: the seconds that were fitted
@@ -114,7 +62,7 @@ class RefitSummary(_ResultModel):
         return self.over_s > 0.0 and self.misfit <= self.limit
 
 
-class FinalCoefficient(_ResultModel):
+class FinalCoefficient(ResultModel):
     """A coefficient at the end of the recording: value, standard deviation, and what a healthy loop would show."""
 
     value: float
@@ -122,7 +70,7 @@ class FinalCoefficient(_ResultModel):
     nominal: float
 
 
-class ResponsePoint(_ResultModel):
+class ResponsePoint(ResultModel):
     """The iFRF at one monitored frequency at the end of the recording."""
 
     frequency_hz: float
@@ -134,7 +82,7 @@ class ResponsePoint(_ResultModel):
     nominal_imag: float
 
 
-class DiagnosisWarning(_ResultModel):
+class DiagnosisWarning(ResultModel):
     """Something about the recording that the reader should know."""
 
     kind: str
@@ -166,7 +114,7 @@ class DiagnosisWarning(_ResultModel):
         )
 
 
-class FaultInterval(_ResultModel):
+class FaultInterval(ResultModel):
     """A time during which the actuator differed from healthy, and what explains that."""
 
     detected_at_s: float | None = None  # first evaluation above a threshold
@@ -180,7 +128,7 @@ class FaultInterval(_ResultModel):
     refit: RefitSummary | None = None  # what the candidates rest on; None where the recursion alone found them
 
 
-class Provenance(_ResultModel):
+class Provenance(ResultModel):
     """What a diagnosis was made with: versions, and hashes of the baseline and of the recording's samples."""
 
     servoscope: str
@@ -197,7 +145,7 @@ WRITTEN_INTERVAL = frozenset(FaultInterval.model_fields) - {
 }  # fields that a Diagnosis repeats
 
 
-class Diagnosis(ShortRepr, _ResultModel):
+class Diagnosis(ShortRepr, ResultModel):
     """The verdict on one recording.
 
     Parameters
