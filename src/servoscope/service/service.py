@@ -12,7 +12,7 @@ import numpy as np
 
 from servoscope import __version__
 from servoscope.core.errors import ServoscopeError, StoreUnavailableError
-from servoscope.core.messages import message, render
+from servoscope.core.messages import count_words, message, render
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.assets.asset import Asset
@@ -135,7 +135,7 @@ class Service:
 
     @property
     def _systemd_status(self) -> str:
-        return f"STATUS={len(self.assets)} assets, {self.degraded_reason or 'all followed'}"
+        return f"STATUS={count_words(len(self.assets), 'asset')}, {self.degraded_reason or 'all followed'}"
 
     def _reload(self, path: Path) -> None:
         """Change to what the service file says now; where that cannot be used, go on as before."""

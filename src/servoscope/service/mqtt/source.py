@@ -272,6 +272,7 @@ class MqttSource(BlockSource):
 
     def close(self) -> None:
         """Disconnect; the broker keeps what comes meanwhile."""
+        self._broker.leave()
         self._client.disconnect()
         self._client.loop_stop()
 
