@@ -16,7 +16,16 @@ import pytest
 import servoscope as ss
 from golden.results import FOLDER
 from servoscope.core import messages
-from servoscope.core.messages import JOINS, Message, catalogue, message, read_messages, render, text_message
+from servoscope.core.messages import (
+    JOINS,
+    Message,
+    catalogue,
+    count_words,
+    message,
+    read_messages,
+    render,
+    text_message,
+)
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, Mimic
 
 SOURCES = sorted((Path(__file__).parents[2] / "src" / "servoscope").rglob("*.py"))
@@ -110,6 +119,16 @@ def test_values_are_joined_and_formatted() -> None:
     for count, text in ((0, ""), (1, "a"), (2, "a or b"), (3, "a, b or c")):
         added = message("diagnosis.second_fault", names=tuple("abc"[:count]))
         assert f"second fault ({text})" in str(added)
+
+
+def test_numbers_of_things_are_counted_in_words() -> None:
+    assert [count_words(n, "asset") for n in (0, 1, 2)] == ["0 assets", "1 asset", "2 assets"]
+    assert count_words(1, "row", "de") == "1 Zeile" and count_words("1\N{THIN SPACE}000", "row", "de").endswith(
+        "Zeilen"
+    )
+    assert str(message("defect.no_stamp", rows=1)) == "1 row without a time stamp dropped"
+    plural = re.compile(r"(?<!of )\{\w+\} (rows|samples|steps|gaps|warnings|evaluations|assets|sources|workers)\b")
+    assert [key for key, text in catalogue().items() if not key.startswith("count.") and plural.search(text)] == []
 
 
 def test_a_message_survives_json() -> None:

@@ -47,6 +47,7 @@ class Names:
         monkeypatch.setattr(socket, "getaddrinfo", self._find)
 
     def _find(self, host: Any, port: Any, *arguments: Any, **more: Any) -> Any:
+        host = host.decode() if isinstance(host, bytes) else host
         if host not in self.addresses:
             return self._resolve(host, port, *arguments, **more)
         self.asked.append(host)

@@ -25,7 +25,7 @@ ReasonOption = Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in th
 
 COMMAND_TIMEOUT_S = 5.0
 LONGEST_S = 366 * 86400.0  # shelving has an end
-COLUMNS = ("asset", "alarm", "state", "since", "until", "priority")
+COLUMNS = ("asset", "alarm", "state", "since", "until", "priority", "cause")
 
 
 @alarms_app.command("list")

@@ -20,6 +20,7 @@ from servoscope.cli.exit import print_json
 from servoscope.cli.options import JsonOption
 from servoscope.cli.output_paths import check_output
 from servoscope.core.errors import ConfigError, ObsoleteSettingWarning, StoreError
+from servoscope.core.messages import count_words
 from servoscope.core.settings_errors import suggest_name
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def run(
         with prefix_file_name(config):
             check_service_file(settings)
         counts = {"asset": len(settings.assets), "source": len(settings.sources)}
-        counted = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items())
+        counted = ", ".join(count_words(count, noun, "en") for noun, count in counts.items())
         typer.echo(f"{config}: {counted}; all can be used")
         if online:
             commission(settings, listen_s)

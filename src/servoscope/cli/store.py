@@ -10,6 +10,7 @@ import typer
 
 from servoscope.cli.app import app
 from servoscope.cli.service import StoreArgument, open_store, parse_store_address
+from servoscope.core.messages import count_words
 
 store_app = typer.Typer(no_args_is_help=True, help="Back up a history, and restore it.")
 app.add_typer(store_app, name="store")
@@ -42,5 +43,5 @@ def restore(
 
 
 def _print_counts(where: str | Path, counts: dict[str, int]) -> None:
-    assets = counts.get("checkpoints", 0)
-    typer.echo(f"{where}: {sum(counts.values())} rows, {assets} saved states")
+    rows, states = sum(counts.values()), counts.get("checkpoints", 0)
+    typer.echo(f"{where}: {count_words(rows, 'row', 'en')}, {count_words(states, 'saved_state', 'en')}")

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from servoscope.core.files import atomic_write, make_folder
+from servoscope.core.messages import count_words
 from servoscope.fleet.discoveries import RATE
 from servoscope.fleet.rows import MICRO
 from servoscope.fleet.summary import COMMON, FAILED, Fleet
@@ -77,7 +78,7 @@ def headline(fleet: Fleet) -> str:
         named = ", ".join(f"{cause.key} {cause.group}" for cause in fleet.accepted[:3])
         parts.append(f"{shared} common cause{'s' * (shared > 1)} ({named}{', ...' * (shared > 3)})")
     if ill:
-        parts.append(f"{ill} asset{'s' * (ill > 1)} ill by {'themselves' if ill > 1 else 'itself'}")
+        parts.append(f"{count_words(ill, 'asset', 'en')} ill by {'themselves' if ill > 1 else 'itself'}")
     return " and ".join(parts) if parts else "No asset has changed from its healthy baseline"
 
 
@@ -88,7 +89,7 @@ def describe_discoveries(fleet: Fleet) -> str:
         return ""
     listed = ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)
     which = f"these {len(names)} have" if len(names) > 1 else "this one has"
-    of = f"Of {len(fleet.assets)} assets, {which} changed: {listed}."
+    of = f"Of {count_words(len(fleet.assets), 'asset', 'en')}, {which} changed: {listed}."
     return f"{of} At most {RATE:.0%} of such names are wrong, on average."
 
 

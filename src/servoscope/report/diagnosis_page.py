@@ -127,7 +127,7 @@ def _recording_size(diagnosis: Diagnosis, loop: Loop) -> list[str]:
     samples, rate = format_count(diagnosis.samples), format_quantity(loop.sample_rate)
     size = [say("report.samples", samples=samples, rate=rate), format_clock_time(diagnosis.duration_s)]
     count = len(diagnosis.warnings)
-    return [*size, say("report.warnings" if count > 1 else "report.warning", count=count)] if count else size
+    return [*size, say("report.warnings", count=count)] if count else size
 
 
 def _fault_notes(diagnosis: Diagnosis, words: Mapping[str, str]) -> Iterator[str]:

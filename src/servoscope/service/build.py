@@ -31,6 +31,7 @@ from servoscope.service.publishers.base import StatusPublisher
 from servoscope.service.sources.base import BlockSource, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.store import CheckpointRow, Store
+from servoscope.service.store.engine import parse_store_url
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
         store.take_over(config.name, assets)
         resume_assets(groups, assets, store, rows, restarted)
         for name, source in sources.items():
-            source.open(resume_positions(config, name, assets))
+            open_source(config, name, source, assets)
         for publisher in publishers.values():
             publisher.open({name: row["status"] for name, row in rows.items()})
     except BaseException:
@@ -136,6 +137,14 @@ def check_service_file(config: ServiceFile) -> None:
     check_actions(config, assets)
     _build_sources(config, assets)
     _build_publishers(config)
+
+
+def open_source(config: ServiceFile, name: str, source: BlockSource, assets: Mapping[str, Asset]) -> None:
+    """Open a source of a service that runs; beside a store in a file it may note what must survive the process."""
+    url, client = parse_store_url(config.store.url, config.folder), config.client_names()["sources", name]
+    prefix = f"{url.database}." if url.get_backend_name() == "sqlite" else ""  # else: in the folder where it runs
+    source.state_file = Path(f"{prefix}{client}.in-hand")
+    source.open(resume_positions(config, name, assets))
 
 
 def resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:

@@ -15,8 +15,8 @@ from servoscope.service.build import (
     build_publisher,
     build_source,
     check_actions,
+    open_source,
     resume_assets,
-    resume_positions,
     source_assets,
 )
 from servoscope.service.config import ServiceFile
@@ -83,7 +83,7 @@ def reload_components(
             publisher.close()
     opened = [name for name, one in sources.items() if one is not running.sources.get(name)]
     for name in opened:
-        sources[name].open(resume_positions(config, name, assets))
+        open_source(config, name, sources[name], assets)
     outlets = [name for name, one in publishers.items() if one is not running.publishers.get(name)]
     for name in outlets:
         try:

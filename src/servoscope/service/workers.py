@@ -14,6 +14,7 @@ from json import loads
 from pathlib import Path
 
 from servoscope.core.errors import ServoscopeError
+from servoscope.core.messages import count_words
 from servoscope.service.build import check_restarted, check_service_file
 from servoscope.service.config import ServiceFile
 from servoscope.service.health import STALL_S
@@ -214,7 +215,8 @@ class WorkerPool:
 
     @property
     def _systemd_status(self) -> str:
-        return f"STATUS={len(self.config.assets)} assets, {len(self._workers)} workers"
+        counts = count_words(len(self.config.assets), "asset"), count_words(len(self._workers), "worker")
+        return f"STATUS={', '.join(counts)}"
 
     def _start(self, files: Sequence[int]) -> None:
         """Start a worker for each shard that has assets and none yet."""

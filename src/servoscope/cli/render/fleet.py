@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, print_facts, print_notes, print_table
+from servoscope.core.messages import count_words
 from servoscope.core.number_format import format_ratios
 from servoscope.report.format_values import DASH, format_probability
 
@@ -23,7 +24,7 @@ def print_fleet(out: Console, f: Fleet) -> None:
     from servoscope.fleet.report import describe_discoveries, headline
 
     colour = COLOURS["fault" if f.count("fault") or f.accepted else "healthy"]
-    out.print(Text.assemble((f"{len(f.assets)} assets", "bold"), ": ", (headline(f), f"bold {colour}")))
+    out.print(Text.assemble((count_words(len(f.assets), "asset", "en"), "bold"), ": ", (headline(f), f"bold {colour}")))
     if told := describe_discoveries(f):
         out.print(told, soft_wrap=True)
     states = ("healthy", "fault", "common cause", "undetermined", "failed")

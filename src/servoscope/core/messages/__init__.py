@@ -39,6 +39,7 @@ __all__ = [
     "MessageText",
     "add_words",
     "catalogue",
+    "count_words",
     "current_language",
     "languages",
     "message",
@@ -232,6 +233,8 @@ class _Renderer(string.Formatter):
             value = render(value, self._language)
         if isinstance(value, (list, tuple)):
             return self._join([self.format_field(each, "") for each in value], spec or "list")
+        if spec.startswith("#"):
+            return count_words(value, spec[1:], self._language)
         if spec in FORMATS:
             return FORMATS[spec](value)
         return str(super().format_field(value, spec))
@@ -256,6 +259,12 @@ def render(given: Message, language: str | None = None) -> str:
         return str(given.values["text"])
     language = language or current_language()
     return _Renderer(language).vformat(template(given.key, language), (), given.values)
+
+
+def count_words(count: float | str, noun: str, language: str | None = None) -> str:
+    """Return a number of things, 1 row or 2 rows; `noun` is a name of the section ``count`` of the catalogue."""
+    one, _, several = render(message(f"count.{noun}", count=count), language).partition("|")
+    return one if str(count) == "1" else several
 
 
 def template(key: str, language: str) -> str:

@@ -10,6 +10,7 @@ from servoscope.core.messages import message, render
 ReceptionState = Literal["followed", "unheard", "silent", "slow", "refused"]
 STATES: tuple[ReceptionState, ...] = get_args(ReceptionState)
 ALARMED_STATES: tuple[ReceptionState, ...] = ("unheard", "slow", "refused")  # silence is a finding of data quality
+MAX_TURN_S = 5.0  # between two polls: after a longer time the service was stopped
 
 
 class AssetTrouble(NamedTuple):
@@ -35,6 +36,23 @@ class Reception:
 
 FOLLOWED = Reception("followed")
 UNHEARD = Reception("unheard", render(message("service.reception.unheard")))
+
+
+class ListeningClock:
+    """Counts the time in which a silence is that of an asset: the service has polled what came, and had room for it.
+
+    Of one step of it at most `MAX_TURN_S` count, and half of the patience: a process that was suspended has not read
+    its connections yet.
+    """
+
+    def __init__(self, now: float) -> None:
+        self.seconds, self._counted_at = 0.0, now
+
+    def advance(self, now: float, silent_s: float, *, is_free: bool) -> None:
+        """Count until now, by the monotonic clock [s]; `silent_s`: the patience; `is_free`: whether there was room."""
+        if is_free:
+            self.seconds += min(now - self._counted_at, MAX_TURN_S, 0.5 * silent_s)
+        self._counted_at = now
 
 
 class ReceptionLog:

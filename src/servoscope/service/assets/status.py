@@ -35,7 +35,7 @@ class _StatusRecord(BaseModel):
 
 
 class AlarmStatus(_StatusRecord):
-    """An alarm; the service's own ones have no priority and no cause."""
+    """An alarm; the service's own ones of version 0.1 have no priority and no cause."""
 
     state: LifecycleState
     since: float  # [UTC s]

@@ -144,7 +144,7 @@ class KafkaSource(MessageSource):
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as a broker is there."""
-        self._collector.open(resume)
+        self._collector.open(resume, self.state_file)
         self._thread.start()
 
     def _run(self) -> None:

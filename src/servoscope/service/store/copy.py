@@ -34,7 +34,15 @@ def copy_store(source: Store, target: str, folder: Path | None = None) -> dict[s
             where = engine.display_url(url)
             raise StoreError(f"{where}: has a table {min(strange)} already, give an empty database")
         METADATA.create_all(writing, tables=copied)
-        counts = {table.name: _copy_rows(reading, writing, table) for table in copied}
+        counts = {}
+        for table in copied:
+            try:
+                counts[table.name] = _copy_rows(reading, writing, table)
+            except (ValueError, TypeError, RecursionError) as error:  # a cell is of another type, or no document
+                reason = f"{type(error).__name__}: {error}"[:100]
+                raise StoreError(
+                    f"{source.name}: table {table.name} is damaged ({reason}), take another copy"
+                ) from None
     return counts
 
 
@@ -51,6 +59,14 @@ def _copy_rows(reading: sa.Connection, writing: sa.Connection, table: sa.Table) 
     return count
 
 
+def _create_private(path: Path) -> None:
+    """Make a file that its owner alone may read; SQLite gives its own further files the same mode."""
+    try:
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
+    except OSError as error:
+        raise StoreError(f"{path.parent}: cannot be written ({error.strerror}), give another folder") from None
+
+
 @contextmanager
 def _target_connection(url: URL) -> Iterator[sa.Connection]:
     """Yield a connection in a transaction; a file is there under its name only when all is in it."""
@@ -61,6 +77,7 @@ def _target_connection(url: URL) -> Iterator[sa.Connection]:
         engine.check_folder(path)
         if path.exists():
             raise StoreError(f"{path}: exists already, give another name")
+        _create_private(part)
     opened = engine.create_store_engine(url.set(database=str(part)) if is_file else url, write=True)
     try:
         with engine.translate_errors(url), opened.begin() as connection:

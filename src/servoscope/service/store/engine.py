@@ -135,7 +135,7 @@ def translate_errors(url: URL) -> Iterator[None]:
         text = " ".join(str(error.orig).split()) + HINTS.get(getattr(error.orig, "sqlite_errorcode", 0) & 0xFF, "")
         kind = StoreUnavailableError if _is_transient(error) else StoreError
         raise kind(f"{display_url(url)}: {text}") from error
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         raise StoreError(f"{display_url(url)}: a document in it is torn ({error}), restore it from a copy") from None
     except OSError as error:  # of a host that has no address, or none that may be reached
         raise StoreUnavailableError(f"{display_url(url)}: {error.strerror or error}") from error
