@@ -28,7 +28,7 @@ test: SELECTION := -m "not slow"
 # types are checked beside the first tests, on what these leave of two cores; what mypy says stands below their results
 test test-all:
 	@mkdir -p .cache; $(TYPES) >.cache/types.log 2>&1 & types=$$!; \
-	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(SELECTION); tests=$$?; \
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(SELECTION); tests=$$?; \
 	wait $$types; types=$$?; echo '$(TYPES)'; cat .cache/types.log; exit $$((tests || types))
 
 lint: style     ## format, lint and types, without changing a file
