@@ -32,6 +32,19 @@ progress.LINE_INTERVAL_S = 3600.0  # what a command says on stderr must not depe
 os.environ.setdefault("NUMBA_CACHE_DIR", str(PROJECT / ".cache" / "numba"))
 
 
+# Files of tests that take longest: they begin first, so that no worker is left with one when the others have nothing.
+LONGEST = (
+    "test_estimators",
+    "test_estimator_peers",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files of tests first."""
+    ranks = {name: rank for rank, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: ranks.get(item.path.stem, len(ranks)))
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Under REQUIRE_ALL=1, report a skipped test as failed, with the reason of the skip."""

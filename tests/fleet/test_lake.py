@@ -32,8 +32,6 @@ from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Columns
 from servoscope.signals import Recording
 
-pytestmark = pytest.mark.xdist_group("lake")  # its fixtures are made once
-
 
 @pytest.fixture(scope="module")
 def lake(tmp_path_factory: pytest.TempPathFactory) -> Path:
