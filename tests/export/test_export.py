@@ -11,10 +11,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import axis_logs
 import numpy as np
 import numpy.typing as npt
 import pytest
-import test_features
 from commands import run
 from drives import Drive, compiler
 from hypothesis import given
@@ -247,7 +247,7 @@ def test_coefficients_alone_behind_a_stage_of_the_input(tmp_path: Path, made: Ca
 @functools.cache
 def with_features() -> Baseline:
     """An axis with friction, learned from as many recordings as features need."""
-    return ss.learn(test_features.LOOP, [test_features.axis(seed) for seed in range(4)])
+    return ss.learn(axis_logs.LOOP, [axis_logs.axis(seed) for seed in range(4)])
 
 
 def test_coefficients_alone_beside_features(tmp_path: Path) -> None:
