@@ -17,7 +17,7 @@ from hostile.other_files import plant
 from servoscope.core import sandbox
 from servoscope.core.errors import ConfigError, RecordingError
 from servoscope.core.sandbox import Sandbox
-from servoscope.core.workers import Worker, WorkerPool
+from servoscope.core.workers import Worker, WorkerGroup
 from servoscope.signals.readers import reader_process
 
 
@@ -44,7 +44,7 @@ def test_a_reader_that_is_taken_over_opens_its_own_file_only(tmp_path: Path, mon
     )
     own = tmp_path / "own.bin"
     own.write_bytes(b"12345")
-    monkeypatch.setattr(reader_process, "_workers", WorkerPool(reader_process.LIMITS))
+    monkeypatch.setattr(reader_process, "_workers", WorkerGroup(reader_process.LIMITS))
     paths = [str(tmp_path / "module"), *filter(None, [os.environ.get("PYTHONPATH")])]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
     with pytest.raises(RecordingError) as told:

@@ -252,7 +252,8 @@ def worker_main() -> None:
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         if code:
             os._exit(code if code > 0 else SIGNAL_CODE - code)
-        parent.send_bytes(b'["ended", null]')
+        with suppress(BrokenPipeError):  # the parent has ended
+            parent.send_bytes(b'["ended", null]')
 
 
 def _run_tasks(parent: Connection, limits: ProcessLimits | None, sandbox: Sandbox | None) -> None:
@@ -310,7 +311,7 @@ def _read_tasks(parent: Connection, waiting: SimpleQueue[tuple[str, tuple[Any, .
     os._exit(0)
 
 
-class WorkerPool:
+class WorkerGroup:
     """Workers side by side, as many as there are tasks at a time; each keeps what it has loaded for its next one.
 
     Parameters are those of `Worker`.
