@@ -210,6 +210,7 @@ def test_a_key_outside_its_section_is_sent_home(rig: dict[str, Any]) -> None:
         ("columns", "segment", "run", "[columns] segment: 'run' is not a list, write [ ... ]"),
         ("columns", "output", "", "[columns] output: must not be empty"),
         ("monitor", "cutoff", 60.0, "[monitor] cutoff: 60 Hz is not below the Nyquist frequency of 50 Hz"),
+        ("monitor", "cutoff", 1e-300, "[monitor] cutoff: 1e-300 Hz is below a millionth of sample_rate = 100 Hz"),
         ("monitor", "cutoff", 0.0, "[monitor] cutoff: 0.0 must be greater than 0"),
         ("monitor", "frequencies", [1.0, 50.0], "[monitor] frequencies: 50 Hz is not below the Nyquist"),
         ("monitor", "frequencies", [], "[monitor] frequencies: has 0 entries, needs at least 1"),

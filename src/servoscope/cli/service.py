@@ -142,7 +142,10 @@ def watch(
     opened, out = open_store(store), results.create_console()
 
     def page() -> Group:
-        return tables.status_page(opened.statuses(asset), out.width)
+        try:
+            return tables.status_page(opened.statuses(asset), out.width)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise StoreError(f"{store}: holds a damaged status ({error!r}), restore a backup of the store") from None
 
     check_assets(opened, asset or ())
     if as_json:

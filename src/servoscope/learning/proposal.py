@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +63,8 @@ class LoopProposal:
                 section = line.section
                 written += ["", f"[{section}]"]
             written.append(f"{line.key} = {line.value}".ljust(40) + f"  # {render(line.why)}")
-        return "\n".join(written) + "\n"
+        # names of columns and files may hold what neither a string nor a comment of TOML may
+        return "".join(re.sub(r"[\0-\x1f\x7f]", lambda sign: f"\\u{ord(sign[0]):04X}", line) + "\n" for line in written)
 
 
 def propose_columns(path: Path, channels: Sequence[ChannelInfo], axis: str | None = None) -> Columns:

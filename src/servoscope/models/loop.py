@@ -28,6 +28,7 @@ FEATURE_FALSE_ALARMS = 0.005
 COVARIATE_HOLD_S = 600.0  # a thermometer may tell rarely, and only what has changed
 RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # names that mean something else
 MAX_DELAY_SAMPLES = 100  # samples; a longer one is a delay in ms given as s, as a rule
+MIN_FREQUENCY_SHARE = 1e-6  # of the sample rate: a slower filter would take millions of samples to settle
 
 Interval = tuple[Finite, Finite]
 
@@ -226,6 +227,10 @@ class Loop(ShortRepr, Settings):
                 raise ValueError(
                     f"{key}: {frequency:g} Hz is not below the Nyquist frequency of {nyquist:g} Hz"
                     f" (sample_rate = {self.sample_rate:g} Hz), lower it"
+                )
+            if frequency is not None and frequency < MIN_FREQUENCY_SHARE * self.sample_rate:
+                raise ValueError(
+                    f"{key}: {frequency:g} Hz is below a millionth of sample_rate = {self.sample_rate:g} Hz, raise it"
                 )
         if len(set(self.monitor.frequencies)) < len(self.monitor.frequencies):
             raise ValueError("[monitor] frequencies: a frequency stands twice, remove one")

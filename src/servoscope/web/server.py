@@ -13,6 +13,7 @@ import uvicorn
 
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
+from servoscope.core.sandbox import find_user
 from servoscope.core.workers import ProcessLimits
 from servoscope.service.access import Sessions, Users, WebSettings
 from servoscope.service.access.allowed_hosts import split_address
@@ -69,6 +70,8 @@ def run_server(
         file = folder / str(settings.users)
         what = "has no users" if file.exists() else "no such file"
         raise ConfigError(f"{file}: {what}, add one: servoscope users add NAME --users {file}")
+    if settings.job_user is not None:
+        find_user(settings.job_user)
     hub, storage = EventHub(store), FileStorage(folder / settings.folder)
     context = Context(
         settings=settings,
@@ -77,7 +80,7 @@ def run_server(
         storage=storage,
         uploads=UploadStorage(storage),
         event_hub=hub,
-        jobs=JobQueue(ProcessLimits(settings.job_s, settings.job_memory_mb)),
+        jobs=JobQueue(ProcessLimits(settings.job_s, settings.job_memory_mb), settings.job_user),
         users=users,
         sessions=Sessions(settings.session_hours * 3600.0),
         single_sign_on=_create_single_sign_on(settings, folder),

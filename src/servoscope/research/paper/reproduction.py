@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
@@ -14,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from servoscope.core.files import atomic_write, make_folder
-from servoscope.core.workers import available_cores, create_pool
+from servoscope.core.workers import WorkerError, WorkerGroup, available_cores
 from servoscope.research.paper import claims, jobs
 from servoscope.research.paper.claims import Claim
 from servoscope.research.paper.jobs import SeedJob
@@ -65,25 +63,16 @@ def run_jobs(work: Sequence[SeedJob], processes: int) -> Iterator[tuple[SeedJob,
     if processes <= 1:
         yield from ((job, jobs.run_job(job)) for job in work)
         return
-    with _one_thread_each(), create_pool(processes) as pool:
-        futures = {pool.submit(jobs.run_job, job): job for job in work}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
+    pool = WorkerGroup(environment={**os.environ, **dict.fromkeys(ONE_THREAD, "1")})
+    for job, found in pool.map(f"{__name__}:run_in_worker", work, processes):
+        if isinstance(found, WorkerError):
+            raise found
+        yield job, found
 
 
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let processes that start within use one thread for linear algebra each: more only get into each other's way."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def run_in_worker(_: StepCallback, job: SeedJob) -> dict[str, float]:
+    """Do one job in a worker."""
+    return jobs.run_job(job)
 
 
 def list_figures(found: Reproduction) -> Iterator[tuple[str, Callable[[], Figure]]]:

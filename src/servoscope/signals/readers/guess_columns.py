@@ -98,6 +98,7 @@ CLOCK_PARTS = (
 def guess_columns(names: Sequence[str]) -> dict[str, str]:
     """Return the likeliest column for t, r, u and y, each column once; without those that no name suggests."""
     parts = {name: _words(name) for name in names}
+    bare = {name: _plain(split_unit(name)[0]) for name in names}
     values = [name for name in names if not parts[name] & ERRORS]
     plain = [name for name in values if not parts[name] & QUANTITIES]
     has_reference = any(parts[name] & set(WORDS["r"]) and not parts[name] & set(COMMAND) for name in plain)
@@ -116,7 +117,7 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
                 name
                 for word in words[letter]
                 for name in left
-                if (_plain(split_unit(name)[0]) == word if whole else word in parts[name])
+                if (bare[name] == word if whole else word in parts[name])
             )
             if (match := next(matches, None)) is not None:
                 found[letter] = match

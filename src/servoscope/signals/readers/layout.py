@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -74,7 +75,7 @@ def find_table(rows: Sequence[Sequence[str]], name: str, header: int | None = No
 
 def check_names(names: Sequence[str], file: str) -> None:
     """Refuse two columns of one name; raises RecordingError."""
-    twice = next((name for name in names if name and names.count(name) > 1), None)
+    twice = next((name for name, count in Counter(names).items() if name and count > 1), None)
     if twice is not None:
         raise RecordingError(f"{file}: two columns are called {twice!r}, rename one of them")
 

@@ -168,6 +168,11 @@ class LoopRef(ApiRequest):
             raise ValueError("give exactly one of toml, baseline, example")
         return self
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """What a job reads for it."""
+        return (self.baseline,) if self.baseline is not None else ()
+
 
 class RecordingSelection(ApiRequest):
     """A part of an upload, and what its columns mean."""
