@@ -20,7 +20,7 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.records import ExactPredictorFit
 from servoscope.cli.render.design import print_study
 from servoscope.core.errors import LoopError, SimulationError
-from servoscope.design import DesignStudy, LearnedStudy, study, study_baseline
+from servoscope.design import BaselineStudy, DesignStudy, study, study_baseline
 from servoscope.design.detectability import AlarmPower, detectable_size
 from servoscope.design.fisher_information import (
     MISNAMED,
@@ -217,7 +217,7 @@ class TestBaselineAlone:
         settings = {key: value for key, value in learned.loop_settings.items() if key != "controller"}
         hidden = learned.model_copy(update={"loop_settings": settings})
         said = study_baseline(hidden)
-        assert isinstance(said, LearnedStudy) and "[controller]" in said.missing
+        assert isinstance(said, BaselineStudy) and "[controller]" in said.missing
         for promise in learned.promises:
             assert said.faults[promise.name].detectable == promise.change
         assert said.cosines["pump"]["pump"] == pytest.approx(1.0)
@@ -225,13 +225,13 @@ class TestBaselineAlone:
         printed = run("design", tmp_path / "baseline.json")
         assert printed.code == 0, printed.err
         assert "pump" in printed.out and "[controller]" in printed.out
-        assert LearnedStudy.model_validate_json(run("design", tmp_path / "baseline.json", "--json").out) == said
+        assert BaselineStudy.model_validate_json(run("design", tmp_path / "baseline.json", "--json").out) == said
         one_line(run("design", tmp_path / "baseline.json", "--report", tmp_path / "page.html"), "no page")
         one_line(run("design", tmp_path / "baseline.json", tmp_path / "baseline.json"), "leave out")
 
     def test_a_learned_axis_needs_no_nominal_values(self) -> None:
         said = study_baseline(Baseline.load(FOLDER / "axis.json"))
-        assert isinstance(said, LearnedStudy) and "linear plant" in said.missing
+        assert isinstance(said, BaselineStudy) and "linear plant" in said.missing
         inertia = said.faults["inertia"]
         assert inertia.detectable == pytest.approx(0.318, rel=0.01)
         assert inertia.isolable is not None and inertia.isolable < 2.0 * inertia.detectable

@@ -87,7 +87,7 @@ class Simulation:
         return found
 
 
-@pytest.mark.parametrize("turn_s", [0.05, service_module.LEAST_TURN_S, 2.0])
+@pytest.mark.parametrize("turn_s", [0.05, service_module.MIN_TURN_S, 2.0])
 def test_silence_is_announced_and_dated_in_time_however_long_a_turn_takes(tmp_path: Path, turn_s: float) -> None:
     simulation = Simulation(tmp_path, silent_from=12.0)
     date, now = simulation.first("lift", "reception", turn_s)  # it has never come

@@ -21,7 +21,7 @@ from servoscope.cli.output_paths import RECORDINGS, REPORTS, check_output
 from servoscope.core.errors import LoopError
 
 if TYPE_CHECKING:
-    from servoscope.design import LearnedStudy
+    from servoscope.design import BaselineStudy
 
 
 @app.command()
@@ -117,7 +117,7 @@ def design(
     reader = RecordingReader.from_options(settings, reading)
     with show_steps(1, 3 + 2 * len(settings.plant.faults)) as steps:
         steps.begin("reading" if healthy else "simulating")
-        study: DesignStudy | LearnedStudy
+        study: DesignStudy | BaselineStudy
         if baseline is not None:
             study = study_baseline(baseline, reference=reference, after_s=after, progress=steps.advance)
         else:

@@ -114,7 +114,7 @@ class FaultPromise(_StudyModel):
     nearest: str  # the fault that it is most like
 
 
-class LearnedStudy(_StudyModel):
+class BaselineStudy(_StudyModel):
     """What a baseline alone says of faults, under the motion that it was learned from; `missing`: why not more."""
 
     loop: str

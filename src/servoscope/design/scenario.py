@@ -29,7 +29,7 @@ from servoscope.simulation.measurement import check_reference
 
 LEAD = 300  # samples before the onset, after which a predictor knows the state
 SEED = 3  # of the noise; it is the same whatever changes
-FEWEST = 50  # samples with the change
+MIN_CHANGED_SAMPLES = 50  # samples with the change
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,8 @@ class Scenario:
         require_study(baseline)
         r = check_reference(r)
         after = round(after_s * baseline.loop.sample_rate)
-        if not FEWEST <= after <= len(r):
-            least = FEWEST / baseline.loop.sample_rate
+        if not MIN_CHANGED_SAMPLES <= after <= len(r):
+            least = MIN_CHANGED_SAMPLES / baseline.loop.sample_rate
             longest = len(r) / baseline.loop.sample_rate
             raise SimulationError(f"{after_s:g} s after the onset: give at least {least:g} s, at most {longest:g} s")
         plain = cls(baseline, r, len(r) - after, np.zeros((0, 0)))

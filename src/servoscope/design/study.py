@@ -20,11 +20,11 @@ from servoscope.design.fisher_information import (
 from servoscope.design.isolability import Span, ambiguous_sizes, hypothesis_distances
 from servoscope.design.operating_limits import LIMIT_KINDS, LimitKind, OperatingLimit, operating_limits
 from servoscope.design.result import (
+    BaselineStudy,
     DesignStudy,
     DirectionStudy,
     FaultPromise,
     FaultStudy,
-    LearnedStudy,
     MimicStudy,
     SizePrecision,
     Spans,
@@ -32,7 +32,7 @@ from servoscope.design.result import (
 from servoscope.design.scenario import Scenario, require_exact_predictor, require_study
 from servoscope.detection.statistic import required_noncentrality
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.learning.learn import SHORTEST, learn_baseline
+from servoscope.learning.learn import MIN_MEMORIES, learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Fault
 from servoscope.signals import Recording
@@ -95,7 +95,7 @@ def design_study(
             reference=message("design.reference_of", recording=longest.name),
             progress=progress,
         )
-    learned = max(LEARNED_S, SHORTEST * loop.monitor.memory)
+    learned = max(LEARNED_S, MIN_MEMORIES * loop.monitor.memory)
     progress("learning")
     r, reference_name = _reference_motion(loop, reference, max(learned, BEFORE_S + after_s))
     noise = WhiteNoise(noise_u_std, noise_y_std)
@@ -259,7 +259,7 @@ def study_baseline(
     reference: str | FloatArray = "profile",
     after_s: float = 30.0,
     progress: Progress = lambda _: None,
-) -> DesignStudy | LearnedStudy:
+) -> DesignStudy | BaselineStudy:
     """Compute the same from a baseline alone: its healthy plant and noise, under a reference.
 
     Where its loop cannot be simulated, only what the baseline itself knows is computed, under the motion that it was
@@ -273,7 +273,7 @@ def study_baseline(
     return study(baseline, r, after_s, reference=name, progress=progress)
 
 
-def learned_study(baseline: Baseline, missing: str) -> LearnedStudy:
+def learned_study(baseline: Baseline, missing: str) -> BaselineStudy:
     """Compute sizes and likeness of faults from a baseline's promises, and from the covariance of its estimates.
 
     A fault moves the coefficients by its signature d. With forgetting over N samples white noise gives theta_hat the
@@ -298,7 +298,7 @@ def learned_study(baseline: Baseline, missing: str) -> LearnedStudy:
         )
         for i, fault in enumerate(baseline.loop.plant.faults)
     }
-    return LearnedStudy(
+    return BaselineStudy(
         loop=baseline.loop.name,
         missing=missing,
         false_alarms_per_year=baseline.loop.monitor.false_alarms_per_year,

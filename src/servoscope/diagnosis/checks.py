@@ -8,14 +8,14 @@ from servoscope.core.messages import Message, catalogue, message, text_message
 from servoscope.diagnosis.result import FaultInterval
 from servoscope.models.loop import Loop
 
-LIKELY = 0.05  # probability from which an explanation is worth a look where none is certain
+MIN_PROBABILITY_CHECKED = 0.05  # probability from which an explanation is worth a look where none is certain
 
 
 def what_to_check(loop: Loop, interval: FaultInterval | None) -> tuple[Message, ...]:
     """Return what to check for the faults of an interval, the likeliest first; nothing without an interval."""
     if interval is None:
         return ()
-    likely = [one for one in interval.candidates if one.probability >= LIKELY]
+    likely = [one for one in interval.candidates if one.probability >= MIN_PROBABILITY_CHECKED]
     names = [one.name for one in interval.faults] or [name for one in likely for name in one.names]
     return tuple(found for name in dict.fromkeys(names) for found in checks_of_fault(loop, name))
 

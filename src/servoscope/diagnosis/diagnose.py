@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,9 +56,10 @@ from servoscope.signals.readers.frames import Source
 if TYPE_CHECKING:
     from servoscope.isolation.ml import RefitResult
 
-SURE = 0.95  # probability from which a fault is named
-LARGEST = 1e60  # of a signal; products of four of them still are numbers
-DOUBTFUL = 0.05  # probability of an unknown change from which an operating point does not explain a recording
+MIN_CERTAINTY = 0.95  # probability from which a fault is named
+MAX_SIGNAL = 1e60  # of a signal; products of four of them still are numbers
+# probability of an unknown change from which an operating point does not explain a recording
+MIN_UNKNOWN_PROBABILITY = 0.05
 
 
 @with_one_blas_thread
@@ -122,7 +124,7 @@ def _diagnose_at_point(
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     """Return the diagnosis at the operating point that explains the recording, and what its trace is made of."""
     largest = max(float(max(x.max(), -x.min())) for x in (recording.r, recording.u, recording.y))
-    if largest > LARGEST:
+    if largest > MAX_SIGNAL:
         raise RecordingError(f"{recording.name}: has values up to {largest:.2g}, check the units of r, u and y")
     try:
         return _judge_sound_part(baseline, recording, progress, point)
@@ -204,7 +206,7 @@ def _change_size(diagnosis: Diagnosis) -> float:
 
 def _is_explained(diagnosis: Diagnosis) -> bool:
     """Return whether known faults explain the change."""
-    known = all(c.probability < DOUBTFUL for c in diagnosis.candidates if c.name == UNKNOWN)
+    known = all(c.probability < MIN_UNKNOWN_PROBABILITY for c in diagnosis.candidates if c.name == UNKNOWN)
     return known and bool(diagnosis.candidates)
 
 
@@ -289,16 +291,15 @@ def _explain_alarm(
 
         # one change that is no fault comes before several that are
         outside = find_outside_onset(refined) if refined.is_unknown else None
-        several = (
-            () if outside else trace_timeline(exam, refined, alarm.onset, recursive, SURE, lambda: progress("refit"))
-        )
+        trace = partial(trace_timeline, exam, refined, alarm.onset, recursive, MIN_CERTAINTY)
+        several = () if outside else trace(lambda: progress("refit"))
         if several:
             return several, _onset_of(several, exam, alarm), []
         candidates = ml_refit.refit_candidates(refined)
         refit = ml_refit.summarise_refit(refined, exam, recursive, outside=outside)
         if outside or not refined.is_unknown:
             onset = ml_refit.refit_onset(refined, exam, outside)
-        doubts = ml_refit.disagreement_warnings(exam, candidates, refit, SURE)
+        doubts = ml_refit.disagreement_warnings(exam, candidates, refit, MIN_CERTAINTY)
     best, t = candidates[0], exam.recording.t
     doubts += (implausible := implausible_warnings(exam, best))
     wait_s = exam.pipeline.bank.wait / exam.recording.sample_rate
@@ -308,7 +309,7 @@ def _explain_alarm(
         end_s=None if exam.alarm[-1] else float(exam.t(int(np.flatnonzero(exam.alarm)[-1]) + 1)),
         from_start=onset.likely_s - float(t[0]) <= 3.0 * wait_s,
         probability=best.probability,
-        faults=best.faults if best.probability >= SURE and best.name != UNKNOWN and not implausible else (),
+        faults=best.faults if best.probability >= MIN_CERTAINTY and best.name != UNKNOWN and not implausible else (),
         candidates=candidates,
         refit=refit,
     )
@@ -366,7 +367,7 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
 
 def _prefers_learned_fault(refined: RefitResult, recursive: Candidate) -> bool:
     """Return whether a fault learned from labelled recordings explains more than the refit, which knows none."""
-    sure = recursive.is_learned and recursive.probability >= SURE
+    sure = recursive.is_learned and recursive.probability >= MIN_CERTAINTY
     return sure and (refined.is_unknown or len(refined.best.fitted.faults) > 1)
 
 

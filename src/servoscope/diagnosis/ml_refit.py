@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
     from servoscope.isolation.ml import Hypothesis, OnsetEstimate, RefitResult
     from servoscope.isolation.ml.axis_vibration import AxisVibration
 
-WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
+MIN_PAIR_PROBABILITY = 1e-3  # probability from which a pair of faults is listed
 MAX_SIZE_DISTANCE = 3.0  # standard deviations between two sizes that are called different
 
 
@@ -65,7 +65,7 @@ def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:
     candidates = [
         _candidate(each, refined.window.plant, least, refined.noise_variance)
         for each in refined.hypotheses
-        if len(each.fitted.faults) == 1 or each.probability >= WORTH_LISTING
+        if len(each.fitted.faults) == 1 or each.probability >= MIN_PAIR_PROBABILITY
     ]
     candidates.append(Candidate(name=UNKNOWN, probability=refined.unknown_probability))
     # where probabilities vanish, the closest comes first

@@ -12,7 +12,7 @@ from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.result import DiagnosisWarning
 from servoscope.diagnosis.warnings import warning_throughout
 
-SATURATED = 0.05  # share of the samples with u at a limit that is worth telling
+MIN_SATURATED_SHARE = 0.05  # share of the samples with u at a limit that is worth telling
 
 
 def motion_warnings(exam: Examination) -> list[DiagnosisWarning]:
@@ -58,4 +58,4 @@ def _describe_quantities(exam: Examination, at: int) -> tuple[Message, ...]:
 
 def _describe_saturation(exam: Examination) -> Message | None:
     share = saturated_share(exam.baseline.loop, exam.recording)
-    return message("motion.saturated", share=share) if share > SATURATED else None
+    return message("motion.saturated", share=share) if share > MIN_SATURATED_SHARE else None

@@ -11,7 +11,8 @@ from servoscope.diagnosis.result import DiagnosisWarning
 
 SHARE = 1.0 / 3.0  # of the recording that counts as its past
 BUDGET = 0.1  # of the budget of false alarms, which this second test adds to that of the first
-SHARPER = 0.7  # of a change that the baseline promises to see: what the past has to promise, or it is not worth asking
+# of a change that the baseline promises to see: what the past has to promise, or it is not worth asking
+MAX_PROMISE_RATIO = 0.7
 
 
 def examine_by_own_past(exam: Examination) -> Examination | None:
@@ -38,7 +39,9 @@ def examine_by_own_past(exam: Examination) -> Examination | None:
     except (ServoscopeError, np.linalg.LinAlgError):  # too short, too little motion
         return None
     known = {promise.parameter: promise.change or np.inf for promise in baseline.promises}
-    sharper = any(promise.change and promise.change < SHARPER * known[promise.parameter] for promise in past.promises)
+    sharper = any(
+        promise.change and promise.change < MAX_PROMISE_RATIO * known[promise.parameter] for promise in past.promises
+    )
     if past.exact is None or past.exact.misfit > 1.0 or not sharper:
         return None
     return Examination.from_recording(past.model_copy(update={"point": baseline.point}), recording)

@@ -24,25 +24,25 @@ from servoscope.learning.inspection.residual import reference_period
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 
-FEWEST = 4  # recordings whose scatter is believed; fewer have no features
+MIN_RECORDINGS = 4  # recordings whose scatter is believed; fewer have no features
 BANDS = 7
-LOWEST = 4.0  # periods of the lowest band in a window
-HIGHEST = 0.45  # of the sample rate: the highest frequency
-MOST_WINDOWS = 2000  # of a recording that are learned from
+MIN_PERIODS_PER_WINDOW = 4.0  # periods of the lowest band in a window
+MAX_FREQUENCY_SHARE = 0.45  # of the sample rate: the highest frequency
+MAX_WINDOWS = 2000  # of a recording that are learned from
 MAX_PERIOD_SEARCH_SAMPLES = 1_000_000  # of a recording, in which a period is looked for
-SHORTEST = 64  # samples of a window
-LONGEST_SPAN = 24  # windows
+MIN_WINDOW_SAMPLES = 64  # samples of a window
+MAX_SPAN_WINDOWS = 24  # windows
 EDGES = (1.0 / 32.0, 1.0 / 16.0, 1.0 / 8.0)  # of a period: octaves after a motion began, where friction builds up
 LEVELS = 3  # lengths of windows where motion does not repeat
 REST_SHARE = 0.05  # of the largest speed, below which the reference rests
-SILENT = 1e-9  # share of a signal's power below which a band is silent
+SILENT_BAND_SHARE = 1e-9  # share of a signal's power below which a band is silent
 REPEATS = 0.02  # of the variance: the reference repeats where its difference after a period stays below
 
 
 def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[FeatureModel | None, list[Message]]:
     """Learn the features of healthy recordings; None where there are too few recordings, or too short ones."""
     share = loop.monitor.feature_false_alarms
-    if not share or len(recordings) < FEWEST:
+    if not share or len(recordings) < MIN_RECORDINGS:
         return None, []
     layout = choose_layout(loop, recordings)
     runner = WindowFeatures(layout)
@@ -77,7 +77,7 @@ def _windows(runner: WindowFeatures, recording: Recording) -> list[Window]:
         part = recording.rows(rows)
         found += runner.run(state, part.r, part.u, part.y, part.restart)
         outofcore.release(*recording.columns)
-        if len(found) >= MOST_WINDOWS:
+        if len(found) >= MAX_WINDOWS:
             break
     return found
 
@@ -106,7 +106,7 @@ def choose_layout(loop: Loop, recordings: Sequence[Recording]) -> FeatureLayout:
         window, levels = period * max(1, round(memory * rate / period)), 1
         edges = tuple(share * period / rate for share in EDGES)
     else:
-        window, levels, edges = max(round(memory * rate / 2.0), SHORTEST), LEVELS, ()
+        window, levels, edges = max(round(memory * rate / 2.0), MIN_WINDOW_SAMPLES), LEVELS, ()
     counts = [recording.samples // window for recording in recordings]
     whole = float(np.median(counts))
     first = 1 if whole >= 3.0 else 0  # start-up is unlike what follows, where anything follows
@@ -114,17 +114,20 @@ def choose_layout(loop: Loop, recordings: Sequence[Recording]) -> FeatureLayout:
     powers = [
         float(np.mean([np.var(x) for x in each])) for each in zip(*((r.u, r.r - r.y) for r in recordings), strict=True)
     ]
-    top = HIGHEST * rate
+    top = MAX_FREQUENCY_SHARE * rate
     return FeatureLayout(
         sample_rate=rate,
         window=window,
         levels=levels,
-        span=int(np.clip(whole - first, 1, LONGEST_SPAN)),
+        span=int(np.clip(whole - first, 1, MAX_SPAN_WINDOWS)),
         settling=first * window,
         rest_speed=REST_SHARE * float(speed.max()),
         edges_s=edges,
-        bands_hz=tuple(np.geomspace(min(LOWEST * rate / window, top / 2.0), top, BANDS + 1).tolist()),
-        floors=(SILENT * powers[0] + np.finfo(float).tiny, SILENT * powers[1] + np.finfo(float).tiny),
+        bands_hz=tuple(np.geomspace(min(MIN_PERIODS_PER_WINDOW * rate / window, top / 2.0), top, BANDS + 1).tolist()),
+        floors=(
+            SILENT_BAND_SHARE * powers[0] + np.finfo(float).tiny,
+            SILENT_BAND_SHARE * powers[1] + np.finfo(float).tiny,
+        ),
     )
 
 

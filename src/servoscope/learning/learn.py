@@ -53,15 +53,15 @@ from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 from servoscope.simulation import reference, simulate
 
-SHORTEST = 10.0  # memories; a shorter baseline is warned about
-FEWEST_PER_COEFFICIENT = 20  # usable samples of every recording
+MIN_MEMORIES = 10.0  # memories; a shorter baseline is warned about
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of every recording
 SPEED_OVER = 0.05  # s over which a speed is measured here
-STILL_SHARE = 0.02  # of the speed of motion, below which an axis stands still
-WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
-MOST_SIMULATED = 2e6  # samples behind a nominal baseline
-LEAST_EXPLAINED = 0.9  # share of u's variance
-NOTHING = 1e-9  # of the residual's variance: what is left below is rounding
-UNLIKELY = 1e-3  # probability below which the physics are not believed to hold
+REST_SPEED_SHARE = 0.02  # of the speed of motion, below which an axis stands still
+MIN_INSTRUMENT_EIGENVALUE = 0.05  # below, the instrument says too little of the regressor to be worth its variance
+MAX_SIMULATED_SAMPLES = 2e6  # samples behind a nominal baseline
+MIN_EXPLAINED_SHARE = 0.9  # share of u's variance
+ROUNDING_SHARE = 1e-9  # of the residual's variance: what is left below is rounding
+MIN_PHYSICS_PROBABILITY = 1e-3  # probability below which the physics are not believed to hold
 
 Progress = Callable[[str], None]
 
@@ -148,13 +148,13 @@ def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
     if not len(speed) or not speed.max() > 0.0:
         return 0.0
     moving = speed[speed > 0.1 * speed.max()]
-    return STILL_SHARE * float(np.sqrt((moving**2).mean()))
+    return REST_SPEED_SHARE * float(np.sqrt((moving**2).mean()))
 
 
 def _tune_pipeline(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline, list[Regression], TuningFit]:
     pipeline = Pipeline.of(loop, two_stage.tune_stage_one(loop, recordings), still_speed(loop, recordings))
     regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
-    fewest = FEWEST_PER_COEFFICIENT * pipeline.bank.n
+    fewest = MIN_SAMPLES_PER_COEFFICIENT * pipeline.bank.n
     for rec, g in zip(recordings, regressions, strict=True):
         if (usable := int(g.ok.sum())) < fewest:
             raise NotEnoughError(
@@ -171,9 +171,9 @@ def _tune(
     plain = loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"estimator": "akf"})})
     if not learns_instrument(loop):
         pipeline, regressions, fit = _tune_pipeline(loop, recordings)
-        if fit.strength >= WEAKEST_INSTRUMENT:
+        if fit.strength >= MIN_INSTRUMENT_EIGENVALUE:
             return pipeline, regressions, fit, []
-        note = message("learning.weak_instrument", strength=fit.strength, least=WEAKEST_INSTRUMENT)
+        note = message("learning.weak_instrument", strength=fit.strength, least=MIN_INSTRUMENT_EIGENVALUE)
         return *_tune_pipeline(plain, recordings), [note]
     pipeline, regressions, fit = _tune_pipeline(plain, recordings)
     found, notes = learn_instrument(pipeline, recordings, fit)
@@ -191,7 +191,7 @@ def nominal_baseline(loop: Loop, progress: Progress = lambda _: None, duration_s
     """
     if not loop.plant.has_physics or loop.controller is None:
         raise LoopError(f"{loop.name}: a nominal baseline needs [controller] and the plant's nominal values")
-    duration_s = min(duration_s, MOST_SIMULATED / loop.sample_rate)
+    duration_s = min(duration_s, MAX_SIMULATED_SAMPLES / loop.sample_rate)
     healthy, _ = simulate(loop, reference("profile", duration_s, loop.sample_rate))
     pipeline, regressions, fit = _tune_pipeline(loop, [healthy])
     note = message("learning.nominal")
@@ -246,7 +246,7 @@ def _assemble_baseline(
             # what the plant leaves of the residual is noise alone: its colour is known better now
             plant = loop.plant.scaled(healthy.ratios)
             gamma = sample_autocovariance(healthy.residuals, AR_ORDER)
-            silent = not gamma[0] > NOTHING * fit.tuning.R  # simulated without noise, for example
+            silent = not gamma[0] > ROUNDING_SHARE * fit.tuning.R  # simulated without noise, for example
             model = fit.tuning.noise if silent else yule_walker(gamma)
             if pipeline.stage_one is None and not silent:
                 noises = fit_white_noise(residual_system(pipeline, plant), healthy.residuals, pipeline.stride)
@@ -269,7 +269,7 @@ def _assemble_baseline(
             # each reference has its own bias
             deviations_between = fit.each - np.array([e.batch_estimate(plant) for e in expectations])
             ratios_covariance = healthy.covariance
-            if healthy.misfit <= special.chdtri(pipeline.bank.n, UNLIKELY):
+            if healthy.misfit <= special.chdtri(pipeline.bank.n, MIN_PHYSICS_PROBABILITY):
                 # the physics hold: what they say is known better than the coefficients one by one
                 theta, theta_covariance = model_theta, healthy.theta_covariance
                 by_chance = homogeneity.scatter_probability(deviations_between, fit.each_covariance)
@@ -333,12 +333,12 @@ def _assemble_baseline(
     covariance = theta_covariance + factor * between + error
     notes += noise_notes(pipeline, fit, estimates, can_simulate(loop))
     excess, suggestion = detectability.baseline_misfit(estimates, deviations, covariance, fit)
-    if fit.explained < LEAST_EXPLAINED:
+    if fit.explained < MIN_EXPLAINED_SHARE:
         notes.append(message("learning.hardly_explained", share=fit.explained))
     duration = sum(rec.duration_s for rec in recordings)
-    if excess > detectability.WORTH_A_LOOK and loop.monitor.model_error < suggestion:
+    if excess > detectability.MAX_T2_PER_COEFFICIENT and loop.monitor.model_error < suggestion:
         notes.append(message("learning.model_error", excess=excess, model_error=suggestion))
-    if duration < (least := SHORTEST * loop.monitor.memory):
+    if duration < (least := MIN_MEMORIES * loop.monitor.memory):
         notes.append(message("learning.short", duration_s=duration, memory_s=loop.monitor.memory, least_s=least))
     supported = supported_budget(pipeline.bank.n, loop, fit.dof, excess)
     if supported > (budget := loop.monitor.false_alarms_per_year):

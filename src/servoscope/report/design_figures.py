@@ -14,7 +14,7 @@ from servoscope.report.plotting import COLOURS, plot_style
 WIDTH = 9.0  # inches
 TONES = ("#1f5fa8", "#c6501c", "#7d8894", "#1c2530")  # one per fault, then again dashed
 RULE = COLOURS["rule"]
-LARGEST = 30.0  # standard deviation that is worth showing
+MAX_STD_SHOWN = 30.0  # standard deviation that is worth showing
 
 
 def format_log_ratio(value: float) -> str:
@@ -76,7 +76,7 @@ def plot_size_precision(study: DesignStudy) -> Figure:
     ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{100.0 * x:g} %"))
     ax.set_xlabel("time after the onset [s]")
     ax.set_ylabel("standard deviation")
-    ax.set_ylim(top=min(ax.get_ylim()[1], LARGEST))
+    ax.set_ylim(top=min(ax.get_ylim()[1], MAX_STD_SHOWN))
     _add_grid_and_legend(figure, ax, columns=4)
     return figure
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from servoscope.design import DesignStudy, LearnedStudy
+from servoscope.design import BaselineStudy, DesignStudy
 from servoscope.report.format_values import (
     DASH,
     format_change,
@@ -14,7 +14,7 @@ from servoscope.report.format_values import (
 )
 from servoscope.report.page import ResultTable, render_page, say, write_page
 
-UNKNOWABLE = 10.0  # standard deviation from which a number says nothing
+MAX_STD_SHOWN = 10.0  # standard deviation from which a number says nothing
 
 
 def write_design_page(path: str | Path, study: DesignStudy) -> None:
@@ -67,11 +67,11 @@ def faults_table(study: DesignStudy) -> ResultTable:
     return ResultTable(head, rows, words=2)
 
 
-def learned_table(study: LearnedStudy) -> ResultTable:
+def learned_table(study: BaselineStudy) -> ResultTable:
     """Return from which size on each fault is detected and named, by a baseline alone."""
 
     def size(change: float | None) -> str:
-        return format_percent(change) if change is not None and change < UNKNOWABLE else "never"
+        return format_percent(change) if change is not None and change < MAX_STD_SHOWN else "never"
 
     rows = [
         (name, fault.parameter, size(fault.detectable), size(fault.isolable), fault.nearest)
@@ -90,7 +90,7 @@ def limits_table(study: DesignStudy) -> ResultTable:
     return ResultTable(("Change, as a ratio to healthy", "Tracking lost at", "Stability lost at"), rows)
 
 
-def cosines_table(study: DesignStudy | LearnedStudy) -> ResultTable:
+def cosines_table(study: DesignStudy | BaselineStudy) -> ResultTable:
     """Return how alike small changes look, each against each."""
     names = tuple(study.faults)
     rows = [(one, *(f"{study.cosines[one][other]:.3f}".replace("-", "−") for other in names)) for one in names]
@@ -122,4 +122,4 @@ def mimics_table(study: DesignStudy, *, described: bool = False) -> ResultTable:
 
 def format_std(value: float | None) -> str:
     """Return a relative standard deviation, as far as it says anything."""
-    return f"{100.0 * value:.3g} %" if value is not None and value < UNKNOWABLE else DASH
+    return f"{100.0 * value:.3g} %" if value is not None and value < MAX_STD_SHOWN else DASH

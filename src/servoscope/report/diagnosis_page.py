@@ -37,7 +37,7 @@ from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 
-UNLIKELY = 0.05  # a candidate below this probability is not in the headline
+MIN_PROBABILITY_IN_HEADLINE = 0.05  # a candidate below this probability is not in the headline
 LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
 
 
@@ -146,7 +146,7 @@ def _headline(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         return say("report.headline.faults", faults=[describe_fault(fault, words) for fault in diagnosis.faults])
     if diagnosis.candidates and diagnosis.candidates[0].name == UNKNOWN:
         return say("report.headline.unknown")
-    likely = [c for c in diagnosis.candidates if c.name != UNKNOWN and c.probability >= UNLIKELY]
+    likely = [c for c in diagnosis.candidates if c.name != UNKNOWN and c.probability >= MIN_PROBABILITY_IN_HEADLINE]
     if len(likely) < 2:
         return say("report.headline.open")
     if all(len(candidate.faults) > 1 for candidate in likely):
@@ -192,7 +192,7 @@ def _checks(diagnosis: Diagnosis, loop: Loop, words: Mapping[str, str]) -> Itera
     """Yield what to look at on the machine, the likeliest first."""
     if diagnosis.verdict != "fault":
         return
-    for candidate in (each for each in diagnosis.candidates if each.probability >= UNLIKELY):
+    for candidate in (each for each in diagnosis.candidates if each.probability >= MIN_PROBABILITY_IN_HEADLINE):
         odds = format_probability(candidate.probability)
         for fault in candidate.faults:
             what, places = describe_fault(fault, words), [str(each) for each in checks_of_fault(loop, fault.name)]

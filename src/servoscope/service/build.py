@@ -24,7 +24,7 @@ from servoscope.service.assets.checkpoint import StreamPosition, unpack_state
 from servoscope.service.assets.examination import compile_examination
 from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.assets.outlook import AssetLimits
-from servoscope.service.assets.reception import UNHEARD
+from servoscope.service.assets.reception import UNHEARD_RECEPTION
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
 from servoscope.service.publishers.base import StatusPublisher
@@ -116,7 +116,7 @@ def resume_assets(
             behind |= {name} if left else set()
         if not asset.heard:
             asset.expect(time.time())
-            asset.reception = UNHEARD
+            asset.reception = UNHEARD_RECEPTION
     # their checkpoints waited; all that they lead to is the state after them
     deque(groups.process(uncounted), maxlen=0)
     for name, number in store.last_residuals(behind).items():

@@ -19,7 +19,7 @@ from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.assets.examination_schedule import PendingDiagnosis
 from servoscope.service.assets.groups import QuietBlocks
-from servoscope.service.assets.reception import FOLLOWED, ListeningClock, ReceptionLog
+from servoscope.service.assets.reception import RECEPTION_OK, ReceptionClock, ReceptionLog
 from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.build import ServiceComponents
 from servoscope.service.clock import SteadyClock
@@ -37,7 +37,7 @@ from servoscope.service.writer import StoreWriter
 
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
 MAX_PAUSE_S = 0.05
-LEAST_TURN_S = 0.25  # blocks that came within a turn are followed together, which costs a fraction of one by one
+MIN_TURN_S = 0.25  # blocks that came within a turn are followed together, which costs a fraction of one by one
 HOUSEKEEPING_EVERY_S = 1.0
 PROGNOSIS_RETRY_S = 60.0  # after one that failed
 
@@ -59,7 +59,7 @@ class Service:
         self._diagnosis_jobs: dict[tuple[str, PendingDiagnosis], Future[StoredDiagnosis]] = {}
         self._prognosis_jobs: dict[str, Future[Prognosis]] = {}
         self._prognosis_from: dict[str, float] = {}  # by asset, before when none is asked for again, monotonic [s]
-        self._listening = ListeningClock(monotonic())
+        self._listening = ReceptionClock(monotonic())
         self._receptions = {name: ReceptionLog(heard_before=asset.heard) for name, asset in self.assets.items()}
         self._housekeeping = Housekeeping(self)
         self._next_commit = self._next_housekeeping = 0.0
@@ -213,7 +213,7 @@ class Service:
                 result = StepResult([audit_row("block refused", document)], [])
             elif result.refusal is None:
                 self._receptions[block.asset].hear(self._listening.seconds)
-                asset.reception = FOLLOWED
+                asset.reception = RECEPTION_OK
             else:
                 source.rejections.add(block.asset, *result.refusal)
             self.handle_result(asset, result)
@@ -295,7 +295,8 @@ class Service:
         for name, asset in self.assets.items():
             source = asset.source
             reception, before, (trouble, of_assets) = self._receptions[name], asset.reception, troubles[source]
-            if before is FOLLOWED and name not in of_assets and reception.is_fresh(self._listening.seconds, fresh_s):
+            fresh = name not in of_assets and reception.is_fresh(self._listening.seconds, fresh_s)
+            if fresh and before is RECEPTION_OK:
                 continue  # nearly all of them, nearly always
             patience_s, own = self.config.quality.silent_s, of_assets.get(name)
             if not math.isinf(self.sources[source].next_block_s):
@@ -377,7 +378,7 @@ class Service:
         """How long to sleep before the next turn [s]."""
         now = self.clock.monotonic()
         # what is measured now is gathered for a while, unless each block is to be stored soon, or a turn was full
-        gather_s = min(LEAST_TURN_S, 0.5 * self.config.service.commit_every_s) if not self._is_behind else 0.0
+        gather_s = min(MIN_TURN_S, 0.5 * self.config.service.commit_every_s) if not self._is_behind else 0.0
         rest_s = max(0.0, self.last_turn + gather_s - now)
         nexts = (max(one.next_block_s, rest_s * (one.clock_rate == 1.0)) for one in self.sources.values())
         due = min(nexts, default=math.inf) if self.writer.free else math.inf  # none: a worker that lost its last asset

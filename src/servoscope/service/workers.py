@@ -23,7 +23,7 @@ from servoscope.service.process_supervisor import ProcessSupervisor
 from servoscope.service.store import Store
 from servoscope.service.systemd import notify_systemd
 
-LOOK_EVERY_S = 1.0
+POLL_INTERVAL_S = 1.0
 ANSWER_S = 5.0  # in which a worker answers
 # of metrics that several workers have under one name: how they are put together, where that is not their sum
 COMBINATIONS: dict[str, Callable[[float, float], float]] = {
@@ -192,7 +192,7 @@ class WorkerPool:
             files = () if store.lock_file is None else (store.lock_file,)
             self._start(files)
             next_look, is_announced = time.monotonic() + STALL_S, False
-            while not self._stopping.wait(LOOK_EVERY_S) and not all(one.supervisor.done for one in self._workers):
+            while not self._stopping.wait(POLL_INTERVAL_S) and not all(one.supervisor.done for one in self._workers):
                 self.last_turn = time.monotonic()
                 notify_systemd("WATCHDOG=1")
                 if not is_announced and all(one.has_begun or one.supervisor.done for one in self._workers):

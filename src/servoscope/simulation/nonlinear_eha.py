@@ -33,9 +33,8 @@ if TYPE_CHECKING:
     from servoscope.simulation.nonlinear_eha_kernels import RigConstants
 
 REFERENCE_C = 40.0  # degC at which the plant's parameters hold
-MAX_RATE_STEP = (
-    0.5  # largest rate times sub-step: on the reference rig y is then within 1e-5 m, a thirtieth of its noise
-)
+# largest rate times sub-step: on the reference rig y is then within 1e-5 m, a thirtieth of its noise
+MAX_RATE_STEP = 0.5
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,14 @@ from servoscope.service.config import ServiceFile
 from servoscope.service.process_supervisor import call_at_end_of_stdin
 from servoscope.service.store import Store
 from servoscope.web.app import create_app
-from servoscope.web.connections import ConnectionTable, LimitedProtocol, TlsListener
+from servoscope.web.connections import ConnectionTable, HttpProtocol, TlsListener
 from servoscope.web.dependencies import Context, SingleSignOn
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
 from servoscope.web.storage import FileStorage
 from servoscope.web.upload_storage import UploadStorage
 
-STORE_PATIENCE = 5.0  # s
+STORE_TIMEOUT_S = 5.0  # s
 STOPS_WITHIN_S = 5
 BACKLOG = 1024
 SEND_BUFFER = 1 << 17  # bytes of each connection; Linux takes them twice
@@ -118,7 +118,7 @@ def _create_single_sign_on(settings: WebSettings, folder: Path) -> SingleSignOn 
 
 def _uvicorn_config(context: Context, tls: dict[str, Any]) -> uvicorn.Config:
     settings = context.settings
-    protocol: Any = partial(LimitedProtocol, context.connections)  # uvicorn calls it as it calls a class
+    protocol: Any = partial(HttpProtocol, context.connections)  # uvicorn calls it as it calls a class
     return uvicorn.Config(
         create_app(context),
         http=protocol,

@@ -13,7 +13,7 @@ from servoscope.report.format_values import format_change, format_duration
 from servoscope.report.page import say
 
 if TYPE_CHECKING:
-    from servoscope.design import DesignStudy, LearnedStudy
+    from servoscope.design import BaselineStudy, DesignStudy
     from servoscope.design.result import DirectionStudy
 
 
@@ -33,7 +33,7 @@ def print_study(out: Console, s: DesignStudy) -> None:
     print_result_table(out, design_page.mimics_table(s))
 
 
-def print_learned_study(out: Console, s: LearnedStudy) -> None:
+def print_learned_study(out: Console, s: BaselineStudy) -> None:
     """Print what a baseline alone says, and why not more."""
     print_title(out, s.loop, "")
     print_facts(out, [("false alarms", f"{s.false_alarms_per_year:g} per year")])

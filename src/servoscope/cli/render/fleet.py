@@ -15,8 +15,8 @@ from servoscope.report.format_values import DASH, format_probability
 if TYPE_CHECKING:
     from servoscope.fleet import Fleet
 
-MOST_SHOWN = 20
-LEAST_SHOWN = 0.05  # probability of a common cause that is worth its line
+MAX_ASSETS_SHOWN = 20
+MIN_PROBABILITY_SHOWN = 0.05  # probability of a common cause that is worth its line
 
 
 def print_fleet(out: Console, f: Fleet) -> None:
@@ -29,7 +29,11 @@ def print_fleet(out: Console, f: Fleet) -> None:
         out.print(told, soft_wrap=True)
     states = ("healthy", "fault", "common cause", "undetermined", "failed")
     print_facts(out, [(state, str(f.count(state))) for state in states if f.count(state)])
-    shared = [(cause, since) for cause, since in zip(f.causes, f.since, strict=True) if cause.probability > LEAST_SHOWN]
+    shared = [
+        (cause, since)
+        for cause, since in zip(f.causes, f.since, strict=True)
+        if cause.probability > MIN_PROBABILITY_SHOWN
+    ]
     if shared:
         rows = []
         for cause, since in shared:
@@ -40,11 +44,12 @@ def print_fleet(out: Console, f: Fleet) -> None:
     ill = [one for one in f.assets if one.state not in ("healthy", "failed")]
     if ill:
         own = [
-            (one.asset, one.day, one.state, format_probability(one.probability), one.said) for one in ill[:MOST_SHOWN]
+            (one.asset, one.day, one.state, format_probability(one.probability), one.said)
+            for one in ill[:MAX_ASSETS_SHOWN]
         ]
         print_table(out, ("asset", "day", "state", "own", ""), own, words=5)
-    if len(ill) > MOST_SHOWN:
-        print_notes(out, [f"{len(ill) - MOST_SHOWN} more are ill, see the report"])
+    if len(ill) > MAX_ASSETS_SHOWN:
+        print_notes(out, [f"{len(ill) - MAX_ASSETS_SHOWN} more are ill, see the report"])
     lost = [f"{asset} {day}: {why}" for asset, day, why in f.failed]
     lost += [f"{name}, not learned: {why}" for name, why in f.unlearned.items()]
-    print_notes(out, lost[:MOST_SHOWN])
+    print_notes(out, lost[:MAX_ASSETS_SHOWN])

@@ -30,7 +30,7 @@ MAX_BRIDGE = 2.2  # sup of a Brownian bridge that is passed in one of ten thousa
 STRIDES = 16, 1, 16, 1  # samples by which a change is moved,
 MAX_MOVES = 16  # and at most so many times
 MIN_ROUND_GAIN = 1.0  # that a round of sizes and sequences gained, for another one
-WHOLE = ChangeProfile(0)
+FROM_START = ChangeProfile(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class _TimelineSearch:
         )
 
     def _predictor(self, plant: ChangedPlant) -> Predictor:
-        return self.window.predictor(self.known, [fault.parameter for fault in plant.faults], plant.x, WHOLE)
+        return self.window.predictor(self.known, [fault.parameter for fault in plant.faults], plant.x, FROM_START)
 
     def _place(self, stretches: Sequence[tuple[int, ChangedPlant]]) -> PlantSequence:
         """Return a sequence whose changes are where they are likeliest; neighbours that are the same become one."""
@@ -193,9 +193,9 @@ class _TimelineSearch:
         for begin, end in pairwise(bounds):
             guard = MIN_STRETCH_SAMPLES if end - begin > 4 * MIN_STRETCH_SAMPLES else 0
             part = self.window.cut(begin + guard * (begin > 0), end - guard * (end < self.window.samples))
-            healthy = fit_hypothesis(part, [], WHOLE, self.known, [np.zeros(0)], free=False)
+            healthy = fit_hypothesis(part, [], FROM_START, self.known, [np.zeros(0)], free=False)
             fitted = [
-                fit_hypothesis(part, [fault], WHOLE, self.known, grid.local_minima(part, WHOLE), free=False)
+                fit_hypothesis(part, [fault], FROM_START, self.known, grid.local_minima(part, FROM_START), free=False)
                 for fault, grid in zip(self.faults, self.grids, strict=True)
             ]
             if min(one.cost for one in fitted) > part.samples + SWITCH_PRICE:
@@ -207,7 +207,7 @@ class _TimelineSearch:
         for one, other in combinations(singles, 2):
             self.progress()
             starts = [np.append(one.x, 0.0), np.append(0.0, other.x)]
-            yield fit_hypothesis(part, [*one.faults, *other.faults], WHOLE, self.known, starts, free=False)
+            yield fit_hypothesis(part, [*one.faults, *other.faults], FROM_START, self.known, starts, free=False)
 
     def _explain(self, bounds: Sequence[int], each: Sequence[ChangedPlant]) -> Iterator[TimelineStretch]:
         begins = [(0, 0, 0)]

@@ -10,7 +10,7 @@ from servoscope.research.paper.tracking import TUNING_SEED_OFFSET
 
 ESTIMATORS = ("akf", "dfrls", "kf", "rls")
 MEMORIES = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0)  # s; N = 100 ... 1200, l of RLS 0.99 ... 0.9992
-FEW = (1.0, 3.0, 8.0)
+MEMORIES_BESIDE_NOMINAL = (1.0, 3.0, 8.0)
 CONDITIONS = (
     OperatingConditions(),
     OperatingConditions("multisine"),
@@ -50,7 +50,7 @@ def trade_off_curve(
 def trade_off_metrics(conditions: OperatingConditions, seed: int) -> dict[str, float]:
     """Return all curves of one operating condition as flat numbers, ``condition|estimator|column|memory``."""
     flat: dict[str, float] = {}
-    memories = MEMORIES if conditions == OperatingConditions() else FEW
+    memories = MEMORIES if conditions == OperatingConditions() else MEMORIES_BESIDE_NOMINAL
     for estimator in ESTIMATORS:
         for column, values in trade_off_curve(estimator, conditions, seed, memories).items():
             for memory, value in zip(memories, values, strict=True):
@@ -60,7 +60,7 @@ def trade_off_metrics(conditions: OperatingConditions, seed: int) -> dict[str, f
 
 def curve_column(flat: dict[str, float], conditions: OperatingConditions, estimator: str, name: str) -> list[float]:
     """Return one column of `trade_off_metrics`, by memory."""
-    memories = MEMORIES if conditions == OperatingConditions() else FEW
+    memories = MEMORIES if conditions == OperatingConditions() else MEMORIES_BESIDE_NOMINAL
     return [flat[f"{conditions}|{estimator}|{name}|{memory:g}"] for memory in memories]
 
 

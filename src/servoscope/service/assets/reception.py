@@ -34,11 +34,11 @@ class Reception:
         return "" if self.state == "followed" else render(message("service.reception.sentence", why=self.why))
 
 
-FOLLOWED = Reception("followed")
-UNHEARD = Reception("unheard", render(message("service.reception.unheard")))
+RECEPTION_OK = Reception("followed")
+UNHEARD_RECEPTION = Reception("unheard", render(message("service.reception.unheard")))
 
 
-class ListeningClock:
+class ReceptionClock:
     """Counts the time in which a silence is that of an asset: the service has polled what came, and had room for it.
 
     Of one step of it at most `MAX_TURN_S` count, and half of the patience: a process that was suspended has not read
@@ -90,7 +90,7 @@ class ReceptionLog:
         if trouble is not None:
             return Reception(*trouble)
         if self._heard and self.silence_s(now) <= patience_s:
-            return FOLLOWED
+            return RECEPTION_OK
         if now - refused_at <= patience_s:
             return Reception("refused", refusal)
         state: ReceptionState = "silent" if self._heard else "unheard"

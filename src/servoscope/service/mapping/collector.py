@@ -26,10 +26,10 @@ from servoscope.service.sources.base import BlockSource, RejectionCounter, Sourc
 from servoscope.service.sources.block import Block, ResumePosition
 
 POLL_S = 0.02
-QUIET_S = 2.0  # without a message of an asset for so long, what has come of it is made a block, however short
-REMEMBERED = 1000  # messages of an asset by which one that comes again is known
+MAX_QUIET_S = 2.0  # without a message of an asset for so long, what has come of it is made a block, however short
+MAX_KNOWN_MESSAGES = 1000  # messages of an asset by which one that comes again is known
 MAX_VALUES = 100_000  # of a signal, between two looks at what is complete
-SETTLED = 0.75  # of a period: behind a row with all signals nothing of its moment comes
+SETTLED_PERIOD_SHARE = 0.75  # of a period: behind a row with all signals nothing of its moment comes
 MARK = 2**32  # added to the checksum by which a message is known, so that it is never 0
 LAG_S = 2.0  # how far a signal may be behind others, which come in messages of their own, by time stamps
 
@@ -85,7 +85,7 @@ class _AssetStream:
         """Return whether a message of this mark was among the last ones; remember it."""
         known = mark in self._seen
         self._seen[mark] = None
-        if len(self._seen) > REMEMBERED:
+        if len(self._seen) > MAX_KNOWN_MESSAGES:
             del self._seen[next(iter(self._seen))]
         return known
 
@@ -114,7 +114,7 @@ class _AssetStream:
         """Make the blocks that are complete, and see which messages are in them."""
         assembler, self.values = self.assembler, 0
         last = max(self._newest)
-        settled = last + SETTLED * assembler.period if self._complete else last
+        settled = last + SETTLED_PERIOD_SHARE * assembler.period if self._complete else last
         if not (self._complete or short):  # others may still come for what one signal has reached
             settled = max(min(self._newest), last - max(LAG_S, self._span_s))
         assembler.collect(-math.inf, settled)
@@ -246,7 +246,7 @@ class MessageCollector:
     def poll(self, limit: int) -> list[Block]:
         """Return up to so many blocks that are complete."""
         with self._lock:
-            self._flush(time.monotonic() - max(QUIET_S, 2.0 * self._settings.block))
+            self._flush(time.monotonic() - max(MAX_QUIET_S, 2.0 * self._settings.block))
             found = list[Block]()
             for stream in self._streams.values():
                 while stream.ready and len(found) < limit:

@@ -27,7 +27,7 @@ from servoscope.service.sources.block import MAX_TIME_S
 
 PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts
 MAX_STAMP = 10**30  # beyond any time, in any unit
-SHOWN = 8  # names that a message lists
+MAX_NAMES_SHOWN = 8  # names that a message lists
 MAX_BAD_ROWS = 100  # of a message that are refused one by one
 MAX_EXTRA = 1000  # names of a message that are not mapped, of which some are shown
 _ALWAYS = frozenset(range(len(SIGNALS)))  # what each sample has; covariates come when they like
@@ -160,7 +160,7 @@ class MessageMapping:
         if not rows and not gone and self._sparkplug is None:
             raise MessageError("keys", f"no rows at {self.settings.rows!r}, {describe_keys(tree)}")
         if extra and not self.settings.ignore_extra:
-            text = ", ".join(sorted(extra)[:SHOWN])[:200]
+            text = ", ".join(sorted(extra)[:MAX_NAMES_SHOWN])[:200]
             self._reject(self.find_asset(topic), "extra", f"is not mapped: {text} (ignore_extra = true leaves it out)")
         return MessageContent(values, gone, complete and bool(values))
 
@@ -268,7 +268,7 @@ class MessageMapping:
 def describe_keys(tree: Any) -> str:
     """Return what there is instead, in words."""
     if isinstance(tree, dict):
-        return f"only {', '.join(sorted(map(str, tree))[:SHOWN])[:200] or 'an empty table'}"
+        return f"only {', '.join(sorted(map(str, tree))[:MAX_NAMES_SHOWN])[:200] or 'an empty table'}"
     return f"only a list of {len(tree)}" if isinstance(tree, list) else f"only {type(tree).__name__} {str(tree)[:40]}"
 
 

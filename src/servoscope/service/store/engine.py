@@ -39,7 +39,7 @@ LARGE_WRITES = (  # samples come and go by megabytes: together these take less t
     "cache_size = -32768",  # a commit of ten thousand assets fits in
     "secure_delete = OFF",  # Debian's SQLite overwrites with zeros what is deleted
 )
-UNCHANGED = {"mode": "ro", "immutable": "1", "uri": "true"}
+READ_ONLY_OPTIONS = {"mode": "ro", "immutable": "1", "uri": "true"}
 LOCK_RELEASE_S = 2.0  # s: after which a killed process has released its lock
 
 
@@ -83,7 +83,7 @@ def create_store_engine(url: URL, *, lock_timeout_s: float = LOCK_TIMEOUT_S, wri
     """Return an engine that has opened nothing yet; raises StoreError if the driver is missing."""
     if url.get_backend_name() == "sqlite":
         lies_still = not write and _lies_still(Path(str(url.database)))
-        read = url.set(database=f"file:{quote(str(url.database))}", query=UNCHANGED) if lies_still else url
+        read = url.set(database=f"file:{quote(str(url.database))}", query=READ_ONLY_OPTIONS) if lies_still else url
         arguments: dict[str, Any] = {"connect_args": {"timeout": lock_timeout_s}, "json_serializer": encode_document}
         engine = sa.create_engine(read, hide_parameters=True, **arguments)
         if not lies_still:
