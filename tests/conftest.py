@@ -32,16 +32,29 @@ progress.LINE_INTERVAL_S = 3600.0  # what a command says on stderr must not depe
 os.environ.setdefault("NUMBA_CACHE_DIR", str(PROJECT / ".cache" / "numba"))
 
 
-# Files of tests that take longest: they begin first, so that no worker is left with one when the others have nothing.
+# Subjects whose files of tests take longest: they begin first, so that no worker has one left when the others are done.
 LONGEST = (
-    "test_estimators",
-    "test_estimator_peers",
+    "estimators",
+    "service",
+    "report",
+    "learning",
+    "source_contract",
+    "opcua",
+    "web_access",
+    "cli",
+    "web",
+    "points",
+    "labelled",
+    "eha_cases",
+    "lake",
+    "refinement",
+    "compatibility",
 )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files of tests first."""
-    ranks = {name: rank for rank, name in enumerate(LONGEST)}
+    ranks = {f"test_{subject}": rank for rank, subject in enumerate(LONGEST)}
     items.sort(key=lambda item: ranks.get(item.path.stem, len(ranks)))
 
 
