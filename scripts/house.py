@@ -6,8 +6,7 @@
     python scripts/house.py --json                              the figures alone, for a later --compare
     python scripts/house.py --offenders                         the table, and below it the names behind the counts
 
-It needs nothing but Python. ``tests/project/test_architecture.py`` uses its functions and holds the figures that are
-rules.
+It needs nothing but Python. ``tests/project/test_architecture.py`` uses its functions and holds the figures that are rules.
 """
 
 from __future__ import annotations
