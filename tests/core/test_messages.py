@@ -205,7 +205,9 @@ def test_another_language_replaces_the_wording_and_nothing_else(
         assert "-fache (1.19" in diagnosis.summary and "seit 30.0 s" in diagnosis.summary
         assert "Ein zweiter Fehler (contamination, friction oder pump) erklärt" in " ".join(diagnosis.explanation)
         assert diagnosis.explanation[0].startswith("Alarm at ")  # English where the language has nothing
-        assert str(diagnosis.checks[0]).startswith("Kolbendichtung")  # the plant's own words, which it translates itself
+        assert str(diagnosis.checks[0]).startswith(
+            "Kolbendichtung"
+        )  # the plant's own words, which it translates itself
         assert diagnosis.model_dump(exclude=words) == numbers
         assert render(diagnosis.headline, "en") == json.loads(english)["summary"]
     finally:

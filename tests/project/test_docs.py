@@ -212,7 +212,7 @@ def test_every_key_of_alarms_data_quality_and_actions_is_documented() -> None:
 
     text = (REFERENCE.parent / "alarms.md").read_text() + (REFERENCE.parent / "how-to" / "actions.md").read_text()
     models = [alarms.AlarmDefinition, alarms.FloodSettings, quality.QualitySettings, actions.RetrySettings]
-    models += [actions.WebhookSettings, actions.CommandSettings, actions.FaultToleranceSettings]
+    models += [actions.WebhookSettings, actions.CommandSettings, actions.EmailSettings, actions.FaultToleranceSettings]
     keys = {key for model in models for key in model.model_fields}
     missing = [key for key in sorted(keys) if not re.search(rf"[`\n ]{key}( = [^`\n]*)?[`\n]|`{key}`", text)]
     assert not missing, f"not in docs/alarms.md or docs/how-to/actions.md: {', '.join(missing)}"

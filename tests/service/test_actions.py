@@ -162,7 +162,7 @@ def test_what_fails_otherwise_is_said_and_put_off_too(tmp_path: Path) -> None:
                 assert not result.delivered
         assert len(receiver.requests) == 1  # no redirect is followed, nothing goes out unsigned
     result = deliver(row_for(webhook(nobody)), ActionSettings(), NOW)
-    assert "no webhook, command or mqtt is called 'desk' any more" in result.detail
+    assert "none of webhook, command, mqtt and email is called 'desk' any more" in result.detail
 
 
 def test_a_receiver_that_does_not_answer_in_time_is_tried_again() -> None:
@@ -292,7 +292,7 @@ def test_waits_double_up_to_a_bound_differ_by_event_and_end() -> None:
         ({"command": {"t": {"argv": "say it"}}}, "'say it' is not a list"),
         (
             {"command": {"t": {"argv": ["x"]}}, "webhook": {"t": {"url": "http://x"}}},
-            "'t' names two of webhook, command and mqtt",
+            "'t' names two of webhook, command, mqtt and email",
         ),
     ],
 )

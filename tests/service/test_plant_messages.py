@@ -6,9 +6,11 @@ import json
 import math
 import time
 import tomllib
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import plant_writers as plants
@@ -18,6 +20,7 @@ from halls import files
 from pydantic import ValidationError
 
 from servoscope.core.errors import ConfigError, MessageError
+from servoscope.models.loop import Columns
 from servoscope.service.mapping import collector as collecting
 from servoscope.service.mapping.collector import MessageCollector
 from servoscope.service.mapping.influx import parse_lines
@@ -27,6 +30,7 @@ from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder, encode_rebirth, payload_class
 from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
+from servoscope.signals.readers import read
 
 NEW_YEAR = 1767225600.0  # 2026-01-01T00:00:00Z, the time of the page's examples
 AHEAD_S = 60.0
@@ -113,6 +117,31 @@ def test_times_in_any_unit_are_one_time(stamp: dict[str, Any], time_of: dict[str
     found = mapping.read("plant/press", json.dumps({**stamp, "r": 1, "u": None, "y": "5e3"}).encode(), 0.0)
     (r, u, y) = found.values["press"]
     assert r.t == u.t == y.t == NEW_YEAR + 0.25 and (r.value, y.value) == (1.0, 5.0) and math.isnan(u.value)
+
+
+def test_local_times_are_those_of_their_zone_also_in_the_hour_that_comes_twice(tmp_path: Path) -> None:
+    """Messages and columns of a file have the same rule: rows after the step back belong to the second hour."""
+    began = datetime(2026, 10, 25, 0, 59, 50, tzinfo=UTC).timestamp()  # ten seconds before clocks are put back
+    utc = began + 0.5 * np.arange(50)
+    local = [datetime.fromtimestamp(t, ZoneInfo("Europe/Berlin")).replace(tzinfo=None).isoformat(" ") for t in utc]
+    mapping = MessageMapping(settings(time={"t": "iso"}, time_zone="Europe/Berlin"), {"press": 2.0, "lift": 2.0}, print)
+    rows = [json.dumps({"t": t, "r": k, "u": k, "y": k}).encode() for k, t in enumerate(local)]
+    mapping.read("plant/lift", rows[-1], 0.0)  # another asset's clock says nothing of this one's
+    times = [mapping.read("plant/press", row, 0.0).values["press"][0].t for row in rows]
+    assert times == utc.tolist()
+    (tmp_path / "log.csv").write_text("t,r,u,y\n" + "".join(f"{t},{k},{k % 7},{k % 5}\n" for k, t in enumerate(local)))
+    recording = read(tmp_path / "log.csv", columns=Columns(time_zone="Europe/Berlin"))
+    assert np.allclose(recording.t, utc - began, rtol=0.0, atol=1e-6)
+    aware = json.dumps({"t": "2026-10-25T02:00:00Z", "r": 1, "u": 1, "y": 1}).encode()
+    assert mapping.read("plant/press", aware, 0.0).values["press"][0].t == began + 3610.0  # it says its own
+    refused: list[tuple[str, ...]] = []
+    mapping = MessageMapping(mapping.settings, {"press": 2.0}, lambda *one: refused.append(one))
+    assert not mapping.read(
+        "plant/press", rows[0].replace(b"2026-10-25 02:59:50", b"9999-12-31 23:59:59.999999"), 0.0
+    ).values
+    assert refused[0][1] == "times"
+    with pytest.raises(ValidationError, match="no zone of the IANA list"):
+        settings(time_zone="Europe/Bielefeld")
 
 
 def test_columns_are_dated_by_their_first_or_last_sample_or_one_by_one() -> None:

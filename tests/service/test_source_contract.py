@@ -137,6 +137,19 @@ def kafka(tmp_path: Path) -> Iterator[Harness]:
 
 
 @pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Harness]:
+    """A source of kind folder, in which two files with what the plant's messages hold lie."""
+    lines = [f"{t!r},{k},{k + 1},{k + 2}\n" for k, t in enumerate(TIMES.tolist())]
+    for name, part in (("b.csv", lines[:250]), ("a.csv", lines[240:])):
+        (tmp_path / "share").mkdir(exist_ok=True)
+        (tmp_path / "share" / name).write_text("t,r,u,y\n" + "".join(part))
+    loop = Loop.load(halls.LOOP)
+    assert loop.sample_rate == 100.0
+    settings = {"path": "share", "complete_after_s": 0.02, "poll_s": 0.02, "block": 0.5}
+    yield Harness("folder", settings, SourceAsset(loop, None), tmp_path)
+
+
+@pytest.fixture
 def opcua(tmp_path: Path) -> Iterator[Harness]:
     plant = Plant("history")
     nodes = OpcuaNodes(r=NODES["r"], u=NODES["u"], y=NODES["y"])
@@ -267,7 +280,7 @@ def test_the_recipe_for_a_source_works(follow: Callable[[str], Path]) -> None:
     (folder / "wrong.toml").write_text(text)
     one_line(
         run("run", folder / "wrong.toml", "--check"),
-        "[sources] line.kind: 'sin' is unknown, choose from kafka, mqtt, opcua, replay, sine",
+        "[sources] line.kind: 'sin' is unknown, choose from folder, kafka, mqtt, opcua, replay, sine",
     )
     (folder / "wrong.toml").write_text(text.replace('"sin"', '"sine"').replace("blocks", "block"))
     one_line(run("run", folder / "wrong.toml", "--check"), "[sources] line.block: unknown key, did you mean 'blocks'?")

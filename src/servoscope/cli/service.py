@@ -85,10 +85,12 @@ def run(
         raise ConfigError("--online: give it together with --check, which follows nothing")
     if check:
         with prefix_file_name(config):
-            check_service_file(settings)
+            lines = check_service_file(settings)
         counts = {"asset": len(settings.assets), "source": len(settings.sources)}
         counted = ", ".join(count_words(count, noun, "en") for noun, count in counts.items())
         typer.echo(f"{config}: {counted}; all can be used")
+        for line in lines:
+            typer.echo(line)
         if online:
             commission(settings, listen_s)
         return

@@ -4,6 +4,7 @@
       ServoscopeError            the base of all
         LoopError                a loop file or a setting is wrong
         RecordingError           a recording cannot be used
+          EmptyRecordingError    it is a file without a row
           NotEnoughError         it is usable as a file, but too short or too still to learn from
           IrregularTimeError     its rows come at no fixed rate, and nobody said that they are to be resampled
         BaselineError            a baseline file is unusable, or of another version
@@ -32,6 +33,10 @@ class LoopError(ServoscopeError):
 
 class RecordingError(ServoscopeError):
     """A recording cannot be used."""
+
+
+class EmptyRecordingError(RecordingError):
+    """A file holds no row."""
 
 
 class NotEnoughError(RecordingError):

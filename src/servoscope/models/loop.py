@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     Field,
     SerializeAsAny,
     ValidationError,
@@ -31,6 +32,19 @@ MAX_DELAY_SAMPLES = 100  # samples; a longer one is a delay in ms given as s, as
 MIN_FREQUENCY_SHARE = 1e-6  # of the sample rate: a slower filter would take millions of samples to settle
 
 Interval = tuple[Finite, Finite]
+
+
+def _check_zone(value: str) -> str:
+    from zoneinfo import ZoneInfo
+
+    try:
+        ZoneInfo(value)
+    except (KeyError, ValueError, OSError):
+        raise ValueError(f"{value!r} is no zone of the IANA list, give one as Europe/Berlin") from None
+    return value
+
+
+TimeZone = Annotated[NonEmptyStr, AfterValidator(_check_zone)]  # its name, as Europe/Berlin
 
 
 class TextLayout(Settings):
@@ -57,20 +71,8 @@ class Columns(Settings):
     segment: tuple[NonEmptyStr, ...] = ()  # columns whose change starts a new run; a time reset does too
     resample: bool = False  # whether rows are put on the loop's sample rate, where logs come irregularly or at another
     # zone of dates and times that are written in local time, as Europe/Berlin; None: they count as they are written
-    time_zone: NonEmptyStr | None = None
+    time_zone: TimeZone | None = None
     text: TextLayout | None = None  # of text files whose table is not found by itself
-
-    @field_validator("time_zone")
-    @classmethod
-    def _known_zone(cls, value: str | None) -> str | None:
-        if value is not None:
-            from zoneinfo import ZoneInfo
-
-            try:
-                ZoneInfo(value)
-            except (KeyError, ValueError, OSError):
-                raise ValueError(f"{value!r} is no zone of the IANA list, give one as Europe/Berlin") from None
-        return value
 
     @field_validator("output")
     @classmethod

@@ -17,8 +17,8 @@ from servoscope.core.settings_errors import suggest_name
 from servoscope.design.operating_limits import LimitKind, OperatingLimit, operating_limits
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.models.loop import Loop
-from servoscope.service.actions import CommandSettings, WebhookSettings, load_secret
-from servoscope.service.actions.settings import Sink
+from servoscope.service.actions import CommandSettings, EmailSettings, WebhookSettings, load_secret
+from servoscope.service.actions.settings import SINKS, Sink
 from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.checkpoint import StreamPosition, unpack_state
 from servoscope.service.assets.examination import compile_examination
@@ -131,12 +131,16 @@ def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, BlockS
     return assets, _build_sources(visit, assets)
 
 
-def check_service_file(config: ServiceFile) -> None:
-    """Read all that a service file names but the store; raises ServoscopeError if something cannot be used."""
+def check_service_file(config: ServiceFile) -> list[str]:
+    """Read all that a service file names but the store; return what sources would do, line by line.
+
+    Raises ServoscopeError if something cannot be used.
+    """
     assets = build_assets(config)
     check_actions(config, assets)
-    _build_sources(config, assets)
+    sources = _build_sources(config, assets)
     _build_publishers(config)
+    return [f"[sources] {name}: {line}" for name, source in sources.items() for line in source.preview()]
 
 
 def open_source(config: ServiceFile, name: str, source: BlockSource, assets: Mapping[str, Asset]) -> None:
@@ -199,7 +203,9 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
         asked = path, point, frozenset(limits.items())
         if asked not in resolved:  # many assets are of one loop
             resolved[asked] = _resolve_limits(shared[path, point][0].loop, limits, name)
-        policy = replace(policy, limits=resolved[asked])
+        pause_s = config.sources[settings.source].pause_s
+        sound = config.quality.model_copy(update={"silent_s": config.quality.silent_s + pause_s})
+        policy = replace(policy, limits=resolved[asked], quality=sound)
         assets[name] = Asset(name, *shared[path, point], policy, settings.group, settings.source)
     known = [fault.name for one in assets.values() for fault in one.baseline.loop.plant.all_faults]
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
@@ -284,8 +290,8 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
     Raises ConfigError if one of them does not exist: alarms would not be sent, which would go unnoticed.
     """
     settings = config.actions.resolve_paths(config.folder)
-    for kind, sinks in (("webhook", settings.webhook), ("command", settings.command), ("mqtt", settings.mqtt)):
-        for name, sink in sinks.items():
+    for kind in SINKS:
+        for name, sink in getattr(settings, kind).items():
             where = f"[actions] {kind}.{name}"
             _check_names(f"{where}.assets", "asset", sink.assets or (), [*assets, config.name])
             _check_names(f"{where}.alarms", "alarm", sink.alarms or (), config.alarms.definitions)
@@ -302,7 +308,7 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
 
 
 def _check_sink(where: str, sink: Sink) -> None:
-    if isinstance(sink, WebhookSettings):
+    if isinstance(sink, WebhookSettings | EmailSettings):
         try:
             load_secret(sink)
         except ValueError as error:

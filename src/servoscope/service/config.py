@@ -210,6 +210,8 @@ class ServiceFile(FileSettings):
                 raise ValueError(f"[{section}] {name}.client: leave it out, each of several workers needs its own")
             if isinstance(settings, PublisherSettings) and settings.listens:
                 raise ValueError(f"[outlets] {name}: one process has its address, so that [service] workers must be 1")
+            if isinstance(settings, SourceSettings) and settings.is_exclusive:
+                raise ValueError(f"[sources] {name}: one process moves its files, so that [service] workers must be 1")
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:

@@ -16,6 +16,7 @@ BUILT_IN = tuple(  # written like the entry points of other packages, and loaded
     EntryPoint(name, f"servoscope.service.{value}", group)
     for group, name, value in (
         (SOURCES, "replay", "sources.replay:ReplaySettings"),
+        (SOURCES, "folder", "sources.folder:FolderSettings"),
         (SOURCES, "mqtt", "mqtt.source:MqttSourceSettings"),
         (SOURCES, "opcua", "opcua.source:OpcuaSourceSettings"),
         (SOURCES, "kafka", "kafka.source:KafkaSourceSettings"),

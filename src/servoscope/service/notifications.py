@@ -12,6 +12,7 @@ from servoscope.core.messages import message, render
 from servoscope.core.settings_errors import suggest_name
 from servoscope.service import actions
 from servoscope.service.actions import ActionSettings, FaultToleranceState, OutboxEntry
+from servoscope.service.actions.outbox import QUIET_STATES
 from servoscope.service.alarms import (
     FAULT_ALARM,
     AlarmSettings,
@@ -19,7 +20,6 @@ from servoscope.service.alarms import (
     AlarmTransition,
     AssetSnapshot,
     FloodState,
-    LifecycleState,
     Notification,
     OperatorCommand,
     advance_flood,
@@ -32,12 +32,6 @@ from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.assets.records import StepResult, TableRow, audit_row, transition_row
 
 VERSION = 1
-NO_NOTIFICATION_STATES = (
-    LifecycleState.NORMAL,
-    LifecycleState.SHELVED,
-    LifecycleState.SUPPRESSED,
-    LifecycleState.OUT_OF_SERVICE,
-)
 
 
 class Notifier:
@@ -137,7 +131,7 @@ class Notifier:
         There are none if operators were not notified of the alarm itself: it is shelved, or held in a flood.
         """
         alarm = alarms.get(FAULT_ALARM)
-        if alarm is None or alarm.state in NO_NOTIFICATION_STATES:
+        if alarm is None or alarm.state in QUIET_STATES:
             return []
         if any(one.key == (alarm.asset, FAULT_ALARM) for one in self._flood.held):
             return []

@@ -298,11 +298,13 @@ class Service:
             fresh = name not in of_assets and reception.is_fresh(self._listening.seconds, fresh_s)
             if fresh and before is RECEPTION_OK:
                 continue  # nearly all of them, nearly always
-            patience_s, own = self.config.quality.silent_s, of_assets.get(name)
+            pause_s = self.sources[source].pause_s
+            patience_s, own = max(asset.policy.quality.silent_s, pause_s), of_assets.get(name)
             if not math.isinf(self.sources[source].next_block_s):
                 asset.reception = reception.evaluate(self._listening.seconds, patience_s, trouble, own)
             silence, result = reception.silence_s(self._listening.seconds), StepResult([], [])
-            if silence >= HOUSEKEEPING_EVERY_S:
+            is_expected = math.isinf(pause_s) or (silence < pause_s and not asset.heard)
+            if silence >= HOUSEKEEPING_EVERY_S and not is_expected:
                 result = asset.advance_time(silence * self.sources[source].clock_rate)
                 self.handle_result(asset, result)
             if result.rows or asset.reception != before:

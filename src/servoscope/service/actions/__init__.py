@@ -1,4 +1,4 @@
-"""What is done about alarms: webhooks, commands and fault-tolerant changes, each at least once by an outbox.
+"""What is done about alarms: webhooks, commands, mails and fault-tolerant changes, each at least once by an outbox.
 
 settings = ActionSettings.model_validate(section)
 entries = transition_entries(settings, transition, priority, now)  # stored with the transition, in one transaction
@@ -23,6 +23,7 @@ from servoscope.service.actions.outbox import (
 from servoscope.service.actions.settings import (
     ActionSettings,
     CommandSettings,
+    EmailSettings,
     FaultToleranceSettings,
     MqttMessageSettings,
     RetrySettings,
@@ -30,7 +31,8 @@ from servoscope.service.actions.settings import (
 )
 
 __all__ = [
-    "ActionSettings", "CommandSettings", "ControlChange", "DeliveryAttempt", "FaultToleranceSettings",
+    "ActionSettings", "CommandSettings", "ControlChange", "DeliveryAttempt", "EmailSettings",
+    "FaultToleranceSettings",
     "FaultToleranceState", "MqttMessageSettings", "OutboxEntry", "RetrySettings", "WebhookSettings",
     "accommodate_fault", "deliver", "diagnosis_entries", "flood_entries", "idempotency_key", "initial_tolerance_state",
     "load_secret", "signature", "transition_entries",

@@ -1,4 +1,4 @@
-"""One attempt to deliver an entry of the outbox: a signed POST, a program run without a shell, an MQTT message."""
+"""One attempt to deliver an entry of the outbox: a signed POST, a program without a shell, an MQTT message, a mail."""
 
 from __future__ import annotations
 
@@ -12,18 +12,22 @@ import ssl
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from servoscope.core.addresses import hide_secrets, show_address
 from servoscope.core.errors import ConfigError
+from servoscope.service.actions.mail import send_mail
 from servoscope.service.actions.outbox import DeliveryAttempt, OutboxEntry, schedule_retry
 from servoscope.service.actions.settings import (
     PLACEHOLDERS,
+    SINK_NAMES,
     ActionSettings,
     CommandSettings,
+    EmailSettings,
     MqttMessageSettings,
+    SecretSettings,
     Sink,
     WebhookSettings,
 )
@@ -48,14 +52,31 @@ def deliver(row: OutboxEntry, settings: ActionSettings, now: float) -> DeliveryA
 
     It blocks for up to the sink's `timeout_s`, and raises nothing.
     """
-    sink, attempt = settings.sinks.get(row.sink), (row.key, row.sink, now, row.attempts + 1)
+    return deliver_together([row], settings, now)[0]
+
+
+def deliver_together(rows: Sequence[OutboxEntry], settings: ActionSettings, now: float) -> list[DeliveryAttempt]:
+    """Do what `deliver` does for entries of one sink at once; only a mail takes several."""
+    name = rows[0].sink
+    sink = settings.sinks.get(name)
     try:
         if sink is None:
-            raise _DeliveryError(f"no webhook, command or mqtt is called {row.sink!r} any more")
-        return DeliveryAttempt(*attempt, True, _send(row, sink))
-    except _DeliveryError as failure:
-        again = schedule_retry(settings.retry, row, now, failure.min_wait_s)
-        return DeliveryAttempt(*attempt, False, _shorten(hide_secrets(str(failure))), again)
+            raise _DeliveryError(f"none of {SINK_NAMES} is called {name!r} any more")
+        outcome, failure = _send(rows, sink), None
+    except _DeliveryError as error:
+        outcome, failure = _shorten(hide_secrets(str(error))), error
+    return [
+        DeliveryAttempt(
+            row.key,
+            row.sink,
+            now,
+            row.attempts + 1,
+            failure is None,
+            outcome,
+            None if failure is None else schedule_retry(settings.retry, row, now, failure.min_wait_s),
+        )
+        for row in rows
+    ]
 
 
 def signature(secret: bytes, timestamp: str, body: bytes) -> str:
@@ -63,7 +84,8 @@ def signature(secret: bytes, timestamp: str, body: bytes) -> str:
     return "sha256=" + hmac.new(secret, timestamp.encode() + b"." + body, hashlib.sha256).hexdigest()
 
 
-def _send(row: OutboxEntry, sink: Sink) -> str:
+def _send(rows: Sequence[OutboxEntry], sink: Sink) -> str:
+    row = rows[0]
     match sink:
         case WebhookSettings():
             return _post(row, sink)
@@ -71,6 +93,16 @@ def _send(row: OutboxEntry, sink: Sink) -> str:
             return _run_command(row, sink)
         case MqttMessageSettings():
             return _publish(row, sink)
+        case EmailSettings():
+            return _mail(rows, sink)
+
+
+def _mail(rows: Sequence[OutboxEntry], sink: EmailSettings) -> str:
+    try:
+        secret = load_secret(sink)
+        return send_mail(rows[0].key, [row.event for row in rows], sink, secret.decode() if secret else None)
+    except (ValueError, OSError, ConfigError) as error:
+        raise _DeliveryError(f"{sink.host}: {error}") from None
 
 
 def _publish(row: OutboxEntry, sink: MqttMessageSettings) -> str:
@@ -181,8 +213,8 @@ def _checked_request(sink: WebhookSettings) -> _Target:
     return _Target(url.copy_with(host=address), {"Host": url.netloc.decode()}, name, verify, False)
 
 
-def load_secret(sink: WebhookSettings) -> bytes | None:
-    """Return the secret that a webhook is signed with; None where it is not signed; ValueError if it is missing."""
+def load_secret(sink: SecretSettings) -> bytes | None:
+    """Return the secret of a sink; None where it has none; ValueError if it is missing."""
     if sink.secret_env is not None:
         value = os.environ.get(sink.secret_env, "")
         if not value:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Sequence
 from queue import SimpleQueue
 
 from servoscope.core.errors import StoreError
 from servoscope.service.actions import ActionSettings, DeliveryAttempt, OutboxEntry
-from servoscope.service.actions.delivery import deliver
+from servoscope.service.actions.delivery import deliver_together
+from servoscope.service.actions.mail import HourlyLimit
+from servoscope.service.actions.settings import EmailSettings
 from servoscope.service.clock import SteadyClock
 from servoscope.service.store import OutboxRow, Store
 
 POLL_S = 0.5
 MAX_ROWS = 20
+MAX_ROWS_AS_ONE = 500  # of a sink that has been held
 
 
 class OutboxDispatcher:
@@ -24,6 +28,8 @@ class OutboxDispatcher:
         self._attempts: SimpleQueue[DeliveryAttempt] = SimpleQueue()
         self._in_progress: dict[tuple[str, int], str] = {}  # key and attempt -> sink, until the attempt is stored
         self._busy: set[str] = set()  # sinks that something is being delivered to
+        self._limits: dict[str, HourlyLimit] = {}  # of sinks that take only so much an hour
+        self._held: dict[str, float] = {}  # until when they take no more, by the monotonic clock; then all as one
         self._stop_event = threading.Event()
         self._thread = threading.Thread(target=self._run, name="delivery", daemon=True)
         self.idle = not settings.sinks  # whether nothing was due at the last poll
@@ -53,9 +59,14 @@ class OutboxDispatcher:
 
     def _run(self) -> None:
         while not self._stop_event.wait(POLL_S):
-            busy = set(self._busy)
+            busy, now, settings = set(self._busy), self._clock.now(), self._settings
+            until_by_sink = self._held.copy()
+            held = {sink for sink, until in until_by_sink.items() if until > time.monotonic()}
             try:
-                rows = self._store.due_deliveries(self._clock.now(), MAX_ROWS, self._service, busy)
+                rows = self._store.due_deliveries(now, MAX_ROWS, self._service, busy | held)
+                for sink in until_by_sink.keys() - held - busy:
+                    others = settings.sinks.keys() - {sink}
+                    rows += self._store.due_deliveries(now, MAX_ROWS_AS_ONE, self._service, others)
             except StoreError:
                 continue  # the service notices for itself
             due = {(row["key"], row["attempts"]): row for row in rows}
@@ -71,12 +82,24 @@ class OutboxDispatcher:
     def _deliver_rows(self, sink: str, rows: Sequence[OutboxRow]) -> None:
         """Deliver to one sink, one after the other."""
         try:
-            for row in rows:
+            sink_settings = self._settings.sinks.get(sink)
+            limit = self._limits.setdefault(sink, HourlyLimit())
+            entries = [
+                OutboxEntry(row["key"], row["sink"], row["event"], row["created"], row["due"] or 0.0, row["attempts"])
+                for row in rows
+            ]
+            together = isinstance(sink_settings, EmailSettings) and self._held.pop(sink, None) is not None
+            for group in [entries] if together else [[entry] for entry in entries]:
                 if self._stop_event.is_set():
                     return
-                entry = OutboxEntry(
-                    row["key"], row["sink"], row["event"], row["created"], row["due"] or 0.0, row["attempts"]
-                )
-                self._attempts.put(deliver(entry, self._settings, self._clock.now()))
+                wait_s = limit.wait_s(sink_settings.per_hour) if isinstance(sink_settings, EmailSettings) else 0.0
+                if wait_s:
+                    self._held[sink] = time.monotonic() + wait_s
+                    return
+                attempts = deliver_together(group, self._settings, self._clock.now())
+                if attempts[0].delivered:
+                    limit.count()
+                for attempt in attempts:
+                    self._attempts.put(attempt)
         finally:
             self._busy.discard(sink)

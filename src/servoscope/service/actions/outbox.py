@@ -10,10 +10,17 @@ from typing import Any
 from servoscope.service.actions.settings import DIAGNOSIS_EVENT, ActionSettings, RetrySettings
 from servoscope.service.alarms import AlarmState, AlarmTransition, LifecycleState, Notification, Priority, alarm_kind
 
+QUIET_STATES = (  # in which nobody has to answer an alarm
+    LifecycleState.NORMAL,
+    LifecycleState.SHELVED,
+    LifecycleState.SUPPRESSED,
+    LifecycleState.OUT_OF_SERVICE,
+)
+
 
 @dataclass(frozen=True)
 class OutboxEntry:
-    """One event for one webhook, command or broker, until it is delivered; times are (epoch, s).
+    """One event for one webhook, command, broker or mail, until it is delivered; times are (epoch, s).
 
     It is written in the same transaction as the transition that it reports, and removed, or put off, after a
     delivery: so it is delivered at least once, and again after a crash in between. Receivers recognise a repetition
@@ -21,7 +28,7 @@ class OutboxEntry:
     """
 
     key: str  # idempotency key: the same for every attempt at the same event, and for no other
-    sink: str  # name of the webhook, command or message
+    sink: str  # name of the webhook, command, message or mail
     event: dict[str, Any]  # what is sent; plain values, ready for JSON
     created: float
     due: float  # when it is to be tried next
@@ -101,6 +108,9 @@ def _alarm_entries(
             (sink.events, event["event"]),
             (sink.states, state),
         )
+        again = event["before"] not in QUIET_STATES and state is LifecycleState.UNACKNOWLEDGED
+        if sink.once_per_episode and again:
+            continue
         if all(accepted is None or value in accepted for accepted, value in filters):
             entries.append(_entry(name, key, event, now))
     return tuple(entries)

@@ -1,12 +1,13 @@
-"""What is done about alarms, from the section `[actions]`: webhooks, commands, fault-tolerant changes."""
+"""What is done about alarms, from the section `[actions]`: webhooks, commands, mails, fault-tolerant changes."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections import Counter
+from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -31,6 +32,8 @@ MAX_RATIO = 1e3  # ratio to healthy, or its inverse, beyond which a change is no
 PLACEHOLDERS = ("key", "time", "asset", "alarm", "event", "after", "priority", "quantity", "value", "previous")
 
 
+SINKS = ("webhook", "command", "mqtt", "email")  # keys of the tables of those that are told
+SINK_NAMES = f"{', '.join(SINKS[:-1])} and {SINKS[-1]}"
 TLS_FILES = ("ca_file", "cert_file", "key_file")
 
 
@@ -48,6 +51,8 @@ class RetrySettings(Settings):
 class SinkSettings(Settings):
     """Which events are sent, and how long an attempt may take."""
 
+    once_per_episode: ClassVar[bool] = False  # whether an alarm that comes again before it was normal is no news
+
     alarms: tuple[NonEmptyStr, ...] | None = None  # alarms, assets: names that concern it; None: all
     assets: tuple[NonEmptyStr, ...] | None = None
     # priorities, events, states: which of their transitions, the states being those entered; None: all. By default a
@@ -63,13 +68,29 @@ class SinkSettings(Settings):
     timeout_s: Positive = 10.0  # how long one attempt may take [s]
 
 
-class WebhookSettings(TlsSettings, SinkSettings):
+class SecretSettings(SinkSettings):
+    """Such a table with a secret: that of the signature, or a password; none: there is none."""
+
+    # secret_env, secret_file: the environment variable or file with it
+    secret_env: NonEmptyStr | None = None
+    secret_file: NonEmptyStr | None = None
+
+    @property
+    def has_secret(self) -> bool:
+        """Whether one is named."""
+        return self.secret_env is not None or self.secret_file is not None
+
+    @model_validator(mode="after")
+    def _check_one_secret(self) -> Self:
+        if self.secret_env is not None and self.secret_file is not None:
+            raise ValueError("give secret_env or secret_file, not both")
+        return self
+
+
+class WebhookSettings(TlsSettings, SecretSettings):
     """A POST of the event as JSON; over https the other side has to prove its identity."""
 
     url: NonEmptyStr  # where to; http or https
-    # secret_env, secret_file: the environment variable or file with the secret of the signature; none: no signature
-    secret_env: NonEmptyStr | None = None
-    secret_file: NonEmptyStr | None = None
 
     @field_validator("url")
     @classmethod
@@ -84,9 +105,7 @@ class WebhookSettings(TlsSettings, SinkSettings):
         return value
 
     @model_validator(mode="after")
-    def _check_secret(self) -> Self:
-        if self.secret_env is not None and self.secret_file is not None:
-            raise ValueError("give secret_env or secret_file, not both")
+    def _check_certificates(self) -> Self:
         if self.has_certificates and not self.url.lower().startswith("https:"):
             raise ValueError("url: certificates are given, but it is no https://")
         if self.key_file is not None and self.cert_file is None:
@@ -123,7 +142,34 @@ class MqttMessageSettings(SinkSettings):
     topic: Annotated[str, Field(strict=True, pattern=r"^[^#+\x00]+$", max_length=1000)]
 
 
-Sink = WebhookSettings | CommandSettings | MqttMessageSettings
+MailAddress = Annotated[str, Field(strict=True, pattern=r"^[^@\s,;<>]+@[^@\s,;<>]+$", max_length=254)]
+
+
+class EmailSettings(TlsSettings, SecretSettings):
+    """A mail in plain text, one for each episode of an alarm; the secret is the password of `user`."""
+
+    once_per_episode: ClassVar[bool] = True
+
+    host: NonEmptyStr  # host, port: the server that takes mails; None: 465 with ``tls``, else 587
+    port: Annotated[int, Field(strict=True, ge=1, le=65535)] | None = None
+    encryption: Literal["starttls", "tls", "none"] = "starttls"  # the server has to prove its identity
+    user: NonEmptyStr | None = None  # who we are to it; None: it asks nobody
+    sender: MailAddress
+    to: Annotated[tuple[MailAddress, ...], Field(min_length=1)]
+    address: Annotated[str, Field(strict=True, pattern=r"^https?://\S+$")] | None = None  # of the pages, for links
+    per_hour: PositiveInt = 20  # most mails within an hour; what is beyond waits, and comes as one
+    states: tuple[LifecycleState, ...] | None = (LifecycleState.UNACKNOWLEDGED,)
+
+    @model_validator(mode="after")
+    def _check_user(self) -> Self:
+        if (self.user is None) == self.has_secret:
+            raise ValueError("user: give it with secret_env or secret_file, or neither")
+        if self.encryption == "none" and (self.has_secret or self.has_certificates):
+            raise ValueError('encryption: "none" would send the password in the clear, write "starttls" or "tls"')
+        return self
+
+
+Sink = WebhookSettings | CommandSettings | MqttMessageSettings | EmailSettings
 
 
 class FaultToleranceSettings(Settings):
@@ -173,23 +219,24 @@ class ActionSettings(Settings):
     webhook: dict[ActionName, WebhookSettings] = Field(default_factory=dict)
     command: dict[ActionName, CommandSettings] = Field(default_factory=dict)
     mqtt: dict[ActionName, MqttMessageSettings] = Field(default_factory=dict)
+    email: dict[ActionName, EmailSettings] = Field(default_factory=dict)
     tolerance: dict[ActionName, FaultToleranceSettings] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:
-        twice = [name for name, count in Counter([*self.webhook, *self.command, *self.mqtt]).items() if count > 1]
+        twice = [name for name, count in Counter(chain(*(getattr(self, key) for key in SINKS))).items() if count > 1]
         if twice:
-            raise ValueError(f"{min(twice)!r} names two of webhook, command and mqtt, rename one")
+            raise ValueError(f"{min(twice)!r} names two of {SINK_NAMES}, rename one")
         for name, one in self.tolerance.items():
-            if one.sink is not None and one.sink not in self.sinks:
+            if one.sink is not None and (one.sink in self.email or one.sink not in self.sinks):
                 raise ValueError(f"tolerance.{name}: sink: no webhook, command or mqtt is called {one.sink!r}")
         return self
 
     def resolve_paths(self, folder: Path) -> ActionSettings:
         """Return the same with the paths of programs and secrets relative to a folder; plain names stay names."""
-        webhook, command, mqtt = dict(self.webhook), dict(self.command), dict(self.mqtt)
-        for name, hook in webhook.items():
-            webhook[name] = _with_paths(hook, folder, "secret_file", *TLS_FILES)
+        command, mqtt = dict(self.command), dict(self.mqtt)
+        webhook = {name: _with_paths(one, folder, "secret_file", *TLS_FILES) for name, one in self.webhook.items()}
+        email = {name: _with_paths(one, folder, "secret_file", *TLS_FILES) for name, one in self.email.items()}
         for name, message in mqtt.items():
             broker = _with_paths(message.broker, folder, "password_file", *TLS_FILES)
             mqtt[name] = message.model_copy(update={"broker": broker})
@@ -197,13 +244,14 @@ class ActionSettings(Settings):
             if "/" in tool.argv[0]:
                 argv = (str(folder / tool.argv[0]), *tool.argv[1:])
                 command[name] = tool.model_copy(update={"argv": argv})
-        return self.model_copy(update={"webhook": webhook, "command": command, "mqtt": mqtt})
+        return self.model_copy(update={"webhook": webhook, "command": command, "mqtt": mqtt, "email": email})
 
     def with_network(self, network: NetworkSettings) -> ActionSettings:
         """Return the same with rules for those that have none of their own."""
         brokers = apply_network({name: one.broker for name, one in self.mqtt.items()}, network)
         mqtt = {name: one.model_copy(update={"broker": brokers[name]}) for name, one in self.mqtt.items()}
-        return self.model_copy(update={"webhook": apply_network(self.webhook, network), "mqtt": mqtt})
+        webhook, email = apply_network(self.webhook, network), apply_network(self.email, network)
+        return self.model_copy(update={"webhook": webhook, "mqtt": mqtt, "email": email})
 
     def with_service_name(self, before: str, name: str) -> Self:
         """Return them with another name of the service, where sinks are limited to its own alarms."""
@@ -216,12 +264,12 @@ class ActionSettings(Settings):
                 for key, one in sinks.items()
             }
 
-        return self.model_copy(update={key: renamed(getattr(self, key)) for key in ("webhook", "command", "mqtt")})
+        return self.model_copy(update={key: renamed(getattr(self, key)) for key in SINKS})
 
     @property
     def sinks(self) -> dict[str, Sink]:
-        """Webhooks, commands and messages, by name."""
-        return {**self.webhook, **self.command, **self.mqtt}
+        """Webhooks, commands, messages and mails, by name."""
+        return {name: sink for key in SINKS for name, sink in getattr(self, key).items()}
 
 
 S = TypeVar("S", bound=Settings)

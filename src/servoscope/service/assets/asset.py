@@ -242,7 +242,7 @@ class Asset(StateHolder):
             quality_state, changed = quality.tick(self._limits, state.quality, now)
             self._ticked |= bool(changed)
         self.state = replace(state, quality=quality_state)
-        if changed or not self.heard or "silent" in quality.active_findings(quality_state):
+        if changed or self.reception != RECEPTION_OK or "silent" in quality.active_findings(quality_state):
             self._advance_alarms(now)
         return self._result
 

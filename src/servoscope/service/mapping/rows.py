@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from servoscope.core.errors import ConfigError, MessageError
 from servoscope.service.mapping.influx import parse_lines
 from servoscope.service.mapping.paths import (
@@ -24,6 +26,7 @@ from servoscope.service.mapping.sparkplug import SparkplugDecoder
 from servoscope.service.mqtt.payload import parse_json
 from servoscope.service.sources.assembly import SIGNALS
 from servoscope.service.sources.block import MAX_TIME_S
+from servoscope.signals.readers.clock import ZoneOffset
 
 PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts
 MAX_STAMP = 10**30  # beyond any time, in any unit
@@ -75,6 +78,8 @@ class MessageMapping:
             (split_path(path), one if isinstance(one, list) else [one]) for path, one in settings.good.items()
         ]
         self._time = [(split_path(path), unit) for path, unit in settings.time.items()]
+        zone = settings.time_zone
+        self._zones = {name: ZoneOffset(zone) for name in rates} if zone is not None else {}  # each has a last time
         self._fields = [split_path(one) for one in settings.fields.all]
         self._by_name = {name: k for k, name in enumerate(settings.fields.all)} if settings.has_signal_names else {}
         self._value = split_path(settings.value)
@@ -151,7 +156,7 @@ class MessageMapping:
             try:
                 signals = self._read_signals(around, row_names, extra)
                 if signals:
-                    made = self._read_values(around, signals, received_at, self._rates[asset])
+                    made = self._read_values(around, signals, received_at, asset)
                     values.setdefault(asset, []).extend(made)
                 complete = complete and len(signals.keys() & _ALWAYS) == len(SIGNALS)
             except MessageError as error:
@@ -210,9 +215,9 @@ class MessageMapping:
         return signals
 
     def _read_values(
-        self, around: list[Any], signals: dict[int, Any], received_at: float, rate: float
+        self, around: list[Any], signals: dict[int, Any], received_at: float, asset: str
     ) -> Iterable[SignalValue]:
-        stamps = self._read_times(around, received_at)
+        stamps = self._read_times(around, received_at, asset)
         good = all(find_around(around, path) in contents for path, contents in self._good)
         if not any(isinstance(one, list) for one in signals.values()) and isinstance(stamps, float):
             return [SignalValue(k, stamps, self._number(k, one, good)) for k, one in signals.items()]
@@ -221,7 +226,7 @@ class MessageMapping:
             raise MessageError("lengths", f"lists of {' and '.join(map(str, sorted(lengths)))} values in one row")
         n = lengths.pop() if lengths else 1
         if isinstance(stamps, float):
-            step = self.settings.step_s or 1.0 / rate
+            step = self.settings.step_s or 1.0 / self._rates[asset]
             first = stamps if self.settings.stamp == "first" else stamps - (n - 1) * step
             stamps = [first + k * step for k in range(n)]
         if len(stamps) != n:
@@ -236,8 +241,8 @@ class MessageMapping:
         """Return whether a signal has a value of each sample; a covariate may have one for all, of the first."""
         return signal in _ALWAYS or isinstance(value, list)
 
-    def _read_times(self, around: list[Any], received_at: float) -> float | list[float]:
-        """Return the time stamp of a row, or of each of its samples [UTC s]."""
+    def _read_times(self, around: list[Any], received_at: float, asset: str) -> float | list[float]:
+        """Return the time stamp of a row of an asset, or of each of its samples [UTC s]."""
         if not self._time:
             return received_at
         total: float | list[float] = 0.0
@@ -247,17 +252,31 @@ class MessageMapping:
                 where = ".".join(map(str, path))
                 raise MessageError("times", f"no time stamp at {where!r}, {describe_keys(around[0])}")
             if isinstance(stamp, list):
-                many = [_parse_time(one, unit) for one in stamp]
+                many = [self._parse_time(one, unit, asset) for one in stamp]
                 before = total if isinstance(total, list) else [total] * len(many)
                 if len(before) != len(many):
                     raise MessageError("lengths", "time stamps of different numbers")
                 total = [one + other for one, other in zip(before, many, strict=True)]
             else:
-                one = _parse_time(stamp, unit)
+                one = self._parse_time(stamp, unit, asset)
                 total = [other + one for other in total] if isinstance(total, list) else total + one
         if not all(0.0 <= t < MAX_TIME_S for t in (total if isinstance(total, list) else [total])):
             raise MessageError("times", "a time stamp outside of the years 1970 to 9999: is its unit right?")
         return total
+
+    def _parse_time(self, value: Any, unit: str, asset: str) -> float:
+        if unit != "iso" and not (type(value) is int and abs(value) < MAX_STAMP):
+            return _parse_number(value, "time stamp") / PER_SECOND[unit]
+        if unit != "iso":
+            return float(value / PER_SECOND[unit])
+        try:
+            moment = datetime.fromisoformat(value)
+            if moment.tzinfo is not None:
+                return moment.timestamp()
+            written, zone = moment.replace(tzinfo=UTC).timestamp(), self._zones.get(asset)
+            return written if zone is None else written - float(zone.offsets(np.array([written]))[0])
+        except (TypeError, ValueError, OverflowError):
+            raise MessageError("times", f"{str(value)[:40]!r} is no date") from None
 
     def _number(self, signal: int, value: Any, good: bool) -> float:
         if value is None or not good:
@@ -280,15 +299,3 @@ def _parse_number(value: Any, what: str) -> float:
         return float(value)
     except (ValueError, OverflowError):
         raise MessageError("wrong type", f"{what}: {str(value)[:40]!r} is no number that a computer can hold") from None
-
-
-def _parse_time(value: Any, unit: str) -> float:
-    if unit != "iso" and not (type(value) is int and abs(value) < MAX_STAMP):
-        return _parse_number(value, "time stamp") / PER_SECOND[unit]
-    if unit != "iso":
-        return float(value / PER_SECOND[unit])
-    try:
-        found = datetime.fromisoformat(value)
-        return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
-    except (TypeError, ValueError, OverflowError):
-        raise MessageError("times", f"{str(value)[:40]!r} is no date") from None

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings
+from servoscope.models.loop import TimeZone
 from servoscope.service.config_types import Seconds
 from servoscope.service.mapping.paths import ASSET, SIGNAL, RowPath, TextPattern
 
@@ -93,6 +94,7 @@ class PayloadSettings(Settings):
     value: Text = ""  # path of the value, where {signal} says of which signal it is
     # paths of the time stamp, with their units: s, ms, us, ns, iso; several are added; none: when the message came
     time: dict[NonEmptyStr, TimeUnit] = Field(default_factory=dict)
+    time_zone: TimeZone | None = None  # of ``iso`` times that are local, as Europe/Berlin; None: they are UTC
     stamp: Literal["first", "last"] = "first"  # which sample of a list a single time stamp is of
     step_s: Positive | None = None  # time between two samples of a list with one time stamp [s]; None: that of the loop
     good: dict[NonEmptyStr, Any] = Field(default_factory=dict)  # what tells that a value is good: paths and contents

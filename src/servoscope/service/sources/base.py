@@ -6,7 +6,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
@@ -97,6 +97,15 @@ class BlockSource(ABC):
         """Processor time of threads of its own so far, by layer [s]: receive, decode."""
         return {}
 
+    @property
+    def pause_s(self) -> float:
+        """How long an asset may pause without being silent [s]; infinite while something of it may be on its way."""
+        return 0.0
+
+    def preview(self) -> Sequence[str]:
+        """Return what it would do, line by line, for somebody who checks a service file; it need not be open."""
+        return ()
+
     @abstractmethod
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Start; assets in `resume` continue behind that sequence, others start at their beginning."""
@@ -151,6 +160,16 @@ class SourceSettings(Settings):
     def is_visit(self) -> bool:
         """Whether the client only listens, and may hear what is not for its assets, too."""
         return self._is_visit
+
+    @property
+    def pause_s(self) -> float:
+        """How long an asset may pause, as a rule, without being silent [s]."""
+        return 0.0
+
+    @property
+    def is_exclusive(self) -> bool:
+        """Whether one process has to follow all its assets."""
+        return False
 
     def carries(self, covariate: str, address: Any) -> bool:
         """Return whether blocks of an asset carry a covariate; `address`: the value of `asset_key`, if there is one."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from servoscope.core.errors import RecordingError
+from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.guess_columns import WORDS
 from servoscope.signals.readers.layout import check_names, count_numeric, find_table
@@ -72,7 +72,7 @@ def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) 
     plain = ["" if line.lstrip().startswith(comments) else line for line in lines]
     plain[: text.skip_rows] = [""] * min(text.skip_rows, len(plain))
     if not any(line.strip() for line in plain):
-        raise RecordingError(f"{path}: holds comments only, no rows")
+        raise EmptyRecordingError(f"{path}: holds comments only, no rows")
     header = None if text.header_row is None else text.header_row - 1
     if header is not None and not (header < len(plain) and lines[header].strip()):
         raise RecordingError(f"{path}: --header-row {text.header_row}: there is no text in this line, name another")

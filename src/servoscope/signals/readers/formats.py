@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from servoscope.core.errors import RecordingError
+from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.addresses import open_address
 from servoscope.signals.readers.archives import ARCHIVES, archive_of, unpack
@@ -135,7 +135,7 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror or error})") from None
     if not head.strip():
-        raise RecordingError(f"{path}: is empty")
+        raise EmptyRecordingError(f"{path}: is empty")
     suffix = path.suffix.lower()
     reader = BUILT_IN.get(suffix)
     if reader is not None:

@@ -26,6 +26,8 @@ from servoscope.signals.readers.select import CellReader, ColumnTypeChanged, Row
 from servoscope.signals.readers.table import Table, TableFile, TimeColumn, number_column
 from servoscope.signals.readers.wrap import Unwrapper
 from servoscope.signals.resample import ResampleTarget
+from servoscope.signals.samples import Samples
+from servoscope.signals.time_axis import build_time_axis
 
 TIME_NAMES = ("t", "time", "zeit", "timestamp", "time_s", "seconds", "datetime", "date", "elapsed")
 
@@ -115,17 +117,44 @@ def read_parts(
     """
     loop = None if loop is None else Loop.of(loop)
     columns = columns or (loop.columns if loop is not None else Columns())
+    return [part.recording() for part in _read_log(path, loop, columns, where or {}, by).parts.values()]
+
+
+def read_log(path: str | Path, loop: Loop, by: str | None = None) -> Log:
+    """Read the rows of a file without judging them, as a service follows them; `by`: as in `read_parts`.
+
+    Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
+    """
+    return _read_log(path, loop, loop.columns, {}, by)
+
+
+def first_time(path: str | Path, loop: Loop) -> float:
+    """Return the first time stamp of a file [s since 1970, or since its own beginning]; NaN if it has none.
+
+    Raises RecordingError if the file cannot be read.
+    """
+    opened = open_source(path, loop.columns.text)
+    clock = _find_time_column(opened, loop.columns, loop)
+    if clock is not None:
+        for table in opened.iter_chunks(clock.columns, clock.texts):
+            t = clock.seconds(table)
+            if np.isfinite(t).any():
+                return clock.origin + float(t[np.isfinite(t)][0])
+    return float("nan")
+
+
+def _read_log(path: Source, loop: Loop | None, columns: Columns, where: Mapping[str, str], by: str | None) -> Log:
     texts: set[str] = set()
     while True:
         try:
-            return _read_table_parts(open_source(path, columns.text), loop, columns, where or {}, by, texts)
+            return _read_rows(open_source(path, columns.text), loop, columns, where, by, texts)
         except ColumnTypeChanged as found:  # what was taken for numbers belongs to a column of text
             texts.add(found.column)
 
 
-def _read_table_parts(
+def _read_rows(
     opened: TableFile, loop: Loop | None, columns: Columns, where: Mapping[str, str], by: str | None, texts: set[str]
-) -> list[Recording]:
+) -> Log:
     name, known = opened.name, opened.columns
     columns = _without_reference(opened, columns, loop)
     chosen = RowFilter(opened, where)
@@ -151,15 +180,21 @@ def _read_table_parts(
     wanted |= {each.column for each in (apart, *segments) if each is not None}
     if clock is not None:
         wanted |= set(clock.columns)
-        texts |= set(clock.columns) if len(clock.columns) > 1 else set()
-    parts: dict[str, _RecordingBuilder] = {}
+        texts |= clock.texts
+    labels = {
+        letter: letter if letter == text else f"{letter} ({text!r})"
+        for letter, text in zip("ruy", keys.values(), strict=True)
+    }
+    target = _resample_target(columns, loop)
+    options = clock is not None, carried, loop, (labels["r"], labels["u"], labels["y"]), target
+    parts: dict[str, LoggedRows] = {}
     run = 0
     for table in opened.iter_chunks(wanted, texts):
         mask = chosen.mask(table)
-        rows: dict[str, BoolArray] = {name: mask}
+        rows: dict[str, BoolArray] = {"": mask}
         if apart is not None:
             cells = apart.read(table)
-            rows = {f"{name}[{by}={format_cell(v)}]": mask & (cells == v) for v in dict.fromkeys(cells[mask].tolist())}
+            rows = {format_cell(v): mask & (cells == v) for v in dict.fromkeys(cells[mask].tolist())}
         each = {
             what: [_evaluate_signal(table, one, what, unwrappers) for one in several]
             for what, several in signals.items()
@@ -177,16 +212,12 @@ def _read_table_parts(
         if sensors:
             values += each["[columns] output"]
         values += [each[f"[columns] covariates.{covariate}"][0] for covariate in columns.covariates]
-        for label, mine in rows.items():
-            parts.setdefault(label, _RecordingBuilder(clock is not None, carried)).add(table, values, mine)
+        for value, mine in rows.items():
+            if value not in parts:
+                parts[value] = LoggedRows(name if by is None else f"{name}[{by}={value}]", *options)
+            parts[value].add(table, values, mine)
     chosen.check_matched()
-    labels = {
-        letter: letter if letter == text else f"{letter} ({text!r})"
-        for letter, text in zip("ruy", keys.values(), strict=True)
-    }
-    target = _resample_target(columns, loop)
-    signals_ = labels["r"], labels["u"], labels["y"]
-    return [part.recording(label, loop, signals_, target) for label, part in parts.items()]
+    return Log(parts, clock.origin if clock is not None else 0.0)
 
 
 def _resample_target(columns: Columns, loop: Loop | None) -> ResampleTarget | None:
@@ -210,11 +241,20 @@ def _without_reference(opened: TableFile, columns: Columns, loop: Loop | None) -
     return columns.model_copy(update={"reference": columns.input})
 
 
-class _RecordingBuilder:
+class LoggedRows:
     """The rows of one recording, as they come: time if the file has it, r, u, y, runs if there are some, channels."""
 
-    def __init__(self, timed: bool, channels: tuple[str, ...]) -> None:
-        self._has_time, self._channels = timed, channels
+    def __init__(
+        self,
+        name: str,
+        timed: bool,
+        channels: tuple[str, ...],
+        loop: Loop | None,
+        labels: tuple[str, str, str],
+        target: ResampleTarget | None,
+    ) -> None:
+        self._name, self._has_time, self._channels = name, timed, channels
+        self._loop, self._labels, self._target = loop, labels, target if timed else None
         self._columns: list[GrowableArray] = []
         self._broken: list[tuple[int, float, int, str]] = []
         self._rows = 0
@@ -231,21 +271,40 @@ class _RecordingBuilder:
             column.append(x if rows.all() else x[rows])
         self._rows += int(rows.sum())
 
-    def recording(
-        self, name: str, loop: Loop | None, labels: tuple[str, str, str], target: ResampleTarget | None
-    ) -> Recording:
-        """Return the rows cleaned."""
-        rate = loop.sample_rate if loop is not None else None
+    @property
+    def _rate(self) -> float | None:
+        return self._loop.sample_rate if self._loop is not None else None
+
+    def _split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
+        """Return t, r, u and y; the runs, if there are some; the channels."""
         columns = [column.to_array() for column in self._columns]
         if not self._has_time:
-            columns.insert(0, _uniform_time(self._rows, rate or 1.0))
+            columns.insert(0, _uniform_time(self._rows, self._rate or 1.0))
         each = dict(zip(self._channels, columns[len(columns) - len(self._channels) :], strict=True))
-        t, r, u, y, *runs = columns[: len(columns) - len(self._channels)]
-        run = runs[0] if runs else None
-        limits = loop.input_limits if loop is not None else None
+        signals, runs = columns[:4], columns[4 : len(columns) - len(self._channels)]
+        return signals, runs[0] if runs else None, each
+
+    def samples(self) -> Samples:
+        """Return the rows in the order of time, and resampled where that is asked for; nothing else is done to them.
+
+        Raises RecordingError if their time stamps are unusable, or their rate is not the loop's.
+        """
+        if self._target is not None:
+            return self.recording()
+        (t, *signals), run, channels = self._split_columns()
+        axis = build_time_axis(t, run, self._rate, self._name)
+        r, u, y = map(axis.reorder, signals)
+        return Samples.from_columns(
+            axis.t, r, u, y, channels={name: axis.reorder(channel) for name, channel in channels.items()}
+        )
+
+    def recording(self) -> Recording:
+        """Return the rows cleaned."""
+        (t, r, u, y), run, each = self._split_columns()
+        limits = self._loop.input_limits if self._loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]
-        options = {"sample_rate": rate, "run": run, "limits": limits, "labels": labels, "channels": each}
-        recording = clean(t, r, u, y, name=name, target=target if self._has_time else None, **options)  # type: ignore[arg-type]
+        options = {"sample_rate": self._rate, "run": run, "limits": limits, "labels": self._labels, "channels": each}
+        recording = clean(t, r, u, y, name=self._name, target=self._target, **options)  # type: ignore[arg-type]
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)
             notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))
@@ -255,6 +314,14 @@ class _RecordingBuilder:
         at = at if self._has_time else float(t[row])
         shown = text if len(text) <= 30 else f"{text[:27]}..."
         return Defect("text", at, at, 1, message("defect.torn", row=number, text=shown))
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """What a file holds."""
+
+    parts: dict[str, LoggedRows]  # by what their column says, in the order of appearance; without one, all under ""
+    origin: float  # what makes seconds since 1970 of their time stamps, where dates are known [s]
 
 
 def _uniform_time(rows: int, rate: float) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import RecordingError
+from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.signals.readers.clock import ClockParser, ZoneOffset, is_clock
 
 NULL_TEXTS = (
@@ -88,7 +88,7 @@ class TimeColumn:
         self._zone = ZoneOffset(zone) if zone is not None else None
         self._first_offset: float | None = None
         self._origin: tuple[int, float] | None = None
-        self._naive = False  # whether the column holds dates and times without a zone
+        self._dated = self._naive = False  # whether the column holds dates and times, and those without a zone
         self._begin: float | None = None
         self._clocks = {column: ClockParser() for column in self.columns}
 
@@ -106,19 +106,36 @@ class TimeColumn:
 
     def _elapsed(self, seconds: FloatArray) -> FloatArray:
         """Return seconds as they passed, where those given are of local dates and a zone is known."""
-        midnights = [clock.midnight for clock in self._clocks.values() if clock.midnight is not None]
-        if self._zone is None or (self._local_origin is None and not midnights):
+        if self._zone is None or not (self._naive or self._midnights):
             return seconds
-        start = self._local_origin if self._local_origin is not None else midnights[0] + (self._begin or 0.0)
-        offsets = self._zone.offsets(seconds + start)
+        offsets = self._zone.offsets(seconds + self._start)
         if self._first_offset is None and np.isfinite(offsets).any():
             self._first_offset = float(offsets[np.isfinite(offsets)][0])
         return np.asarray(seconds - (offsets - (self._first_offset or 0.0)))
 
     @property
-    def _local_origin(self) -> float | None:
-        """The first moment of a column of moments without a zone [s since 1970]; None where there is none."""
-        return self._origin[0] / self._origin[1] if self._origin is not None and self._naive else None
+    def texts(self) -> set[str]:
+        """Those of its columns that are text even where they look like numbers."""
+        return set(self.columns) if len(self.columns) > 1 else set()
+
+    @property
+    def origin(self) -> float:
+        """What makes seconds since 1970 of its seconds, UTC unless dates are local and no zone is known [s].
+
+        0 where no dates are known: it counts from 1970 itself then, or from anywhere.
+        """
+        return self._start - (self._first_offset or 0.0)
+
+    @property
+    def _midnights(self) -> list[float]:
+        return [clock.midnight for clock in self._clocks.values() if clock.midnight is not None]
+
+    @property
+    def _start(self) -> float:
+        """The first moment as it is written [s since 1970]; 0 where there are no dates."""
+        if self._origin is not None and self._dated:
+            return self._origin[0] / self._origin[1]
+        return self._midnights[0] + (self._begin or 0.0) if self._midnights else 0.0
 
     def _column_seconds(self, table: Table, name: str, unit: str) -> FloatArray:
         import pyarrow as pa
@@ -133,7 +150,8 @@ class TimeColumn:
             column = column.cast(pa.timestamp("ms"))
         elif pa.types.is_time32(column.type):
             column = column.cast(pa.time64("ns"))
-        self._naive = pa.types.is_timestamp(column.type) and column.type.tz is None
+        self._dated = pa.types.is_timestamp(column.type)
+        self._naive = self._dated and column.type.tz is None
         per_second = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[column.type.unit]
         whole = column.cast(pa.int64()).fill_null(0).to_numpy()
         known = np.flatnonzero(~missing)
@@ -207,7 +225,7 @@ class TableFile:
             if table.rows:
                 yield table
         if not rows:
-            raise RecordingError(f"{self.path}: holds no rows")
+            raise EmptyRecordingError(f"{self.path}: holds no rows")
 
 
 def shorten_error(error: Exception) -> str:

@@ -1,0 +1,169 @@
+"""Log files of a folder: which asset and time their names say, and the rows in them by asset."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+from zoneinfo import ZoneInfo
+
+from pydantic import Field
+
+from servoscope.core.errors import ConfigError, RecordingError, ServoscopeError
+from servoscope.core.settings import NonEmptyStr
+from servoscope.models.loop import Loop
+from servoscope.service.sources.base import SourceSettings
+from servoscope.service.sources.block import Block
+from servoscope.signals.readers.recording_file import first_time, read_log
+from servoscope.signals.samples import Samples
+
+TEMPORARY_NAMES = ("*.part", "*.filepart", "*.tmp", "*.crdownload", "~$*", ".*")
+MIN_EPOCH_S = 1e8  # time stamps from 1973 on are dates; smaller ones count from the beginning of a file
+NAME_PARTS = re.compile(r"(\{asset\}|\{time\}|\*)")
+TIME_FORMATS = {8: "%Y%m%d", 10: "%Y%m%d%H", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}  # by how many digits there are
+
+
+class FolderNames(SourceSettings):
+    """Which files of a folder are read, and of which asset they are."""
+
+    # which files in it: ``*`` stands for anything but ``/``, ``{asset}`` for an asset, ``{time}`` for the date and time
+    # of the first row
+    match: NonEmptyStr = "*"
+    ignore: tuple[NonEmptyStr, ...] = TEMPORARY_NAMES  # names of files that are not complete
+    asset_column: NonEmptyStr | None = None  # the column that names the asset of a row, where files hold several
+    called: dict[NonEmptyStr, NonEmptyStr] = Field(default_factory=dict)  # by asset, what files call it
+
+
+class FileVersion(NamedTuple):
+    """What tells that a file has changed."""
+
+    size: int
+    modified_ns: int
+
+
+class LogFile(NamedTuple):
+    """A file in the folder whose name matches."""
+
+    name: str  # relative to the folder, with /
+    asset: str  # by its name; empty: a column names assets
+    time: str  # of its first row, by its name; empty: the name does not say
+    version: FileVersion
+    changed_at: float  # when it was written, or put there [UTC s]
+
+    @property
+    def modified_at(self) -> float:
+        """When it was written [UTC s]."""
+        return self.version.modified_ns / 1e9
+
+
+class IncompleteFile(NamedTuple):
+    """A file of which nobody knows yet whether it is complete; by the monotonic clock [s]."""
+
+    version: FileVersion
+    unchanged_since: float
+    seen_since: float
+
+
+class FileRows(NamedTuple):
+    """The rows of an asset in a file."""
+
+    samples: Samples
+    offset: float  # what makes seconds since 1970 of their time stamps [s]
+
+
+@dataclass(eq=False)
+class ReadFile:
+    """A file that was read, until its blocks are stored."""
+
+    file: LogFile
+    rows: dict[str, FileRows]
+    is_new: bool  # whether it came while we looked
+    subfolder: str  # where it belongs when they are stored
+    unstored: int = 1  # blocks that were polled and are not stored; one more until all have been polled
+    blocks: Iterator[Block] | None = None  # None: none has been polled
+
+
+class FileNames:
+    """Which files belong to which asset, as `match` says."""
+
+    def __init__(self, settings: FolderNames, assets: Sequence[str]) -> None:
+        if strange := set(settings.called) - set(assets):
+            raise ConfigError(f"called: there is no asset {min(strange)!r} of this source")
+        self.assets = {settings.called.get(name, name): name for name in assets}
+        if len(self.assets) < len(assets):
+            raise ConfigError("called: two assets of this source are called the same")
+        named, by_column = "{asset}" in settings.match, settings.asset_column is not None
+        if named == by_column and (named or len(assets) > 1):
+            raise ConfigError("match: write {asset} where the name says which asset a file is of, or give asset_column")
+        if settings.match.count("{asset}") > 1 or settings.match.count("{time}") > 1 or settings.match[0] == "/":
+            raise ConfigError("match: a path in the folder, as {asset}/*.csv, with {asset} and {time} once at most")
+        self._only = "" if by_column or not assets else next(iter(assets))
+        called = "|".join(re.escape(name) for name in sorted(self.assets, key=len, reverse=True))
+        parts = {"{asset}": f"(?P<asset>{called})", "{time}": r"(?P<time>\d[\d T_.:-]*)", "*": "[^/]*"}
+        self._regex = re.compile("".join(parts.get(one, re.escape(one)) for one in NAME_PARTS.split(settings.match)))
+        self._ignored = settings.ignore
+        self.depth = settings.match.count("/")  # of folders in the folder
+
+    def match(self, name: str) -> tuple[str, str] | None:
+        """Return the asset and the time that a name says, empty where it says none; None: it is another file's."""
+        match = self._regex.fullmatch(name)
+        if match is None or any(fnmatch.fnmatch(name.rpartition("/")[2], one) for one in self._ignored):
+            return None
+        groups = match.groupdict(default="")
+        return self.assets[groups["asset"]] if "asset" in groups else self._only, groups.get("time", "")
+
+
+def parse_file(
+    folder: Path, file: LogFile, names: FileNames, settings: FolderNames, loop_of: Mapping[str, Loop]
+) -> tuple[dict[str, FileRows], dict[str, str]]:
+    """Return the rows of a file by asset, and of which assets they cannot be used, and why."""
+    rows, failures, path = dict[str, FileRows](), dict[str, str](), folder / file.name
+    assets = [file.asset] if file.asset else list(loop_of)
+    loops = {loop_of[name].hash(): loop_of[name] for name in assets}
+    for key, loop in loops.items():
+        logged = read_log(path, loop, settings.asset_column)
+        for called, part in logged.parts.items():
+            name = file.asset or names.assets.get(called, "")
+            if not name or loop_of[name].hash() != key:
+                continue
+            try:
+                samples = part.samples()
+            except RecordingError as error:
+                failures[name] = str(error)
+                continue
+            first, last = samples.t[[0, -1]].tolist()
+            offset = logged.origin
+            if first + offset < MIN_EPOCH_S:  # it says how much time has passed, and not since when
+                named = _named_time(file.time, loop)
+                offset = file.modified_at - last if named is None else named - first
+            rows[name] = FileRows(samples, offset)
+    return rows, failures
+
+
+def _named_time(text: str, loop: Loop) -> float | None:
+    """Return the time that a file's name says [UTC s], local where the loop's columns are; None: it says none."""
+    digits = re.sub(r"\D", "", text)[:14]
+    zone = ZoneInfo(loop.columns.time_zone) if loop.columns.time_zone else UTC
+    try:
+        return datetime.strptime(digits, TIME_FORMATS[len(digits)]).replace(tzinfo=zone).timestamp()
+    except (KeyError, ValueError):
+        return None
+
+
+def find_first_time(path: Path, file: LogFile, loop: Loop) -> float:
+    """Return the time of the first row [UTC s], as the file, its name or its date says."""
+    try:
+        first = first_time(path, loop)
+    except Exception:  # why it cannot be read is told when it is its turn
+        first = math.nan
+    return first if first >= MIN_EPOCH_S else _named_time(file.time, loop) or file.modified_at
+
+
+def describe_error(error: Exception) -> str:
+    """Return what a file's reader raised, in one line."""
+    return str(error) if isinstance(error, ServoscopeError) else f"{type(error).__name__}: {error}"
