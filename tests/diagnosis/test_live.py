@@ -355,9 +355,9 @@ class TestConfig:
             (
                 'kind = "replay"',
                 'kind = "mqt"',
-                "[sources] line.kind: 'mqt' is unknown, choose from kafka, mqtt, opcua, replay",
+                "[sources] line.kind: 'mqt' is unknown, choose from folder, kafka, mqtt, opcua, replay",
             ),
-            ('kind = "replay"', "", "[sources] line.kind: missing, choose from kafka, mqtt, opcua, replay"),
+            ('kind = "replay"', "", "[sources] line.kind: missing, choose from folder, kafka, mqtt, opcua, replay"),
             (
                 'kind = "replay"',
                 'kind = "mqtt"',

@@ -70,9 +70,8 @@ class Service:
 
     def _take_components(self, config: ServiceFile, components: ServiceComponents) -> None:
         self.config, self._components = config, components
-        self.sources, self.store = components.sources, components.store
-        self.assets, self.notifier = components.assets, components.notifier
-        self._groups, self._publishers = components.groups, components.publishers
+        self.sources, self.store, self._publishers = components.sources, components.store, components.publishers
+        self.assets, self.notifier, self._groups = components.assets, components.notifier, components.groups
         # those of which a full diagnosis may be pending, in order
         self._awaiting = {name: None for name, one in self.assets.items() if one.pending_diagnoses}
 
@@ -119,10 +118,8 @@ class Service:
         finally:
             self.dispatcher.stop()
             self._diagnosis_worker.close()
-            for source in self.sources.values():
-                source.close()
-            for publisher in self._publishers.values():
-                publisher.close()
+            for close in [one.close for kind in (self.sources, self._publishers) for one in kind.values()]:
+                close()
             self.store.close()
         log("info", "stopped", service=self.config.name, why=self._stop_reason)
 
@@ -293,21 +290,24 @@ class Service:
         troubles = {name: (source.trouble, source.asset_troubles) for name, source in self.sources.items()}
         fresh_s = min(HOUSEKEEPING_EVERY_S, self.config.quality.silent_s)
         for name, asset in self.assets.items():
-            source = asset.source
-            reception, before, (trouble, of_assets) = self._receptions[name], asset.reception, troubles[source]
+            reception, before, (trouble, of_assets) = self._receptions[name], asset.reception, troubles[asset.source]
             fresh = name not in of_assets and reception.is_fresh(self._listening.seconds, fresh_s)
             if fresh and before is RECEPTION_OK:
                 continue  # nearly all of them, nearly always
-            pause_s = self.sources[source].pause_s
-            patience_s, own = max(asset.policy.quality.silent_s, pause_s), of_assets.get(name)
-            if not math.isinf(self.sources[source].next_block_s):
-                asset.reception = reception.evaluate(self._listening.seconds, patience_s, trouble, own)
-            silence, result = reception.silence_s(self._listening.seconds), StepResult([], [])
+            source, own = self.sources[asset.source], of_assets.get(name)
+            pause_s, silence = source.pause_s, reception.silence_s(self._listening.seconds)
             is_expected = math.isinf(pause_s) or (silence < pause_s and not asset.heard)
+            if is_expected and not asset.heard and own is None and not trouble:
+                asset.reception = RECEPTION_OK  # its first samples may still come in time
+            elif not math.isinf(source.next_block_s):
+                patience_s = max(asset.policy.quality.silent_s, 0.0 if trouble else pause_s)
+                asset.reception = reception.evaluate(self._listening.seconds, patience_s, trouble, own)
+            has_changed = asset.reception != before
             if silence >= HOUSEKEEPING_EVERY_S and not is_expected:
-                result = asset.advance_time(silence * self.sources[source].clock_rate)
+                result = asset.advance_time(silence * source.clock_rate)
                 self.handle_result(asset, result)
-            if result.rows or asset.reception != before:
+                has_changed |= bool(result.rows)
+            if has_changed:
                 self.writer.set_checkpoint(asset)
 
     @property

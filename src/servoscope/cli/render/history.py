@@ -160,7 +160,7 @@ def row_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Tabl
     """Return a table of some columns of rows; times as dates."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in columns:
-        table.add_column(plain_name(name), overflow="fold", no_wrap=name in ("t", "at", "created", "due", "asset"))
+        table.add_column(plain_name(name), overflow="fold", no_wrap=name in (*TIME_COLUMNS, "asset"))
     for row in rows:
         table.add_row(
             *(_format_cell(name, _delivery_subject(row) if name == "subject" else row.get(name)) for name in columns)
