@@ -7,9 +7,10 @@ STAMP := $(VENV)/.installed
 # what the demonstration needs, which is what users install; the rest, if it is there, will do as well
 PRODUCT := $(or $(wildcard $(STAMP)),$(VENV)/.product)
 CODE := src tests benchmarks scripts
+TYPES := $(BIN)/python -m mypy --strict src
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format figures pictures docs sbom clean
+.PHONY: help install demo test test-all lint style format figures pictures docs sbom clean
 .DELETE_ON_ERROR:
 
 help:           ## list the targets
@@ -20,16 +21,22 @@ install: $(STAMP)  ## make .venv with servoscope, editable, and what its tests n
 demo: $(PRODUCT)  ## simulate a rig, break it, diagnose it; the report goes to demo-output/
 	$(BIN)/servoscope demo -o demo-output
 
-test: lint      ## what must pass before a commit: format, lint, types, all tests but the slow ones
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+test: style     ## what must pass before a commit: format, lint, types, all tests but the slow ones
+test-all: style  ## the same with the slow ones: browsers, Spark, kills and chaos (REQUIRE_ALL=1: no test may skip)
 
-test-all: lint  ## the same with the slow ones: browsers, Spark, kills and chaos (REQUIRE_ALL=1: no test may skip)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+test: SELECTION := -m "not slow"
+# types are checked beside the first tests, on what these leave of two cores; what mypy says stands below their results
+test test-all:
+	@mkdir -p .cache; $(TYPES) >.cache/types.log 2>&1 & types=$$!; \
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(SELECTION); tests=$$?; \
+	wait $$types; types=$$?; echo '$(TYPES)'; cat .cache/types.log; exit $$((tests || types))
 
-lint: $(STAMP)  ## format, lint and types, without changing a file
+lint: style     ## format, lint and types, without changing a file
+	$(TYPES)
+
+style: $(STAMP)
 	$(BIN)/python -m ruff format --check $(CODE)
 	$(BIN)/python -m ruff check $(CODE)
-	$(BIN)/python -m mypy --strict src
 
 format: $(STAMP)  ## put the code into shape
 	$(BIN)/python -m ruff check --fix $(CODE)

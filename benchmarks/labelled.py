@@ -15,7 +15,7 @@ from tables import Table, parse_with_data, parser, show
 
 import servoscope as ss
 from servoscope.core.errors import NotEnoughError
-from servoscope.research.scoring import accuracy, confusion
+from servoscope.scoring import accuracy, confusion
 
 ROOT = Path(__file__).resolve().parent.parent
 LOADS = ("20", "40", "-40")

@@ -1,12 +1,11 @@
 #!/usr/bin/env python3
-"""Measures the structure of src/servoscope: sizes, names, comments, and what stands twice.
+"""Counts the structure of src/servoscope: sizes, comments, and names that several things have.
 
     python scripts/house.py                                     a table
     python scripts/house.py --compare scripts/house-0.1.json    beside the figures of an earlier release
     python scripts/house.py --json                              the figures alone, for a later --compare
-    python scripts/house.py --offenders                         the table, and below it the names behind the counts
 
-It needs nothing but Python. ``tests/project/test_architecture.py`` uses its functions and holds the figures that are rules.
+It needs nothing but Python. What is a rule is in ``tests/project/test_architecture.py`` and ``test_names.py``.
 """
 
 from __future__ import annotations
@@ -24,85 +23,12 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 PACKAGE = Path("src", "servoscope")
 ENTRY = {"__init__", "__main__"}  # the two modules that belong at the top
 LONG = 300
 FUNCTION = ast.FunctionDef | ast.AsyncFunctionDef
-
-# Participles that do not end in -ed, and `since`, which names nothing either. Not here: forms that are a noun of the
-# field or a plain verb as well (bound, cut, fit, put, read, run, set, split).
-_IRREGULAR = """
-arisen awoken beaten become begun bent bitten blown born borne bought broken brought built caught chosen come dealt done
-drawn driven eaten fallen felt fled flown forgotten found fought frozen given gone grown heard held hidden hung kept
-known laid learnt left lent lost made meant met overheard overtaken paid proven ridden risen said seen sent shaken shown
-slept sold sought spelt spent spoken spun stolen stood struck stuck swept sworn taken taught thought thrown told torn
-undone understood unheard unseen won worn woven written
-since
-"""
-IRREGULAR = frozenset(_IRREGULAR.split())
-
-# Words in -ing and -ed that count nowhere, with the reason. A participle that could stand there as a plain adjective
-# (`fitted`, `measured`, `weighted`) is no exception: the thing has a noun.
-EXCEPTIONS: dict[str, str] = {
-    # not formed from a verb at all
-    "string": "no participle",
-    "ring": "no participle: a ring buffer",
-    "spring": "no participle: a mechanical spring",
-    "thing": "no participle",
-    "nothing": "no participle",
-    "speed": "no participle: a signal",
-    "seed": "no participle: of random numbers",
-    "feed": "no participle: a feed of data, feed rate",
-    "need": "no participle",
-    "exceed": "no participle: the infinitive",
-    "embed": "no participle: the infinitive",
-    "red": "no participle: the colour",
-    "hundred": "no participle: the number",
-    # parts and properties of a machine
-    "bearing": "noun: the machine part",
-    "gearing": "noun: the machine part",
-    "coupling": "noun: the machine part; coupling between axes",
-    "damping": "noun: the coefficient",
-    # control, signals and statistics
-    "tuning": "noun: of an estimator or a controller",
-    "tracking": "noun: tracking error, control's word for following a reference",
-    "settling": "noun: settling time",
-    "sampling": "noun: sampling time, sampling rate",
-    "timing": "noun: of samples or of a benchmark",
-    "filtering": "noun: of signals",
-    "smoothing": "noun: of signals",
-    "whitening": "noun: of noise",
-    "forgetting": "noun: forgetting factor of a recursion",
-    "rounding": "noun: rounding error",
-    "scaling": "noun: of variables",
-    "scoring": "noun: of detectors",
-    "learning": "noun: as in machine learning; the package",
-    "monitoring": "noun: condition monitoring, the field itself",
-    "engineering": "noun: the profession",
-    # data and software
-    "recording": "noun: the data of one measurement, the product's central record",
-    "reading": "noun: the value that an instrument shows",
-    "setting": "noun: what a user configures",
-    "warning": "noun: as in the standard library",
-    "logging": "noun: as in the standard library",
-    "finding": "noun: one result of an inspection or audit",
-    "streaming": "noun: Spark Structured Streaming",
-    "plotting": "noun: as in matplotlib and pandas",
-    "housekeeping": "noun: of a service",
-}
-
-# Pairs of words that are one term.
-TERMS: dict[tuple[str, str], str] = {
-    ("closed", "loop"): "control's term",
-    ("sliding", "window"): "the estimator's name in the literature",
-    ("coloured", "noise"): "term of statistics",
-    ("fixed", "point"): "term of arithmetic and of analysis",
-    ("mean", "squared"): "term of statistics",
-    ("shared", "memory"): "term of operating systems",
-}
 
 # What tells a tool something, not a reader.
 DIRECTIVE = re.compile(r"#(?:!|\s*(?:noqa|type:\s*ignore|pragma\b|fmt:|mypy:|ruff:|isort:|-\*-))")
@@ -125,11 +51,6 @@ class Source:
     tree: ast.Module
 
     @property
-    def module(self) -> str:
-        """The name that a reader gives it: the folder's for an ``__init__``."""
-        return self.path.parent.name or "servoscope" if self.path.stem == "__init__" else self.path.stem
-
-    @property
     def lines(self) -> int:
         """The number of lines."""
         return self.text.count("\n")
@@ -147,21 +68,6 @@ def read(package: Path) -> list[Source]:
         text = path.read_text(encoding="utf-8")
         sources.append(Source(path.relative_to(package), text, ast.parse(text, str(path))))
     return sources
-
-
-def words_of(name: str) -> list[str]:
-    """Split a name at underscores and capitals: ``_OrderTried`` and ``order_tried`` are both order, tried."""
-    parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
-    return [part.lower() for part in parts]
-
-
-def participles_in(name: str) -> list[str]:
-    """Return the words of a name that are participles or gerunds, and no exceptions."""
-    words = words_of(name)
-    for one, other in pairwise(words):
-        if (one, other) in TERMS:
-            words = [word for word in words if word not in (one, other)]
-    return [word for word in words if word in IRREGULAR or (word.endswith(("ing", "ed")) and word not in EXCEPTIONS)]
 
 
 def repeated(names: Iterable[tuple[str, Path]]) -> dict[str, list[Path]]:
@@ -189,18 +95,6 @@ def repeated_functions(sources: Iterable[Source]) -> dict[str, list[Path]]:
 def repeated_modules(sources: Iterable[Source]) -> dict[str, list[Path]]:
     """Return the file names that stand in two folders or more, ``__init__`` apart."""
     return repeated((source.path.stem, source.path) for source in sources if source.path.stem not in ENTRY)
-
-
-def modules_by_participle(sources: Iterable[Source]) -> list[str]:
-    """Return the paths of the modules that are named by a participle or gerund."""
-    return [source.path.as_posix() for source in sources if participles_in(source.module)]
-
-
-def classes_by_participle(sources: Iterable[Source]) -> list[str]:
-    """Return path and name of the classes that are named by a participle or gerund."""
-    return [
-        f"{source.path.as_posix()}: {name}" for source in sources for name in source.classes if participles_in(name)
-    ]
 
 
 def statements_of(tree: ast.Module) -> int:
@@ -245,9 +139,7 @@ def measure(sources: list[Source]) -> dict[str, float]:
         "function_p99": lengths[math.ceil(0.99 * len(lengths)) - 1],
         "longest_file": max((source.lines for source in sources), default=0),
         "long_files": sum(source.lines > LONG for source in sources),
-        "modules_by_participle": len(modules_by_participle(sources)),
         "classes": sum(len(source.classes) for source in sources),
-        "classes_by_participle": len(classes_by_participle(sources)),
         "comment_lines": sum(alone for alone, _ in comments),
         "trailing_comments": sum(trailing for _, trailing in comments),
         "repeated_classes": len(repeated_classes(sources)),
@@ -278,8 +170,6 @@ ROWS: list[tuple[str, Callable[[dict[str, float]], str]]] = [
     ("lines of a function: 99th percentile", _plain("function_p99")),
     ("lines of the longest file", _plain("longest_file")),
     (f"files of more than {LONG} lines", _share("long_files", "files")),
-    ("modules named by a participle or gerund", _share("modules_by_participle", "files")),
-    ("classes named by a participle or gerund", _share("classes_by_participle", "classes")),
     ("comment lines", _share("comment_lines", "nonblank_lines")),
     ("code lines that end in a comment", _share("trailing_comments", "nonblank_lines")),
     ("class names that stand twice or more", _plain("repeated_classes")),
@@ -304,31 +194,12 @@ def table(now: dict[str, float], before: dict[str, float] | None = None) -> str:
     return "\n".join([line(head), rule, *map(line, rows)])
 
 
-def offenders(sources: list[Source]) -> str:
-    """Return the names behind the counts."""
-    lists = {
-        f"Files of more than {LONG} lines": [
-            f"{source.path.as_posix()}: {source.lines}" for source in sources if source.lines > LONG
-        ],
-        "Modules named by a participle or gerund": modules_by_participle(sources),
-        "Classes named by a participle or gerund": classes_by_participle(sources),
-    }
-    for title, found in {
-        "Class names that stand twice or more": repeated_classes(sources),
-        "Names of top-level functions in two files or more": repeated_functions(sources),
-        "File names in two folders or more": repeated_modules(sources),
-    }.items():
-        lists[title] = [f"{name}: {', '.join(path.as_posix() for path in paths)}" for name, paths in found.items()]
-    return "\n\n".join("\n".join([f"{title}:", *(f"- {line}" for line in lines)]) for title, lines in lists.items())
-
-
 def main() -> int:
     """Run as a command."""
     parser = argparse.ArgumentParser(description="Measure the structure of src/servoscope.")
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent, help="the project")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     parser.add_argument("--compare", type=Path, metavar="FILE.json", help="figures of an earlier --json")
-    parser.add_argument("--offenders", action="store_true", help="print the names behind the counts too")
     given = parser.parse_args()
     sources = read(given.root / PACKAGE)
     if not sources:
@@ -338,8 +209,6 @@ def main() -> int:
         print(json.dumps(now, indent=2))
         return 0
     print(table(now, json.loads(given.compare.read_text(encoding="utf-8")) if given.compare else None))
-    if given.offenders:
-        print("\n" + offenders(sources))
     return 0
 
 

@@ -32,6 +32,48 @@ progress.LINE_INTERVAL_S = 3600.0  # what a command says on stderr must not depe
 os.environ.setdefault("NUMBA_CACHE_DIR", str(PROJECT / ".cache" / "numba"))
 
 
+# Subjects whose files of tests take longest: they begin first, so that no worker has one left when the others are done.
+LONGEST = (
+    "web_access",
+    "spark",
+    "twostage",
+    "estimator_peers",
+    "signal_defects",
+    "web",
+    "report",
+    "paper",
+    "chaos",
+    "source_contract",
+    "service",
+    "learning",
+    "eha_cases",
+    "web_pages",
+    "estimators",
+    "web_oidc",
+    "compatibility",
+    "points",
+    "store",
+    "fleet",
+    "web_slow",
+    "export",
+    "sequential",
+    "timeline",
+    "instrument",
+    "opcua",
+    "damage",
+    "refinement",
+    "labelled",
+    "cli",
+    "lake",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files of tests first."""
+    ranks = {f"test_{subject}": rank for rank, subject in enumerate(LONGEST)}
+    items.sort(key=lambda item: ranks.get(item.path.stem, len(ranks)))
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Under REQUIRE_ALL=1, report a skipped test as failed, with the reason of the skip."""

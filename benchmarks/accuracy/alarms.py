@@ -13,7 +13,7 @@ from accuracy.innovations import innovations
 from accuracy.rig import FAULT_AT, HOURS_PER_YEAR, alarm_times, baseline, loop, record, until_first
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from servoscope.core.arrays import FloatArray
-from servoscope.research.scoring import (
+from servoscope.scoring import (
     DUMMIES,
     Detections,
     Detector,

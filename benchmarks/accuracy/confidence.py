@@ -11,7 +11,7 @@ from accuracy.rig import FAULT_AT, baseline, loop, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.estimation.frequency_response import CHI2_95_2DOF
-from servoscope.research.scoring import share
+from servoscope.scoring import share
 from servoscope.simulation import FaultEvent
 
 RUNS = 20  # per baseline

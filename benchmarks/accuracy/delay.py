@@ -13,7 +13,7 @@ from accuracy.rig import FAULT_AT, HOURS_PER_YEAR, alarm_times, baseline, loop, 
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from servoscope.core.arrays import FloatArray
 from servoscope.research.paper.conditions import FAULT_NAMES
-from servoscope.research.scoring import Detections, detections, needed_information, shortest_delay
+from servoscope.scoring import Detections, detections, needed_information, shortest_delay
 from servoscope.simulation import FaultEvent
 
 KIND = "multisine"

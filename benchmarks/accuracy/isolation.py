@@ -13,8 +13,9 @@ from accuracy.draws import KINDS, PARAMETERS, SECONDS, clear, designed, large, r
 from accuracy.rig import FAULT_AT, baseline, record
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import is_named, is_right, percent, seen, told
-from servoscope.detection.result import UNKNOWN
-from servoscope.research.scoring import Reliability, reliability, share
+from servoscope.design import DirectionStudy
+from servoscope.isolation.candidate import UNKNOWN
+from servoscope.scoring import Reliability, reliability, share
 from servoscope.simulation import FaultEvent
 
 RUNS = 20  # per baseline, half of them with small faults
@@ -46,10 +47,17 @@ def job(seed: int, kind: str, runs: int = RUNS) -> Numbers:
 def radii(kind: str) -> Numbers:
     """Return what the study says of each fault and direction: detectable and isolable ratio, radius over bound."""
     return {
-        f"{name} {'up' if up else 'down'}": [each.detectable, each.first_isolable, each.times_bound]
+        f"{name} {'up' if up else 'down'}": [side.detectable, side.first_isolable, times_bound(side)]
         for name, fault in designed(kind).faults.items()
-        for up, each in ((True, fault.up), (False, fault.down))
+        for up, side in ((True, fault.up), (False, fault.down))
     }
+
+
+def times_bound(side: DirectionStudy) -> float | None:
+    """Return the smallest ratio that is named rightly against the linear bound, as logarithms; None without either."""
+    if side.first_isolable is None or side.bound in (None, 1.0):
+        return None
+    return float(np.log(side.first_isolable) / np.log(side.bound))
 
 
 def isolability(words: str, found: Sequence[Numbers]) -> list[Row]:

@@ -14,8 +14,8 @@ from accuracy.draws import between
 from accuracy.rig import SEEDS_PER_UNIT
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import percent
-from servoscope.detection.result import UNKNOWN
-from servoscope.research.scoring import reliability
+from servoscope.isolation.candidate import UNKNOWN
+from servoscope.scoring import reliability
 from servoscope.simulation import FaultEvent, reference, simulate_rig
 
 UNITS = 300

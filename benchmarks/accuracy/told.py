@@ -11,13 +11,13 @@ import numpy as np
 import servoscope as ss
 from accuracy.rig import FAULT_AT
 from accuracy.scenario import Numbers, Row
-from servoscope.detection.result import UNKNOWN, Candidate
-from servoscope.diagnosis.diagnose import SURE, first_alarm
+from servoscope.diagnosis.diagnose import MIN_CERTAINTY, first_alarm
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, refit_onset, refit_recording
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.ml import find_other_causes
 from servoscope.research.paper.conditions import FAULT_NAMES
-from servoscope.research.scoring import share
+from servoscope.scoring import share
 from servoscope.simulation import FaultEvent
 
 LISTED = 6  # candidates that are kept
@@ -41,7 +41,7 @@ def told(learned: ss.Baseline, recording: ss.Recording, truth: Sequence[FaultEve
         "detected": round(float(recording.t[alarm.sample]), 3),
         "said": {each.name: round(each.probability, 6) for each in candidates[:LISTED]},
         "first": best.name,
-        "named": best.name != UNKNOWN and best.probability >= SURE,
+        "named": best.name != UNKNOWN and best.probability >= MIN_CERTAINTY,
         "given": right.probability if right else 0.0,
         "sizes": {f.name: [_short(v) for v in (f.ratio, *f.interval)] for f in (right.faults if right else ())},
         "onset": [round(t, 3) for t in (onset.low_s, onset.likely_s, onset.high_s)],

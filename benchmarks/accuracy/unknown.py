@@ -14,7 +14,7 @@ from accuracy.rig import FAULT_AT, SEEDS_PER_UNIT, baseline, loop
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from accuracy.told import percent, seen, told
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.result import UNKNOWN
+from servoscope.isolation.candidate import UNKNOWN
 from servoscope.models.discretise import discretise
 from servoscope.simulation import reference
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD, draw_noise, make_recording

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hostile.damage import damaged
+from hostile.other_files import leaked
 from hostile.targets import Target, targets
 from servoscope.core.errors import MessageError, ServoscopeError
 
@@ -41,6 +42,7 @@ def fed(target: Target, inputs: int, seed: int = 1) -> dict[str, Any]:
             came["read"] += 1
         except ServoscopeError as error:
             text = str(error)
+            came["leaked"] += leaked(text)
             came["refused" if text and "\n" not in text else "badly told"] += 1
             cases[error.kind if isinstance(error, MessageError) else type(error).__name__] += 1
         except Exception as error:
@@ -51,8 +53,15 @@ def fed(target: Target, inputs: int, seed: int = 1) -> dict[str, Any]:
                 print(f"{target.name}, input {number}:", file=sys.stderr)
                 traceback.print_exc()
         slowest = max(slowest, time.perf_counter() - begun)
+    for data in target.others:
+        try:
+            answer = target.show(data)
+        except ServoscopeError as error:
+            answer = str(error)
+        came["leaked"] += leaked(answer)
     return {
-        "name": target.name, "inputs": inputs, **{key: came[key] for key in ("read", "refused", "badly told", "other")},
+        "name": target.name, "inputs": inputs, "others": len(target.others), "leaked": came["leaked"],
+        **{key: came[key] for key in ("read", "refused", "badly told", "other")},
         "cases": dict(cases.most_common()), "slowest_s": round(slowest, 2),
         "peak_mb": round(max(kb for one, kb in peaks_kb().items() if kb > before.get(one, 0) or one == "self") / 1024),
     }  # fmt: skip
@@ -79,7 +88,7 @@ def broken_bounds(found: list[dict[str, Any]]) -> list[str]:
     return [
         one["name"]
         for one in found
-        if one["other"] + one["badly told"] or one["slowest_s"] > MAX_S or one["peak_mb"] > MAX_MB
+        if one["other"] + one["badly told"] + one["leaked"] or one["slowest_s"] > MAX_S or one["peak_mb"] > MAX_MB
     ]
 
 
@@ -93,8 +102,11 @@ def feed_all(inputs: int, only: str = "") -> list[dict[str, Any]]:
 def markdown(found: dict[str, Any]) -> str:
     """Return the table."""
     lines = [
-        ("reader or decoder", "inputs", "read", "refused", "any other exception", "slowest", "most memory"),
-        ("---",) * 7,
+        (
+            *("reader or decoder", "inputs", "read", "refused", "any other exception", "slowest", "most memory"),
+            *("names another file", "shows some of it"),
+        ),
+        ("---",) * 9,
     ]
     lines += [
         (
@@ -105,6 +117,8 @@ def markdown(found: dict[str, Any]) -> str:
             f"{one['other'] + one['badly told']}",
             f"{one['slowest_s']:.2f} s",
             f"{one['peak_mb']} MB",
+            f"{one['others']}",
+            f"{one['leaked']}",
         )
         for one in found["targets"]
     ]

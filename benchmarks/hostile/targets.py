@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from hostile.damage import refitted
+from hostile.other_files import other_files
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import MessageError
 from servoscope.diagnosis.monitor import Monitor
@@ -35,6 +36,7 @@ from servoscope.service.opcua.subscriptions import parse_block, parse_value
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, readers, writers
 from servoscope.signals.quality import QualitySettings
+from servoscope.signals.readers.formats import open_file
 from servoscope.simulation import reference, simulate
 
 __all__ = ["Target", "targets"]
@@ -80,11 +82,15 @@ class Target:
         What it reads without complaint; empty: `feed` makes its own.
     feed
         Takes bytes, and the chance for what is made of them; returns in one word what came of it.
+    others, show
+        Files that name another file, and what returns all that is read of one.
     """
 
     name: str
     good: Sequence[bytes]
     feed: Callable[[bytes, random.Random], str]
+    others: Sequence[bytes] = ()
+    show: Callable[[bytes], str] = lambda _: ""
 
 
 def targets(folder: Path) -> list[Target]:
@@ -123,6 +129,12 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
             readers.read(path, columns=Columns(time="time") if path.suffix in clocked else None)
             return "read"
 
+        def show(data: bytes, path: Path = path) -> str:
+            path.write_bytes(data)
+            opened = open_file(path)
+            tables = opened.iter_chunks(opened.columns)
+            return str([opened, *({name: cells.to_pylist() for name, cells in one.columns.items()} for one in tables)])
+
         good = [path.read_bytes()]
         if kind == "CSV":
             text = good[0].decode()
@@ -131,7 +143,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
                 text.replace(",", " ").encode(),
                 text.encode("utf-16"),
             ]
-        found.append(Target(f"{kind} file", good, feed))
+        found.append(Target(f"{kind} file", good, feed, other_files(kind, folder), show))
     return found
 
 

@@ -26,10 +26,10 @@ import numpy as np
 from tables import Table, parse_with_data, parser, show
 
 import servoscope as ss
+from public.output_error import OutputErrorFit, fit_output_error, simulate_free
 from public.servoscope_detector import COLUMNS, ROOT, Count, all_scores, with_coefficient, with_gain
 from public.simple_detectors import halves
 from servoscope.learning.axis_fit import fit_axis
-from servoscope.learning.output_error import OutputErrorFit, fit_output_error, simulate_free
 from servoscope.models.plants.axis import AxisPlant
 
 SKIPPED = 20  # samples before the score counts

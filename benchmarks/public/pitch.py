@@ -29,7 +29,7 @@ from servoscope.baseline.sensors import find_sensor_deviation
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.diagnosis.sensor_check import wrong_sensor
-from servoscope.research.scoring import FaultIndices, alarm_rate, events, fault_indices
+from servoscope.scoring import FaultIndices, alarm_rate, events, fault_indices
 
 LEARNED_S, CASE_S, HOUR_S = 600.0, 600.0, 3600.0
 TRAINING = 5  # winds

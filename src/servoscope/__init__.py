@@ -13,16 +13,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from servoscope.core import aliases
-
 __version__ = "0.1.0"
 
 __all__ = [
     "Baseline",
+    "Columns",
     "Diagnosis",
     "Loop",
     "Monitor",
     "Recording",
+    "ServoscopeError",
     "Trace",
     "__version__",
     "design_study",
@@ -36,19 +36,18 @@ __all__ = [
     "write_report",
 ]
 
-aliases.install()
-
 if TYPE_CHECKING:
     from servoscope.baseline.baseline import Baseline
+    from servoscope.core.errors import ServoscopeError
     from servoscope.design import design_study
-    from servoscope.detection.result import Diagnosis
     from servoscope.detection.trace import Trace
     from servoscope.diagnosis.diagnose import diagnose
     from servoscope.diagnosis.monitor import Monitor
     from servoscope.diagnosis.novelty import NoveltyDetector as NoveltyDetector
     from servoscope.diagnosis.operating_points import learn
+    from servoscope.diagnosis.result import Diagnosis
     from servoscope.learning.inspection import inspect
-    from servoscope.models.loop import Loop
+    from servoscope.models.loop import Columns, Loop
     from servoscope.report.diagnosis_page import write_report
     from servoscope.report.plots import plot
     from servoscope.signals.readers import read, read_parts
@@ -57,11 +56,13 @@ if TYPE_CHECKING:
 else:  # hidden from type checkers, which would otherwise accept any name
     _HOMES = {
         "Baseline": "baseline.baseline",
-        "Diagnosis": "detection.result",
+        "Columns": "models.loop",
+        "Diagnosis": "diagnosis.result",
         "Loop": "models.loop",
         "Monitor": "diagnosis.monitor",
         "NoveltyDetector": "diagnosis.novelty",  # not in __all__: it needs scikit-learn
         "Recording": "signals.recording",
+        "ServoscopeError": "core.errors",
         "Trace": "detection.trace",
         "design_study": "design",
         "diagnose": "diagnosis.diagnose",
@@ -77,8 +78,6 @@ else:  # hidden from type checkers, which would otherwise accept any name
     def __getattr__(name: str) -> object:
         import importlib
 
-        if f"{__name__}.{name}" in aliases.ALIASES:
-            return importlib.import_module(f"{__name__}.{name}")
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         found = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

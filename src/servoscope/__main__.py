@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 
-INTERRUPTED = 130  # exit code, as shells have it
+EXIT_INTERRUPTED = 130  # exit code, as shells have it
 
 
 def main() -> None:
@@ -20,14 +20,14 @@ def main() -> None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         run_command()
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        sys.exit(EXIT_INTERRUPTED)
     finally:
         if is_interruptible:
             signal.signal(signal.SIGINT, _end)  # what is left to do is Python's
 
 
 def _end(*_: object) -> None:
-    os._exit(INTERRUPTED)
+    os._exit(EXIT_INTERRUPTED)
 
 
 if __name__ == "__main__":

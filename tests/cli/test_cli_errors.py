@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 from commands import loop_with, one_line, prepared, rows_of, run, write_rows
 
+from servoscope.cli.app import _format_warning
+from servoscope.core.errors import ObsoleteSettingWarning
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -177,3 +180,9 @@ def test_a_fault_of_the_program_keeps_its_traceback(
     monkeypatch.setattr("servoscope.models.loop.Loop.load", broken)
     with pytest.raises(ZeroDivisionError):
         run("simulate", made / "loop.toml", "-o", tmp_path / "x.csv")
+
+
+def test_a_setting_of_an_earlier_version_is_one_line() -> None:
+    told = _format_warning("loop.toml: gone", ObsoleteSettingWarning, "settings.py", 7)
+    assert told == "servoscope: warning: loop.toml: gone\n"
+    assert "settings.py:7" in _format_warning("other", RuntimeWarning, "settings.py", 7)

@@ -16,6 +16,7 @@ from golden.results import FOLDER
 from servoscope.core import messages
 from servoscope.core.messages import catalogue, languages, message, render, translate
 from servoscope.models import plants
+from servoscope.models.plants import axis
 
 OTHERS = [name for name in languages() if name != "en"]
 # English words that no text of another language has; symbols, file names and settings are English everywhere
@@ -98,15 +99,37 @@ def test_words_keep_their_units_and_what_nobody_translated_stays() -> None:
     )
 
 
+def faults_of_kinds() -> Iterator[plants.Fault]:
+    """All faults that the plants of this project know, in whatever form they are declared."""
+    terms = list(axis.TERMS)
+    rig = ss.Baseline.load(FOLDER / "rig.json").loop.plant
+    yield from rig.faults
+    for kept in (terms, [term for term in terms if term != "viscous_by_direction"]):
+        named = [term for term in kept if term != "viscous" or "viscous_by_direction" not in kept]
+        table = {"kind": "axis", "terms": named, "stribeck_speed": 1.0, "period": 1.0}
+        for more in ({}, {"payload_arm": 1.0}):
+            yield from plants.parse_plant(table | more).faults
+    for friction in ("coulomb", "directional"):
+        table = {"kind": "polynomial", "order": 2, "stiffness": True, "friction": friction, "offset": True}
+        yield from plants.parse_plant(table).faults
+
+
 @pytest.mark.parametrize("language", OTHERS)
-def test_faults_of_plants_have_names_and_checks(language: str) -> None:
-    axis = plants.axis.FAULTS.values()
-    names = [fault.name for fault in plants.eha.FAULTS] + [name for name, _ in axis]
-    assert [
-        name for name in names if f"word.{name}" not in catalogue(language) or f"check.{name}" not in catalogue()
-    ] == []
-    words = [one for _, what in axis for one in (what, what.replace("more ", "less ", 1))]
-    assert [one for one in words if translate(one, language) == one] == []
+def test_faults_of_plants_have_names_words_and_checks(language: str) -> None:
+    faults = list(faults_of_kinds())
+    known = catalogue(language)
+    said = {text for fault in faults for text in (fault.name, fault.words.partition(" (")[0], fault.checks)}
+    said |= {re.sub("^more ", "less ", text) for text in said}
+    assert "" not in said and sorted(text for text in said if f"word.{text}" not in known) == []
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_no_two_plants_translate_the_same_words_in_two_ways(language: str) -> None:
+    words: dict[str, set[str]] = {}
+    for kind in plants.plant_kinds():
+        for english, text in plants.plant_class(kind).translations[language].items():
+            words.setdefault(english, set()).add(text)
+    assert [english for english, texts in words.items() if len(texts) > 1] == []
 
 
 def test_the_loop_file_says_what_to_check(tmp_path: Path) -> None:

@@ -16,8 +16,17 @@ import pytest
 import servoscope as ss
 from golden.results import FOLDER
 from servoscope.core import messages
-from servoscope.core.messages import JOINS, Message, catalogue, message, read_messages, render, text_message
-from servoscope.detection.result import Diagnosis, DiagnosisWarning, Mimic
+from servoscope.core.messages import (
+    JOINS,
+    Message,
+    catalogue,
+    count_words,
+    message,
+    read_messages,
+    render,
+    text_message,
+)
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, Mimic
 
 SOURCES = sorted((Path(__file__).parents[2] / "src" / "servoscope").rglob("*.py"))
 TEMPLATES = sorted((Path(__file__).parents[2] / "src" / "servoscope").rglob("templates/*.html"))
@@ -112,6 +121,16 @@ def test_values_are_joined_and_formatted() -> None:
         assert f"second fault ({text})" in str(added)
 
 
+def test_numbers_of_things_are_counted_in_words() -> None:
+    assert [count_words(n, "asset") for n in (0, 1, 2)] == ["0 assets", "1 asset", "2 assets"]
+    assert count_words(1, "row", "de") == "1 Zeile" and count_words("1\N{THIN SPACE}000", "row", "de").endswith(
+        "Zeilen"
+    )
+    assert str(message("defect.no_stamp", rows=1)) == "1 row without a time stamp dropped"
+    plural = re.compile(r"(?<!of )\{\w+\} (rows|samples|steps|gaps|warnings|evaluations|assets|sources|workers)\b")
+    assert [key for key, text in catalogue().items() if not key.startswith("count.") and plural.search(text)] == []
+
+
 def test_a_message_survives_json() -> None:
     inner = message("diagnosis.deviations", value=3.5)
     given = message("diagnosis.coefficients", t=60.0, changes=(inner, text_message("as {it} is")), unit=None)
@@ -168,7 +187,8 @@ def test_another_language_replaces_the_wording_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     diagnosis = diagnosed()
-    english, numbers = diagnosis.model_dump_json(), diagnosis.model_dump(exclude={"summary", "explanation", "warnings"})
+    words = {"summary", "explanation", "warnings", "checks"}
+    english, numbers = diagnosis.model_dump_json(), diagnosis.model_dump(exclude=words)
     (tmp_path / "en.toml").write_bytes(messages.FOLDER.joinpath("en.toml").read_bytes())
     (tmp_path / "de.toml").write_text(
         '[join]\nor = "{first} oder {last}"\n[diagnosis]\n'
@@ -185,7 +205,10 @@ def test_another_language_replaces_the_wording_and_nothing_else(
         assert "-fache (1.19" in diagnosis.summary and "seit 30.0 s" in diagnosis.summary
         assert "Ein zweiter Fehler (contamination, friction oder pump) erklärt" in " ".join(diagnosis.explanation)
         assert diagnosis.explanation[0].startswith("Alarm at ")  # English where the language has nothing
-        assert diagnosis.model_dump(exclude={"summary", "explanation", "warnings"}) == numbers
+        assert str(diagnosis.checks[0]).startswith(
+            "Kolbendichtung"
+        )  # the plant's own words, which it translates itself
+        assert diagnosis.model_dump(exclude=words) == numbers
         assert render(diagnosis.headline, "en") == json.loads(english)["summary"]
     finally:
         catalogue.cache_clear()

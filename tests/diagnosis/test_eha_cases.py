@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.detection.result import Diagnosis
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.diagnosis.result import Diagnosis
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.signals.readers import read

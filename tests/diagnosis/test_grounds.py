@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from pages import make_diagnosis, read
 
-from servoscope.detection.result import Candidate, Diagnosis, FaultEstimate, Mimic, RefitSummary
+from servoscope.diagnosis.result import Diagnosis, Mimic, RefitSummary
+from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.models.loop import Loop
 
 

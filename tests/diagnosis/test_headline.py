@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from servoscope.core.messages import message, text_message
-from servoscope.detection.result import Candidate, DiagnosisWarning, FaultEstimate, FaultInterval, Mimic, RefitSummary
 from servoscope.diagnosis.explanation import build_headline
+from servoscope.diagnosis.result import DiagnosisWarning, FaultInterval, Mimic, RefitSummary
+from servoscope.isolation.candidate import Candidate, FaultEstimate
 
 LEAK = FaultEstimate(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.19, 1.21))
 WEAK = FaultEstimate(name="pump", parameter="p_s", ratio=0.9, interval=(0.898, 0.902))

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from servoscope.core.errors import AlarmError, ConfigError, RecordingError, StateError
 from servoscope.core.messages import text_message
-from servoscope.detection.result import Verdict
 from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.diagnosis.result import Verdict
 from servoscope.service.alarms import AlarmSettings, LifecycleEvent, LifecycleState, OperatorCommand
 from servoscope.service.assets import checkpoint
 from servoscope.service.assets.asset import Asset, AssetPolicy
@@ -355,9 +355,9 @@ class TestConfig:
             (
                 'kind = "replay"',
                 'kind = "mqt"',
-                "[sources] line.kind: 'mqt' is unknown, choose from kafka, mqtt, opcua, replay",
+                "[sources] line.kind: 'mqt' is unknown, choose from folder, kafka, mqtt, opcua, replay",
             ),
-            ('kind = "replay"', "", "[sources] line.kind: missing, choose from kafka, mqtt, opcua, replay"),
+            ('kind = "replay"', "", "[sources] line.kind: missing, choose from folder, kafka, mqtt, opcua, replay"),
             (
                 'kind = "replay"',
                 'kind = "mqtt"',

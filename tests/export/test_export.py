@@ -11,10 +11,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import axis_logs
 import numpy as np
 import numpy.typing as npt
 import pytest
-import test_features
 from commands import run
 from drives import Drive, compiler
 from hypothesis import given
@@ -26,6 +26,7 @@ from servoscope.core.errors import BaselineError, StateError
 from servoscope.detection.baseline_run import cusum_constants
 from servoscope.detection.statistic import apply_alarm_delays
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.estimation import estimators
 from servoscope.export import export_c, pack_image, unpack_image
 from servoscope.export.golden import frozen_signals, golden_signals
 from servoscope.learning.learn import learn_baseline, nominal_baseline
@@ -34,6 +35,11 @@ from servoscope.signals.quality import QualitySettings
 from servoscope.simulation import FaultEvent, reference, simulate
 
 AXIS: dict[str, Any] = {"kind": "polynomial", "order": 2, "coefficients": {"viscous_friction": 200.0, "inertia": 90.0}}
+WITH_COVARIANCE = [
+    name
+    for name in estimators.estimator_names()
+    if not hasattr(estimators.load_estimator(name), "steady_gain") and name != "sliding-window"  # which is refused
+]
 RIG = Path(str(files("servoscope").joinpath("simulation", "reference-rig.toml")))
 
 
@@ -112,7 +118,7 @@ def test_delays_of_the_alarm(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("estimator", ["iv-akf", "kf", "rls", "rls-reset", "dfrls", "nlms"])
+@pytest.mark.parametrize("estimator", WITH_COVARIANCE)
 def test_estimators_with_a_covariance_of_their_own(tmp_path: Path, estimator: str) -> None:
     baseline = fresh(altered(demo(), estimator=estimator))
     same(Drive.built(baseline, tmp_path), baseline, 20_000)
@@ -241,7 +247,7 @@ def test_coefficients_alone_behind_a_stage_of_the_input(tmp_path: Path, made: Ca
 @functools.cache
 def with_features() -> Baseline:
     """An axis with friction, learned from as many recordings as features need."""
-    return ss.learn(test_features.LOOP, [test_features.axis(seed) for seed in range(4)])
+    return ss.learn(axis_logs.LOOP, [axis_logs.axis(seed) for seed in range(4)])
 
 
 def test_coefficients_alone_beside_features(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,6 @@ from servoscope.fleet.tasks import ExamineTask
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Columns
 from servoscope.signals import Recording
-
-pytestmark = pytest.mark.xdist_group("lake")  # its fixtures are made once
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +207,8 @@ class Killer(ExamineTask):
         return {"asset": self.item.asset, "day": self.item.day, "stamp": "", "status": "examined", "error": None}
 
 
-def test_a_task_that_kills_its_process_costs_itself_only(lake: Path) -> None:
+def test_a_task_that_kills_its_process_costs_itself_only(lake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # where a worker finds `Killer`
     tasks = [Killer(item, None, "", 1, None, 1.0, None) for item in Lake.open(str(lake)).items[2:5]]
     found = {task.key: result["status"] for task, result in local(2)(tasks)}
     assert found == {task.key: "failed" if task.item.asset == lakes.ILL else "examined" for task in tasks}

@@ -35,8 +35,7 @@ from servoscope.fleet.tasks import ExamineTask
 from servoscope.service.store import Store
 from servoscope.service.store.tables import diagnoses
 
-# one session for all of them, so one process of the test runner
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("spark")]
+pytestmark = pytest.mark.slow
 
 SOURCES = str(Path(fleet.__file__).parents[2])
 MASTER = "local[1,2]"  # one core; a task may fail once

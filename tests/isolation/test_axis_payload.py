@@ -17,13 +17,13 @@ from servoscope.core.errors import LoopError
 from servoscope.core.messages import render
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.learning.axis_structures import explore_structures
-from servoscope.learning.output_error import simulate_free
 from servoscope.learning.proposal import propose
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.simulation import FaultEvent, simulate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 from accuracy import arm
+from public.output_error import simulate_free
 
 COEFFICIENTS = {"inertia": 2.0, "viscous_friction": 1.0, "coulomb_friction": 0.5, "gravity": -8.0, "load_friction": 0.4}
 TERMS = ["viscous", "coulomb", "gravity", "load_friction"]

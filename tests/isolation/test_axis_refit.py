@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from accuracy.axis import AXES, moves, record
 from accuracy.axis import loop as axis_loop
+from public.output_error import fit_output_error
 from scipy.signal import lfilter
 
 import servoscope as ss
@@ -19,13 +20,12 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
 from servoscope.core.jit import sine
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals
-from servoscope.isolation.ml.axis_scan import FALSE_ALARMS, TRIM, scan_limit
+from servoscope.isolation.ml.axis_scan import EDGE_SHARE, FALSE_ALARMS, scan_limit
 from servoscope.isolation.ml.axis_vibration import find_vibration
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import fit_hypothesis
 from servoscope.isolation.ml.window import ChangeProfile
 from servoscope.learning.axis_fit import fit_axis
-from servoscope.learning.output_error import fit_output_error
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.simulation import FaultEvent, simulate
 
@@ -156,7 +156,7 @@ class TestWindow:
         e = rng.normal(size=(tries, N))
         S, t = np.cumsum(e, axis=1), np.arange(1, N + 1) / N
         bridge = (S - t * S[:, -1:]) / np.sqrt(N)
-        inside = (t >= TRIM) & (t <= 1.0 - TRIM)
+        inside = (t >= EDGE_SHARE) & (t <= 1.0 - EDGE_SHARE)
         largest = (bridge[:, inside] ** 2 / (t * (1.0 - t))[inside]).max(axis=1)
         share = float((largest > scan_limit(1, 0.01)).mean())
         assert 0.005 < share < 0.013  # discrete steps miss a little of the continuous path

@@ -10,8 +10,8 @@ import pytest
 from scipy import integrate
 
 from servoscope.core.errors import SimulationError
-from servoscope.detection.result import UNKNOWN, Candidate
-from servoscope.isolation.isolate import SYSTEMATIC, isolate
+from servoscope.isolation.candidate import UNKNOWN, Candidate
+from servoscope.isolation.isolate import SYSTEMATIC_ERROR_SHARE, isolate
 from servoscope.isolation.signature import Signature, coefficient_signature, parameter_signature
 from servoscope.models.plants import Fault
 
@@ -97,7 +97,7 @@ def test_probabilities_are_the_integrals_over_the_prior() -> None:
 
     def weight(x: float, shift: Callable[[float], naive.Array]) -> float:
         s = shift(float(np.exp(x)))
-        S = (SIGMA + np.diag((SYSTEMATIC * s) ** 2)) / np.outer(size, size)
+        S = (SIGMA + np.diag((SYSTEMATIC_ERROR_SHARE * s) ** 2)) / np.outer(size, size)
         miss = (d - s) / size
         return float(np.exp(-0.5 * miss @ np.linalg.inv(S) @ miss) / np.sqrt(np.linalg.det(S)))
 
@@ -127,7 +127,7 @@ def test_interval_is_as_sharp_where_the_grid_misses_the_truth() -> None:
         best = isolate(pair, d, sigma**2 * np.eye(4))[0]
         assert best.name == "true"
         widths.append(np.log(best.faults[0].interval[1] / best.faults[0].interval[0]))
-    expected = 3.92 * np.hypot(sigma, SYSTEMATIC * np.log(ratio)) / np.linalg.norm(along)
+    expected = 3.92 * np.hypot(sigma, SYSTEMATIC_ERROR_SHARE * np.log(ratio)) / np.linalg.norm(along)
     assert np.mean(widths) == pytest.approx(expected, rel=0.3)
 
 

@@ -15,8 +15,8 @@ from commands import one_line, run
 import servoscope as ss
 from servoscope.baseline.learned_fault import LearnedFault
 from servoscope.core.errors import BaselineError, NotEnoughError
-from servoscope.detection.result import UNKNOWN, Candidate
 from servoscope.diagnosis.learn_faults import fit_learned_fault
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.isolate import isolate, misfit_limit
 from servoscope.isolation.signature import coefficient_signature
 from servoscope.isolation.signatures import learned_signature

@@ -144,7 +144,7 @@ class TestPredictor:
         assert np.abs(correlations).max() < 4.0 / np.sqrt(len(e))
 
     def test_the_bound_is_that_of_the_theory(self, rig_loop: ss.Loop) -> None:
-        """THEORY section 7: 10 s of the profile, one parameter alone and all four free, in per cent."""
+        """How-it-works, "Refit": 10 s of the profile, one parameter alone and all four free, in per cent."""
         learned = ss.learn(rig_loop, [simulate(rig_loop, reference("profile", 60.0, 100.0), seed=1)[0]])
         paper = ExactPredictorFit(noise=WhiteNoise(1e-4, float(np.sqrt(1e-7))), misfit=0.0)
         known = learned.model_copy(update={"ratios": {}, "ratios_covariance": (), "exact": paper})

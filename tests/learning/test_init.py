@@ -42,3 +42,11 @@ def test_a_log_whose_names_say_nothing_needs_columns(log: Path, tmp_path: Path) 
     mapping = "t=c0[ms], r=1e-3*c1, u=c2, y=1e-3*c3"
     assert run("init", path, "-o", tmp_path / "a.toml", "--columns", mapping).code == 0
     assert Loop.load(tmp_path / "a.toml").columns.output == "1e-3*c3"
+
+
+def test_control_characters_in_names_leave_valid_toml(log: Path, tmp_path: Path) -> None:
+    path, target = tmp_path / "a\nname = 1.csv", tmp_path / "loop.toml"
+    path.write_text(log.read_text(encoding="utf-8").replace("Istposition", "Ist\x7fposition"), encoding="utf-8")
+    assert run("init", path, "-o", target).code == 0
+    assert Loop.load(target).columns.output == "0.001 * `Ist\x7fposition [mm]`"
+    assert "\n" not in target.read_text(encoding="utf-8").splitlines()[0]

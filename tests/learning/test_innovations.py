@@ -17,7 +17,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.noise_model import WhiteNoise, arma_from_system, arma_from_white_noise, colour_error
 from servoscope.estimation.pipeline import Pipeline
-from servoscope.learning.innovation_fit import COLOURED, fit_innovations
+from servoscope.learning.innovation_fit import MAX_AUTOCORRELATION_STDS, fit_innovations
 from servoscope.models.lti import LinearSystem, autocovariances, innovation_gain
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 
@@ -62,7 +62,7 @@ class TestHealthyParameters:
         swung = replace(healthy, y=healthy.y + 2e-3 * np.sin(2.0 * np.pi * 3.0 * healthy.t))
         each = [fit_innovations(second_rig.second_loop(), [recording], PAPER) for recording in (healthy, swung)]
         assert each[0] is not None and each[1] is not None
-        assert each[0].whiteness < COLOURED < each[1].whiteness
+        assert each[0].whiteness < MAX_AUTOCORRELATION_STDS < each[1].whiteness
         assert each[1].covariance[0, 0] > 4.0 * each[0].covariance[0, 0]
 
     @pytest.mark.slow  # compiles the recursion of another order
@@ -123,7 +123,7 @@ class TestWrongFile:
         """From this file alone it ended with beta a third too low, 300 in -2 log likelihood above the minimum."""
         wrong = wrong_file.wrong_loop(4, wrong_file.WRONG)
         found = fit_innovations(wrong, [rig.record("multisine", 60.0, 4, 0)], PAPER)
-        assert found is not None and found.whiteness < COLOURED
+        assert found is not None and found.whiteness < MAX_AUTOCORRELATION_STDS
         assert found.noise.y_std == pytest.approx(PAPER.y_std, rel=0.02)
 
     @pytest.mark.slow

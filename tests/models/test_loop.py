@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from servoscope.core.errors import LoopError, ServoscopeError
+from servoscope.core.errors import LoopError, ObsoleteSettingWarning, ServoscopeError
 from servoscope.models.loop import DEFAULT_FREQUENCIES, Columns, Loop, MonitorSettings
 
 RIG = """
@@ -210,6 +210,7 @@ def test_a_key_outside_its_section_is_sent_home(rig: dict[str, Any]) -> None:
         ("columns", "segment", "run", "[columns] segment: 'run' is not a list, write [ ... ]"),
         ("columns", "output", "", "[columns] output: must not be empty"),
         ("monitor", "cutoff", 60.0, "[monitor] cutoff: 60 Hz is not below the Nyquist frequency of 50 Hz"),
+        ("monitor", "cutoff", 1e-300, "[monitor] cutoff: 1e-300 Hz is below a millionth of sample_rate = 100 Hz"),
         ("monitor", "cutoff", 0.0, "[monitor] cutoff: 0.0 must be greater than 0"),
         ("monitor", "frequencies", [1.0, 50.0], "[monitor] frequencies: 50 Hz is not below the Nyquist"),
         ("monitor", "frequencies", [], "[monitor] frequencies: has 0 entries, needs at least 1"),
@@ -290,3 +291,11 @@ def test_an_empty_file_is_told(tmp_path: Path) -> None:
 
 def test_one_except_clause_catches_all() -> None:
     assert issubclass(LoopError, ServoscopeError)
+
+
+def test_a_setting_of_an_earlier_version_is_read_with_a_warning(tmp_path: Path) -> None:
+    path = tmp_path / "loop.toml"
+    path.write_text(f'{RIG}sequential_step = "update"\n', encoding="utf-8")
+    with pytest.warns(ObsoleteSettingWarning, match=r"loop\.toml: \[monitor\] sequential_step.*evaluation_rate"):
+        loop = Loop.load(path)
+    assert Loop.from_dict(loop.to_dict()) == loop  # what a baseline keeps brings no warning

@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 import pydantic
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from servoscope.core.errors import LoopError
-from servoscope.models.plants import EXTRA_COLUMNS, Plant, parse_plant, plant_kinds
+from servoscope.models.plants import Column, Plant, parse_plant, plant_kinds
 from servoscope.models.plants.eha import EHA
 from servoscope.models.plants.polynomial import PolynomialPlant
 
@@ -115,34 +113,6 @@ class TestEHA:
         assert pump == pytest.approx(valve, rel=1e-12)
 
 
-class TestInversion:
-    @given(
-        p_s=st.floats(0.3, 3.0),
-        C_ie=st.floats(0.3, 5.0),
-        b_p=st.floats(0.2, 100.0),
-        beta=st.floats(0.001, 30.0),
-    )
-    def test_round_trip_of_simultaneous_faults(self, p_s: float, C_ie: float, b_p: float, beta: float) -> None:
-        eha = EHA.model_validate(RIG)
-        faulty = eha.with_ratios({"p_s": p_s, "C_ie": C_ie, "b_p": b_p, "beta": beta})
-        kappa = eha.kappa_from_theta(faulty.theta())
-        # b_p and C_ie are differences of larger terms, which costs digits where one of the terms dominates.
-        assert kappa["p_s"] == pytest.approx(faulty.p_s, rel=1e-6)
-        assert kappa["C_ie"] == pytest.approx(faulty.C_ie, rel=1e-6)
-        assert kappa["b_p"] == pytest.approx(faulty.b_p, rel=1e-6)
-        assert kappa["beta"] == pytest.approx(faulty.beta, rel=1e-6)
-        assert eha.from_theta(faulty.theta()).theta() == pytest.approx(faulty.theta(), rel=1e-6)
-
-    def test_no_actuator_has_these(self, eha: EHA) -> None:
-        with pytest.raises(LoopError, match="no actuator"):
-            eha.kappa_from_theta([-1.0, 0.2, 5e-5, 3e-7])
-
-    @pytest.mark.parametrize("theta", [[0.0, 0.2, 5e-5, 3e-7], [0.2, 0.2, 5e-5, 0.0]])
-    def test_zero_coefficients_are_refused_without_a_warning(self, eha: EHA, theta: list[float]) -> None:
-        with pytest.raises(LoopError, match="no actuator"):
-            eha.kappa_from_theta(theta)
-
-
 class TestWithoutSpring:
     @pytest.fixture
     def free(self) -> EHA:
@@ -151,21 +121,6 @@ class TestWithoutSpring:
     def test_it_integrates(self, free: EHA) -> None:
         assert free.theta()[0] == 0.0
         assert np.abs(np.linalg.eigvals(free.state_space()[0])).min() < 1e-9
-
-    @given(C_ie=st.floats(0.5, 2.0), b_p=st.floats(0.5, 20.0), beta=st.floats(0.5, 10.0))
-    def test_three_parameters_come_back_at_known_gain(self, C_ie: float, b_p: float, beta: float) -> None:
-        free = EHA.model_validate(RIG | {"k_p": 0.0})
-        faulty = free.with_ratios({"C_ie": C_ie, "b_p": b_p, "beta": beta})
-        # Told from the truth, the nearer of the two solutions is the right one.
-        found = faulty.from_theta(faulty.theta())
-        assert found.p_s == free.p_s
-        assert found.beta == pytest.approx(faulty.beta, rel=1e-9)
-        assert found.theta()[1:] == pytest.approx(faulty.theta()[1:], rel=1e-6)
-        assert free.from_theta(faulty.theta()).theta()[1:] == pytest.approx(faulty.theta()[1:], rel=1e-6)
-
-    def test_a_leak_alone_comes_back(self, free: EHA) -> None:
-        leaking = free.with_ratios({"C_ie": 1.3})
-        assert free.from_theta(leaking.theta()).C_ie == pytest.approx(leaking.C_ie, rel=1e-6)
 
 
 class TestPolynomial:
@@ -202,7 +157,7 @@ class TestPolynomial:
     ) -> None:
         plant = PolynomialPlant.model_validate(settings)
         assert (plant.names, plant.powers, plant.extras) == (names, powers, extras)
-        assert set(plant.extras) <= set(EXTRA_COLUMNS)
+        assert all(isinstance(extra, Column) for extra in plant.extras)
         assert [fault.name for fault in plant.faults] == [*names, "input_gain"]
 
     def test_without_coefficients_nothing_is_made_up(self) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from servoscope.fleet.common_cause import SIZES, Evidence, Prior, causes, fault_probability
 from servoscope.fleet.summary import summarise_fleet
-from servoscope.research.scoring import reliability
+from servoscope.scoring import reliability
 
 NAMES = ("p_s", "C_ie", "b_p", "beta")
 

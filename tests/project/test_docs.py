@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import inspect
 import re
+import tomllib
 import typing
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.main
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
+from pydantic.fields import FieldInfo
 
 import servoscope
 
@@ -140,6 +143,67 @@ def test_every_key_of_the_service_file_is_documented() -> None:
     text = section("service-file.md", r"\[web\.oidc\]") or ""
     missing += [f"web.oidc: {name}" for name in OidcSettings.model_fields if not has_line(text, name)]
     assert not missing, f"not in docs/reference/service-file.md: {', '.join(missing)}"
+
+
+def default_cells(text: str) -> Iterator[tuple[str, str]]:
+    """Yield key and documented default of each row of the tables that have a column of defaults."""
+    column = None
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split(" | ")] if line.startswith("|") else []
+        if "default" in [cell.strip() for cell in cells]:
+            column = [cell.strip() for cell in cells].index("default")
+        elif not cells:
+            column = None
+        elif column is not None and len(cells) > column:
+            keys, given = re.findall(r"`(\w+)`", cells[0]), cells[column].split(", ")
+            yield from zip(keys, given if len(given) == len(keys) else [cells[column]] * len(keys), strict=True)
+
+
+def wrong_default(field: FieldInfo, cell: str) -> bool:
+    """Tell whether a default that the code has is another than the documented one; words stand for a computed one."""
+    if cell == "required" or field.is_required():
+        return (cell == "required") != field.is_required()
+    default = field.get_default(call_default_factory=True, validated_data={})
+    if not (literal := re.match(r"`([^`]*)`", cell)):
+        return cell == "none" and bool(default)
+    try:
+        documented = tomllib.loads(f"x = {literal[1]}")["x"]
+    except tomllib.TOMLDecodeError:
+        return False  # a name that the code forms
+    return bool(documented != TypeAdapter(Any).dump_python(default, mode="json"))
+
+
+def test_documented_defaults_are_those_of_the_code() -> None:
+    from servoscope.models import plants
+    from servoscope.models.loop import Columns, Controller, Loop, MonitorSettings
+    from servoscope.service.config import ServiceFile
+    from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
+
+    tables: list[tuple[str, tuple[str, ...], type[BaseModel]]] = [
+        ("loop-file.md", ("Top level",), Loop),
+        ("loop-file.md", (r"\[columns\]",), Columns),
+        ("loop-file.md", (r"\[controller\]",), Controller),
+        ("loop-file.md", (r"\[monitor\]",), MonitorSettings),
+        *(("loop-file.md", (r"\[plant\]", kind), plants.plant_class(kind)) for kind in plants.plant_kinds()),
+    ]
+    for key, field in ServiceFile.model_fields.items():
+        tables += [("service-file.md", (rf"^\[{key}(\.NAME)?\]$",), model) for model in models_in(field.annotation)]
+    for key, group in (("sources", SOURCES), ("outlets", PUBLISHERS)):
+        for kind, found in find_kinds(group).items():
+            tables.append(("service-file.md", (rf"\[{key}\.NAME\]$", kind), found.load()))
+    wrong, compared = [], 0
+    for name, words, model in tables:
+        text = section(name, *words)
+        if text is None:  # one section has the tables of all kinds
+            parts = re.split(r"^Of kind `(\w+)`", section(name, *words[:1]) or "", flags=re.MULTILINE)
+            text = dict(zip(parts[1::2], parts[2::2], strict=True)).get(words[-1], "")
+        for key, cell in default_cells(text):
+            field = model.model_fields.get(key)
+            compared += field is not None
+            if field is not None and wrong_default(field, cell):
+                wrong.append(f"{name} {' '.join(words)} {key}: {cell}, in the code {field.default!r}")
+    assert not wrong, "\n".join(wrong)
+    assert compared > 100, compared
 
 
 def test_every_key_of_alarms_data_quality_and_actions_is_documented() -> None:

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browsing import Served
+from commands import run
 from dirty import signals
+from halls import service_of
 
+from servoscope.core import messages
 from servoscope.core.errors import LoopError, RecordingError
+from servoscope.core.messages import catalogue, translate
+from servoscope.learning.learn import nominal_baseline
 from servoscope.models.loop import Loop
 from servoscope.models.plants import parse_plant, plant_kinds
 from servoscope.signals import readers, writers
 from servoscope.signals.cleanup import clean
+from servoscope.simulation import FaultEvent, reference, simulate
 
 READER = '''
 """Reads .rec files: a line of names, then raw doubles, row by row."""
@@ -59,7 +68,21 @@ class Motor(Plant):
     names = property(lambda self: ("b", "J"))
     powers = property(lambda self: (1, 2))
     has_physics = property(lambda self: True)
-    faults = property(lambda self: (Fault("dry bearing", "b", (0.5, 20.0), "the bearing is dry"),))
+    faults = property(
+        lambda self: (
+            Fault("friction", "b", (0.5, 20.0), "the bearing is dry", "bearing: grease, noise"),
+            Fault("added_disc", "J", (0.2, 5.0), "the wheel is heavier", "screws of the disc"),
+        )
+    )
+    translations = {
+        "de": {
+            "the bearing is dry": "das Lager ist trocken",
+            "bearing: grease, noise": "Lager: Fett, Laufgeräusch",
+            "added_disc": "Zusatzscheibe",
+            "the wheel is heavier": "das Rad ist schwerer",
+            "screws of the disc": "Schrauben der Scheibe",
+        }
+    }
 
     def theta(self):
         return np.array([self.b, self.J])
@@ -71,6 +94,8 @@ class Motor(Plant):
         A = np.array([[0.0, 1.0], [0.0, -self.b / self.J]])
         return A, np.array([[0.0], [1.0 / self.J]]), np.array([[1.0, 0.0]])
 '''
+WHEEL = {"name": "wheel", "sample_rate": 100.0, "plant": {"kind": "motor", "J": 2.0, "b": 3.0}}
+CONTROL = {"kind": "pi", "k_p": 40.0, "k_i": 20.0}
 
 
 def install(folder: Path, module: str, text: str, entry_point: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,16 +130,88 @@ def test_a_reader_of_another_package_reads_what_a_csv_file_gives(
     assert "\n" not in str(caught.value)
 
 
-def test_a_plant_of_another_package_is_the_plant_of_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(LoopError, match="unknown, choose from"):
-        parse_plant({"kind": "motor", "J": 2.0, "b": 3.0})
+@pytest.fixture
+def motors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on the path with the package of a plant."""
     install(tmp_path, "my_plants", PLANT, "[servoscope.plants]\nmotor = my_plants:Motor\n", monkeypatch)
+    catalogue.cache_clear()
+    yield tmp_path
+    monkeypatch.undo()
+    catalogue.cache_clear()
+
+
+def test_a_plant_of_another_package_is_the_plant_of_a_loop(motors: Path) -> None:
     assert "motor" in plant_kinds()
-    loop = Loop.from_dict({"name": "wheel", "sample_rate": 100.0, "plant": {"kind": "motor", "J": 2.0, "b": 3.0}})
+    loop = Loop.from_dict(WHEEL)
     assert loop.plant.theta().tolist() == [3.0, 2.0]
     assert loop.plant.with_ratios({"b": 2.0}).theta().tolist() == [6.0, 2.0]
     A, B, C = loop.plant.state_space()
     s = 2.0j
     assert (C @ np.linalg.solve(s * np.eye(2) - A, B)).item() == pytest.approx(1.0 / (3.0 * s + 2.0 * s**2))
     with pytest.raises(LoopError, match="J"):
-        Loop.from_dict({"name": "wheel", "sample_rate": 100.0, "plant": {"kind": "motor", "b": 3.0}})
+        Loop.from_dict({**WHEEL, "plant": {"kind": "motor", "b": 3.0}})
+
+
+def test_a_plant_of_no_package_is_refused_and_a_broken_package_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(LoopError, match="unknown, choose from"):
+        parse_plant(WHEEL["plant"])
+    install(tmp_path, "no_plants", "import nothing_like_it", "[servoscope.plants]\nmotor = no_plants:M\n", monkeypatch)
+    with pytest.raises(LoopError, match="its package is broken, repair or remove it"):
+        parse_plant(WHEEL["plant"])
+    catalogue.cache_clear()
+    assert translate("leakage", "de") == "innere Leckage"
+
+
+@pytest.fixture
+def turned(motors: Path) -> Path:
+    """The folder with a baseline of a wheel, and a recording whose bearing runs dry."""
+    loop = Loop.from_dict({**WHEEL, "controller": CONTROL})
+    nominal_baseline(loop).save(motors / "wheel.json")
+    r = 10.0 * reference("multisine", 60.0, loop.sample_rate)
+    fault = FaultEvent.parse("friction=1.5@30")
+    recording, _ = simulate(loop, r, faults=[fault], seed=1)
+    writers.write_recording(motors / "dry.csv", recording)
+    return motors
+
+
+@pytest.mark.parametrize(
+    ("language", "name", "meaning", "checks", "other"),
+    [
+        ("en", "friction", "the bearing is dry", "bearing: grease, noise", "the wheel is heavier"),
+        ("de", "Reibung", "das Lager ist trocken", "Lager: Fett, Laufgeräusch", "das Rad ist schwerer"),
+    ],
+)
+def test_the_words_of_a_plant_of_another_package_reach_the_reader(
+    turned: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    language: str, name: str, meaning: str, checks: str, other: str,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(messages, "LANGUAGE", language)
+    shown = run("diagnose", turned / "wheel.json", turned / "dry.csv", "--report", turned / "dry.html")
+    assert shown.code == 0
+    text = " ".join(shown.out.split())
+    assert name in text and checks in text and "rod seal" not in text and "Stangendichtung" not in text
+    page = " ".join((turned / "dry.html").read_text(encoding="utf-8").split())
+    assert meaning.capitalize() in page.replace(meaning, meaning.capitalize()) and checks in page
+    said = run("diagnose", turned / "wheel.json", turned / "dry.csv", "--json")
+    assert any(checks in words for words in json.loads(said.out)["checks"])
+    assert translate("the wheel is heavier", language) == other
+
+
+def test_the_pages_know_the_words_of_a_plant_of_another_package(turned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (turned / "hall.toml").write_text(
+        'name = "hall"\n[service]\nlisten = ""\nlog = "error"\n[store]\nurl = "hall.sqlite"\n'
+        '[web]\nlisten = "127.0.0.1:0"\n[diagnosis]\nwindow_s = 40.0\nevery_s = 30.0\n'
+        '[sources.line]\nkind = "replay"\nspeed = 0.0\n'
+        '[assets.wheel]\nbaseline = "wheel.json"\nsource = "line"\nfiles = ["dry.csv"]\n',
+        encoding="utf-8",
+    )
+    monkeypatch.setenv("PYTHONPATH", str(turned))  # of the processes that diagnose and serve
+    service_of(turned / "hall.toml").run()
+    with Served(turned, "serve", "hall.toml") as served, served.client(headers={"Accept-Language": "de"}) as client:
+        asset = client.get("/assets/wheel").raise_for_status().json()
+        words = client.get(f"{served.url}/static/language.js").raise_for_status().text
+    assert "the bearing is dry" in json.dumps(asset)
+    assert '"the bearing is dry": "das Lager ist trocken"' in words and '"added_disc": "Zusatzscheibe"' in words

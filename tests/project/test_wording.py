@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from servoscope.detection.result import Candidate, FaultEstimate
+from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.report import format_values
 
 PUMP = FaultEstimate(name="pump", parameter="p_s", ratio=0.9, interval=(0.8, 1.0))

@@ -17,8 +17,9 @@ from pages import PROVENANCE, Reader, make_diagnosis, make_recording, make_trace
 from servoscope import report
 from servoscope.cli.output_paths import REPORTS, check_output
 from servoscope.core.errors import OutputError
-from servoscope.detection.result import Candidate, DiagnosisWarning, FaultEstimate, FinalCoefficient
 from servoscope.diagnosis.motion_signature import compare_signatures
+from servoscope.diagnosis.result import DiagnosisWarning, FinalCoefficient
+from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.models.loop import Loop
 from servoscope.report import diagnosis_figures, plotting
 from servoscope.signals import clean

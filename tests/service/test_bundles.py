@@ -97,7 +97,7 @@ def rows(store: Store, table: sa.Table) -> int:
 
 def test_whatever_comes_and_goes_each_asset_finds_what_it_needs(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bundles, "BUNDLES", 2)
-    monkeypatch.setattr(bundles, "PATIENCE", 3)
+    monkeypatch.setattr(bundles, "MAX_COMMITS_WAITED", 3)
     chance, names, feed = random.Random(1), [f"axis{i}" for i in range(7)], Feed(store)
     first = dict.fromkeys(names, 0)
     for turn in range(60):
@@ -122,13 +122,13 @@ def test_an_asset_that_falls_silent_for_ever_holds_its_own_blocks_and_no_rows(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bundles, "BUNDLES", 1)
-    monkeypatch.setattr(bundles, "PATIENCE", 5)
+    monkeypatch.setattr(bundles, "MAX_COMMITS_WAITED", 5)
     names, feed = [f"axis{i}" for i in range(8)], Feed(store)
     for turn in range(40):
         awake = names if turn < 10 else names[1:]
         feed.write(awake, {name: max(0, turn - 6) for name in awake})
         feed.check()
-        assert rows(store, tables.bundles) <= 6 + 2 + bundles.PATIENCE
+        assert rows(store, tables.bundles) <= 6 + 2 + bundles.MAX_COMMITS_WAITED
     assert rows(store, tables.recent) == len(feed.needed["axis0"]) == 7
     feed.write(["axis0"], {"axis0": 10})  # it is back
     feed.check()

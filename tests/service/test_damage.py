@@ -53,6 +53,12 @@ def test_a_store_that_is_not_whole_is_refused(sound: Path, tmp_path: Path, chang
     one_line(run("watch", config, "--once"), "hall.sqlite: ", said)
 
 
+@pytest.mark.parametrize("status", ["{}", "[]", "3", '{"verdict": "fault", "residual": 5}'])
+def test_a_status_that_is_none_is_refused_in_one_line(sound: Path, tmp_path: Path, status: str) -> None:
+    config = damaged(sound, tmp_path, f"UPDATE checkpoints SET status = '{status}' WHERE asset = 'press'")
+    one_line(run("watch", config, "--once"), "holds a damaged status", "restore a backup")
+
+
 @pytest.mark.parametrize("name", ["press", "hall"])
 def test_a_torn_state_is_replaced_for_good(sound: Path, tmp_path: Path, name: str) -> None:
     config = damaged(sound, tmp_path, f"UPDATE checkpoints SET state = x'00' WHERE asset = '{name}'")

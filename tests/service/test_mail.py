@@ -105,7 +105,7 @@ def test_what_keeps_a_mail_from_its_server_is_told_and_it_is_tried_again(
         ("doesn't match|not valid for", {"host": "127.0.0.1"}),
         ("Authentication", {"user": "somebody"}),
         ("refused", {"port": 1}),
-        ("network that \\[network\\] refuses", {"network": {"refused": ["internal"]}}),
+        ("internal address, which \\[network\\] refuses", {"network": {"internal": False}}),
         ("holds no secret", {"secret_env": "NOT_SET"}),
     ):
         settings = settings_of(**{**good, **changed})

@@ -22,18 +22,19 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from pydantic import ValidationError
+from typer.testing import CliRunner
 
-from servoscope.core.errors import ConfigError, StoreUnavailableError
+from servoscope.cli import app
+from servoscope.core.errors import ConfigError, ObsoleteSettingWarning
 from servoscope.service.actions import ActionSettings, OutboxEntry, deliver
 from servoscope.service.config import ServiceFile
 from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
 from servoscope.service.network import NetworkSettings
 from servoscope.service.opcua.source import OpcuaSourceSettings, create_opcua_client
-from servoscope.service.store import Store
 
 NAME = "hook.example"  # which is nobody's
-REFUSED = {"refused": ["internal"]}
-LOOPBACK_ONLY = {"refused": ["0.0.0.0/0", "::/0"], "allowed": ["127.0.0.0/8"]}
+PUBLIC_ONLY = {"internal": False}
+LOOPBACK_TOO = {"internal": False, "allowed": ["127.0.0.0/8"]}
 
 
 class Names:
@@ -46,6 +47,7 @@ class Names:
         monkeypatch.setattr(socket, "getaddrinfo", self._find)
 
     def _find(self, host: Any, port: Any, *arguments: Any, **more: Any) -> Any:
+        host = host.decode() if isinstance(host, bytes) else host
         if host not in self.addresses:
             return self._resolve(host, port, *arguments, **more)
         self.asked.append(host)
@@ -107,12 +109,18 @@ def attempt(url: str, folder: Path = Path(), **more: Any) -> tuple[bool, str]:
         *(("8.8.8.8", True), ("2001:4860:4860::8888", True)),
         *(("10.1.2.3", False), ("127.0.0.1", False), ("169.254.169.254", False), ("100.64.0.1", False)),
         *(("0.0.0.0", False), ("::1", False), ("fd00::1", False), ("fe80::1", False), ("224.0.0.1", False)),
-        *(("::ffff:10.1.2.3", False), ("64:ff9b::10.1.2.3", False)),  # IPv4 in IPv6
+        *(("fec0::1", False), ("ff0e::1", False), ("5f00::1", False), ("255.255.255.255", False), ("::", False)),
+        *(("::ffff:8.8.8.8", True), ("64:ff9b::8.8.8.8", True)),  # IPv4 in IPv6, of a public host
+        *(("::ffff:10.1.2.3", False), ("::ffff:7f00:1", False), ("::127.0.0.1", False)),  # mapped, compatible
+        *(("::ffff:0:7f00:1", False), ("::ffff:0:127.0.0.1", False)),  # translated
+        *(("64:ff9b::10.1.2.3", False), ("64:ff9b:1::7f00:1", False), ("64:ff9b:1:7f00:0:100::", False)),  # NAT64
+        *(("2002:7f00:1::", False), ("2002:a01:203::1", False)),  # 6to4
+        *(("2001::7f00:1", False), ("2001:0:4136:e378:8000:63bf:80ff:fffe", False)),  # Teredo
         *(("192.168.7.7", True), ("::ffff:192.168.7.7", True), ("192.168.7.8", False)),  # the exception
     ],
 )
 def test_internal_networks_are_refused_but_for_exceptions(address: str, reached: bool) -> None:
-    rules = NetworkSettings(refused=("internal",), allowed=("192.168.7.7",))
+    rules = NetworkSettings(internal=False, allowed=("192.168.7.7",))
     if reached:
         assert ipaddress.ip_address(rules.resolve(address, 80)) == ipaddress.ip_address(address)
     else:
@@ -122,12 +130,12 @@ def test_internal_networks_are_refused_but_for_exceptions(address: str, reached:
 
 def test_of_several_addresses_one_that_is_permitted_is_taken(names: Names) -> None:
     names.addresses[NAME] = [["10.0.0.1", "8.8.8.8"]]
-    assert NetworkSettings(refused=("10.0.0.0/8",)).resolve(NAME, 80) == "8.8.8.8"
+    assert NetworkSettings(internal=False).resolve(NAME, 80) == "8.8.8.8"
     assert NetworkSettings().resolve(NAME, 80) == NAME  # without rules nothing is looked up
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"allowed": ("10.0.0.0/8",)}, {"refused": ("intern",)}, {"refused": ("10.0.0.0/99",)}]
+    "wrong", [{"allowed": ("10.0.0.0/8",)}, {"internal": "no"}, {"internal": False, "allowed": ("10.0.0.0/99",)}]
 )
 def test_rules_that_mean_nothing_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
@@ -136,18 +144,18 @@ def test_rules_that_mean_nothing_are_refused(wrong: dict[str, Any]) -> None:
 
 def test_a_webhook_does_not_reach_a_refused_network() -> None:
     with receiving() as (port, heard):
-        done, detail = attempt(f"http://localhost:{port}/x", network=REFUSED)
-        assert not done and "is in a network that [network] refuses" in detail and heard == []
-        assert attempt(f"http://localhost:{port}/x", network=LOOPBACK_ONLY)[0] and heard == [f"localhost:{port}"]
+        done, detail = attempt(f"http://localhost:{port}/x", network=PUBLIC_ONLY)
+        assert not done and "is an internal address, which [network] refuses" in detail and heard == []
+        assert attempt(f"http://localhost:{port}/x", network=LOOPBACK_TOO)[0] and heard == [f"localhost:{port}"]
 
 
 def test_a_name_that_changes_between_the_look_and_the_connection_gains_nothing(names: Names) -> None:
     names.addresses[NAME] = [["8.8.8.8"], ["127.0.0.1"]]
-    rules = NetworkSettings(refused=("internal",))
+    rules = NetworkSettings(**PUBLIC_ONLY)
     assert rules.resolve(NAME, 80) == "8.8.8.8"
     names.addresses[NAME], names.asked = [["127.0.0.1"], ["203.0.113.1"]], []
     with receiving() as (port, heard):
-        assert attempt(f"http://{NAME}:{port}/x", network=LOOPBACK_ONLY) == (True, "answered 200")
+        assert attempt(f"http://{NAME}:{port}/x", network=LOOPBACK_TOO) == (True, "answered 200")
         assert heard == [f"{NAME}:{port}"] and names.asked == [NAME]  # asked once: what was checked is what it went to
 
 
@@ -198,7 +206,7 @@ def test_over_https_both_sides_prove_who_they_are(keys: Path, names: Names) -> N
     ours = {"cert_file": "us.pem", "key_file": "us.key"}
     with receiving(context) as (port, heard):
         url = f"https://{NAME}:{port}/x"
-        for network in (LOOPBACK_ONLY, None):  # to an address that was checked, and as httpx does it
+        for network in (LOOPBACK_TOO, None):  # to an address that was checked, and as httpx does it
             assert attempt(url, keys, ca_file="root.pem", network=network, **ours) == (True, "answered 200")
             taken = len(heard)
             assert not attempt(url, keys, ca_file="other.pem", network=network, **ours)[0]
@@ -226,10 +234,10 @@ def test_a_broker_and_a_server_are_held_to_the_rules_too(names: Names) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
         broker = {"host": NAME, "port": port}
-        client = create_mqtt_client(BrokerSettings(**broker, network=NetworkSettings(**REFUSED)), Path(), "a")
+        client = create_mqtt_client(BrokerSettings(**broker, network=NetworkSettings(**PUBLIC_ONLY)), Path(), "a")
         with pytest.raises(PermissionError, match="refuses"):
             client.connect(NAME, port)
-        settings = BrokerSettings(**broker, network=NetworkSettings(**LOOPBACK_ONLY))
+        settings = BrokerSettings(**broker, network=NetworkSettings(**LOOPBACK_TOO))
         client = create_mqtt_client(settings, Path(), "a")
         client.connect(NAME, port)
         listening.accept()[0].close()
@@ -242,35 +250,21 @@ def test_a_broker_and_a_server_are_held_to_the_rules_too(names: Names) -> None:
             one.disconnect_socket()
 
         with pytest.raises(PermissionError, match="refuses"):
-            asyncio.run(connect(REFUSED))
-        asyncio.run(connect(LOOPBACK_ONLY))
-
-
-def test_a_database_is_held_to_the_rules_of_its_store(names: Names) -> None:
-    names.addresses[NAME] = [["127.0.0.1"]]
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        listening.settimeout(10.0)
-        url = f"postgresql://us@{NAME}:{listening.getsockname()[1]}/history"
-        with pytest.raises(StoreUnavailableError, match=r"hook\.example.*127\.0\.0\.1 is in a network.*refuses"):
-            Store.open(url, network=NetworkSettings(**REFUSED))
-        hanging_up = threading.Thread(target=lambda: listening.accept()[0].close())
-        hanging_up.start()
-        with pytest.raises(StoreUnavailableError, match=r"^(?!.*refuses)"):
-            Store.open(url, network=NetworkSettings(**LOOPBACK_ONLY))
-        hanging_up.join()  # it was reached, under the address that was checked: nobody else knows the name
+            asyncio.run(connect(PUBLIC_ONLY))
+        asyncio.run(connect(LOOPBACK_TOO))
 
 
 def test_the_section_holds_for_all_that_have_no_rules_of_their_own(tmp_path: Path) -> None:
     more = """
     [network]
-    refused = ["internal"]
+    internal = false
     [sources.cell]
     kind = "opcua"
     url = "opc.tcp://localhost:4840"
     [sources.bus]
     kind = "mqtt"
     host = "localhost"
-    network = { refused = ["10.0.0.0/8"] }
+    network = { internal = false, allowed = ["10.0.0.0/8"] }
     [outlets.wall]
     kind = "mqtt"
     host = "localhost"
@@ -283,9 +277,9 @@ def test_the_section_holds_for_all_that_have_no_rules_of_their_own(tmp_path: Pat
     found = ServiceFile.load(halls.hall(tmp_path, "hall", more=more))
     held: list[Any] = [found.sources["cell"], found.outlets["wall"], found.actions.webhook["desk"]]
     held.append(found.actions.mqtt["bell"].broker)
-    assert all(one.rules.refused == ("internal",) for one in held)
-    assert found.sources["bus"].rules.refused == ("10.0.0.0/8",)  # type: ignore[attr-defined]
-    with pytest.raises(ConfigError, match=r"network.*refused: missing"):
+    assert all(one.rules == NetworkSettings(**PUBLIC_ONLY) for one in held)
+    assert found.sources["bus"].rules.allowed == ("10.0.0.0/8",)  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"network.*internal = false, add it"):
         ServiceFile.load(halls.hall(tmp_path, "wrong", more='[network]\nallowed = ["10.0.0.0/8"]\n'))
 
 
@@ -294,3 +288,26 @@ def test_the_files_of_a_broker_of_an_action_lie_beside_the_service_file(tmp_path
     one = ActionSettings.model_validate({"mqtt": {"bell": message}}).resolve_paths(tmp_path).mqtt["bell"].broker
     assert (one.password_file, one.ca_file) == (str(tmp_path / "p"), str(tmp_path / "c"))
     assert json.loads(one.model_dump_json())["host"] == "a"
+
+
+@pytest.mark.parametrize(
+    ("section", "said", "rules"),
+    [
+        ('[network]\nrefused = ["internal"]', "internal = false", {"internal": False}),
+        (
+            '[network]\nrefused = ["::/0"]\nallowed = ["10.2.0.7"]',
+            "firewall",
+            {"internal": False, "allowed": ("10.2.0.7",)},
+        ),
+        ("[network]\nrefused = []", "internal = false", {}),
+        ('[store.network]\nrefused = ["internal"]', "sslmode=verify-full", {}),
+    ],
+)
+def test_keys_of_earlier_versions_are_read_with_a_warning_and_refused_by_check(
+    section: str, said: str, rules: dict[str, Any], tmp_path: Path
+) -> None:
+    path = halls.hall(tmp_path, "hall", more=section)
+    with pytest.warns(ObsoleteSettingWarning, match=said):
+        assert ServiceFile.load(path).network == NetworkSettings(**rules)
+    refused = CliRunner().invoke(app, ["run", str(path), "--check"])
+    assert refused.exit_code == 1 and said in refused.output and len(refused.output.splitlines()) == 1

@@ -23,6 +23,7 @@ from opcua_plant import NODES
 from reliability.servers import Cable
 
 from servoscope.core.errors import ConfigError, MessageError
+from servoscope.service.opcua import server as opcua_server
 from servoscope.service.opcua.monitored_items import _AnswerRecorder
 from servoscope.service.opcua.server import OpcuaServer, OpcuaServerSettings
 from servoscope.service.opcua.settings import OpcuaNodes
@@ -322,3 +323,31 @@ def test_values_that_come_while_nodes_are_subscribed_reach_the_session() -> None
     """The library reports them to what it takes for the session: it once wrote a traceback into the log."""
     session = SimpleNamespace(observer=object())
     assert _AnswerRecorder(session).observer is session.observer
+
+
+def test_silent_clients_use_up_no_files_of_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opcua_server, "HANDSHAKE_S", 3.0)
+    outlet = OpcuaServer(OpcuaServerSettings(kind="opcua", listen=f"127.0.0.1:{free_port()}"), tmp_path)
+    outlet.open({"press": STATUS})
+    host, port = outlet.settings.listen.split(":")
+    silent = list[socket.socket]()
+
+    def files() -> int:
+        return len(list(Path("/proc/self/fd").iterdir())) - len(silent)
+
+    before = files()
+    for _ in range(2 * opcua_server.MAX_CONNECTIONS):
+        silent.append(socket.create_connection((host, int(port)), timeout=5.0))
+    until(lambda: files() <= before + opcua_server.MAX_CONNECTIONS, 15.0)
+    until(lambda: files() <= before, 30.0)  # and those that say nothing are closed, too
+
+    async def read() -> Any:
+        from asyncua import Client
+
+        async with Client(f"opc.tcp://{outlet.settings.listen}/servoscope", timeout=30.0) as client:
+            return await client.get_node("ns=2;s=press.Verdict").read_value()
+
+    assert asyncio.run(read()) == STATUS["verdict"]
+    outlet.close()
+    for one in silent:
+        one.close()

@@ -22,6 +22,7 @@ from reliability.servers import Mosquitto
 from typer.testing import CliRunner
 
 from servoscope.cli.app import app
+from servoscope.cli.render.history import active_alarms
 from servoscope.core.errors import ConfigError
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.actions import ActionSettings
@@ -31,6 +32,7 @@ from servoscope.service.assets.reception import AssetTrouble, ReceptionLog
 from servoscope.service.build import build_components
 from servoscope.service.config import DiagnosisSettings, ServiceFile
 from servoscope.service.health import serve_health
+from servoscope.service.mqtt import client
 from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
 from servoscope.service.notifications import Notifier
 from servoscope.service.service import Service
@@ -176,6 +178,17 @@ def test_a_client_that_is_thrown_out_by_one_of_its_name_says_so(tmp_path: Path, 
         one.close()
 
 
+def test_to_leave_a_broker_is_no_loss(tmp_path: Path, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch) -> None:
+    events = list[str]()
+    monkeypatch.setattr(client, "log", lambda _level, event, **_: events.append(event))
+    settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=broker.port)
+    for visitor in (MqttSource(settings.for_visit(), frozenset({"press"}), tmp_path, f"hall.{k}") for k in range(2)):
+        visitor.open({})
+        until(lambda one=visitor: one.connected, 30.0)
+        visitor.close()
+    assert events == ["broker connected"] * 2
+
+
 def test_an_action_for_connections_takes_those_of_all_sources() -> None:
     sinks = {"command": {"bell": {"argv": ["true"], "alarms": ["connection"]}}}
     alarms = AlarmSettings.model_validate({"connection": {"on_delay_s": 0.0}})
@@ -184,6 +197,11 @@ def test_an_action_for_connections_takes_those_of_all_sources() -> None:
     assert [(one.alarm, one.cause) for one in result.transitions] == [("connection.plant", "Not authorized")]
     (row,) = notifier.notify(result.transitions, {}, NOW)
     assert row.table == "outbox" and row.values["event"]["alarm"] == "connection.plant"
+    (shown,) = active_alarms({"hall": {"status": notifier.status}})
+    assert (shown["priority"], shown["cause"]) == ("high", "Not authorized")
+    resumed = Notifier("hall", AlarmSettings(definitions={}), ActionSettings())  # its definition has gone
+    resumed.resume(notifier.checkpoint()["state"])
+    assert active_alarms({"hall": {"status": resumed.status}}) == [{**shown, "priority": None}]
     assert notifier.check_service(0.0, {"plant": ""}, NOW + 1.0).transitions == []
     assert set(notifier.status["alarms"]) == {"buffering", "connection.plant"}  # one that has no source is forgotten
 
@@ -207,7 +225,7 @@ def test_a_dead_broker_and_an_asset_that_never_comes_are_alarms_from_the_start(
     }
     with urllib.request.urlopen(f"http://127.0.0.1:{server.server_address[1]}/health/ready", timeout=5.0) as answer:
         ready = json.load(answer)
-    assert ready["ok"] and ready["degraded"].startswith("2 of 2 assets are not followed, press for example")
+    assert ready["ok"] and ready["degraded"].startswith("2 of 2 assets not followed, press for example")
     metrics = service.metrics.render().decode()
     assert 'servoscope_reception{asset="lift",source="dead",state="unheard"} 1.0' in metrics
     assert 'servoscope_connection_trouble{name="dead"} 1.0' in metrics

@@ -9,9 +9,9 @@ import halls
 import numpy as np
 import pytest
 
-from servoscope.detection.result import FaultEstimate
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.fleet.summary import summarise_fleet
+from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import AlarmSettings
 from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.examination import StoredDiagnosis, diagnose_blocks, undetermined

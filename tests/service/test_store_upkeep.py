@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import os
 import shutil
+import sqlite3
 import threading
 import tracemalloc
 from collections.abc import Iterator
@@ -20,6 +22,7 @@ from golden.results import FOLDER
 from servoscope.service.config import StoreSettings
 from servoscope.service.retention import DAY_S, delete_old_rows
 from servoscope.service.store import Batch, Store, schema, tables
+from servoscope.service.store import copy as copying
 from servoscope.service.store.copy import copy_store
 from servoscope.service.store.series import read_notes
 
@@ -124,6 +127,47 @@ def test_a_backup_is_of_one_moment_while_rows_are_written(store: Store, url: str
         sizes.append(commits)
     assert sizes == sorted(set(sizes)) and sizes[0] >= 30
     assert sorted(one.name for one in tmp_path.iterdir() if "part" in one.name) == []
+
+
+DAMAGES = {"deep": 20_000 * "[" + 20_000 * "]", "torn": "{", "bytes": b"\xff\xfe", "nothing": None}
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_a_damaged_cell_is_copied_or_refused_in_one_line(tmp_path: Path, kind: str) -> None:
+    sound, damaged, refused = old_store(tmp_path, max(STORES)), tmp_path / "damaged.sqlite", set[str]()
+    columns = [column for table in tables.METADATA.sorted_tables for column in table.columns]
+    for column in (one for one in columns if isinstance(one.type, sa.JSON | sa.LargeBinary | sa.Double)):
+        shutil.copy(sound, damaged)
+        with contextlib.closing(sqlite3.connect(damaged)) as connection, contextlib.suppress(sqlite3.IntegrityError):
+            changed = connection.execute(f"UPDATE {column.table.name} SET {column.name} = ?", (DAMAGES[kind],)).rowcount
+            connection.commit()
+            if changed:
+                done = run("store", "restore", damaged, tmp_path / "restored.sqlite")
+                if done.code:
+                    one_line(done, "damaged.sqlite")
+                    refused.add(str(column))
+                    assert not (tmp_path / "restored.sqlite").exists()
+                (tmp_path / "restored.sqlite").unlink(missing_ok=True)
+    assert ("checkpoints.status" in refused) == (kind != "nothing")
+
+
+def test_a_copy_is_its_owners_alone_from_its_first_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, modes = old_store(tmp_path, max(STORES)), set[int]()
+    copy_rows = copying._copy_rows
+
+    def watched(*arguments: Any) -> int:
+        modes.update(one.stat().st_mode & 0o777 for one in tmp_path.glob("*.part*"))
+        return copy_rows(*arguments)
+
+    monkeypatch.setattr(copying, "_copy_rows", watched)
+    before = os.umask(0o000)
+    try:
+        assert run("store", "backup", source, tmp_path / "backup.sqlite").code == 0
+        assert run("store", "restore", tmp_path / "backup.sqlite", tmp_path / "restored.sqlite").code == 0
+    finally:
+        os.umask(before)
+    modes.update((tmp_path / name).stat().st_mode & 0o777 for name in ("backup.sqlite", "restored.sqlite"))
+    assert modes == {0o600}
 
 
 def write_samples(store: Store, commits: int, asset: str, samples: bytes) -> None:

@@ -28,7 +28,7 @@ from servoscope.service.alarms import LifecycleEvent, OperatorCommand
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.checkpoint import pack_state, unpack_state
 from servoscope.service.assets.groups import AssetGroups, BlockResult
-from servoscope.service.assets.reception import FOLLOWED, Reception
+from servoscope.service.assets.reception import RECEPTION_OK, Reception
 from servoscope.service.assets.records import StepResult
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
@@ -141,7 +141,7 @@ def test_whatever_happens_to_some_assets_all_come_to_what_they_come_to_alone(
         turn = [blocks.pop(0) for blocks in waiting.values() for _ in range(min(chance.randrange(3), len(blocks)))]
         for one in turn:
             expected[one.asset] += alone[one.asset].process(one, latest).rows
-            alone[one.asset].reception = FOLLOWED
+            alone[one.asset].reception = RECEPTION_OK
         changed = set()
         for result in groups.process(turn, latest):
             for name, rows in halls.block_rows([result]):
@@ -149,7 +149,7 @@ def test_whatever_happens_to_some_assets_all_come_to_what_they_come_to_alone(
             if isinstance(result, BlockResult):
                 assert isinstance(result.result, StepResult)
                 changed |= set() if result.result.repeatable else {result.block.asset}
-                together[result.block.asset].reception = FOLLOWED
+                together[result.block.asset].reception = RECEPTION_OK
             else:
                 quiet += len(result.blocks)
         name, kind = chance.choice(list(together)), chance.choice(["silence", "shelve", "slow", *["nothing"] * 20])

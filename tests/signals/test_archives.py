@@ -12,6 +12,7 @@ from commands import one_line, run
 from logs import as_expected, lines, written
 
 from servoscope.core.errors import RecordingError
+from servoscope.core.workers import WorkerGroup
 from servoscope.signals.readers import archives, read, readable_suffixes, reader_process
 from servoscope.signals.readers.archives import expand_paths
 
@@ -58,7 +59,7 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
 
 
 def test_what_swells_when_unpacked_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(archives, "LEAST_BYTES", 1000)
+    monkeypatch.setattr(archives, "MIN_UNPACKED_LIMIT_BYTES", 1000)
     path = tmp_path / "x.csv.gz"
     path.write_bytes(gzip.compress(b"1,2\n" * 5_000_000))
     with pytest.raises(RecordingError, match="MB when unpacked, unpack it yourself"):
@@ -70,7 +71,9 @@ def test_a_reader_that_hangs_is_stopped_and_the_next_file_is_read(
 ) -> None:
     (tmp_path / "hanging.py").write_text("def open_it(path):\n    while True:\n        pass\n")
     path = written(tmp_path, lines(), "x.bin")
-    monkeypatch.setattr(reader_process, "_idle", [])  # a worker finds what is on the path when it starts
+    monkeypatch.setattr(
+        reader_process, "_workers", WorkerGroup(reader_process.LIMITS)
+    )  # a worker finds what is on the path when it starts
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]))
     monkeypatch.setattr(reader_process, "BASE_S", 0.5)
     with pytest.raises(RecordingError, match=r"x\.bin: is a damaged Odd file \(it took more than 0\.5"):
@@ -79,8 +82,7 @@ def test_a_reader_that_hangs_is_stopped_and_the_next_file_is_read(
     opened = reader_process.open_bounded(path, "CSV", "servoscope.signals.readers.csv", "open_csv", "pyarrow")
     assert opened.columns == ("t", "r", "u", "y")
     assert sum(table.rows for table in opened.iter_chunks(opened.columns)) == 300
-    for worker in reader_process._idle:
-        worker.stop()
+    reader_process._workers.close()
 
 
 def test_help_groups_the_commands_and_shows_one() -> None:

@@ -14,11 +14,11 @@ from logs import lines, written
 from servoscope.baseline.baseline import Baseline
 from servoscope.core import outofcore
 from servoscope.core.errors import RecordingError
-from servoscope.detection.result import Diagnosis
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose, diagnose_with_trace
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.operating_points import learn
+from servoscope.diagnosis.result import Diagnosis
 from servoscope.models.loop import Columns, Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import csv, parquet, read

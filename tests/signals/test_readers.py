@@ -13,6 +13,7 @@ from servoscope.core.errors import LoopError, RecordingError
 from servoscope.models.loop import Columns, Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import list_channels, read, read_parts
+from servoscope.signals.readers.formats import open_file
 
 CRANFIELD = Columns(
     time="time",
@@ -217,3 +218,12 @@ def test_the_simulated_cases_are_read_as_numpy_reads_them(eha_cases: Path, loop:
 def test_a_bad_combination_is_an_error_of_the_loop(tmp_path: Path) -> None:
     with pytest.raises(LoopError):
         read(written(tmp_path, lines()), columns=Columns(input="sin(u)"))
+
+
+@pytest.mark.parametrize("rows", [1, 3, 40])
+def test_the_names_of_thousands_of_columns_are_read_whole(tmp_path: Path, rows: int) -> None:
+    names = ["t", *(f"valve block {k} pressure" for k in range(3500))]  # 80 kB
+    row = ",".join(["0.5"] * len(names))
+    path = tmp_path / "wide.csv"
+    path.write_text("\n".join([",".join(names), *[row] * rows]) + "\n", encoding="utf-8")
+    assert open_file(path).columns == tuple(names)

@@ -29,7 +29,7 @@ class Served:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "servoscope", *self._arguments],
             cwd=self._folder,
-            env={**os.environ, "PYTHONPATH": str(SOURCE)},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(SOURCE), os.environ.get("PYTHONPATH", "")])},
             stderr=subprocess.PIPE,
             text=True,
         )

@@ -8,16 +8,10 @@ from typing import Any
 import numpy as np
 
 from servoscope import report
-from servoscope.detection.result import (
-    Candidate,
-    Diagnosis,
-    DiagnosisWarning,
-    FaultEstimate,
-    FinalCoefficient,
-    ResponsePoint,
-)
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FinalCoefficient, ResponsePoint
 from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 

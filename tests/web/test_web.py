@@ -26,8 +26,6 @@ from servoscope.service.store.queries import query_downsampled
 from servoscope.signals import writers
 from servoscope.simulation import FaultEvent
 
-pytestmark = pytest.mark.xdist_group("web")  # one service for all of them, heard from its beginning on
-
 LEAKING = 200  # minutes of it, by the clock of the samples: longer than the tests
 WEB = """
 [web]

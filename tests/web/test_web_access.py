@@ -25,8 +25,6 @@ from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
 
-pytestmark = pytest.mark.xdist_group("access")
-
 PASSWORDS = {"vera": "a long password of hers", "otto": "a long password of his", "enno": "one more long password"}
 ROLES = {"vera": "viewer", "otto": "operator", "enno": "engineer"}
 

@@ -16,7 +16,7 @@ from screens import asked, until
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
 expect = playwright.expect
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
+pytestmark = pytest.mark.slow
 
 SIGNALS = ("Time", "Reference r", "Input u", "Output y")
 

@@ -19,7 +19,7 @@ from golden.results import FOLDER
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
 expect = playwright.expect
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
+pytestmark = pytest.mark.slow
 
 # no German text has them; names of files, columns, commands and faults in a document's own words are marked as such
 ENGLISH = re.compile(

@@ -19,7 +19,7 @@ from servoscope.prognosis.series import read_sizes
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
 expect = playwright.expect
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
+pytestmark = pytest.mark.slow
 
 
 def test_the_fleet_shows_the_worst_first(open_page: Open) -> None:

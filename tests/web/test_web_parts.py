@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from starlette.datastructures import Headers
 
+from servoscope.core.sandbox import Sandbox
 from servoscope.core.workers import ProcessLimits, WorkerError
 from servoscope.service.store import Batch, Store
 from servoscope.signals.readers.guess_columns import guess_mapping
@@ -23,8 +24,9 @@ from servoscope.web.schemas.requests import DesignRequest, LoopRef
 def test_work_that_takes_too_long_is_ended(tmp_path: Path) -> None:
     request = DesignRequest(loop=LoopRef(example="reference-rig"))
     arguments = request, request.loop, [], str(tmp_path)
+    walls = Sandbox((str(tmp_path),))
     with pytest.raises(WorkerError, match="more than 1 s of processor time"):
-        asyncio.run(run_task("study_design", arguments, tmp_path, ProcessLimits(1.0, 3000.0)))
+        asyncio.run(run_task("study_design", arguments, tmp_path, ProcessLimits(1.0, 3000.0), walls))
 
 
 def test_a_reader_that_is_late_hears_the_newest_state_and_no_backlog(tmp_path: Path) -> None:

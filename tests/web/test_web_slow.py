@@ -24,13 +24,13 @@ from pydantic import ValidationError
 from servoscope.core.networks import is_member
 from servoscope.service.access import WebSettings
 from servoscope.service.health import serve_health
-from servoscope.web.connections import ConnectionTable, LimitedProtocol
+from servoscope.web.connections import ConnectionTable, HttpProtocol
 
 HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
 WHOLE = HALF + b"\r\n"
 
 
-class Impatient(LimitedProtocol):
+class Impatient(HttpProtocol):
     """Deadlines that a test can wait for."""
 
     HEADER_S, BODY_S, BODY_RATE, DRAIN_S = 0.5, 0.5, 1000.0, 0.5

@@ -42,7 +42,7 @@ from servoscope.models.plants import Plant
 
 FORMAT = "servoscope-baseline"
 VERSION = 2
-LATER = "motion", "axis", "covariates", "scatter"  # what earlier versions did not know
+NEWER_FIELDS = "motion", "axis", "covariates", "scatter"  # what earlier versions did not know
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
@@ -176,9 +176,9 @@ class Baseline(ShortRepr, BaselineMemory):
 
     @model_serializer(mode="wrap")
     def _without_nothing(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what is `LATER`, where there is none: files of earlier versions are written as they were."""
+        """Leave out what is `NEWER_FIELDS`, where there is none: files of earlier versions are written as they were."""
         fields: dict[str, Any] = write(self)
-        return {name: value for name, value in fields.items() if value or name not in LATER}
+        return {name: value for name, value in fields.items() if value or name not in NEWER_FIELDS}
 
     @cached_property
     def loop(self) -> Loop:

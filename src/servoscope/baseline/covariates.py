@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.messages import Message, message
 
-EDGE = 0.05  # share of the learned range, by which a covariate may be outside of it
+EDGE_SHARE = 0.05  # share of the learned range, by which a covariate may be outside of it
 
 
 class WarmUp(BaseModel):
@@ -56,7 +56,7 @@ class CovariateModel(BaseModel):
     @cached_property
     def _known(self) -> tuple[FloatArray, FloatArray]:
         """The learned range and what is next to it, shapes (k,)."""
-        edge = EDGE * (np.array(self.high) - np.array(self.low))
+        edge = EDGE_SHARE * (np.array(self.high) - np.array(self.low))
         return np.asarray(self.low - edge), np.asarray(self.high + edge)
 
     def basis(self, c: FloatArray) -> FloatArray:

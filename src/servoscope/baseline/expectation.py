@@ -32,9 +32,9 @@ from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 from servoscope.simulation.closed_loop import LoopSimulation
 
-COLOURED = 0.1  # autocorrelation, and error of the variance, that a whitening may leave
-REMEMBERED = 4  # models of noise per loop: a recording asks for the same again and again
-LONGEST_FILL = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
+COLOUR_TOLERANCE = 0.1  # autocorrelation, and error of the variance, that a whitening may leave
+CACHED_MODELS = 4  # models of noise per loop: a recording asks for the same again and again
+MAX_FILL_S = 10.0  # s; a longer gap in r tells nothing about what the loop did meanwhile
 
 
 class Moments(NamedTuple):
@@ -68,7 +68,7 @@ def reference_path(recording: Recording, before: tuple[float, float] | None = No
     if before is not None:
         t, r = np.append(before[0], t), np.append(before[1], r)
     steps = np.round(np.diff(t) * recording.sample_rate).astype(np.int64)
-    steps = np.clip(steps, 1, round(LONGEST_FILL * recording.sample_rate))
+    steps = np.clip(steps, 1, round(MAX_FILL_S * recording.sample_rate))
     kept = np.concatenate([[0], np.cumsum(steps)])
     if kept[-1] >= len(kept):
         r = np.interp(np.arange(kept[-1] + 1), kept, r)
@@ -106,7 +106,7 @@ def residual_noise_model(pipeline: Pipeline, plant: Plant, noise: WhiteNoise) ->
     known, key = pipeline.noise_models, (plant.model_dump_json(), noise)
     model = known.get(key)
     if model is None:
-        if len(known) >= REMEMBERED:
+        if len(known) >= CACHED_MODELS:
             known.clear()
         known[key] = model = _make_noise_model(pipeline, plant, noise)
     return model
@@ -119,7 +119,9 @@ def _make_noise_model(pipeline: Pipeline, plant: Plant, noise: WhiteNoise) -> Ar
     model = model.times(power / float(model.gamma[0]))
     # the simple one where it does: it has four poles, and is forgotten sooner
     return (
-        model if colour_error(model, system, pipeline.stride) <= COLOURED else arma_from_system(system, pipeline.stride)
+        model
+        if colour_error(model, system, pipeline.stride) <= COLOUR_TOLERANCE
+        else arma_from_system(system, pipeline.stride)
     )
 
 

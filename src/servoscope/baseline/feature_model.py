@@ -24,11 +24,11 @@ from servoscope.baseline.threshold import FEATURE_SHARE, SECONDS_PER_YEAR
 from servoscope.core.arrays import FloatArray, IndexArray
 from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayout, Window
 
-PRIOR = 12.0  # degrees of freedom of the shape of S_w behind S
+PRIOR_DEGREES = 12.0  # degrees of freedom of the shape of S_w behind S
 SCORE_STD = 0.5  # of the logarithm of healthy scores, expected before any was seen
 SCORE_PRIOR = 8.0  # degrees of freedom of that expectation
-WIDER = 0.5  # share by which the healthy range of motion is widened either way
-SLACK = 0.05  # and by how much at least: of a share of time, of a logarithm of speed
+WIDENING_SHARE = 0.5  # share by which the healthy range of motion is widened either way
+MIN_WIDENING = 0.05  # and by how much at least: of a share of time, of a logarithm of speed
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
@@ -186,7 +186,7 @@ class GroupStatistic(NamedTuple):
         # recordings of one window say nothing of the shape: no feature then goes with another
         shape = within if np.trace(within) > 0.0 else np.eye(len(centre))
         ratio = float(np.trace(between) / np.trace(shape))
-        S = (dof * between + PRIOR * ratio * shape) / (dof + PRIOR)
+        S = (dof * between + PRIOR_DEGREES * ratio * shape) / (dof + PRIOR_DEGREES)
         ahead = n * n / tt if drift else 0.0
         C = S * (1.0 + 1.0 / n + ahead) + n * n * np.outer(slope, slope) + 1e-9 * np.eye(len(centre))
         kept = np.array(group.kept) if features is None else features

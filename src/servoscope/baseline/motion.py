@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from servoscope.core import outofcore
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray, to_tuples
 from servoscope.estimation.pipeline import Pipeline, RegressionRunner, Tuning
 from servoscope.signals import Recording
 
@@ -23,10 +23,10 @@ __all__ = ["QUANTITIES", "MotionRange", "RecordedMotion", "learn_motion"]
 QUANTITIES = ("amplitude", "speed", "acceleration", "frequency")
 # of the windows in memories: the last ones, which the estimate remembers, and those around, which vary less
 WINDOWS = ((2.0, False), (4.0, True))
-TOLERANCE = 0.05  # relative excess by which recordings of one kind of motion differ
-ENOUGH = 0.5  # of a window, from which what it holds of the recording's beginning counts
-SMALLEST = 1e-3  # of the largest value of a quantity: below, r or y counts as still
-WEAKEST = 1e-6  # of the mean square of a regressor: directions without motion say nothing
+KIND_TOLERANCE = 0.05  # relative excess by which recordings of one kind of motion differ
+MIN_WINDOW_SHARE = 0.5  # of a window, from which what it holds of the recording's beginning counts
+MIN_MOTION_SHARE = 1e-3  # of the largest value of a quantity: below, r or y counts as still
+MIN_DIRECTION_SHARE = 1e-6  # of the mean square of a regressor: directions without motion say nothing
 SIGNALS = 2  # r and y
 MOMENTS = 3  # mean squares of position, speed and acceleration
 
@@ -152,11 +152,11 @@ def motion_excess(pipeline: Pipeline, seen: MotionRange, values: FloatArray, fil
     """
     windows = values.shape[1]
     least, most = np.array(seen.least), np.array(seen.most)
-    floor = SMALLEST * most.max(axis=(0, 1)) + np.finfo(np.float64).tiny
+    floor = MIN_MOTION_SHARE * most.max(axis=(0, 1)) + np.finfo(np.float64).tiny
     values, least, most = (np.maximum(x, floor) for x in (values, least[:windows], most[:windows]))
     above, below = ((values / most).min(axis=2) - 1.0, (least / values).min(axis=2) - 1.0)
     outside = np.where(above > 0.0, above, -np.maximum(below, 0.0))
-    outside[filled < ENOUGH] = 0.0
+    outside[filled < MIN_WINDOW_SHARE] = 0.0
     if 0 not in pipeline.loop.plant.powers:  # without stiffness one place is like another
         outside[..., 0] = 0.0
     larger = np.abs(outside).argmax(axis=1)[:, None]
@@ -166,16 +166,17 @@ def motion_excess(pipeline: Pipeline, seen: MotionRange, values: FloatArray, fil
 def model_error_covariance(pipeline: Pipeline, tuning: Tuning, means: FloatArray, excess: FloatArray) -> FloatArray:
     """Return the covariance that the model's error may add to theta_hat, shape (K, n, n).
 
-    It is the bound of this module's first lines times the squared excess beyond `TOLERANCE`, up to 1. What the model
-    leaves out of eta grows with the size of eta. `means`: over the first of `WINDOWS`, (K, 6 + n n); `excess`: (K, 4).
+    It is the bound of this module's first lines times the squared excess beyond `KIND_TOLERANCE`, up to 1. What the
+    model leaves out of eta grows with the size of eta. `means`: over the first of `WINDOWS`, (K, 6 + n n); `excess`:
+    (K, 4).
     """
     n, scale, theta = len(tuning.theta), tuning.scale, tuning.theta
     normal = means[:, SIGNALS * MOMENTS :].reshape(-1, n, n)
     healthy = tuning.R / pipeline.memory * np.linalg.inv(tuning.P_d)
     larger = np.maximum((normal @ theta @ theta) / (theta @ healthy @ theta), 1.0)
-    growth = np.clip(np.abs(excess).max(axis=1) - TOLERANCE, 0.0, 1.0) ** 2
+    growth = np.clip(np.abs(excess).max(axis=1) - KIND_TOLERANCE, 0.0, 1.0) ** 2
     units = np.outer(scale, scale)
-    inverse = np.linalg.inv(normal / units + WEAKEST * np.eye(n)) / units
+    inverse = np.linalg.inv(normal / units + MIN_DIRECTION_SHARE * np.eye(n)) / units
     return np.asarray((tuning.R * larger * growth)[:, None, None] * inverse)
 
 
@@ -187,14 +188,10 @@ def learn_motion(pipeline: Pipeline, recordings: Sequence[Recording]) -> MotionR
         motion = RecordedMotion.from_recording(pipeline, recording, origin)
         values, filled = motion.quantities(slice(None))
         full = filled[:, 0] >= min(1.0, filled[:, 0].max(initial=0.0))
-        if full.any() and filled[:, 0].max() >= ENOUGH:
+        if full.any() and filled[:, 0].max() >= MIN_WINDOW_SHARE:
             found.append(values[full])
     if not found:
         return None
     values = np.concatenate(found)
-    least, most = (_nested(x) for x in (values.min(axis=0), values.max(axis=0)))
+    least, most = (to_tuples(x) for x in (values.min(axis=0), values.max(axis=0)))
     return MotionRange(origin=origin, least=least, most=most)
-
-
-def _nested(x: FloatArray) -> Ranges:
-    return tuple(tuple(tuple(map(float, row)) for row in window) for window in x)

@@ -19,13 +19,17 @@ from servoscope.models.lti import autocovariances, solve_scaled
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
-FREE = 1.0  # standard deviation of how far covariates may move the logarithm of a parameter
-FARTHEST = 3.0  # how far they move it at most
-NEWTON_STEPS, NEARBY, SETTLED = 20, 1e-6, 1e-9  # of the search for it: steps, and lengths in the logarithm
-PRIOR = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
+COVARIATE_PRIOR_STD = 1.0  # standard deviation of how far covariates may move the logarithm of a parameter
+MAX_COVARIATE_LOGARITHM = 3.0  # how far they move it at most
+NEWTON_STEPS, STEP_TOLERANCE, CONVERGENCE_TOLERANCE = (
+    20,
+    1e-6,
+    1e-9,
+)  # of the search for it: steps, and lengths in the logarithm
+PRIOR_STD = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
 
 
-MOST_SATURATED = 0.5  # share of rows with u at a limit, from which u says nothing
+MAX_SATURATED_SHARE = 0.5  # share of rows with u at a limit, from which u says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +93,7 @@ def fit_healthy_plant(
     found: TuningFit,
     theta: FloatArray,
     noise: ArmaNoise,
-    prior: float = PRIOR,
+    prior: float = PRIOR_STD,
 ) -> HealthyPlant:
     """Fit the plant's parameters to the healthy recordings, held near the loop file's by a prior.
 
@@ -176,27 +180,29 @@ def match_ratios(
 
     def misfit(x: FloatArray) -> FloatArray:
         plant = loop.plant.scaled(dict(zip(ratios, np.exp(before + x).tolist(), strict=True)))
-        return np.concatenate([white @ (nominal_theta(loop, plant) - theta), x / FREE])
+        return np.concatenate([white @ (nominal_theta(loop, plant) - theta), x / COVARIATE_PRIOR_STD])
 
     x = _minimise_squares(misfit, len(before))
     return dict(zip(ratios, np.exp(before + x).tolist(), strict=True))
 
 
 def _minimise_squares(misfit: Callable[[FloatArray], FloatArray], parameters: int) -> FloatArray:
-    """Return where the sum of squares is least, near 0 and within `FARTHEST`."""
+    """Return where the sum of squares is least, near 0 and within `MAX_COVARIATE_LOGARITHM`."""
     x = np.zeros(parameters)
     for _ in range(NEWTON_STEPS):  # a window of a service moves a few parameters a little: three or four steps
         now = misfit(x)
-        slopes = [(misfit(x + NEARBY * e) - now) / NEARBY for e in np.eye(parameters)]
+        slopes = [(misfit(x + STEP_TOLERANCE * e) - now) / STEP_TOLERANCE for e in np.eye(parameters)]
         step = np.linalg.lstsq(np.stack(slopes, axis=1), -now, rcond=None)[0]
         x = x + step
-        if not np.abs(x).max() < FARTHEST:
+        if not np.abs(x).max() < MAX_COVARIATE_LOGARITHM:
             break
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < CONVERGENCE_TOLERANCE:
             return x
     from scipy.optimize import least_squares  # several times as slow near 0, and sure of its way
 
-    return np.asarray(least_squares(misfit, np.zeros(parameters), bounds=(-FARTHEST, FARTHEST)).x)
+    return np.asarray(
+        least_squares(misfit, np.zeros(parameters), bounds=(-MAX_COVARIATE_LOGARITHM, MAX_COVARIATE_LOGARITHM)).x
+    )
 
 
 def fault_directions(
@@ -204,7 +210,7 @@ def fault_directions(
 ) -> dict[str, FloatArray]:
     """Return d theta / d log(parameter) for every parameter of the plant's faults, or others, each of shape (n,)."""
     parameters = plant.parameters if parameters is None else parameters
-    if plant.has_physics and not plant.extras and loop.plant.kind != "polynomial":
+    if plant.has_physics and not plant.extras and not plant.parameters_are_coefficients:
         step = 1e-4
 
         def at(ratio: float, parameter: str) -> FloatArray:

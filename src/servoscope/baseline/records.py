@@ -18,7 +18,7 @@ Value = TypeVar("Value")
 # what a baseline remembers: computed from the fields of its loop alone, or from any but some that stand beside it
 OF_LOOP, OF_ALL = ("loop", "_pipeline"), ("baseline_run", "bias", "fault_directions")
 LOOP_FIELDS = {"loop", "loop_settings", "stage_one", "still_speed", "instrument"}
-BESIDE = {"features", "point", "others"}
+SEPARATE_FIELDS = {"features", "point", "others"}
 
 
 class BaselineModel(BaseModel):
@@ -32,7 +32,7 @@ class BaselineMemory(BaselineModel):
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return a copy with some fields changed, which takes along what does not depend on these."""
-        copied, changed = super().model_copy(update=update, deep=deep), set(update or ()) - BESIDE
+        copied, changed = super().model_copy(update=update, deep=deep), set(update or ()) - SEPARATE_FIELDS
         for name in (*OF_ALL, *(OF_LOOP if changed & LOOP_FIELDS else ())) if changed else ():
             if name not in changed:
                 vars(copied).pop(name, None)

@@ -33,12 +33,12 @@ __all__ = [
 SensorKind = Literal["fixed", "gain", "offset", "noise"]
 
 ALLOWANCE = 1.0  # standard deviations of a block that each CUSUM forgives per block
-MARGIN = 1.5  # times the largest CUSUM of the healthy recordings: slow disagreement is no white noise
+LIMIT_MARGIN = 1.5  # times the largest CUSUM of the healthy recordings: slow disagreement is no white noise
 REPEATS = 5  # equal values in a row from which a sensor stands still, where no healthy one repeats any
-EXPLAINED = 0.5  # share of the squared disagreement from which an offset or a gain explains it
-FEWEST_BLOCKS = 20  # of healthy recordings
+MIN_EXPLAINED_SHARE = 0.5  # share of the squared disagreement from which an offset or a gain explains it
+MIN_BLOCKS = 20  # of healthy recordings
 YEAR_S = 365.25 * 86400.0
-FLOOR = 1e-6  # of the sensors' rms: the least noise, for sensors that are copies of each other
+MIN_NOISE_SHARE = 1e-6  # of the sensors' rms: the least noise, for sensors that are copies of each other
 
 Vector = tuple[float, ...]
 
@@ -106,14 +106,14 @@ def learn_sensors(loop: Loop, recordings: Sequence[Recording]) -> SensorModel | 
     size = max(2, round(loop.sample_rate / loop.monitor.evaluation_rate))
     parts = [_blocks(x, size) for x in values]
     blocks = _Blocks(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-    if len(blocks.median) < FEWEST_BLOCKS:
+    if len(blocks.median) < MIN_BLOCKS:
         raise NotEnoughError(
             f"{recordings[0].name}: {len(blocks.median)} blocks of {size} samples are too few to compare "
-            f"{' and '.join(names)}, at least {FEWEST_BLOCKS} are needed: record longer"
+            f"{' and '.join(names)}, at least {MIN_BLOCKS} are needed: record longer"
         )
     regressors = np.column_stack([np.ones_like(blocks.median), blocks.median])
     (offset, slope), *_ = np.linalg.lstsq(regressors, blocks.difference, rcond=None)
-    floor = FLOOR * float(np.sqrt(np.mean(np.concatenate(values) ** 2))) + np.finfo(np.float64).tiny
+    floor = MIN_NOISE_SHARE * float(np.sqrt(np.mean(np.concatenate(values) ** 2))) + np.finfo(np.float64).tiny
     model = SensorModel(
         names=names,
         samples=size,
@@ -121,12 +121,12 @@ def learn_sensors(loop: Loop, recordings: Sequence[Recording]) -> SensorModel | 
         slope=tuple(slope),
         std=tuple(np.maximum((blocks.difference - regressors @ np.array([offset, slope])).std(axis=0), floor)),
         log_noise=tuple(blocks.log_noise.mean(axis=0)),
-        log_noise_std=tuple(np.maximum(blocks.log_noise.std(axis=0), FLOOR)),
+        log_noise_std=tuple(np.maximum(blocks.log_noise.std(axis=0), MIN_NOISE_SHARE)),
         limit=_cusum_limit(loop, len(names)),
         repeats=max(REPEATS, 1 + 2 * max(int(_repeats(x).max(initial=0)) for x in values)),
     )
     worst = max(float(level.max(initial=0.0)) for one in parts for level in _levels(model, one))
-    return model.model_copy(update={"limit": max(model.limit, MARGIN * worst)})
+    return model.model_copy(update={"limit": max(model.limit, LIMIT_MARGIN * worst)})
 
 
 def find_sensor_deviation(
@@ -178,7 +178,7 @@ def _classify(
     offset, total = float(e.mean()), float(e @ e)
     gain = float(e @ median / (median @ median)) if median.any() else 0.0
     of_offset, of_gain = float(((e - offset) ** 2).sum()), float(((e - gain * median) ** 2).sum())
-    if min(of_offset, of_gain) > (1.0 - EXPLAINED) * total:
+    if min(of_offset, of_gain) > (1.0 - MIN_EXPLAINED_SHARE) * total:
         growth = blocks.log_noise[after].mean(axis=0) - np.array(model.log_noise)
         loudest = int(np.argmax(growth))
         return _deviation(model, (loudest,), "noise", math.exp(0.5 * float(growth[loudest])), onset, detected)
@@ -210,7 +210,7 @@ def _blocks(x: FloatArray, size: int) -> _Blocks:
     # second differences leave motion out; a sensor without any noise has that of its resolution
     rough = np.diff(x, n=2, axis=0, prepend=x[:1], append=x[-1:])[: count * size] if len(x) > 1 else x[:0]
     power = (rough.reshape(count, size, sensors) ** 2).mean(axis=1)
-    least = FLOOR**2 * float((x**2).mean()) if len(x) else 0.0
+    least = MIN_NOISE_SHARE**2 * float((x**2).mean()) if len(x) else 0.0
     log_noise = np.log(power + least + np.finfo(np.float64).tiny)
     return _Blocks(middle, rows.mean(axis=1) - middle[:, None], log_noise)
 

@@ -24,8 +24,8 @@ UserOption = Annotated[str | None, typer.Option(metavar="NAME", help="Who asks; 
 ReasonOption = Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in the history.")]
 
 COMMAND_TIMEOUT_S = 5.0
-LONGEST_S = 366 * 86400.0  # shelving has an end
-COLUMNS = ("asset", "alarm", "state", "since", "until", "priority")
+MAX_SHELVING_S = 366 * 86400.0  # shelving has an end
+COLUMNS = ("asset", "alarm", "state", "since", "until", "priority", "cause")
 
 
 @alarms_app.command("list")
@@ -67,7 +67,7 @@ def shelve(
 ) -> None:
     """Put it on the shelf for a time: it is not announced until that has passed."""
     for_s = parse_duration(time_, "--for")
-    if for_s > LONGEST_S:
+    if for_s > MAX_SHELVING_S:
         raise typer.BadParameter(f"--for {time_!r}: at most 366d; what is to stay silent longer is out-of-service")
     send_command(store, asset, alarm, "shelve", who, why, for_s)
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import atexit
 import gc
 import sys
+import warnings
 from typing import Annotated, Any
 
 import typer
 
 from servoscope.cli.exit import CommandGroup
 from servoscope.core.cache_folders import replace_library_warnings
+from servoscope.core.errors import ObsoleteSettingWarning
+
+_format_library_warning = warnings.formatwarning
 
 GARBAGE = 200_000  # new objects before cycles are looked for: loading code makes very many, and no garbage
 
@@ -51,7 +55,16 @@ def main() -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without a sign for squared is no reason to stop
     replace_library_warnings()
+    warnings.formatwarning = _format_warning
     app(prog_name="servoscope")
+
+
+def _format_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    if issubclass(category, ObsoleteSettingWarning):
+        return f"servoscope: warning: {message}\n"
+    return _format_library_warning(message, category, filename, lineno, line)
 
 
 def _print_version(wanted: bool) -> None:

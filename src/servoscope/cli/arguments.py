@@ -7,7 +7,6 @@ import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,21 +50,7 @@ def parse_time(text: str | None, option: str) -> float | None:
             ) from None
 
 
-MOST_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
-
-
-class EngineName(StrEnum):
-    """Engines of ``fleet``."""
-
-    local = "local"
-    spark = "spark"
-
-
-class RigModel(StrEnum):
-    """Models of the rig that ``simulate`` has."""
-
-    linear = "linear"
-    nonlinear = "nonlinear"
+MAX_SIMULATED_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
 
 
 def parse_healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
@@ -244,6 +229,6 @@ def check_reference(text: str) -> None:
 def check_length(duration_s: float, sample_rate: float) -> None:
     """Refuse a ``--duration`` that has no samples, or more than a machine's memory is sure to hold."""
     samples = duration_s * sample_rate
-    if not 0.5 < samples <= MOST_SAMPLES:  # not a number is refused too
-        most = MOST_SAMPLES / sample_rate
+    if not 0.5 < samples <= MAX_SIMULATED_SAMPLES:  # not a number is refused too
+        most = MAX_SIMULATED_SAMPLES / sample_rate
         raise typer.BadParameter(f"--duration {duration_s:g}: give more than 0 s and at most {most:g} s")

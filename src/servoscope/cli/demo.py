@@ -85,7 +85,7 @@ def run_demo(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
     """
     from servoscope.cli.render import diagnosis, results
     from servoscope.core.jit import on_compilation
-    from servoscope.detection.result import Diagnosis
+    from servoscope.diagnosis.result import Diagnosis
 
     write_loop_file(folder)
     out = results.create_console()

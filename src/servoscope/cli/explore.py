@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from servoscope.learning.axis_structures import AxisStructure
 
-SHOWN = 8  # structures, the supported one first
+MAX_LISTED_STRUCTURES = 8  # structures, the supported one first
 
 
 @app.command()
@@ -77,14 +77,12 @@ def explore(
 
 def plant_table(structure: AxisStructure) -> str:
     """Return the section of a loop file; the constant force joins, which every recording has of its own."""
-    from servoscope.models.plants.axis import AxisPlant
-
     plant = structure.plant
     terms = ", ".join(f'"{term}"' for term in (*plant.terms, "offset"))
     lines = ["[plant]", 'kind = "axis"', f"terms = [{terms}]", f"input_gain = {plant.input_gain!r}"]
-    for key in ("stribeck_speed", "hanging_at", "payload_arm", "y"):
-        if (value := getattr(plant, key)) != AxisPlant.model_fields[key].default:
-            lines.append(f"{key} = {json.dumps(value)}")
+    keys = {"stribeck_speed", "hanging_at", "payload_arm", "y"}
+    settings = plant.model_dump(include=keys, exclude_defaults=True)
+    lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -109,30 +107,24 @@ def _summary(one: AxisStructure) -> dict[str, object]:
 
 
 def _print(out: Console, found: tuple[AxisStructure, ...], count: int, table: str) -> None:
-    from rich.table import Table
     from rich.text import Text
 
     from servoscope.cli.render import results
     from servoscope.report.page import say
 
-    shown = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("terms", "Stribeck speed", "worse by", "standard error"):
-        shown.add_column(name, overflow="fold")
-    for one in found[:SHOWN]:
-        speed = "" if one.plant.stribeck_speed is None else f"{one.plant.stribeck_speed:g}"
-        shown.add_row(", ".join(one.plant.terms) or "-", speed, f"{one.excess:.1f}", f"{one.excess_std:.1f}")
-    out.print(shown)
+    structures = [
+        (
+            ", ".join(structure.plant.terms) or "-",
+            "" if structure.plant.stribeck_speed is None else f"{structure.plant.stribeck_speed:g}",
+            f"{structure.excess:.1f}",
+            f"{structure.excess_std:.1f}",
+        )
+        for structure in found[:MAX_LISTED_STRUCTURES]
+    ]
+    results.print_table(out, ("terms", "Stribeck speed", "worse by", "standard error"), structures)
     best = found[0]
-    notes = [say("explore.found", count=count, structures=len(found))]
-    if best.inertia is None:
-        notes.append(say("explore.no_input"))
-    else:
-        notes.append(say("explore.inertia", inertia=best.inertia))
-    results.print_notes(out, notes)
-    values = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("coefficient over inertia", "value", "95 % between recordings"):
-        values.add_column(name, overflow="fold")
-    for name, value in best.ratios.items():
-        values.add_row(name, f"{value:.4g}", f"± {1.96 * best.ratios_std[name]:.2g}")
-    out.print(values)
+    inertia = say("explore.no_input") if best.inertia is None else say("explore.inertia", inertia=best.inertia)
+    results.print_notes(out, [say("explore.found", count=count, structures=len(found)), inertia])
+    values = [(name, f"{value:.4g}", f"± {1.96 * best.ratios_std[name]:.2g}") for name, value in best.ratios.items()]
+    results.print_table(out, ("coefficient over inertia", "value", "95 % between recordings"), values)
     out.print(Text("\n" + table), soft_wrap=True)

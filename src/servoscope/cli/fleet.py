@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from servoscope.cli import arguments
 from servoscope.cli.app import app
-from servoscope.cli.arguments import EngineName
 from servoscope.cli.exit import EXIT_FAULT, print_json
 from servoscope.cli.options import ColumnsOption, JsonOption
 
@@ -47,8 +46,8 @@ def fleet(
     columns: ColumnsOption = None,
     window: Annotated[float, typer.Option(metavar="S", min=1.0, help="Seconds that a diagnosis sees.")] = WINDOW,
     engine: Annotated[
-        EngineName, typer.Option(help="local: this machine's cores; spark: a cluster's.")
-    ] = EngineName.local,
+        Literal["local", "spark"], typer.Option(help="local: this machine's cores; spark: a cluster's.")
+    ] = "local",
     jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; else one per core.")] = None,
     master: Annotated[str | None, typer.Option(metavar="URL", help="Spark's master, if no session says.")] = None,
     stream: Annotated[bool, typer.Option("--stream", help="Follow what comes into LAKE, with Spark.")] = False,
@@ -82,16 +81,68 @@ def fleet(
     if len(keys) != 2 or not all(keys):
         raise typer.BadParameter(f"--partition {partition!r}: write two names, as in asset,day")
 
-    alike = tuple(arguments.expand_baselines(population or []))
-    options = _FleetOptions(
-        lake, output, loop, baselines, baseline_by, healthy_days, groups, (keys[0], keys[1]), columns, window, alike
-    )
-    if stream:
-        result = _run_stream(
-            options, master, _StreamOptions(assets, every, late, checkpoint, tuple(source or ()), store)
+    def run_batch() -> Fleet:
+        """Run over what is in the lake."""
+        from servoscope.cli.progress import show_count
+        from servoscope.core.workers import available_cores
+        from servoscope.fleet import Lake, Plan, run
+        from servoscope.fleet.local_engine import local
+        from servoscope.models.loop import Loop
+
+        settings = Loop.load(loop) if loop is not None else None
+        plan = Plan(
+            lake=Lake.open(lake, (keys[0], keys[1]), read_groups(groups) if groups is not None else None),
+            output=output,
+            loop=settings,
+            baselines=baselines,
+            by=baseline_by,
+            healthy=healthy_days,
+            columns=arguments.parse_mapping(columns, settings.columns if settings is not None else None),
+            window_s=window,
+            population=tuple(arguments.expand_baselines(population or [])),
         )
-    else:
-        result = _run_batch(options, engine, jobs, master)
+        if engine == "spark":
+            from servoscope.fleet.spark import session, spark
+
+            carry = spark(session(master))
+        else:
+            carry = local(jobs or available_cores())
+        with show_count() as tell:
+            return run(plan, carry, tell)
+
+    def run_stream() -> Fleet:
+        """Follow what comes in: all there is, or on and on until interrupted; write the report at the end."""
+        from servoscope.cli.progress import show_spinner
+        from servoscope.fleet import Lake, sinks
+        from servoscope.fleet.baselines import Baselines
+        from servoscope.fleet.spark import session
+        from servoscope.fleet.streaming import follow
+
+        if baselines is None:
+            raise typer.BadParameter("--stream goes with --baselines: learn them from the lake first")
+        count = assets or (sum(1 for _ in baselines.glob("*.json")) if baselines.is_dir() else None)
+        if count is None:
+            raise typer.BadParameter("--assets N: say how many assets share the budget of false alarms")
+        learned = Baselines.from_source(baselines, count, window).first().loop.columns
+        mapping = arguments.parse_mapping(columns, learned) or learned
+        spark = session(master)
+        make = sinks.kafka_stream if lake == KAFKA else sinks.file_stream
+        frame = make(spark, lake, mapping, dict(text.partition("=")[::2] for text in source or ()))
+        followed = follow(
+            frame, baselines, assets=count, columns=mapping, delay_s=late, by=baseline_by, window_s=window
+        )
+        query = sinks.start(followed, output, checkpoint=checkpoint, every_s=every, store=store)
+        with show_spinner("following the stream"):
+            sinks.wait_for_stream(query)
+        named = read_groups(groups) if groups is not None else {}
+        if lake != KAFKA:
+            items = Lake.open(lake, (keys[0], keys[1]), named).items
+            named = {item.asset: dict(item.groups) for item in items}
+        return sinks.write_stream_report(spark, output, named, lake)
+
+    from servoscope.fleet.lake import read_groups
+
+    result = run_stream() if stream else run_batch()
     if as_json:
         print_json(result.to_dict(), lines=False)
     else:
@@ -102,94 +153,3 @@ def fleet(
         results.print_written_path(results.create_console(), output / "report.html")
     if fail_on_fault and (result.count("fault") or result.accepted):
         raise typer.Exit(EXIT_FAULT)
-
-
-class _StreamOptions(NamedTuple):
-    assets: int | None
-    every: float | None
-    late: float
-    checkpoint: str | None
-    source: tuple[str, ...]
-    store: str | None
-
-
-class _FleetOptions(NamedTuple):
-    lake: str
-    output: Path
-    loop: Path | None
-    baselines: Path | None
-    by: str
-    healthy: int
-    groups: Path | None
-    partition: tuple[str, str]
-    columns: str | None
-    window: float
-    population: tuple[Path, ...]
-
-
-def _run_batch(options: _FleetOptions, engine: EngineName, jobs: int | None, master: str | None) -> Fleet:
-    """Run over what is in the lake."""
-    from servoscope.cli.progress import show_count
-    from servoscope.core.workers import available_cores
-    from servoscope.fleet import Lake, Plan, run
-    from servoscope.fleet.lake import read_groups
-    from servoscope.fleet.local_engine import local
-    from servoscope.models.loop import Loop
-
-    settings = Loop.load(options.loop) if options.loop is not None else None
-    groups = read_groups(options.groups) if options.groups is not None else None
-    plan = Plan(
-        lake=Lake.open(options.lake, options.partition, groups),
-        output=options.output,
-        loop=settings,
-        baselines=options.baselines,
-        by=options.by,
-        healthy=options.healthy,
-        columns=arguments.parse_mapping(options.columns, settings.columns if settings is not None else None),
-        window_s=options.window,
-        population=options.population,
-    )
-    if engine is EngineName.spark:
-        from servoscope.fleet.spark import session, spark
-
-        carry = spark(session(master))
-    else:
-        carry = local(jobs or available_cores())
-    with show_count() as tell:
-        return run(plan, carry, tell)
-
-
-def _run_stream(options: _FleetOptions, master: str | None, stream: _StreamOptions) -> Fleet:
-    """Follow what comes in: all there is, or on and on until interrupted; write the report at the end."""
-    from servoscope.cli.progress import show_spinner
-    from servoscope.fleet import Lake, sinks
-    from servoscope.fleet.baselines import Baselines
-    from servoscope.fleet.lake import read_groups
-    from servoscope.fleet.spark import session
-    from servoscope.fleet.streaming import follow
-
-    path = options.baselines
-    if path is None:
-        raise typer.BadParameter("--stream goes with --baselines: learn them from the lake first")
-    assets = stream.assets or (sum(1 for _ in path.glob("*.json")) if path.is_dir() else None)
-    if assets is None:
-        raise typer.BadParameter("--assets N: say how many assets share the budget of false alarms")
-    learned = Baselines.from_source(path, assets, options.window).first().loop.columns
-    columns = arguments.parse_mapping(options.columns, learned) or learned
-    source = dict(text.partition("=")[::2] for text in stream.source)
-    spark = session(master)
-    make = sinks.kafka_stream if options.lake == KAFKA else sinks.file_stream
-    frame = make(spark, options.lake, columns, source)
-    followed = follow(
-        frame, path, assets=assets, columns=columns, delay_s=stream.late, by=options.by, window_s=options.window
-    )
-    query = sinks.start(
-        followed, options.output, checkpoint=stream.checkpoint, every_s=stream.every, store=stream.store
-    )
-    with show_spinner("following the stream"):
-        sinks.wait_for_stream(query)
-    groups = read_groups(options.groups) if options.groups is not None else {}
-    if options.lake != KAFKA:
-        lake = Lake.open(options.lake, options.partition, groups)
-        groups = {item.asset: dict(item.groups) for item in lake.items}
-    return sinks.write_stream_report(spark, options.output, groups, options.lake)

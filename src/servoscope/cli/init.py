@@ -84,8 +84,6 @@ def _axis_file(output: Path, axis: str | None) -> Path:
 
 def _propose(out: Console, log: Path, columns: Columns, output: Path, asks: bool) -> None:
     """Print the proposal for a log with its evidence, write it, and inspect the log with it."""
-    from rich.table import Table
-
     from servoscope.cli.render import results
     from servoscope.core.files import atomic_write
     from servoscope.core.messages import render
@@ -95,13 +93,11 @@ def _propose(out: Console, log: Path, columns: Columns, output: Path, asks: bool
     from servoscope.signals import readers
 
     proposal = propose_loop(log, columns)
-    table = Table(show_edge=False, box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("setting", "proposed", "why"):
-        table.add_column(name, overflow="fold")
-    for line in proposal.lines:
-        mark = " ?" if line.doubtful else ""
-        table.add_row(f"{line.section}.{line.key}".lstrip("."), line.value + mark, render(line.why))
-    out.print(table)
+    lines = [
+        (f"{line.section}.{line.key}".lstrip("."), line.value + " ?" * line.doubtful, render(line.why))
+        for line in proposal.lines
+    ]
+    results.print_table(out, ("setting", "proposed", "why"), lines, words=3)
     if any(line.doubtful for line in proposal.lines):
         results.print_notes(out, [say("init.doubtful")])
         if asks:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
 LINE_INTERVAL_S = 10.0  # until the first line where stderr is no terminal: what takes less says nothing
-RAREST = 60.0  # times as long is the longest silence between two lines: a stream may run for months
+MAX_INTERVAL_FACTOR = 60.0  # times as long is the longest silence between two lines: a stream may run for months
 
 
 class StepProgress:
@@ -116,7 +116,7 @@ def _lines(describe: Callable[[], str]) -> Iterator[None]:
         wait = LINE_INTERVAL_S
         with suppress(OSError, ValueError):  # nobody reads it any more
             while not ended.wait(wait):
-                wait = min(2.0 * wait, RAREST * LINE_INTERVAL_S)
+                wait = min(2.0 * wait, MAX_INTERVAL_FACTOR * LINE_INTERVAL_S)
                 print(f"{describe() or 'working'}, {time.monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
 
     writer = threading.Thread(target=write, name="servoscope-progress", daemon=True)

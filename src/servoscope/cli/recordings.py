@@ -118,12 +118,9 @@ def learn(
         raise typer.BadParameter("give healthy recordings or --nominal, and not both")
     if (accept_change and compare is None) or (nominal and compare is not None):
         raise typer.BadParameter("--accept-change goes with --compare, and that with recordings")
-    if nominal and accept_delay:
-        raise typer.BadParameter("--accept-delay goes with healthy recordings, not with --nominal")
-    if nominal and population:
-        raise typer.BadParameter("--population goes with healthy recordings, not with --nominal")
-    if nominal and fault:
-        raise typer.BadParameter("--fault goes with healthy recordings, not with --nominal")
+    for option, value in (("--accept-delay", accept_delay), ("--population", population), ("--fault", fault)):
+        if nominal and value:
+            raise typer.BadParameter(f"{option} goes with healthy recordings, not with --nominal")
     faults = arguments.parse_labelled(fault or [], list(dict.fromkeys(point for point, _ in named)))
     files = [path for _, path in named] + [path for *_, path in faults]
     alike = arguments.expand_baselines(population or [])

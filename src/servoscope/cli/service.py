@@ -6,11 +6,11 @@ import os
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -19,14 +19,14 @@ from servoscope.cli.arguments import parse_time
 from servoscope.cli.exit import print_json
 from servoscope.cli.options import JsonOption
 from servoscope.cli.output_paths import check_output
-from servoscope.core.errors import ConfigError, StoreError
+from servoscope.core.errors import ConfigError, ObsoleteSettingWarning, StoreError
+from servoscope.core.messages import count_words
 from servoscope.core.settings_errors import suggest_name
 
 if TYPE_CHECKING:
     from rich.console import Group
 
     from servoscope.service.config import ServiceFile
-    from servoscope.service.network import NetworkSettings
     from servoscope.service.store import Store
 
 
@@ -38,24 +38,13 @@ AssetOption = Annotated[list[str] | None, typer.Option(metavar="NAME", help="Onl
 
 EXPORTS = (".csv", ".parquet", ".pq", ".json")
 DEFAULT_ROWS = 50
-
-
-class HistoryKind(StrEnum):
-    """Kinds of rows that ``history`` prints."""
-
-    diagnoses = "diagnoses"
-    alarms = "alarms"
-    audit = "audit"
-    residuals = "residuals"
-    deliveries = "deliveries"
-
-
-COLUMNS = {
-    HistoryKind.diagnoses: ("t", "asset", "grounds", "summary"),
-    HistoryKind.alarms: ("t", "asset", "alarm", "after", "who", "cause"),
-    HistoryKind.audit: ("at", "who", "asset", "what", "document"),
-    HistoryKind.residuals: ("t", "asset", "statistic", "level"),
-    HistoryKind.deliveries: ("created", "sink", "subject", "attempts", "due", "outcome"),
+HistoryKind = Literal["diagnoses", "alarms", "audit", "residuals", "deliveries"]
+COLUMNS: dict[HistoryKind, tuple[str, ...]] = {
+    "diagnoses": ("t", "asset", "grounds", "summary"),
+    "alarms": ("t", "asset", "alarm", "after", "who", "cause"),
+    "audit": ("at", "who", "asset", "what", "document"),
+    "residuals": ("t", "asset", "statistic", "level"),
+    "deliveries": ("created", "sink", "subject", "attempts", "due", "outcome"),
 }
 
 
@@ -85,14 +74,20 @@ def run(
     from servoscope.service.build import build_components, check_service_file
     from servoscope.service.config import ServiceFile
 
-    settings = ServiceFile.load(config)
+    with warnings.catch_warnings():
+        if check:
+            warnings.simplefilter("error", ObsoleteSettingWarning)
+        try:
+            settings = ServiceFile.load(config)
+        except ObsoleteSettingWarning as obsolete:
+            raise ConfigError(f"{config}: {obsolete}") from None
     if online and not check:
         raise ConfigError("--online: give it together with --check, which follows nothing")
     if check:
         with prefix_file_name(config):
             lines = check_service_file(settings)
         counts = {"asset": len(settings.assets), "source": len(settings.sources)}
-        counted = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items())
+        counted = ", ".join(count_words(count, noun, "en") for noun, count in counts.items())
         typer.echo(f"{config}: {counted}; all can be used")
         for line in lines:
             typer.echo(line)
@@ -149,7 +144,10 @@ def watch(
     opened, out = open_store(store), results.create_console()
 
     def page() -> Group:
-        return tables.status_page(opened.statuses(asset), out.width)
+        try:
+            return tables.status_page(opened.statuses(asset), out.width)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise StoreError(f"{store}: holds a damaged status ({error!r}), restore a backup of the store") from None
 
     check_assets(opened, asset or ())
     if as_json:
@@ -168,7 +166,7 @@ def watch(
 @app.command()
 def history(
     store: StoreArgument,
-    kind: Annotated[HistoryKind, typer.Option(help="What to tell.")] = HistoryKind.diagnoses,
+    kind: Annotated[HistoryKind, typer.Option(help="What to tell.")] = "diagnoses",
     asset: AssetOption = None,
     since: Annotated[
         str | None, typer.Option("--from", metavar="TIME", help="From this time on: 2026-01-31T12:00 (UTC), or 8h ago.")
@@ -227,30 +225,21 @@ def prefix_file_name(config: Path) -> Iterator[None]:
         raise ConfigError(f"{config}: {error}") from None
 
 
-class StoreAddress(NamedTuple):
-    """Where a store is."""
-
-    url: str
-    folder: Path | None = None
-    network: NetworkSettings | None = None
-
-
-def parse_store_address(text: str) -> StoreAddress:
-    """Return where a store is, by a service file or by itself."""
+def parse_store_address(text: str) -> tuple[str, Path | None]:
+    """Return where a store is, and the folder that this is relative to: by a service file or by itself."""
     if not text.endswith(".toml"):
-        return StoreAddress(text)
+        return text, None
     from servoscope.service.config import ServiceFile
 
     config = ServiceFile.load(text)
-    return StoreAddress(config.store.url, config.folder, config.store.rules)
+    return config.store.url, config.folder
 
 
 def open_store(text: str) -> Store:
     """Open a store for reading, by a service file or by itself; a locked one is waited for."""
     from servoscope.service.store import Store
 
-    url, folder, network = parse_store_address(text)
-    return Store.open(url, folder, lock_timeout_s=5.0, network=network)
+    return Store.open(*parse_store_address(text), lock_timeout_s=5.0)
 
 
 def check_assets(store: Store, assets: Sequence[str]) -> None:

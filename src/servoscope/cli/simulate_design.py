@@ -1,9 +1,9 @@
-"""The commands that need no recording: simulate, design, reproduce, bench, demo; parse, call, print."""
+"""The commands that need no recording: simulate, design, reproduce, demo; parse, call, print."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -18,6 +18,10 @@ from servoscope.cli.options import (
     with_reading_options,
 )
 from servoscope.cli.output_paths import RECORDINGS, REPORTS, check_output
+from servoscope.core.errors import LoopError
+
+if TYPE_CHECKING:
+    from servoscope.design import BaselineStudy
 
 
 @app.command()
@@ -37,9 +41,9 @@ def simulate(
     noise_y: Annotated[float, typer.Option(metavar="X", min=0.0, help="Noise on y, std. dev.")] = 3.162e-4,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the noise.")] = 0,
     rig: Annotated[
-        arguments.RigModel,
+        Literal["linear", "nonlinear"],
         typer.Option(help="nonlinear: an EHA with friction, valve, sensor, limits and warming oil."),
-    ] = arguments.RigModel.linear,
+    ] = "linear",
     as_json: JsonOption = False,
 ) -> None:
     """Simulate a loop, with faults if wanted, and write what a machine would log."""
@@ -59,12 +63,12 @@ def simulate(
     with show_steps(1, 1) as steps:
         steps.begin("simulating")
         r = simulation.reference(reference, duration, settings.sample_rate, amplitude=amplitude)
-        run = simulation.simulate if rig is arguments.RigModel.linear else simulation.simulate_rig
+        run = simulation.simulate if rig == "linear" else simulation.simulate_rig
         recording, truth = run(settings, r, faults=events, noise_u_std=noise_u, noise_y_std=noise_y, seed=seed)
         steps.advance("writing")
         used = writers.write_recording(output, recording, settings.columns)
     if as_json:
-        how = {"reference": reference, "amplitude": amplitude, "seed": seed, "rig": rig.value}
+        how = {"reference": reference, "amplitude": amplitude, "seed": seed, "rig": rig}
         noise = {"noise_u_std": noise_u, "noise_y_std": noise_y}
         facts = plain_values.simulation_summary(recording, truth, used)
         print_json({"recording": str(output), **facts, **how, **noise}, lines=False)
@@ -93,37 +97,48 @@ def design(
     as_json: JsonOption = False,
     report: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Write a page with plots.")] = None,
 ) -> None:
-    """Say before deployment which faults can be detected and told apart, at which size, after how long."""
+    """Say which faults can be detected and told apart, from which size on: of a loop file, or of a baseline alone."""
     check_output(report, "--report", REPORTS, [loop, *(healthy or [])])
     arguments.check_reference(reference)
 
+    from servoscope.baseline.baseline import Baseline
     from servoscope.cli.progress import show_steps
     from servoscope.cli.render import design as studies
     from servoscope.cli.render import results
-    from servoscope.design import design_study
+    from servoscope.design import DesignStudy, design_study, study_baseline
     from servoscope.models.loop import Loop
     from servoscope.report import plain_values
 
-    settings = Loop.load(loop)
+    baseline = Baseline.load(loop) if loop.suffix.lower() == ".json" else None
+    if baseline is not None and healthy:
+        raise LoopError(f"{loop}: is a baseline, which knows its healthy recordings: leave out the others")
+    settings = Loop.load(loop) if baseline is None else baseline.loop
     arguments.check_length(after, settings.sample_rate)
     reader = RecordingReader.from_options(settings, reading)
-    with show_steps(1, 4 + 2 * len(settings.plant.faults)) as steps:
+    with show_steps(1, 3 + 2 * len(settings.plant.faults)) as steps:
         steps.begin("reading" if healthy else "simulating")
-        recordings = [recording for path in healthy or [] for recording in reader.read(path)]
-        study = design_study(
-            settings,
-            recordings,
-            reference=reference,
-            after_s=after,
-            noise_u_std=noise_u,
-            noise_y_std=noise_y,
-            progress=steps.advance,
-        )
+        study: DesignStudy | BaselineStudy
+        if baseline is not None:
+            study = study_baseline(baseline, reference=reference, after_s=after, progress=steps.advance)
+        else:
+            study = design_study(
+                settings,
+                [recording for path in healthy or [] for recording in reader.read(path)],
+                reference=reference,
+                after_s=after,
+                noise_u_std=noise_u,
+                noise_y_std=noise_y,
+                progress=steps.advance,
+            )
     if as_json:
         print_json(plain_values.to_plain_values(study), lines=False)
-    else:
+    elif isinstance(study, DesignStudy):
         studies.print_study(results.create_console(), study)
+    else:
+        studies.print_learned_study(results.create_console(), study)
     if report is not None:
+        if not isinstance(study, DesignStudy):
+            raise LoopError(f"{loop}: no page without a simulation of the loop: {study.missing}")
         from servoscope.report import design_page as pages
 
         pages.write_design_page(report, study)
@@ -155,27 +170,6 @@ def reproduce(
     else:
         results.print_claims(results.create_console(), [(c.claim, c.measured, c.verdict) for c in paper.claims])
         results.print_written_path(results.create_console(), output)
-
-
-@app.command()
-def bench(
-    repeats: Annotated[int, typer.Option(metavar="N", min=1, help="Of each measurement; medians count.")] = 9,
-    share: Annotated[
-        float, typer.Option(metavar="SHARE", min=0.001, max=1.0, help="Of assets, samples, simulations.")
-    ] = 1.0,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure how fast it is here, beside the machine's own limits and the other libraries that are installed."""
-    from servoscope.cli.progress import show_steps
-    from servoscope.cli.render import results
-    from servoscope.research import bench as benchmark
-
-    with show_steps(10, 1) as steps:
-        result = benchmark.run_benchmarks(repeats, steps.begin, share=share)
-    if as_json:
-        print_json(result.to_dict(), lines=False)
-    else:
-        results.print_benchmark(results.create_console(), result)
 
 
 @app.command()

@@ -10,6 +10,7 @@ import typer
 
 from servoscope.cli.app import app
 from servoscope.cli.service import StoreArgument, open_store, parse_store_address
+from servoscope.core.messages import count_words
 
 store_app = typer.Typer(no_args_is_help=True, help="Back up a history, and restore it.")
 app.add_typer(store_app, name="store")
@@ -35,12 +36,12 @@ def restore(
     from servoscope.service.store.copy import copy_store
     from servoscope.service.store.engine import display_url, parse_store_url
 
-    url, folder, network = parse_store_address(store)
+    url, folder = parse_store_address(store)
     with closing(open_store(str(file))) as opened:
-        counts = copy_store(opened, url, folder, network)
+        counts = copy_store(opened, url, folder)
     _print_counts(display_url(parse_store_url(url, folder or Path())), counts)
 
 
 def _print_counts(where: str | Path, counts: dict[str, int]) -> None:
-    assets = counts.get("checkpoints", 0)
-    typer.echo(f"{where}: {sum(counts.values())} rows, {assets} saved states")
+    rows, states = sum(counts.values()), counts.get("checkpoints", 0)
+    typer.echo(f"{where}: {count_words(rows, 'row', 'en')}, {count_words(states, 'saved_state', 'en')}")

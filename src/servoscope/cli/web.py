@@ -56,7 +56,7 @@ def serve(
         raise ConfigError(f"{error.name} is missing, pip install 'servoscope[web]'") from None
     from servoscope.service.config import ServiceFile
     from servoscope.service.store import Store
-    from servoscope.web.server import STORE_PATIENCE, run_server
+    from servoscope.web.server import STORE_TIMEOUT_S, run_server
 
     service = ServiceFile.load(config) if config is not None else None
     # paths on the command line are relative to the current folder, those in the service file to its own
@@ -67,8 +67,7 @@ def serve(
     url = service.store.url if service is not None else str(store)
     # a store that exists is only read; one that does not is made, so that files can be diagnosed at once
     missing = "://" not in url and not (here / url).exists()
-    rules = service.store.rules if service is not None else None
-    opened = Store.open(url, here, write=missing, lock_timeout_s=STORE_PATIENCE, network=rules)
+    opened = Store.open(url, here, write=missing, lock_timeout_s=STORE_TIMEOUT_S)
     if missing:
         typer.echo(f"servoscope: {opened.name} is new, and empty until servoscope run follows assets", err=True)
     run_server(settings, opened, service, here, with_parent=with_parent)

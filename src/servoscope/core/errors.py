@@ -101,3 +101,7 @@ class StateError(ServoscopeError):
 
 class AccessError(ServoscopeError):
     """A file of users cannot be used, or what was asked of it makes no sense."""
+
+
+class ObsoleteSettingWarning(FutureWarning):
+    """A file has a setting of an earlier version; the text says what takes its place."""

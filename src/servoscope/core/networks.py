@@ -10,9 +10,11 @@ from pydantic import AfterValidator, Field
 
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
-
-INTERNAL = "internal"  # in place of a network: every address that is not public
-NAT64 = ipaddress.ip_network("64:ff9b::/96")  # carries IPv4 addresses in the last four bytes
+# IPv6 whose last four bytes are the address of IPv4 that is meant: mapped (RFC 4291), and NAT64 (RFC 6052)
+CARRIERS = tuple(map(ipaddress.IPv6Network, ("::ffff:0:0/96", "64:ff9b::/96")))
+GLOBAL_UNICAST = ipaddress.IPv6Network("2000::/3")  # all that IANA has assigned to the internet
+# Tunnels inside it, which lead to any address of IPv4: Teredo (RFC 4380) and 6to4 (RFC 3056)
+TUNNELS = tuple(map(ipaddress.IPv6Network, ("2001::/32", "2002::/16")))
 
 
 def check_network(value: str) -> str:
@@ -34,22 +36,25 @@ def parse_ip(host: str) -> IpAddress | None:
     except ValueError:
         return None
     # otherwise ::ffff:10.0.0.1 would pass rules for 10.0.0.0/8
-    if isinstance(address, ipaddress.IPv6Address):
-        if address in NAT64:
-            return ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
-        return address.ipv4_mapped or address
+    if any(address in network for network in CARRIERS):
+        return ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
     return address
 
 
 def is_member(host: str, networks: Iterable[str]) -> bool:
     """Tell whether a numeric address belongs to one of the networks; a name belongs to none."""
     address = parse_ip(host)
-    if address is None:
-        return False
-    return any(_contains(network, address) for network in networks)
+    return address is not None and any(address in ipaddress.ip_network(one, strict=False) for one in networks)
 
 
-def _contains(network: str, address: IpAddress) -> bool:
-    if network == INTERNAL:
-        return not address.is_global or address.is_multicast
-    return address in ipaddress.ip_network(network, strict=False)
+def is_internal(host: str) -> bool:
+    """Tell whether an address is, or may lead to, another one than a public address of a single host.
+
+    IPv6 is judged by what is known to be public, so that forms which carry IPv4 in other ways (compatible, translated,
+    NAT64 of a site, tunnels), site-local addresses and what is not assigned yet are internal without a list of them.
+    """
+    address = parse_ip(host)
+    if address is None or not address.is_global or address.is_multicast:
+        return True
+    in_tunnel = any(address in network for network in TUNNELS)
+    return address.version == 6 and (address not in GLOBAL_UNICAST or in_tunnel)

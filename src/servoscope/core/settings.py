@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import tomllib
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from servoscope.core.errors import ServoscopeError
+from servoscope.core.errors import ObsoleteSettingWarning, ServoscopeError
 
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
@@ -20,6 +22,15 @@ class Settings(BaseModel):
     """The base of settings: frozen, unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def drop_obsolete(table: Any, remedies: Mapping[str, str]) -> Any:
+    """Return a table without the keys of earlier versions; a warning says what takes the place of each."""
+    if not isinstance(table, Mapping):
+        return table
+    for key in remedies.keys() & table.keys():
+        warnings.warn(remedies[key], ObsoleteSettingWarning, stacklevel=2)
+    return {key: value for key, value in table.items() if key not in remedies}
 
 
 def read_toml_text(path: Path, what: str, error: type[ServoscopeError]) -> str:

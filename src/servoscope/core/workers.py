@@ -1,36 +1,44 @@
 """Work in other processes: a worker with limits, for what may fail or comes from strangers, and pools of equal ones.
 
-A worker is told what to do in pickles and answers in lines of JSON, so that a file that takes over the worker that
-reads it has no way into the process that asked. Where tasks are trusted and many, a pool of `concurrent.futures` is
-enough.
+A worker is told what to do in pickles and answers in JSON, so that a file that takes over the worker that reads it has
+no way into the process that asked.
+
+A worker's process loads libraries, and forks for each sandbox: walls are for good, and loading takes a second.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
-import multiprocessing
 import os
-import pickle
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from itertools import islice
+from multiprocessing.connection import Connection
 from pathlib import Path
+from pickle import UnpicklingError
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, TypeVar
 
 from servoscope.core.cache_folders import replace_library_warnings
 from servoscope.core.errors import ServoscopeError
+from servoscope.core.sandbox import Sandbox
 
 Progress = Callable[[str], None]
+Task = TypeVar("Task")
 
 WORKER_CODE = "from servoscope.core.workers import worker_main; worker_main()"
+START_S = 60.0  # that a process and its libraries may take to start, on a machine that is busy
+SIGNAL_CODE = 128  # plus the number of the signal that ended a task's process: exit code of the one that forked it
+TASKS_PER_PROCESS = 2  # tasks handed out per process: enough to keep it busy
 NICENESS = 5  # samples and pages come first
 MAX_ANSWER_BYTES = 64 << 20
 OPEN_FILES = 256  # of a process with limits
@@ -89,10 +97,18 @@ class Worker:
         self._limits, self._folder, self._environment = limits, folder, environment
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
+        self._fork: tuple[Sequence[str], Sandbox | None] | None = None  # libraries and sandbox of the tasks' process
+        self._connection: Connection
         self._stopped = False
 
     def run(
-        self, function: str, *arguments: Any, progress: Progress = lambda _: None, timeout_s: float | None = None
+        self,
+        function: str,
+        *arguments: Any,
+        progress: Progress = lambda _: None,
+        timeout_s: float | None = None,
+        libraries: Sequence[str] = (),
+        sandbox: Sandbox | None = None,
     ) -> Any:
         """Run a function and return its result.
 
@@ -103,33 +119,23 @@ class Worker:
             returns what can be written as JSON.
         timeout_s
             How long it may take by the clock on the wall [s].
+        libraries
+            Modules that are loaded before this time counts, once for all sandboxes.
+        sandbox
+            Within which it runs; tasks of another one do not see what it has left in memory.
 
         Raises
         ------
         WorkerError
             If it failed, or needed more than its limits; the worker has ended then.
         """
-        process, late = self._start(), threading.Event()
-
-        def expire() -> None:
-            late.set()
-            _kill(process)
-
-        timer = threading.Timer(threading.TIMEOUT_MAX if timeout_s is None else timeout_s, expire)
-        timer.daemon = True
-        timer.start()
-        try:
-            return self._exchange(process, (function, arguments), progress)
-        except (EOFError, OSError, ValueError):  # it has ended, perhaps in the middle of an answer
-            code = self._end(process)
-        except BaseException:
-            self._end(process)
-            raise
-        finally:
-            timer.cancel()
-        if late.is_set():
-            raise WorkerError(f"it took more than {timeout_s:g} s, and was stopped")
-        raise WorkerError(self._cause_of_death(code))
+        process = self._start()
+        if self._fork != (libraries, sandbox):
+            if self._fork is not None:
+                self._exchange(process, None)
+            self._exchange(process, (libraries, self._limits, sandbox), timeout_s=START_S)
+            self._fork = libraries, sandbox
+        return self._exchange(process, (function, arguments), progress, timeout_s)
 
     def stop(self) -> None:
         """Stop for good, from any thread; a task that is running fails."""
@@ -144,31 +150,62 @@ class Worker:
             if self._stopped:
                 raise WorkerError("it was stopped")
             if self._process is None:
-                self._process = subprocess.Popen(
-                    [sys.executable, "-c", WORKER_CODE],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    cwd=self._folder,
-                    env=self._environment,
-                    start_new_session=True,  # Ctrl-C in a terminal is for the parent, which then ends it
-                )
-                with suppress(OSError):  # a process that has died already is met by the task
-                    _send(self._process, asdict(self._limits) if self._limits is not None else None)
+                # not pipes: whoever holds one end of a pipe can open the other one through /proc
+                ours, theirs = socket.socketpair()
+                with theirs:
+                    self._process = subprocess.Popen(
+                        [sys.executable, "-c", WORKER_CODE],
+                        stdin=theirs.fileno(),
+                        cwd=self._folder,
+                        env=self._environment,
+                        start_new_session=True,  # Ctrl-C in a terminal is for the parent, which then ends it
+                    )
+                self._connection, self._fork = Connection(ours.detach()), None
             return self._process
 
-    def _exchange(self, process: subprocess.Popen[bytes], task: tuple[str, tuple[Any, ...]], progress: Progress) -> Any:
-        assert process.stdout is not None, "it is a pipe"
-        _send(process, task)
-        while line := process.stdout.readline(MAX_ANSWER_BYTES + 1):
-            if len(line) > MAX_ANSWER_BYTES:
-                raise WorkerError(f"its answer is larger than {MAX_ANSWER_BYTES >> 20} MB")
-            kind, content = json.loads(line)
-            if kind == "result":
-                return content
-            if kind == "error":
-                raise WorkerError(content)
-            progress(content)
-        raise EOFError
+    def _exchange(
+        self,
+        process: subprocess.Popen[bytes],
+        question: Any,
+        progress: Progress = lambda _: None,
+        timeout_s: float | None = None,
+    ) -> Any:
+        late = threading.Event()
+
+        def expire() -> None:
+            late.set()
+            _kill(process)
+
+        timer = threading.Timer(threading.TIMEOUT_MAX if timeout_s is None else timeout_s, expire)
+        timer.daemon = True
+        timer.start()
+        try:
+            self._connection.send(question)
+            while True:
+                kind, content = json.loads(self._connection.recv_bytes(MAX_ANSWER_BYTES))
+                if kind == ("ended" if question is None else "result"):
+                    return content
+                if kind == "ended":  # a task has left its process
+                    raise EOFError
+                if kind == "error":
+                    raise WorkerError(content)
+                progress(content)
+        except (
+            EOFError,
+            OSError,
+            TypeError,
+            ValueError,
+            RecursionError,
+        ):  # it has ended, perhaps in the middle of an answer
+            code = self._end(process)
+        except BaseException:
+            self._end(process)
+            raise
+        finally:
+            timer.cancel()
+        if late.is_set():
+            raise WorkerError(f"it took more than {timeout_s:g} s, and was stopped")
+        raise WorkerError(self._cause_of_death(code if code <= SIGNAL_CODE else SIGNAL_CODE - code))
 
     def _end(self, process: subprocess.Popen[bytes]) -> int:
         """End a process and return its exit code: its own one, if it had ended already."""
@@ -177,10 +214,6 @@ class Worker:
         with self._lock:
             if self._process is process:
                 self._process = None
-        for stream in (process.stdin, process.stdout):
-            with suppress(OSError):
-                assert stream is not None, "both are pipes"
-                stream.close()
         return code
 
     def _cause_of_death(self, code: int) -> str:
@@ -191,12 +224,6 @@ class Worker:
         return f"it took its process down ({code}){need}"
 
 
-def _send(process: subprocess.Popen[bytes], content: Any) -> None:
-    assert process.stdin is not None, "it is a pipe"
-    pickle.dump(content, process.stdin)
-    process.stdin.flush()
-
-
 def _kill(process: subprocess.Popen[bytes]) -> None:
     with suppress(ProcessLookupError):
         if process.returncode is None:  # otherwise its number may be another's by now
@@ -204,66 +231,135 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def worker_main() -> None:
-    """Run tasks from stdin until it is closed; what a worker's process executes."""
+    """Fork a process for each sandbox that comes from stdin, until that is closed; what a worker executes."""
     os.nice(NICENESS)
     replace_library_warnings()
-    tasks = sys.stdin.buffer
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever prints must not get between the answers
+    parent = Connection(os.dup(sys.stdin.fileno()))
+    silent = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(silent, sys.stdin.fileno())
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    while True:
+        try:
+            libraries, limits, sandbox = parent.recv()
+        except (EOFError, OSError, UnpicklingError):  # the last: the parent was killed in the middle of a task
+            return
+        for library in libraries:
+            with suppress(ImportError):  # a task says what is missing
+                importlib.import_module(library)
+        child = os.fork()
+        if child == 0:
+            _run_tasks(parent, limits, sandbox)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if code:
+            os._exit(code if code > 0 else SIGNAL_CODE - code)
+        with suppress(BrokenPipeError):  # the parent has ended
+            parent.send_bytes(b'["ended", null]')
+
+
+def _run_tasks(parent: Connection, limits: ProcessLimits | None, sandbox: Sandbox | None) -> None:
+    """Run tasks until the parent ends, or asks for another sandbox."""
 
     def answer(kind: str, content: Any) -> None:
-        answers.write(json.dumps((kind, content)) + "\n")
-        answers.flush()
+        text = json.dumps((kind, content)).encode()
+        if len(text) > MAX_ANSWER_BYTES:
+            text = json.dumps(("error", f"its answer is larger than {MAX_ANSWER_BYTES >> 20} MB")).encode()
+        parent.send_bytes(text)
 
-    limits = pickle.load(tasks)
-    if limits is not None:
-        ProcessLimits(**limits).apply()
-    waiting: SimpleQueue[tuple[str, tuple[Any, ...]]] = SimpleQueue()
-    threading.Thread(target=_read_tasks, args=(tasks, waiting), daemon=True).start()
-    while True:
-        name, arguments = waiting.get()
+    def progress(step: str) -> None:
+        answer("step", step)
+
+    def run(name: str, *arguments: Any) -> None:
+        module, _, function = name.partition(":")
         try:
-            module, _, function = name.partition(":")
-            run = getattr(importlib.import_module(module), function)
-            answer("result", run(lambda step: answer("step", step), *arguments))
+            answer("result", getattr(importlib.import_module(module), function)(progress, *arguments))
         except BrokenPipeError:  # the parent has ended, and nobody is left to be told
             os._exit(0)
         except ServoscopeError as error:
             answer("error", str(error))
         except MemoryError:
-            answer("error", f"it needs more than {limits['memory_mb']:g} MB of memory" if limits else "memory is full")
+            answer("error", f"it needs more than {limits.memory_mb:g} MB of memory" if limits else "memory is full")
         except Exception as error:  # a damaged file may lead to anything, and must not look like a fault of the parent
             traceback.print_exc()
             answer("error", f"it cannot be used ({type(error).__name__}: {str(error)[:200]})")
 
+    waiting: SimpleQueue[tuple[str, tuple[Any, ...]]] = SimpleQueue()
+    run(f"{__name__}:enter_bounds", limits, sandbox)  # before there is another thread: walls are around each thread
+    threading.Thread(target=_read_tasks, args=(parent, waiting), daemon=True).start()
+    while True:
+        name, arguments = waiting.get()
+        run(name, *arguments)
 
-def _read_tasks(stream: Any, waiting: SimpleQueue[tuple[str, tuple[Any, ...]]]) -> None:
+
+def enter_bounds(_: Progress, limits: ProcessLimits | None, sandbox: Sandbox | None) -> None:
+    """Bound this process, before its first task."""
+    if sandbox is not None:
+        sandbox.enter()
+    if limits is not None:
+        limits.apply()
+
+
+def _read_tasks(parent: Connection, waiting: SimpleQueue[tuple[str, tuple[Any, ...]]]) -> None:
     """Read tasks in a thread, so that the end of the parent ends a task too."""
     try:
-        while True:
-            waiting.put(pickle.load(stream))
-    except (EOFError, pickle.UnpicklingError):  # the latter where the parent was killed in the middle of a task
-        os._exit(0)
+        while task := parent.recv():
+            waiting.put(task)
+    except (EOFError, OSError, UnpicklingError):
+        pass
+    except Exception:  # what a task needs cannot be imported here
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)
+
+
+class WorkerGroup:
+    """Workers side by side, as many as there are tasks at a time; each keeps what it has loaded for its next one.
+
+    Parameters are those of `Worker`.
+    """
+
+    def __init__(self, limits: ProcessLimits | None = None, environment: Mapping[str, str] | None = None) -> None:
+        self._limits, self._environment = limits, environment
+        self._idle: list[Worker] = []
+
+    def run(self, function: str, *arguments: Any, **how: Any) -> Any:
+        """Run a function as `Worker.run` does, from any thread."""
+        try:
+            worker = self._idle.pop()
+        except IndexError:
+            worker = Worker(self._limits, environment=self._environment)
+        try:
+            return worker.run(function, *arguments, **how)
+        finally:  # after a failure, its next task starts its process again
+            self._idle.append(worker)
+
+    def map(self, function: str, tasks: Iterable[Task], processes: int) -> Iterator[tuple[Task, Any]]:
+        """Yield tasks with what a function makes of each, as they end; of a task that failed, its WorkerError.
+
+        A task that kills its process costs itself only. Few wait at a time, so that memory is bounded.
+        """
+
+        def attempt(task: Task) -> tuple[Task, Any]:
+            try:
+                return task, self.run(function, task)
+            except WorkerError as error:
+                return task, error
+
+        waiting, running = iter(tasks), set[Future[tuple[Task, Any]]]()
+        with closing(self), ThreadPoolExecutor(processes, "workers") as threads:
+            while True:
+                some = islice(waiting, TASKS_PER_PROCESS * processes - len(running))
+                running |= {threads.submit(attempt, task) for task in some}
+                if not running:
+                    return
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                yield from (future.result() for future in done)
+
+    def close(self) -> None:
+        """Stop the workers that have nothing to do."""
+        while self._idle:
+            self._idle.pop().stop()
 
 
 def available_cores() -> int:
     """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def create_pool(processes: int) -> ProcessPoolExecutor:
-    """Return a pool of fresh processes, which end with this one, however that ends."""
-    # not forked: threads of Arrow and of the linear algebra do not survive that
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(processes, mp_context=context, initializer=_exit_with_parent)
-
-
-def _exit_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None, "a pool has one"
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

@@ -1,8 +1,16 @@
-"""Before deployment: which faults can be detected and told apart, at which size, after how long."""
+"""Before deployment: which faults can be detected and told apart, and at which size."""
 
-from servoscope.design.isolability_pairs import explanation_distances
-from servoscope.design.result import DesignStudy, DirectionStudy, FaultStudy
+from servoscope.design.result import BaselineStudy, DesignStudy, DirectionStudy, FaultStudy
 from servoscope.design.scenario import Scenario
-from servoscope.design.study import design_study, study
+from servoscope.design.study import design_study, study, study_baseline
 
-__all__ = ["DesignStudy", "DirectionStudy", "FaultStudy", "Scenario", "design_study", "explanation_distances", "study"]
+__all__ = [
+    "BaselineStudy",
+    "DesignStudy",
+    "DirectionStudy",
+    "FaultStudy",
+    "Scenario",
+    "design_study",
+    "study",
+    "study_baseline",
+]

@@ -1,4 +1,4 @@
-"""Fisher information: how surely each change could be sized, alone and together, and how alike any two look."""
+"""Fisher information: how surely each change could be sized, and how alike any two look."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import FloatArray
 from servoscope.design.scenario import Scenario
 from servoscope.isolation.ml.least_squares import normalise_columns
 
 MISNAMED = 0.005  # probability of a wrong name at the isolability radius; as much is left for pairs and "unknown"
-SINGULAR = 1e-9  # eigenvalue of a correlation below which two changes are one
 
 
 def fisher_matrix(scene: Scenario, seconds: float | None = None, exact: bool = True) -> FloatArray:
@@ -31,33 +30,6 @@ def fisher_matrix(scene: Scenario, seconds: float | None = None, exact: bool = T
     if exact or not m:
         return np.asarray(H[m:, m:])
     return np.asarray(H[m:, m:] - H[m:, :m] @ np.linalg.solve(H[:m, :m], H[:m, m:]))
-
-
-def cramer_rao_std(F: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Cramer-Rao standard deviations from an information (k, k): each size alone, and all free; (k,) each.
-
-    Infinite where a change says nothing, or nothing of its own.
-    """
-    with np.errstate(divide="ignore"):
-        alone = 1.0 / np.sqrt(np.diag(F))
-    together = np.where(_unidentifiable(F), np.inf, np.sqrt(np.diag(inverse_information(F))))
-    return alone, together
-
-
-def inverse_information(F: FloatArray) -> FloatArray:
-    """Return the inverse of an information (k, k); directions that say nothing keep a large variance."""
-    size = np.sqrt(np.maximum(np.diag(F), 1e-300))
-    value, vector = np.linalg.eigh(F / np.outer(size, size))
-    inverse = (vector / np.maximum(value, SINGULAR)) @ vector.T
-    return np.asarray(inverse / np.outer(size, size))
-
-
-def _unidentifiable(F: FloatArray) -> BoolArray:
-    """Return which sizes take part in a combination that the information (k, k) says nothing of, shape (k,)."""
-    size = np.sqrt(np.maximum(np.diag(F), 1e-300))
-    value, vector = np.linalg.eigh(F / np.outer(size, size))
-    silent = vector[:, value < SINGULAR]
-    return np.asarray(((silent**2).sum(axis=1) > SINGULAR) | (np.diag(F) <= 0.0))
 
 
 def cosines(columns: FloatArray, others: FloatArray) -> FloatArray:

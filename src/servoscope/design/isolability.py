@@ -24,7 +24,8 @@ from servoscope.isolation.ml.least_squares import solve_least_squares
 from servoscope.isolation.ml.window import RefitWindow
 from servoscope.models.plants import Fault
 
-NEAR = 200.0  # squared distance from which hypotheses are never taken for each other, and not fitted any closer
+# squared distance from which hypotheses are never taken for each other, and not fitted any closer
+MAX_SQUARED_DISTANCE = 200.0
 STEPS = 8  # of Gauss and Newton
 SHORTER = (1.0, 0.3, 0.1)  # shares of a step that are tried
 CONVERGED = 1e-3  # of a squared distance of one
@@ -32,8 +33,7 @@ GRID = 12  # sizes between the radius that linear distances promise and the end 
 FINE = 0.01  # relative precision of a radius
 SUSPICIOUS = 1.0  # logarithm of a distance relative to what is needed, below which a dip is looked into
 LOOKS = 6  # into a dip
-FAR = 10.0  # stands for a distance beyond all need
-DRAWS = 20_000
+UNLIMITED_DISTANCE = 10.0  # stands for a distance beyond all need
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +50,6 @@ class HypothesisDistances:
     def nearest(self) -> str:
         """Name of the closest other fault; empty where there is none."""
         return self.others[int(np.argmin(self.squared))].name if self.others else ""
-
-    def misnaming_probabilities(self, seed: int = 0) -> dict[str, float]:
-        """Return the probability with which each of the others is more likely than the truth and all else.
-
-        Drawn from the joint distribution of the log-likelihood ratios, D^2/2 + D'w each.
-        """
-        root = np.asarray(np.linalg.qr(self.residuals.T, mode="r"), dtype=np.float64).T
-        w = np.random.default_rng(seed).standard_normal((DRAWS, root.shape[1]))
-        against = 0.5 * self.squared + w @ root.T
-        wins = (against < 0.0) & (against <= against.min(axis=1, keepdims=True))
-        return {fault.name: float(share) for fault, share in zip(self.others, wins.mean(axis=0), strict=True)}
 
 
 def hypothesis_distances(scene: Scenario, fault: Fault, x: float) -> HypothesisDistances:
@@ -132,7 +121,7 @@ def ambiguous_sizes(
             """Return the logarithm of the distance relative to what is needed."""
             found = at(log_x)
             if found is None:
-                return FAR
+                return UNLIMITED_DISTANCE
             return float(
                 np.log(
                     max(equivalent_distance(misnaming_probability(getattr(found, of))), 1e-6)
@@ -220,7 +209,8 @@ def minimise_distance(
     """Go down from z = [d, x] to where some faults are closest to the truth, by Gauss and Newton.
 
     `own` (N + m,) are the innovations and the prior of the truth; with `held`, d stays as it is, and else the search
-    ends as soon as a linear step leaves more than `NEAR`. Returns the closest point and what differs there, (N + m,).
+    ends as soon as a linear step leaves more than `MAX_SQUARED_DISTANCE`. Returns the closest point and what differs
+    there, (N + m,).
     """
     m, names, profile = window.nuisance_count, tuple(fault.parameter for fault in faults), scene.profile
     first = m if held else 0
@@ -229,7 +219,7 @@ def minimise_distance(
     for _ in range(STEPS):
         J = window.jacobian(z, names, profile, slice(first, None))
         step, distance = solve_least_squares(J, left)
-        if not held and distance > NEAR:
+        if not held and distance > MAX_SQUARED_DISTANCE:
             return z, left + J @ step
         for shorter in SHORTER:
             new = z.copy()

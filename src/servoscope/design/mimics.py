@@ -11,11 +11,11 @@ from servoscope.core.messages import Message, message, text_message
 from servoscope.design.fisher_information import MISNAMED, cosines, equivalent_distance
 from servoscope.design.scenario import Scenario
 from servoscope.isolation.ml.predictor import Predictor
-from servoscope.isolation.ml.window import TINY
+from servoscope.isolation.ml.window import COMPLEX_STEP
 
 PARALLEL = 1e-6  # 1 - cosine^2 below which two changes are one and the same
 LOUDER = 1e-4  # gain by which one is taken
-LATER = 0.01  # samples of delay by which the derivative is taken
+DELAY_STEP = 0.01  # samples of delay by which the derivative is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,20 +36,23 @@ def mimic_causes(scene: Scenario) -> list[MimicCause]:
     found = [MimicCause(name, text_message(plant.causes[name]), "relative", J[:, i]) for i, name in enumerate(names)]
     healthy, factory = window.healthy, window.factory
     louder, softer = (factory.predictor(plant, output_gain=1.0 + step) for step in (LOUDER, -LOUDER))
-    stronger = factory.predictor(plant.model_copy(update={"input_gain": plant.input_gain * (1.0 + 1j * TINY)}))
-    later = factory.predictor(plant, later_s=LATER / scene.loop.sample_rate)
+    stronger = factory.predictor(plant.model_copy(update={"input_gain": plant.input_gain * (1.0 + 1j * COMPLEX_STEP)}))
+    later = factory.predictor(plant, later_s=DELAY_STEP / scene.loop.sample_rate)
     gain_of_y = (_innovation_column(scene, louder) - _innovation_column(scene, softer)).real / (2.0 * LOUDER)
     return [
         *found,
         MimicCause("gain of y", message("design.gain_of_y"), "relative", gain_of_y),
         MimicCause(
-            "gain of u", message("design.gain_of_u"), "relative", _innovation_column(scene, stronger).imag / TINY
+            "gain of u",
+            message("design.gain_of_u"),
+            "relative",
+            _innovation_column(scene, stronger).imag / COMPLEX_STEP,
         ),
         MimicCause(
             "delay",
             message("design.delay"),
             "samples",
-            (_innovation_column(scene, later) - _innovation_column(scene, healthy)).real / LATER,
+            (_innovation_column(scene, later) - _innovation_column(scene, healthy)).real / DELAY_STEP,
         ),
     ]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, get_args
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -24,7 +25,8 @@ BISECTIONS = 30
 FREQUENCIES = 400  # of the margin, up to half of the sample rate
 
 
-class OperatingLimit(NamedTuple):
+@dataclass(frozen=True)
+class OperatingLimit:
     """A fault's ratio to healthy above 1 and below 1 from which on the loop fails; None: nowhere in its range."""
 
     fault: str

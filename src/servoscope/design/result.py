@@ -8,22 +8,11 @@ from pydantic import BaseModel, ConfigDict
 
 from servoscope.core.messages import MessageText
 
-SIZES = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # detectability radii whose delays are told
-
 Spans = tuple[tuple[float, float | None], ...]
 
 
 class _StudyModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class DetectionDelay(_StudyModel):
-    """How soon a fault of one size is announced: probability in time, and times [s] by which half and 90 % are."""
-
-    ratio: float
-    probability: float
-    half_s: float | None
-    most_s: float | None
 
 
 class DirectionStudy(_StudyModel):
@@ -33,8 +22,6 @@ class DirectionStudy(_StudyModel):
     ----------
     detectable
         Ratio from which on the monitor announces it in time with 90 % probability; None: nowhere in its range.
-    delays
-        How soon, by size.
     unclear
         Spans of ratios at which it is not named rightly with 99.5 % probability, from the smallest change on; an open
         end is None.
@@ -44,20 +31,16 @@ class DirectionStudy(_StudyModel):
         End of the first span as linear sensitivities and the Cramer-Rao bound have it.
     nearest
         Fault that it is taken for, if any.
-    called
-        Probability of each other name at the ratio `detectable`.
     tracking, stability
         Ratio from which on the loop no longer follows its reference, or has lost half of its margin of stability; None:
         nowhere in its range, or a study of before this was asked.
     """
 
     detectable: float | None
-    delays: tuple[DetectionDelay, ...]
     unclear: Spans
     certain: Spans
     bound: float | None
     nearest: str
-    called: dict[str, float]
     tracking: float | None = None
     stability: float | None = None
 
@@ -71,13 +54,6 @@ class DirectionStudy(_StudyModel):
         """Smallest ratio at which it is named rightly, though larger ones may be unclear again."""
         return self.unclear[0][1] if self.unclear else 1.0
 
-    @property
-    def times_bound(self) -> float | None:
-        """`first_isolable` against `bound`, as logarithms; None where one of them does not exist."""
-        if self.first_isolable is None or self.bound is None or self.bound == 1.0:
-            return None
-        return math.log(self.first_isolable) / math.log(self.bound)
-
     def clear(self, ratio: float) -> bool:
         """Return whether a fault of this ratio is named rightly."""
         x = abs(math.log(ratio))
@@ -87,48 +63,21 @@ class DirectionStudy(_StudyModel):
 class SizePrecision(_StudyModel):
     """Smallest standard deviation of a size, relative, so many seconds after the onset; None: nothing tells it.
 
-    `alone` if nothing else may have changed, `together` if all parameters may; `alone_learned` and `together_learned`
-    with the healthy ones known only as the baseline and the seconds before the onset know them.
+    The healthy parameters are known as the baseline and the seconds before the onset know them.
     """
 
     seconds: float
-    alone: float | None
-    together: float | None
-    alone_learned: float | None
-    together_learned: float | None
+    std: float | None
 
 
 class FaultStudy(_StudyModel):
-    """One fault: `information` is Fisher's about the logarithm of its ratio, per second."""
+    """One fault, by direction, and how precise its size becomes."""
 
     name: str
     parameter: str
-    information: float
     sizes: tuple[SizePrecision, ...]
     up: DirectionStudy
     down: DirectionStudy
-
-
-class PairStudy(_StudyModel):
-    """Two faults at once, nothing else: standard deviations of both sizes and their correlation."""
-
-    names: tuple[str, str]
-    std: tuple[float | None, float | None]
-    correlation: float
-
-
-class JointStudy(_StudyModel):
-    """All parameters at once; the standard deviation is None where another change can take a size's place.
-
-    `confused` are the shares of each parameter's logarithm in the combination that is known worst, the largest 1, and
-    `worst` the standard deviation along it as a multiple of what it would be if they did not overlap.
-    """
-
-    parameters: tuple[str, ...]
-    std: tuple[float | None, ...]
-    correlation: tuple[tuple[float, ...], ...]
-    confused: dict[str, float]
-    worst: float
 
 
 class MimicStudy(_StudyModel):
@@ -156,35 +105,27 @@ class MimicStudy(_StudyModel):
     told_apart: float | None
 
 
-class FrequencyStudy(_StudyModel):
-    """One frequency of the iFRF: standard deviations of each size as seen there, alone and apart from all others."""
+class FaultPromise(_StudyModel):
+    """One fault, by a baseline alone: relative changes from which on it is detected, and named; None: never."""
 
-    frequency_hz: float
-    alone: dict[str, float | None]
-    apart: dict[str, float | None]
-
-
-class FrequencyComparison(_StudyModel):
-    """Frequencies to monitor: the loop's and the best; `gain` is the mean factor in what sets the faults apart."""
-
-    own: tuple[FrequencyStudy, ...]
-    best: tuple[FrequencyStudy, ...]
-    gain: float
+    parameter: str
+    detectable: float | None
+    isolable: float | None
+    nearest: str  # the fault that it is most like
 
 
-class DitherStudy(_StudyModel):
-    """A sine on the reference; `radius` as ratios, of linear sensitivities, and `std` relative, by fault."""
+class BaselineStudy(_StudyModel):
+    """What a baseline alone says of faults, under the motion that it was learned from; `missing`: why not more."""
 
-    frequency_hz: float
-    share: float
-    amplitude: float
-    extra_u_rms: float
-    std: dict[str, float | None]
-    radius: dict[str, float | None]
+    loop: str
+    missing: str
+    false_alarms_per_year: float
+    faults: dict[str, FaultPromise]
+    cosines: dict[str, dict[str, float]]
 
 
 class DesignStudy(_StudyModel):
-    """Which faults of a loop can be seen and told apart, at which size, after how long.
+    """Which faults of a loop can be detected and told apart, and at which size.
 
     Parameters
     ----------
@@ -202,12 +143,8 @@ class DesignStudy(_StudyModel):
         By name.
     cosines
         Between what small faults do, by their names; what errors of the healthy parameters explain is left out.
-    joint, pairs
-        Several faults at once.
     mimics
         What else the faults could be.
-    frequencies, dither
-        What to monitor, and what a sine on the reference would buy; the first dither is none.
     """
 
     loop: str
@@ -220,8 +157,4 @@ class DesignStudy(_StudyModel):
     false_alarms_per_year: float
     faults: dict[str, FaultStudy]
     cosines: dict[str, dict[str, float]]
-    joint: JointStudy
-    pairs: tuple[PairStudy, ...]
     mimics: tuple[MimicStudy, ...]
-    frequencies: FrequencyComparison
-    dither: tuple[DitherStudy, ...]

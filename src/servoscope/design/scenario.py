@@ -29,7 +29,7 @@ from servoscope.simulation.measurement import check_reference
 
 LEAD = 300  # samples before the onset, after which a predictor knows the state
 SEED = 3  # of the noise; it is the same whatever changes
-FEWEST = 50  # samples with the change
+MIN_CHANGED_SAMPLES = 50  # samples with the change
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +50,11 @@ class Scenario:
         Raises BaselineError, LoopError if the loop cannot be simulated, or not by the exact predictor; raises
         SimulationError if r is no reference, or shorter than `after_s`.
         """
-        require_exact_predictor(baseline.loop)
-        if baseline.exact is None:
-            raise BaselineError(
-                "the baseline has no exact predictor: a study needs a linear plant, a held input, and noise in the "
-                "healthy recordings, without which every change is seen"
-            )
+        require_study(baseline)
         r = check_reference(r)
         after = round(after_s * baseline.loop.sample_rate)
-        if not FEWEST <= after <= len(r):
-            least = FEWEST / baseline.loop.sample_rate
+        if not MIN_CHANGED_SAMPLES <= after <= len(r):
+            least = MIN_CHANGED_SAMPLES / baseline.loop.sample_rate
             longest = len(r) / baseline.loop.sample_rate
             raise SimulationError(f"{after_s:g} s after the onset: give at least {least:g} s, at most {longest:g} s")
         plain = cls(baseline, r, len(r) - after, np.zeros((0, 0)))
@@ -153,6 +148,16 @@ class Scenario:
         loop = self.loop.model_copy(update={"plant": self.baseline.plant})
         u_std, y_std = self.noise.u_std, self.noise.y_std
         return simulate(loop, self.r, faults=faults, noise_u_std=u_std, noise_y_std=y_std, seed=SEED)[0]
+
+
+def require_study(baseline: Baseline) -> None:
+    """Refuse a baseline whose loop cannot be simulated, or not by the exact predictor."""
+    require_exact_predictor(baseline.loop)
+    if baseline.exact is None:
+        raise BaselineError(
+            "the baseline has no exact predictor: a study needs a linear plant, a held input, and noise in the "
+            "healthy recordings, without which every change is seen"
+        )
 
 
 def require_exact_predictor(loop: Loop) -> None:

@@ -3,44 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
 
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import SimulationError
+from servoscope.core.errors import BaselineError, LoopError, SimulationError
 from servoscope.core.messages import Message, message, text_message
-from servoscope.design import dither, frequencies, mimics
-from servoscope.design.detection_delay import AlarmSimulator, detectability_radius
+from servoscope.design import mimics
+from servoscope.design.detectability import AlarmPower, detectable_size
 from servoscope.design.fisher_information import (
     cosines,
-    cramer_rao_std,
     fisher_matrix,
-    inverse_information,
     linear_isolability_radius,
 )
 from servoscope.design.isolability import Span, ambiguous_sizes, hypothesis_distances
 from servoscope.design.operating_limits import LIMIT_KINDS, LimitKind, OperatingLimit, operating_limits
 from servoscope.design.result import (
-    SIZES,
+    BaselineStudy,
     DesignStudy,
-    DetectionDelay,
     DirectionStudy,
-    DitherStudy,
+    FaultPromise,
     FaultStudy,
-    FrequencyComparison,
-    FrequencyStudy,
-    JointStudy,
     MimicStudy,
-    PairStudy,
     SizePrecision,
     Spans,
 )
-from servoscope.design.scenario import Scenario, require_exact_predictor
-from servoscope.detection.statistic import POWER
+from servoscope.design.scenario import Scenario, require_exact_predictor, require_study
+from servoscope.detection.statistic import required_noncentrality
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.learning.learn import SHORTEST, learn_baseline
+from servoscope.learning.learn import MIN_MEMORIES, learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Fault
 from servoscope.signals import Recording
@@ -65,7 +57,7 @@ def design_study(
     noise_y_std: float = NOISE_Y_STD,
     progress: Progress = lambda _: None,
 ) -> DesignStudy:
-    """Compute before deployment which faults of a loop can be detected and isolated, at which size, after how long.
+    """Compute before deployment which faults of a loop can be detected and isolated, and at which size.
 
     Parameters
     ----------
@@ -103,7 +95,7 @@ def design_study(
             reference=message("design.reference_of", recording=longest.name),
             progress=progress,
         )
-    learned = max(LEARNED_S, SHORTEST * loop.monitor.memory)
+    learned = max(LEARNED_S, MIN_MEMORIES * loop.monitor.memory)
     progress("learning")
     r, reference_name = _reference_motion(loop, reference, max(learned, BEFORE_S + after_s))
     noise = WhiteNoise(noise_u_std, noise_y_std)
@@ -134,7 +126,7 @@ def study(
     reference: str | Message = "",
     progress: Progress = lambda _: None,
 ) -> DesignStudy:
-    """Compute which faults can be detected and isolated, at which size, after how long, by simulating the loop.
+    """Compute which faults can be detected and isolated, and at which size, by simulating the loop.
 
     Parameters
     ----------
@@ -147,7 +139,7 @@ def study(
     reference
         Name of r.
     progress
-        Called with each step: once per fault and direction and three times more.
+        Called with each step: once per fault and direction and twice more.
 
     Raises
     ------
@@ -158,16 +150,14 @@ def study(
     """
     progress("alarms")
     scene = Scenario.from_baseline(baseline, r, after_s)
-    alarms = AlarmSimulator(scene)
+    alarms = AlarmPower(scene)
     lost = {(one.fault, one.kind): one for one in operating_limits(scene.loop)}
     faults = {f.name: _fault(scene, alarms, f, lost, progress) for f in scene.loop.plant.faults}
-    progress("mimics and frequencies")
+    progress("mimics")
     columns = scene.project_out_nuisances(scene.sensitivity)
     names = list(faults)
     cosine = cosines(columns, columns)
     mimics_studied = [_mimic(scene, cause) for cause in mimics.mimic_causes(scene)]
-    monitored = _frequencies(scene, alarms)
-    progress("dither")
     return DesignStudy(
         loop=scene.loop.name,
         reference=text_message(reference) if isinstance(reference, str) else reference,
@@ -179,17 +169,13 @@ def study(
         false_alarms_per_year=scene.loop.monitor.false_alarms_per_year,
         faults=faults,
         cosines={name: dict(zip(names, map(float, row), strict=True)) for name, row in zip(names, cosine, strict=True)},
-        joint=_joint(scene),
-        pairs=tuple(_pair(scene, names, i, j) for i, j in combinations(range(len(names)), 2)),
         mimics=tuple(mimics_studied),
-        frequencies=monitored,
-        dither=tuple(_dither(names, each) for each in [dither.without_dither(scene), *dither.best_dither(scene)]),
     )
 
 
 def _fault(
     scene: Scenario,
-    alarms: AlarmSimulator,
+    alarms: AlarmPower,
     fault: Fault,
     lost: Mapping[tuple[str, LimitKind], OperatingLimit],
     progress: Progress,
@@ -197,9 +183,9 @@ def _fault(
     i = scene.names.index(fault.parameter)
     sizes = []
     for seconds in sorted({min(s, scene.after_s) for s in SECONDS}):
-        exact, learned = (cramer_rao_std(fisher_matrix(scene, seconds, known)) for known in (True, False))
-        values = [_finite(each[i]) for each in (*exact, *learned)]
-        sizes.append(SizePrecision(seconds=seconds, **dict(zip(STDS, values, strict=True))))
+        information = float(fisher_matrix(scene, seconds, exact=False)[i, i])
+        std = _finite(1.0 / np.sqrt(information)) if information > 0.0 else None  # the Cramer-Rao bound
+        sizes.append(SizePrecision(seconds=seconds, std=std))
     sides = []
     for up in (True, False):
         progress(f"{fault.name}, {'up' if up else 'down'}")
@@ -210,33 +196,25 @@ def _fault(
     return FaultStudy(
         name=fault.name,
         parameter=fault.parameter,
-        information=float(fisher_matrix(scene)[i, i]) / scene.after_s,
         sizes=tuple(sizes),
         up=sides[0],
         down=sides[1],
     )
 
 
-STDS = ("alone", "together", "alone_learned", "together_learned")
-
-
-def _side(scene: Scenario, alarms: AlarmSimulator, fault: Fault, up: bool) -> DirectionStudy:
+def _side(scene: Scenario, alarms: AlarmPower, fault: Fault, up: bool) -> DirectionStudy:
     sign = 1.0 if up else -1.0
-    seen = detectability_radius(alarms, fault, up)
+    seen = detectable_size(alarms, fault, up)
     end = abs(float(np.log(fault.ratio_range[1 if up else 0])))
-    delays = [_detection_delay(alarms, fault, sign * seen * k) for k in SIZES if seen * k <= end]
     found = ambiguous_sizes(scene, fault, up)
     first = next((high for _, high in found.spans), 0.0)
     at = min(first, end) or min(seen, end)
-    misnamed = hypothesis_distances(scene, fault, sign * seen).misnaming_probabilities() if np.isfinite(seen) else {}
     return DirectionStudy(
         detectable=_ratio(sign * seen),
-        delays=tuple(each for each in delays if each is not None),
         unclear=_spans(found.spans, sign),
         certain=_spans(found.spans_if_certain, sign),
         bound=_ratio(sign * linear_isolability_radius(fisher_matrix(scene), scene.names.index(fault.parameter))),
         nearest=_nearest_fault(scene, fault, sign * at),
-        called=misnamed,
     )
 
 
@@ -245,39 +223,6 @@ def _nearest_fault(scene: Scenario, fault: Fault, x: float) -> str:
         return hypothesis_distances(scene, fault, x).nearest
     except SimulationError:
         return ""
-
-
-def _detection_delay(alarms: AlarmSimulator, fault: Fault, x: float) -> DetectionDelay | None:
-    try:
-        delays = alarms.delays(fault, x)
-    except SimulationError:  # nobody could have recorded it
-        return None
-    half, most = (_finite(delays.quantile(share)) for share in (0.5, POWER))
-    return DetectionDelay(ratio=float(np.exp(x)), probability=delays.probability(), half_s=half, most_s=most)
-
-
-def _joint(scene: Scenario) -> JointStudy:
-    F = fisher_matrix(scene, exact=False)
-    C = inverse_information(F)
-    std = np.sqrt(np.diag(C))
-    size = np.sqrt(np.maximum(np.diag(F), 1e-300))
-    value, vector = np.linalg.eigh(F / np.outer(size, size))
-    shares = vector[:, 0] / size
-    shares = shares / shares[int(np.argmax(np.abs(shares)))]
-    return JointStudy(
-        parameters=scene.names,
-        std=tuple(_finite(x) for x in cramer_rao_std(F)[1]),
-        correlation=tuple(tuple(row) for row in (C / np.outer(std, std)).tolist()),
-        confused=dict(zip(scene.names, shares.tolist(), strict=True)),
-        worst=float(1.0 / np.sqrt(max(value[0], 1e-12))),
-    )
-
-
-def _pair(scene: Scenario, names: Sequence[str], i: int, j: int) -> PairStudy:
-    F = fisher_matrix(scene, exact=False)[np.ix_([i, j], [i, j])]
-    C, (one, other) = inverse_information(F), cramer_rao_std(F)[1]
-    correlation = float(C[0, 1] / np.sqrt(C[0, 0] * C[1, 1]))
-    return PairStudy(names=(names[i], names[j]), std=(_finite(one), _finite(other)), correlation=correlation)
 
 
 def _mimic(scene: Scenario, cause: mimics.MimicCause) -> MimicStudy:
@@ -295,38 +240,6 @@ def _mimic(scene: Scenario, cause: mimics.MimicCause) -> MimicStudy:
     )
 
 
-def _frequencies(scene: Scenario, alarms: AlarmSimulator) -> FrequencyComparison:
-    own = frequencies.frequency_sensitivity(scene, alarms.covariance, np.array(scene.loop.monitor.frequencies))
-    best = frequencies.best_frequencies(scene, alarms.covariance)
-    gain = best.score(list(range(len(best.frequencies)))) - own.score(list(range(len(own.frequencies))))
-    return FrequencyComparison(
-        own=_frequency_studies(scene, own), best=_frequency_studies(scene, best), gain=float(np.exp(gain))
-    )
-
-
-def _frequency_studies(scene: Scenario, seen: frequencies.FrequencySensitivity) -> tuple[FrequencyStudy, ...]:
-    names = [fault.name for fault in scene.loop.plant.faults]
-
-    def std(row: FloatArray) -> dict[str, float | None]:
-        return {name: 1.0 / float(x) if x > 1e-9 else None for name, x in zip(names, row, strict=True)}
-
-    return tuple(
-        FrequencyStudy(frequency_hz=float(f), alone=std(alone), apart=std(own))
-        for f, alone, own in zip(seen.frequencies, seen.alone, seen.isolated, strict=True)
-    )
-
-
-def _dither(names: Sequence[str], found: dither.DitherEffect) -> DitherStudy:
-    return DitherStudy(
-        frequency_hz=found.frequency_hz,
-        share=found.share,
-        amplitude=found.amplitude,
-        extra_u_rms=found.extra_u_rms,
-        std={name: _finite(x) for name, x in zip(names, found.std, strict=True)},
-        radius={name: _ratio(float(x)) for name, x in zip(names, found.radius, strict=True)},
-    )
-
-
 def _spans(spans: Sequence[Span], sign: float) -> Spans:
     return tuple((float(np.exp(sign * low)), _ratio(sign * high)) for low, high in spans)
 
@@ -338,3 +251,57 @@ def _ratio(x: float) -> float | None:
 
 def _finite(x: float) -> float | None:
     return float(x) if np.isfinite(x) else None
+
+
+def study_baseline(
+    baseline: Baseline,
+    *,
+    reference: str | FloatArray = "profile",
+    after_s: float = 30.0,
+    progress: Progress = lambda _: None,
+) -> DesignStudy | BaselineStudy:
+    """Compute the same from a baseline alone: its healthy plant and noise, under a reference.
+
+    Where its loop cannot be simulated, only what the baseline itself knows is computed, under the motion that it was
+    learned from; `missing` says why.
+    """
+    try:
+        require_study(baseline)
+    except (BaselineError, LoopError) as error:
+        return learned_study(baseline, str(error))
+    r, name = _reference_motion(baseline.loop, reference, BEFORE_S + after_s)
+    return study(baseline, r, after_s, reference=name, progress=progress)
+
+
+def learned_study(baseline: Baseline, missing: str) -> BaselineStudy:
+    """Compute sizes and likeness of faults from a baseline's promises, and from the covariance of its estimates.
+
+    A fault moves the coefficients by its signature d. With forgetting over N samples white noise gives theta_hat the
+    covariance P_d/2, to which the baseline adds its own C, so that two faults are alike by d_i' (P_d/2 + C)^-1 d_j.
+    The promises, which know the colour of the noise, say how large each has to be.
+    """
+    promises = {promise.parameter: promise.change for promise in baseline.promises}
+    names = tuple(fault.name for fault in baseline.loop.plant.faults)
+    changes = np.array([promises.get(fault.parameter) or np.inf for fault in baseline.loop.plant.faults])
+    signatures = np.array([baseline.fault_directions[fault.parameter] for fault in baseline.loop.plant.faults])
+    root = np.linalg.cholesky(np.linalg.inv(np.array(baseline.P_d) / 2.0 + baseline.covariance_array()))
+    cosine = cosines(root.T @ signatures.T, root.T @ signatures.T)
+    sensitivity = np.sqrt(required_noncentrality(len(baseline.theta), baseline.limit)) / changes
+    F = cosine * np.outer(sensitivity, sensitivity)
+    alike = np.abs(cosine) - 2.0 * np.eye(len(names))
+    faults = {
+        fault.name: FaultPromise(
+            parameter=fault.parameter,
+            detectable=_finite(changes[i]),
+            isolable=_finite(linear_isolability_radius(F, i)) if len(names) > 1 else _finite(changes[i]),
+            nearest=names[int(np.argmax(alike[i]))] if len(names) > 1 else "",
+        )
+        for i, fault in enumerate(baseline.loop.plant.faults)
+    }
+    return BaselineStudy(
+        loop=baseline.loop.name,
+        missing=missing,
+        false_alarms_per_year=baseline.loop.monitor.false_alarms_per_year,
+        faults=faults,
+        cosines={name: dict(zip(names, map(float, row), strict=True)) for name, row in zip(names, cosine, strict=True)},
+    )

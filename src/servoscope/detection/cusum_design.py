@@ -33,21 +33,24 @@ from servoscope.models.lti import (
 )
 from servoscope.models.plants import Plant
 
-FACTOR = 4.0  # in information from one size to the next: in between, a CUSUM is at most a fifth slower than the best
-FASTEST = 2000.0  # 1/s; a change with more information shows within a few samples anyway
-IN_ONE_STEP = 20.0  # information of one step of the test, with more of which a change is found at the next one anyway
+# in information from one size to the next: in between, a CUSUM is at most a fifth slower than the best
+INFORMATION_FACTOR = 4.0
+MAX_INFORMATION_RATE = 2000.0  # 1/s; a change with more information shows within a few samples anyway
+# information of one step of the test, with more of which a change is found at the next one anyway
+MAX_STEP_INFORMATION = 20.0
 OVERSHOOT = 1.166  # twice Siegmund's 0.583: by how much a random walk passes its limit, in its own steps
-SLOWEST = 0.05  # 1/s; with less, a change would take a quarter of an hour
-LOST = 0.1  # of a change's information at most, where changes are made of few directions: its CUSUM is a ninth slower
-ROUNDS = 200  # in which directions are sought
-TRIED = 8  # sizes per direction at which the information is computed
-TOLERANCE = 0.02  # of a change's size: by how much the shadow may err that serves steps once per evaluation
-MOTION = 1.0  # s, below which a reference moves the less the faster
+MIN_INFORMATION_RATE = 0.05  # 1/s; with less, a change would take a quarter of an hour
+# of a change's information at most, where changes are made of few directions: its CUSUM is a ninth slower
+MAX_LOST_SHARE = 0.1
+MAX_ROUNDS = 200  # in which directions are sought
+SIZE_COUNT = 8  # sizes per direction at which the information is computed
+SHADOW_TOLERANCE = 0.02  # of a change's size: by how much the shadow may err that serves steps once per evaluation
+MOTION_TIME_S = 1.0  # s, below which a reference moves the less the faster
 RANK_TOLERANCE = 1e-9  # of the largest singular value: smaller ones are rounding
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
-FEWEST = 500  # updates with less of which a reference says nothing
-LONGEST = 60.0  # s of a healthy recording by which the test is designed
-ROUNDING = 1e-6  # of a level, by which limits that stand in its weights may change it
+MIN_UPDATES = 500  # updates with less of which a reference says nothing
+MAX_DESIGN_S = 60.0  # s of a healthy recording by which the test is designed
+LEVEL_TOLERANCE = 1e-6  # of a level, by which limits that stand in its weights may change it
 
 
 def sure_level(members: Sequence[CusumHypothesis], false_alarms_per_year: float) -> float:
@@ -59,7 +62,7 @@ def sure_level(members: Sequence[CusumHypothesis], false_alarms_per_year: float)
     limits = [member.limit(false_alarms_per_year / max(len(members), 1)) for member in members]
     kept = [member for member, limit in zip(members, limits, strict=True) if np.isfinite(limit)]
     alone = [m.limit(false_alarms_per_year) / m.limit(false_alarms_per_year / len(kept)) for m in kept]
-    return (1.0 - ROUNDING) * min(alone, default=1.0)
+    return (1.0 - LEVEL_TOLERANCE) * min(alone, default=1.0)
 
 
 def choose_cusum_hypotheses(
@@ -73,7 +76,7 @@ def choose_cusum_hypotheses(
     `covariance`: of the logarithms of the plant's parameters, shape (m, m).
     """
     whitened = _WhitenedResidual(_design_expectation(expectation), plant, noise)
-    if len(whitened.phi) < FEWEST:
+    if len(whitened.phi) < MIN_UPDATES:
         return ()
     size = np.sqrt((whitened.phi**2).mean(axis=0))
     found = []
@@ -104,7 +107,7 @@ def _design_expectation(expectation: Expectation) -> Expectation:
 
 def design_duration_s(pipeline: Pipeline) -> float:
     """Return how much of a reference the design needs [s]."""
-    return max(LONGEST, 10.0 * FEWEST * pipeline.stride / pipeline.loop.sample_rate)
+    return max(MAX_DESIGN_S, 10.0 * MIN_UPDATES * pipeline.stride / pipeline.loop.sample_rate)
 
 
 class _WhitenedResidual:
@@ -128,12 +131,14 @@ class _WhitenedResidual:
         ]
 
     def sizes(self, parameter: str, bound: float) -> list[float]:
-        """Return sizes between nothing and a bound, `FACTOR` apart in information per second, largest first.
+        """Return sizes between nothing and a bound, the largest first.
+
+        They are `INFORMATION_FACTOR` apart in information per second.
 
         The information is computed at a few sizes and read off in between on logarithmic scales.
         """
         tried, information = [], []
-        for x in np.geomspace(abs(bound), 1e-3, TRIED) * np.sign(bound):
+        for x in np.geomspace(abs(bound), 1e-3, SIZE_COUNT) * np.sign(bound):
             try:
                 d = self.shift(parameter, float(x))
             except SimulationError:  # nobody could have recorded it
@@ -143,29 +148,32 @@ class _WhitenedResidual:
         if not tried:
             return []
         logs = np.minimum.accumulate(np.array(information))[::-1]  # a larger change may tell less: the smaller counts
-        largest = np.log(IN_ONE_STEP * self.rate / self.together) if self.together > 1 else np.inf
-        target, sizes = min(np.log(FASTEST), logs[-1]), []  # the same sizes for both steps, but for the largest
-        while target >= max(np.log(SLOWEST), logs[0]):
+        largest = np.log(MAX_STEP_INFORMATION * self.rate / self.together) if self.together > 1 else np.inf
+        target, sizes = (
+            min(np.log(MAX_INFORMATION_RATE), logs[-1]),
+            [],
+        )  # the same sizes for both steps, but for the largest
+        while target >= max(np.log(MIN_INFORMATION_RATE), logs[0]):
             if target <= largest:
                 sizes.append(float(np.sign(bound) * np.exp(np.interp(target, logs, np.array(tried)[::-1]))))
-            target -= np.log(FACTOR)
+            target -= np.log(INFORMATION_FACTOR)
         return sizes
 
     def combine(self, chosen: Sequence[CusumHypothesis]) -> list[CusumHypothesis]:
-        """Return the members with changes that are combinations of few: `LOST` of no change's information is lost."""
+        """Return the members with changes that are combinations of few, which lose at most `MAX_LOST_SHARE`."""
         R = np.linalg.qr(self.phi, mode="r")  # |R change| is the size of a change's shift
         shifts = R @ np.array([member.change for member in chosen]).T
         unit = shifts / np.linalg.norm(shifts, axis=0)
         for count in range(1, len(R) + 1):
             left, lost = _fairest_directions(unit, count)
-            if lost <= LOST:
+            if lost <= MAX_LOST_SHARE:
                 break
         kept = np.linalg.solve(R, left @ (left.T @ shifts))
         return [replace(member, change=tuple(change.tolist())) for member, change in zip(chosen, kept.T, strict=True)]
 
     def worst_case(self, chosen: Sequence[CusumHypothesis], covariance: FloatArray) -> tuple[CusumHypothesis, ...]:
         """Return the members with rate and drift under this reference where they are worse than those that stand."""
-        if len(self.phi) < FEWEST:
+        if len(self.phi) < MIN_UPDATES:
             return tuple(chosen)
         names = self.plant.physical_parameters[: len(covariance)]
         drift = np.array([self.shift(parameter, STEP) / STEP for parameter in names])
@@ -189,7 +197,7 @@ def _fairest_directions(unit: FloatArray, count: int) -> tuple[FloatArray, float
     The worst ones get more weight in a singular value decomposition, round by round (Arora, Hazan and Kale, 2012).
     """
     weights, least = np.ones(unit.shape[1]), np.inf
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         left = np.linalg.svd(unit * np.sqrt(weights))[0][:, :count]
         lost = np.maximum(1.0 - ((left.T @ unit) ** 2).sum(axis=0), 0.0)
         if lost.max() < least:
@@ -257,14 +265,14 @@ def _truncate_shadow(
 ) -> LinearSystem:
     """Return r -> [residual of the healthy loop, white columns], in few states.
 
-    Columns only weigh the measured residual: theirs may err by `TOLERANCE` of each change without a false alarm more.
-    What is subtracted from it errs by as much of the smallest change.
+    Columns only weigh the measured residual: theirs may err by `SHADOW_TOLERANCE` of each change without more false
+    alarms. What is subtracted from it errs by as much of the smallest change.
     """
-    pole = float(np.exp(-1.0 / (MOTION * pipeline.loop.sample_rate)))
+    pole = float(np.exp(-1.0 / (MOTION_TIME_S * pipeline.loop.sample_rate)))
     both = unit_states(block_diagonal([residual, columns]).input(np.ones((2, 1))), pole)
     rows = np.zeros((len(shares) + 1, 1 + shares.shape[1]))
     rows[0, 0], rows[1:, 1:] = gain, shares
     size = output_deviations(both.output(rows), pole)
     size[0] = size[1:].min()
     rows /= size[:, None]
-    return truncate_states(both, rows, pole, TOLERANCE)
+    return truncate_states(both, rows, pole, SHADOW_TOLERANCE)

@@ -11,11 +11,11 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.detection.statistic import t2_statistic
 
-BY_CHANCE = 1e-3  # probability with which recordings of one plant may be called different
+DIFFERENCE_BY_CHANCE = 1e-3  # probability with which recordings of one plant may be called different
 SCATTER_BY_CHANCE = 0.01  # probability of such scatter by noise alone, below which few recordings are believed
-WIDENING = 1.25  # factor by which the scatter's variance is raised at a time
-MOST_WIDENED = 1e3  # and at most in all; what this does not help is left
-ENOUGH = 4  # recordings whose scatter is believed in any case
+WIDENING_FACTOR = 1.25  # factor by which the scatter's variance is raised at a time
+MAX_WIDENING = 1e3  # and at most in all; what this does not help is left
+MIN_RECORDINGS = 4  # recordings whose scatter is believed in any case
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def find_outliers(apart: FloatArray, covariances: FloatArray) -> list[RecordingO
     from scipy import special
 
     m, n = apart.shape
-    limit = float(special.chdtri(n, BY_CHANCE / m))
+    limit = float(special.chdtri(n, DIFFERENCE_BY_CHANCE / m))
     x, C, W = _standardise(apart, covariances)
     remaining, outliers_found = list(range(m)), []
     while len(remaining) > 1:
@@ -106,7 +106,7 @@ def scatter(apart: FloatArray, covariances: FloatArray) -> FloatArray:
     The arguments are those of `find_outliers`.
     """
     m, n = apart.shape
-    if m < 2 or (m < ENOUGH and scatter_probability(apart, covariances) > SCATTER_BY_CHANCE):
+    if m < 2 or (m < MIN_RECORDINGS and scatter_probability(apart, covariances) > SCATTER_BY_CHANCE):
         return np.zeros((n, n))
     own = np.mean([np.diag(c) for c in covariances], axis=0)
     beyond = np.maximum(apart.var(axis=0, ddof=1) - own, 0.0)
@@ -160,7 +160,7 @@ def scatter_of_others(apart: FloatArray, covariances: FloatArray, shares: Sequen
 
 def prediction_factor(m: int) -> float:
     """Return by how much the deviation of a further recording from the mean of m exceeds their own variance."""
-    return ((m - 1.0) / (m - 3.0) if m >= ENOUGH else 3.0) * (1.0 + 1.0 / m)
+    return ((m - 1.0) / (m - 3.0) if m >= MIN_RECORDINGS else 3.0) * (1.0 + 1.0 / m)
 
 
 def leave_one_out(
@@ -182,7 +182,7 @@ def leave_one_out(
     `common`: what theta is known to without scatter, (n, n).
     """
     m = len(apart)
-    if m < ENOUGH:
+    if m < MIN_RECORDINGS:
         return 1.0, np.zeros(0)
     shifts = [np.delete(apart, i, axis=0).mean(axis=0) - apart.mean(axis=0) for i in range(m)]
     ratios = np.zeros(m)
@@ -197,8 +197,8 @@ def leave_one_out(
             return float(t2_statistic(d, np.zeros_like(d), S + factor * B).max()) / limit
 
         ratios[i] = worst(1.0)
-        while worst(factors[i]) > 1.0 and factors[i] < MOST_WIDENED:
-            factors[i] *= WIDENING
+        while worst(factors[i]) > 1.0 and factors[i] < MAX_WIDENING:
+            factors[i] *= WIDENING_FACTOR
         if worst(factors[i]) > 1.0:  # the others agree where this one differs: widened, their scatter hides all faults
             factors[i] = 1.0
     return float(factors.max()), ratios

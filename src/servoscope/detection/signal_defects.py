@@ -18,18 +18,22 @@ from servoscope.signals.quality import QualityFinding, QualitySettings, check_bl
 SIGNALS = ("r", "u", "y")
 # units that are confused: powers of ten; inches and mm; degrees and radians; turns and radians; per minute and second
 FACTORS = (*(10.0**k for k in range(1, 7)), 25.4, 180.0 / np.pi, 2.0 * np.pi, 60.0)
-CLEARER = 5.0  # times smaller is the residual of the healthy plant where the signals are put right
-AS_HEALTHY = 2.0  # the same where that residual is the healthy one, and up to how many times that it counts as such
+MIN_RESIDUAL_RATIO = 5.0  # times smaller is the residual of the healthy plant where the signals are put right
+# the same where that residual is the healthy one, and up to how many times that it counts as such
+HEALTHY_RESIDUAL_RATIO = 2.0
 FROZEN_S = 1.0  # how long y or u stays exactly the same while the motion demands a change [s]
-TRAVEL = 0.1  # of the range of y, that r moves by then
-UNASKED = 0.5  # of a motion, that r - y moves too where y does not follow r
-SILENT = 1e-6  # of the largest u: what a resampling filter leaves of 0
-JUMP = 0.4  # of the range of y, in one sample: a counter that wraps or is reset
-MOST_JUMPS = 0.1  # share of the samples
-SMOOTHER = 2.0  # times smaller are all other steps of y, and those of r at that time
-AHEAD = 3  # samples that r may step before y does
-MOST_ROWS = 50_000  # that the residual is computed from
-UNEXPLAINED, EXPLAINED = 0.1, 0.05  # share of eta^2 that a plant known roughly leaves of signals: wrong, right
+TRAVEL_SHARE = 0.1  # of the range of y, that r moves by then
+UNASKED_SHARE = 0.5  # of a motion, that r - y moves too where y does not follow r
+SILENCE_SHARE = 1e-6  # of the largest u: what a resampling filter leaves of 0
+JUMP_SHARE = 0.4  # of the range of y, in one sample: a counter that wraps or is reset
+MAX_JUMP_SHARE = 0.1  # share of the samples
+MIN_STEP_RATIO = 2.0  # times smaller are all other steps of y, and those of r at that time
+LEAD_SAMPLES = 3  # samples that r may step before y does
+MAX_ROWS = 50_000  # that the residual is computed from
+MIN_WRONG_SHARE, MAX_RIGHT_SHARE = (
+    0.1,
+    0.05,
+)  # share of eta^2 that a plant known roughly leaves of signals: wrong, right
 UNIT_ERROR = 0.25  # relative, up to which the spreads of r and y tell the factor between their units
 
 
@@ -70,7 +74,7 @@ class Correction:
 def find_signal_defect(recording: Recording) -> SignalDefect | None:
     """Return the first place where y or u is stuck while the motion demands a change, or where y jumps."""
     span = float(np.ptp(recording.y))
-    settings = QualitySettings(frozen_s=FROZEN_S, frozen_travel=TRAVEL * span or None)
+    settings = QualitySettings(frozen_s=FROZEN_S, frozen_travel=TRAVEL_SHARE * span or None)
     limits, state = settings.limits(recording.sample_rate), init_state()
     for chunk in outofcore.iter_chunks(0, recording.samples):
         rows = recording.rows(chunk)
@@ -85,7 +89,7 @@ def find_signal_defect(recording: Recording) -> SignalDefect | None:
 def find_switched_off(recording: Recording) -> SignalDefect | None:
     """Return from where on the drive is off: u stays at 0 for long while y moves, and not as r asks it to."""
     u, span = recording.u, float(np.ptp(recording.y))
-    silent = SILENT * max(float(u.max()), -float(u.min()))
+    silent = SILENCE_SHARE * max(float(u.max()), -float(u.min()))
     off = np.zeros(recording.samples, dtype=np.bool_)
     for rows in outofcore.iter_chunks(0, recording.samples, *recording.columns):
         off[rows] = (np.abs(u[rows]) <= silent) & ~recording.restart[rows]
@@ -93,7 +97,7 @@ def find_switched_off(recording: Recording) -> SignalDefect | None:
     for begin, end in edges[np.diff(edges)[:, 0] > FROZEN_S * recording.sample_rate].tolist():
         y, e = recording.y[begin:end], recording.r[begin:end] - recording.y[begin:end]
         moved = float(np.ptp(y))
-        if moved > TRAVEL * span and np.ptp(e) > UNASKED * moved:
+        if moved > TRAVEL_SHARE * span and np.ptp(e) > UNASKED_SHARE * moved:
             text = message("signals.off", name=recording.name, t=float(recording.t[begin]), by=moved)
             return SignalDefect(begin, text)
     return None
@@ -108,7 +112,7 @@ def find_corrections(
     which are alike to a linear plant. None yields both. In a tight loop r and y are nearly alike, and exchanging them
     makes the residual few times smaller: where it comes down to the healthy one, that is enough.
     """
-    rows = recording.rows(slice(0, MOST_ROWS))
+    rows = recording.rows(slice(0, MAX_ROWS))
 
     def residual(correction: Correction) -> tuple[float, float]:
         return _residual_share(pipeline, theta, correction.apply(rows))
@@ -116,8 +120,8 @@ def find_corrections(
     share, _ = residual(Correction())
     tried = {correction: residual(correction) for correction in _single_corrections()}
     best, left = min(tried.values(), default=(np.inf, np.inf))
-    explained = residual_power is not None and left < AS_HEALTHY * residual_power
-    if not best * (AS_HEALTHY if explained else CLEARER) < share:
+    explained = residual_power is not None and left < HEALTHY_RESIDUAL_RATIO * residual_power
+    if not best * (HEALTHY_RESIDUAL_RATIO if explained else MIN_RESIDUAL_RATIO) < share:
         yield from _reference_corrections(rows)
         return
     near = [correction for correction, (each, _) in tried.items() if each < 2.5 * best]
@@ -142,13 +146,13 @@ def describe_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording)
 
     For plants that are known roughly, as before learning.
     """
-    rows = recording.rows(slice(0, MOST_ROWS))
-    if not _residual_share(pipeline, theta, rows)[0] > UNEXPLAINED:
+    rows = recording.rows(slice(0, MAX_ROWS))
+    if not _residual_share(pipeline, theta, rows)[0] > MIN_WRONG_SHARE:
         return None
     found = [
         correction
         for correction in find_corrections(pipeline, theta, None, rows)
-        if _residual_share(pipeline, theta, correction.apply(rows))[0] < EXPLAINED
+        if _residual_share(pipeline, theta, correction.apply(rows))[0] < MAX_RIGHT_SHARE
     ]
     of_u = [correction for correction in found if abs(correction.factors[1]) != 1.0]
     of_y = [correction for correction in found if abs(correction.factors[2]) != 1.0]
@@ -209,19 +213,19 @@ def _frozen_defect(recording: Recording, finding: QualityFinding) -> SignalDefec
 
 
 def _largest_near(steps: FloatArray, at: npt.NDArray[np.intp]) -> float:
-    near = np.clip(at[:, None] + np.arange(-AHEAD, 2), 0, len(steps) - 1)
+    near = np.clip(at[:, None] + np.arange(-LEAD_SAMPLES, 2), 0, len(steps) - 1)
     return float(steps[near].max())
 
 
 def _find_jump(rows: Recording, first: int) -> SignalDefect | None:
     steps = np.where(rows.restart[1:], 0.0, np.abs(np.diff(rows.y)))
     span = float(np.ptp(rows.y))
-    jumps = np.flatnonzero(steps > JUMP * span) if span > 0.0 else np.zeros(0, dtype=np.intp)
-    if not len(jumps) or len(jumps) > MOST_JUMPS * len(steps):
+    jumps = np.flatnonzero(steps > JUMP_SHARE * span) if span > 0.0 else np.zeros(0, dtype=np.intp)
+    if not len(jumps) or len(jumps) > MAX_JUMP_SHARE * len(steps):
         return None
     size, other = float(np.median(steps[jumps])), float(np.delete(steps, jumps).max(initial=0.0))
     demanded = _largest_near(np.abs(np.diff(rows.r)), jumps)
-    if SMOOTHER * max(other, demanded) > size or np.ptp(steps[jumps]) > 2.0 * other:
+    if MIN_STEP_RATIO * max(other, demanded) > size or np.ptp(steps[jumps]) > 2.0 * other:
         return None  # a motion, or jumps of several sizes
     begin = int(jumps[0]) + 1
     text = message("signals.jump", t=float(rows.t[begin]), size=size)

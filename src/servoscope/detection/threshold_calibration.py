@@ -25,15 +25,14 @@ from servoscope.signals import Recording
 from servoscope.simulation import simulate
 
 SAMPLES = 120_000  # as many as a third of a second simulates
-MOST_SAMPLES = 1_200_000
+MAX_SAMPLES = 1_200_000
 MEMORIES = 240.0  # or delays of the alarm, that a rehearsal lasts if it can
-FEW = 10.0  # alarms: fewer are not believed where they would lower a limit
-COUNTED = 30.0  # alarms that theory expects among them
+MIN_ALARMS = 10.0  # alarms: fewer are not believed where they would lower a limit
+EXPECTED_ALARMS = 30.0  # alarms that theory expects among them
 SEED = 20
-REHEARSALS = (
-    4  # where the sequential test steps once per evaluation: one alone leaves its limits off by a third in rate
-)
-UNLIKELY = 1e-3  # chance of an alarm during the healthy recordings from which noise is not believed to raise it
+# where the sequential test steps once per evaluation: one alone leaves its limits off by a third in rate
+REHEARSALS = 4
+MIN_ALARM_CHANCE = 1e-3  # chance of an alarm during the healthy recordings from which noise is not believed to raise it
 
 
 def calibrate_thresholds(
@@ -44,8 +43,8 @@ def calibrate_thresholds(
     loop = pipeline.loop.model_copy(update={"plant": plant})
     off = pipeline.delays[1] * pipeline.every / loop.sample_rate
     wanted = max(SAMPLES, round(MEMORIES * max(loop.monitor.memory, off) * loop.sample_rate))
-    samples = min(wanted, MOST_SAMPLES)
-    counted = COUNTED * samples / wanted
+    samples = min(wanted, MAX_SAMPLES)
+    counted = EXPECTED_ALARMS * samples / wanted
     budget = counted * SECONDS_PER_YEAR * loop.sample_rate / samples
     r = np.resize(expectation.reference.r, samples)
     certain = [replace(member, drift=0.0) for member in hypotheses]
@@ -91,7 +90,10 @@ def design_sequential_test(
     pipeline = first.pipeline
     # the recordings are short: they speak where an alarm during them would have a chance of one in a thousand
     years = sum(rec.duration_s for rec in recordings) / SECONDS_PER_YEAR
-    budget = max(SEQUENTIAL_SHARE * pipeline.loop.monitor.false_alarms_per_year, UNLIKELY / years) / calibration.cusum
+    budget = (
+        max(SEQUENTIAL_SHARE * pipeline.loop.monitor.false_alarms_per_year, MIN_ALARM_CHANCE / years)
+        / calibration.cusum
+    )
     test = build_cusum_constants(pipeline, plant, largest_noise, tuning.scale, hypotheses, budget)
     highest = max(float(pipeline.estimate(tuning, rec, test).level.max(initial=0.0)) for rec in recordings)
     if test is None or highest >= 1.0:
@@ -103,4 +105,4 @@ def design_sequential_test(
 def _share(events: float, expected: float) -> float:
     """Return events against those expected, none counting as a half."""
     share = float((events + 0.5) / (expected + 0.5))
-    return share if expected >= FEW else max(share, 1.0)
+    return share if expected >= MIN_ALARMS else max(share, 1.0)

@@ -11,7 +11,7 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.frequency_response import FrequencyResponse
 
-UNSEEN = 0.1  # relative, by which a motion is outside of the baseline's from which on it counts as never seen
+UNSEEN_EXCESS = 0.1  # relative, by which a motion is outside of the baseline's from which on it counts as never seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,9 @@ def detection_statistics(
     """Return the statistics that raise the alarm, each with where it is above its limit.
 
     `motion`: how far the motion is outside of the baseline's; the sequential test, which knows no model error, is
-    silent from `UNSEEN` on.
+    silent from `UNSEEN_EXCESS` on.
     """
-    known = ready if motion is None else ready & (motion < UNSEEN)
+    known = ready if motion is None else ready & (motion < UNSEEN_EXCESS)
     found = Statistic("t2", t2, limit, ready & (t2 > limit)), Statistic("cusum", cusum, 1.0, known & (cusum >= 1.0))
     return found if features is None else (*found, Statistic("features", features, 1.0, features > 1.0))
 

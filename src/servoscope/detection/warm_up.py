@@ -22,15 +22,15 @@ from servoscope.signals import Recording
 
 # channels of a course that a monitor has followed: the warm-up as a covariate, whose learned range is 0 to 1, its
 # standard deviation, and the smallest jump that would be found
-FOLLOWED = NAME, STD, JUMP = "warm_up", "warm_up_std", "warm_up_jump"
-BLOCK = 0.2  # memories over which the sums are taken
-MOST_BLOCKS = 400
+COURSE_CHANNELS = NAME, STD, JUMP = "warm_up", "warm_up_std", "warm_up_jump"
+BLOCK_MEMORIES = 0.2  # memories over which the sums are taken
+MAX_BLOCKS = 400
 PRIOR_STD = 1.0  # of w_0, s and k around the middle of the learned range, where the recording does not tell
-BY_CHANCE = 1e-6  # probability with which a smooth course is called broken, over all moments
-MOST_JUMPS = 3
-ROUNDS = 8  # of Gauss and Newton
+BREAK_BY_CHANCE = 1e-6  # probability with which a smooth course is called broken, over all moments
+MAX_JUMPS = 3
+MAX_ROUNDS = 8  # of Gauss and Newton
 STEP = 1e-4  # of w, for derivatives
-UNSEEN = 1e-30  # of the best known information: less is rounding, as of a machine at rest
+MIN_INFORMATION_SHARE = 1e-30  # of the best known information: less is rounding, as of a machine at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class BlockSums:
     def of(cls, pipeline: Pipeline, recording: Recording) -> BlockSums:
         """Add up the usable samples of a recording."""
         N, n = recording.samples, pipeline.bank.n
-        size = max(round(BLOCK * pipeline.memory_samples), -(-N // MOST_BLOCKS), 1)
+        size = max(round(BLOCK_MEMORIES * pipeline.memory_samples), -(-N // MAX_BLOCKS), 1)
         runner, rows = RegressionRunner(pipeline), []
         for begin in range(0, N, size):
             at = slice(begin, min(begin + size, N))
@@ -115,7 +115,7 @@ def fit_course(
     middle, prior = np.zeros(k + n - 1), np.zeros(k + n - 1)
     middle[:2], prior[:3] = 0.5, warm_up.variance / PRIOR_STD**2
     p, J = middle.copy(), np.zeros((m, n, k + n - 1))
-    for last in (*(False,) * ROUNDS, True):
+    for last in (*(False,) * MAX_ROUNDS, True):
         w = (G @ p[:k])[:, None]
         slope = (model.theta(theta, w + STEP) - model.theta(theta, w - STEP)) / (2.0 * STEP)
         alike = np.einsum("mij,mj->i", A, slope)
@@ -124,7 +124,7 @@ def fit_course(
         fitted = model.theta(theta, w) + J[:, :, k:] @ p[k:]
         left = sums.moment - np.einsum("mij,mj->mi", A, fitted)
         H = np.einsum("mia,mij,mjb->ab", J, A, J) + np.diag(prior)
-        H += np.diag(np.diag(H) <= UNSEEN * H.max())  # what the recording does not show stays as it is
+        H += np.diag(np.diag(H) <= MIN_INFORMATION_SHARE * H.max())  # what the recording does not show stays as it is
         size = np.sqrt(np.diag(H))
         C = np.linalg.inv(H / np.outer(size, size)) / np.outer(size, size)
         if not last:
@@ -166,10 +166,10 @@ def find_course(sums: BlockSums, warm_up: WarmUp, theta: FloatArray, model: Cova
     from scipy import special
 
     fit = fit_course(sums, warm_up, theta, model)
-    limit = float(special.chdtri(1.0, BY_CHANCE / len(sums.first)))
+    limit = float(special.chdtri(1.0, BREAK_BY_CHANCE / len(sums.first)))
     at, statistic, information = _most_likely_jump(sums, fit, warm_up.variance)
     smallest = float(np.sqrt(required_noncentrality(1, limit) / information)) if information else np.inf
-    while statistic > limit and at not in fit.jumps and len(fit.jumps) < MOST_JUMPS:
+    while statistic > limit and at not in fit.jumps and len(fit.jumps) < MAX_JUMPS:
         fit = fit_course(sums, warm_up, theta, model, (*fit.jumps, at))
         at, statistic, _ = _most_likely_jump(sums, fit, warm_up.variance)
     return fit, smallest

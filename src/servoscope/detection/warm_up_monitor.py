@@ -10,7 +10,7 @@ unlikely enough by chance.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,31 +20,27 @@ from servoscope.baseline.covariates import CovariateModel, WarmUp
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
 from servoscope.detection.statistic import required_noncentrality
-from servoscope.detection.warm_up import BLOCK, BY_CHANCE, JUMP, NAME, PRIOR_STD, STD, STEP, UNSEEN
+from servoscope.detection.warm_up import (
+    BLOCK_MEMORIES,
+    BREAK_BY_CHANCE,
+    JUMP,
+    MIN_INFORMATION_SHARE,
+    NAME,
+    PRIOR_STD,
+    STD,
+    STEP,
+)
 from servoscope.estimation.pipeline import RegressionRunner
 
 ONSETS = 40  # newest blocks with which a jump may have begun
-SHORTEST = 2  # blocks that a jump has to last
-SETTLED = 0.1  # standard deviation of w below which it is known
-DRIFT = 0.03  # of the learned range by which the surroundings drift within a time constant
-ROUNDS = 4  # of Gauss and Newton
-MOST_LOSSES = 100.0  # times the usual ones that a block may have; more is a sample that was read wrongly
-FAR = 10.0  # learned ranges: no machine is warmer than that
+MIN_JUMP_BLOCKS = 2  # blocks that a jump has to last
+MAX_KNOWN_STD = 0.1  # standard deviation of w below which it is known
+DRIFT_SHARE = 0.03  # of the learned range by which the surroundings drift within a time constant
+MAX_ROUNDS = 4  # of Gauss and Newton
+MAX_LOSS_RATIO = 100.0  # times the usual ones that a block may have; more is a sample that was read wrongly
+MAX_RANGES = 10.0  # learned ranges: no machine is warmer than that
 POINTS, PER_CONSTANT = 32, 8.0  # of the course that is kept, and how many of them lie within a time constant
 LOOK = np.array([1.0, 0.0, 0.0, 1.0])  # what a block sees of x
-
-
-class _Parts(NamedTuple):
-    """Views of the state."""
-
-    head: FloatArray  # samples of the block that runs, last y, blocks since the last point was kept
-    sums: FloatArray  # phi phi', phi eta, losses, samples with losses
-    x: FloatArray  # (4,)
-    P: FloatArray  # (4, 4)
-    onsets: FloatArray  # by block: what a jump there does to x, its information and its score, (ONSETS, 6)
-    course: FloatArray  # (POINTS, 2): w and its standard deviation
-    average: FloatArray
-    filters: FloatArray
 
 
 class WarmUpMonitor(CovariateMonitor):
@@ -56,30 +52,30 @@ class WarmUpMonitor(CovariateMonitor):
         super().__init__(baseline, model)
         self._pipeline, self._warm_up = baseline.pipeline(), warm_up
         self._rate = baseline.loop.sample_rate
-        self._block = max(round(BLOCK * self._pipeline.memory_samples), 1)
+        self._block = max(round(BLOCK_MEMORIES * self._pipeline.memory_samples), 1)
         self._seconds = self._block / self._rate
         self._keep = float(np.exp(-self._seconds / warm_up.time_constant_s))
         self._every = max(round(warm_up.time_constant_s / PER_CONSTANT / self._seconds), 1)
-        self._limit = float(special.chdtri(1.0, BY_CHANCE / ONSETS))
+        self._limit = float(special.chdtri(1.0, BREAK_BY_CHANCE / ONSETS))
         self._noncentrality = required_noncentrality(1, self._limit)
         n = self._n = len(baseline.theta)
-        filters = RegressionRunner(self._pipeline).state.size
-        shapes = (
-            (3,),
-            (n * n + n + 2,),
-            (4,),
-            (4, 4),
-            (ONSETS, 6),
-            (POINTS, 2),
-            (self.average.size,),
-            (filters,),
+        self._layout = np.dtype(
+            [
+                ("head", "f8", 3),  # samples of the block that runs, last y, blocks since the last point was kept
+                ("sums", "f8", n * n + n + 2),  # phi phi', phi eta, losses, samples with losses
+                ("x", "f8", 4),
+                ("P", "f8", (4, 4)),
+                ("onsets", "f8", (ONSETS, 6)),  # by block: what a jump there does to x, its information and its score
+                ("course", "f8", (POINTS, 2)),  # w and its standard deviation
+                ("average", "f8", self.average.size),
+                ("filters", "f8", RegressionRunner(self._pipeline).state.size),
+            ]
         )
-        self._shapes, self._ends = shapes, np.cumsum([int(np.prod(shape)) for shape in shapes])
-        self.size = int(self._ends[-1])
+        self.size = self._layout.itemsize // 8
 
-    def _parts(self, state: FloatArray) -> _Parts:
-        pieces = np.split(state, self._ends[:-1])
-        return _Parts(*(piece.reshape(shape) for piece, shape in zip(pieces, self._shapes, strict=True)))
+    def _parts(self, state: FloatArray) -> Any:
+        """Return the state by the names of its parts, which are views."""
+        return state.view(self._layout).view(np.recarray)[0]
 
     def start(self) -> FloatArray:
         """Return the state before the first sample: nothing is known of the warmth."""
@@ -90,12 +86,12 @@ class WarmUpMonitor(CovariateMonitor):
         self._forget(parts)
         return state
 
-    def _forget(self, parts: _Parts) -> None:
+    def _forget(self, parts: Any) -> None:
         """Know nothing of warmth and machine, as at the start: what was believed cannot be."""
         parts.x[:], parts.P[:] = (0.5, 0.5, 0.0, 0.0), np.diag([PRIOR_STD**2] * 3 + [0.0])
         self._begin(parts)
 
-    def _begin(self, parts: _Parts) -> None:
+    def _begin(self, parts: Any) -> None:
         """Begin anew behind a gap, of which nobody knows how long it was: the warmth is unknown, the rest is kept."""
         parts.head[:], parts.sums[:], parts.onsets[:] = (0.0, np.nan, 0.0), 0.0, 0.0
         parts.P[0], parts.P[:, 0] = 0.0, 0.0
@@ -132,7 +128,7 @@ class WarmUpMonitor(CovariateMonitor):
             rows = slice(k, end)
             # one after the other, whatever the blocks: pairwise sums would differ in the last bit
             parts.sums[:] = np.cumsum(np.vstack([parts.sums, columns[rows]]), axis=0)[-1]
-            if parts.P[0, 0] < SETTLED**2:
+            if parts.P[0, 0] < MAX_KNOWN_STD**2:
                 if np.isnan(parts.average).any():
                     start = self.model.theta(self._theta, self.model.clip(parts.x[:1]))
                 found[rows, 0] = self.average.run(parts.average, np.full((end - k, 1), parts.x[0]))[:, 0]
@@ -143,7 +139,7 @@ class WarmUpMonitor(CovariateMonitor):
             parts.head[1], k = y[end - 1], end
         return found, start
 
-    def _end_block(self, parts: _Parts) -> None:
+    def _end_block(self, parts: Any) -> None:
         """Take what a block measures, see whether a jump explains the last ones, and go on to the next one."""
         n, sums = self._n, parts.sums
         A, b, (loss, count) = sums[: n * n].reshape(n, n), sums[n * n : -2], sums[-2:]
@@ -156,43 +152,43 @@ class WarmUpMonitor(CovariateMonitor):
             parts.course[:-1] = parts.course[1:].copy()
             parts.course[-1] = parts.x[0], np.sqrt(parts.P[0, 0])
             parts.head[2] = 0.0
-        keep, drift = self._keep, DRIFT**2 * self._seconds / self._warm_up.time_constant_s
+        keep, drift = self._keep, DRIFT_SHARE**2 * self._seconds / self._warm_up.time_constant_s
         parts.x[:] = F @ parts.x
         parts.P[:] = F @ parts.P @ F.T
         parts.P[0, 0] += 0.0 if known else (0.5 * (1.0 - keep) * parts.x[2]) ** 2  # it may have run, or stood still
         parts.P[1, 1] += drift
         parts.onsets[:, :4] = parts.onsets[:, :4] @ F.T
         parts.head[0], parts.sums[:] = 0.0, 0.0
-        if not (abs(parts.x[0]) < FAR and np.isfinite(parts.P).all()):
+        if not (abs(parts.x[0]) < MAX_RANGES and np.isfinite(parts.P).all()):
             self._forget(parts)
 
     def _transition(self, loss: float, count: float) -> tuple[FloatArray, bool]:
         """Return what leads x to the next block, with the losses of this one if known, or half of the usual ones."""
         power = self._warm_up.power
-        known = count >= 0.5 * self._block and (not power or abs(loss) <= MOST_LOSSES * power * count)
+        known = count >= 0.5 * self._block and (not power or abs(loss) <= MAX_LOSS_RATIO * power * count)
         p = 0.0 if not power else loss / count / power if known else 0.5
         F = np.eye(4)
         F[0, :3] = self._keep, 1.0 - self._keep, (1.0 - self._keep) * p
         return F, known
 
-    def _measure(self, parts: _Parts, A: FloatArray, b: FloatArray) -> tuple[float, float] | None:
+    def _measure(self, parts: Any, A: FloatArray, b: FloatArray) -> tuple[float, float] | None:
         """Return w + j as a block shows it, and its variance; None where the block shows nothing."""
         x, P, z, variance = parts.x, parts.P, float(LOOK @ parts.x), 0.0
         prior = float(LOOK @ P @ LOOK)
         w = z
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ROUNDS):
             at = np.array([[w + STEP], [w - STEP]])
             upper, lower = self.model.theta(self._theta, at)
             slope = (upper - lower) / (2.0 * STEP)
             information = float(slope @ A @ slope)
-            if not information > UNSEEN:
+            if not information > MIN_INFORMATION_SHARE:
                 return None
             z = w + float(slope @ (b - A @ self.model.theta(self._theta, np.array([w])))) / information
             variance = self._warm_up.variance / information
             w = float(LOOK @ x) + prior / (prior + variance) * (z - float(LOOK @ x))
         return z, variance
 
-    def _update(self, parts: _Parts, z: float, variance: float) -> None:
+    def _update(self, parts: Any, z: float, variance: float) -> None:
         """Correct x by a measurement, and then by a jump where one is needed."""
         x, P, onsets = parts.x, parts.P, parts.onsets
         S = float(LOOK @ P @ LOOK) + variance
@@ -207,7 +203,7 @@ class WarmUpMonitor(CovariateMonitor):
         onsets[:, :4] += seen[:, None] * gain
         onsets[:, 4] += seen**2 / S
         onsets[:, 5] += seen * off / S
-        information, score = onsets[: -SHORTEST + 1, 4], onsets[: -SHORTEST + 1, 5]
+        information, score = onsets[: -MIN_JUMP_BLOCKS + 1, 4], onsets[: -MIN_JUMP_BLOCKS + 1, 5]
         statistic = np.divide(score**2, information, out=np.zeros_like(score), where=information > 0.0)
         best = int(np.argmax(statistic))
         if statistic[best] > self._limit:
@@ -219,7 +215,7 @@ class WarmUpMonitor(CovariateMonitor):
     def latest(self, state: FloatArray) -> FloatArray:
         """Return the average of w in a state, and its standard deviation, shape (2,)."""
         parts = self._parts(state)
-        known = parts.P[0, 0] < SETTLED**2
+        known = parts.P[0, 0] < MAX_KNOWN_STD**2
         return np.array([self.average.latest(parts.average)[0] if known else np.nan, np.sqrt(parts.P[0, 0])])
 
     def history(self, state: FloatArray) -> CovariateHistory:

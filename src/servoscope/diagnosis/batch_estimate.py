@@ -17,8 +17,8 @@ from servoscope.estimation.tuning import fit_tuning
 from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import fault_signatures
 
-LONGEST = 500_000  # samples of a stretch; more of them add nothing
-ENOUGH = 0.05  # stated relative deviation, up to which half a stretch is enough
+MAX_STRETCH_SAMPLES = 500_000  # samples of a stretch; more of them add nothing
+HALF_STRETCH_TOLERANCE = 0.05  # stated relative deviation, up to which half a stretch is enough
 
 
 def stretch_begin(baseline: Baseline, low_s: float, high_s: float) -> float:
@@ -58,7 +58,7 @@ def _deviation_by_instrument(exam: Examination, from_s: float, to_s: float) -> t
     found, end_s = _fit_stretch(exam, from_s, to_s), min(to_s, float(exam.recording.t[-1]))
     with contextlib.suppress(NotEnoughError):
         half = _fit_stretch(exam, 0.5 * (from_s + end_s), to_s)
-        found = half if half.deviation <= ENOUGH else found
+        found = half if half.deviation <= HALF_STRETCH_TOLERANCE else found
     return found.fit.tuning.theta - np.array(exam.baseline.theta), found.fit.covariance
 
 
@@ -86,7 +86,10 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     recording, e, last = exam.recording, exam.estimates, int(exam.estimates.index[at])
     first, whole = exam.memory_start(at), None
     if (exam.baseline.learned or exam.baseline.instrument is not None) and exam.noise is None:
-        begin = max(stretch_begin(exam.baseline, onset.low_s, onset.high_s), float(recording.t[max(last - LONGEST, 0)]))
+        begin = max(
+            stretch_begin(exam.baseline, onset.low_s, onset.high_s),
+            float(recording.t[max(last - MAX_STRETCH_SAMPLES, 0)]),
+        )
         # where it is not enough, the recursion, which starts from healthy, needs no more than the alarm did
         with contextlib.suppress(NotEnoughError):
             whole = estimate_batch_deviation(exam, begin, float(recording.t[last]) + 0.5 / recording.sample_rate)

@@ -12,18 +12,19 @@ from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.detection.onset import Onset
-from servoscope.detection.result import UNKNOWN, VIBRATION, Candidate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import VIBRATION
 from servoscope.estimation import frequency_response
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.models.plants import Plant
 
 AT_ONCE = 4096  # evaluations whose responses are computed together
-FREE = 3.0  # standard deviation of the logarithm of a parameter before anything is known
+PRIOR_LOG_STD = 3.0  # standard deviation of the logarithm of a parameter before anything is known
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
-HOPELESS = 1e6  # stands for the misfit of an actuator that cannot run
+UNSTABLE_MISFIT = 1e6  # stands for the misfit of an actuator that cannot run
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +177,8 @@ def fit_actuator(
         try:
             off = np.linalg.solve(L, (theta - expected(x)) / size)
         except SimulationError:
-            off = np.full(len(theta), HOPELESS)
-        return np.concatenate([off, x / FREE])
+            off = np.full(len(theta), UNSTABLE_MISFIT)
+        return np.concatenate([off, x / PRIOR_LOG_STD])
 
     x = _search(misfit, np.log([guess.get(name, 1.0) for name in names]))
     here = expected(x)
@@ -189,7 +190,7 @@ def fit_actuator(
         J[:, i] = (expected(moved) - here) / STEP
         T[:, i] = (nominal_theta(loop, faulty(moved)) - true) / STEP
     white = np.linalg.solve(L, J / size[:, None])
-    fitted = np.linalg.solve(white.T @ white + np.eye(len(names)) / FREE**2, white.T @ np.linalg.inv(L) / size)
+    fitted = np.linalg.solve(white.T @ white + np.eye(len(names)) / PRIOR_LOG_STD**2, white.T @ np.linalg.inv(L) / size)
     return faulty(x), np.eye(len(theta)) + (T - J) @ fitted
 
 
@@ -197,4 +198,4 @@ def _search(misfit: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
     from scipy.optimize import least_squares as minimise
 
     found = minimise(misfit, start, diff_step=[STEP], max_nfev=12, x_scale=0.1)
-    return np.asarray(found.x if found.cost < HOPELESS else start, dtype=np.float64)
+    return np.asarray(found.x if found.cost < UNSTABLE_MISFIT else start, dtype=np.float64)

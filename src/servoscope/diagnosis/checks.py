@@ -1,28 +1,31 @@
-"""What to check on the machine: for each fault what its loop file says, or the plant's own words of the catalogue."""
+"""What to check on the machine: for each fault what its loop file says, or its plant."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from servoscope.core.messages import Message, catalogue, message, text_message
-from servoscope.detection.result import FaultInterval
+from servoscope.diagnosis.result import FaultInterval
 from servoscope.models.loop import Loop
 
-LIKELY = 0.05  # probability from which an explanation is worth a look where none is certain
+MIN_PROBABILITY_CHECKED = 0.05  # probability from which an explanation is worth a look where none is certain
 
 
 def what_to_check(loop: Loop, interval: FaultInterval | None) -> tuple[Message, ...]:
     """Return what to check for the faults of an interval, the likeliest first; nothing without an interval."""
     if interval is None:
         return ()
-    likely = [one for one in interval.candidates if one.probability >= LIKELY]
+    likely = [one for one in interval.candidates if one.probability >= MIN_PROBABILITY_CHECKED]
     names = [one.name for one in interval.faults] or [name for one in likely for name in one.names]
     return tuple(found for name in dict.fromkeys(names) for found in checks_of_fault(loop, name))
 
 
 def checks_of_fault(loop: Loop, name: str) -> Iterator[Message]:
     """Yield what to check for one fault; nothing where nobody has said it."""
+    checks = next((fault.checks for fault in loop.plant.faults if fault.name == name), "")
     if name in (loop.checks or {}):
         yield from map(text_message, (loop.checks or {})[name])
+    elif checks:
+        yield message("diagnosis.check", checks=checks)
     elif f"check.{name}" in catalogue():
         yield message(f"check.{name}")

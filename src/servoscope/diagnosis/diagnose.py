@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,18 +15,8 @@ from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
 from servoscope.detection.onset import Onset, estimate_onset
-from servoscope.detection.result import (
-    UNKNOWN,
-    Candidate,
-    Diagnosis,
-    DiagnosisWarning,
-    FaultInterval,
-    FinalCoefficient,
-    ResponsePoint,
-    Verdict,
-)
 from servoscope.detection.signal_defects import find_signal_defect
-from servoscope.detection.trace import UNSEEN, Trace
+from servoscope.detection.trace import UNSEEN_EXCESS, Trace
 from servoscope.diagnosis import ml_refit
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
@@ -35,6 +26,14 @@ from servoscope.diagnosis.explanation import build_headline, build_reasons, unwa
 from servoscope.diagnosis.motion_check import motion_warnings
 from servoscope.diagnosis.output_onset import refine_onset
 from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
+from servoscope.diagnosis.result import (
+    Diagnosis,
+    DiagnosisWarning,
+    FaultInterval,
+    FinalCoefficient,
+    ResponsePoint,
+    Verdict,
+)
 from servoscope.diagnosis.sensor_check import check_sensors
 from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
 from servoscope.diagnosis.timeline import trace_timeline
@@ -48,6 +47,7 @@ from servoscope.diagnosis.warnings import (
     warning_throughout,
 )
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.isolate import isolate
 from servoscope.signals import MIN_SAMPLES, Recording
 from servoscope.signals.readers import as_recording
@@ -56,9 +56,10 @@ from servoscope.signals.readers.frames import Source
 if TYPE_CHECKING:
     from servoscope.isolation.ml import RefitResult
 
-SURE = 0.95  # probability from which a fault is named
-LARGEST = 1e60  # of a signal; products of four of them still are numbers
-DOUBTFUL = 0.05  # probability of an unknown change from which an operating point does not explain a recording
+MIN_CERTAINTY = 0.95  # probability from which a fault is named
+MAX_SIGNAL = 1e60  # of a signal; products of four of them still are numbers
+# probability of an unknown change from which an operating point does not explain a recording
+MIN_UNKNOWN_PROBABILITY = 0.05
 
 
 @with_one_blas_thread
@@ -123,7 +124,7 @@ def _diagnose_at_point(
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     """Return the diagnosis at the operating point that explains the recording, and what its trace is made of."""
     largest = max(float(max(x.max(), -x.min())) for x in (recording.r, recording.u, recording.y))
-    if largest > LARGEST:
+    if largest > MAX_SIGNAL:
         raise RecordingError(f"{recording.name}: has values up to {largest:.2g}, check the units of r, u and y")
     try:
         return _judge_sound_part(baseline, recording, progress, point)
@@ -205,7 +206,7 @@ def _change_size(diagnosis: Diagnosis) -> float:
 
 def _is_explained(diagnosis: Diagnosis) -> bool:
     """Return whether known faults explain the change."""
-    known = all(c.probability < DOUBTFUL for c in diagnosis.candidates if c.name == UNKNOWN)
+    known = all(c.probability < MIN_UNKNOWN_PROBABILITY for c in diagnosis.candidates if c.name == UNKNOWN)
     return known and bool(diagnosis.candidates)
 
 
@@ -282,7 +283,7 @@ def _explain_alarm(
     # the refit takes the model for exact, but that of an axis follows the recording
     seen = exam.change is not None or (
         not exam.drifts
-        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN).all()
+        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
     )
     refined = ml_refit.refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
@@ -290,16 +291,15 @@ def _explain_alarm(
 
         # one change that is no fault comes before several that are
         outside = find_outside_onset(refined) if refined.is_unknown else None
-        several = (
-            () if outside else trace_timeline(exam, refined, alarm.onset, recursive, SURE, lambda: progress("refit"))
-        )
+        trace = partial(trace_timeline, exam, refined, alarm.onset, recursive, MIN_CERTAINTY)
+        several = () if outside else trace(lambda: progress("refit"))
         if several:
             return several, _onset_of(several, exam, alarm), []
         candidates = ml_refit.refit_candidates(refined)
         refit = ml_refit.summarise_refit(refined, exam, recursive, outside=outside)
         if outside or not refined.is_unknown:
             onset = ml_refit.refit_onset(refined, exam, outside)
-        doubts = ml_refit.disagreement_warnings(exam, candidates, refit, SURE)
+        doubts = ml_refit.disagreement_warnings(exam, candidates, refit, MIN_CERTAINTY)
     best, t = candidates[0], exam.recording.t
     doubts += (implausible := implausible_warnings(exam, best))
     wait_s = exam.pipeline.bank.wait / exam.recording.sample_rate
@@ -309,7 +309,7 @@ def _explain_alarm(
         end_s=None if exam.alarm[-1] else float(exam.t(int(np.flatnonzero(exam.alarm)[-1]) + 1)),
         from_start=onset.likely_s - float(t[0]) <= 3.0 * wait_s,
         probability=best.probability,
-        faults=best.faults if best.probability >= SURE and best.name != UNKNOWN and not implausible else (),
+        faults=best.faults if best.probability >= MIN_CERTAINTY and best.name != UNKNOWN and not implausible else (),
         candidates=candidates,
         refit=refit,
     )
@@ -367,7 +367,7 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
 
 def _prefers_learned_fault(refined: RefitResult, recursive: Candidate) -> bool:
     """Return whether a fault learned from labelled recordings explains more than the refit, which knows none."""
-    sure = recursive.is_learned and recursive.probability >= SURE
+    sure = recursive.is_learned and recursive.probability >= MIN_CERTAINTY
     return sure and (refined.is_unknown or len(refined.best.fitted.faults) > 1)
 
 

@@ -26,7 +26,7 @@ from servoscope.core.errors import RecordingError
 from servoscope.detection import cusum_design
 from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants
 from servoscope.detection.statistic import apply_alarm_delays, t2_statistic
-from servoscope.detection.trace import UNSEEN, Statistic, any_exceeded, detection_statistics
+from servoscope.detection.trace import UNSEEN_EXCESS, Statistic, any_exceeded, detection_statistics
 from servoscope.detection.warm_up import follow_warm_up
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
@@ -37,12 +37,12 @@ from servoscope.signals import Recording
 from servoscope.simulation import closed_loop_poles
 
 MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip before the AKF takes over
-WEAKEST_INSTRUMENT = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
+MIN_INSTRUMENT_EIGENVALUE = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
 FALL_BACK = {"estimator": "akf"}
 MIN_NOISE_GROWTH = 1.5  # of the variance; below it counts as none
-DRIFTING = 1.0  # T^2 of what covariates do within a recording, from which on no single plant explains it
+MAX_COVARIATE_T2 = 1.0  # T^2 of what covariates do within a recording, from which on no single plant explains it
 AT_ONCE = 4096  # evaluations
-FORGOTTEN = 1e-9  # share of the past below which it counts as forgotten
+FORGOTTEN_SHARE = 1e-9  # share of the past below which it counts as forgotten
 MEMORIES = 22.0  # after which it usually is
 
 
@@ -117,7 +117,7 @@ class Examination:
             return False
         theta = self.along.expected(self.estimates.index)
         C = np.broadcast_to(self.covariance(self.evaluations - 1), self.estimates.S.shape)
-        return bool(t2_statistic(theta, np.broadcast_to(theta[-1], theta.shape), C).max() > DRIFTING)
+        return bool(t2_statistic(theta, np.broadcast_to(theta[-1], theta.shape), C).max() > MAX_COVARIATE_T2)
 
     @property
     def evaluations(self) -> int:
@@ -182,7 +182,7 @@ class Examination:
             C = self.covariance(at) + self.model_error(at)
             T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
             # the sequential test knows no model error
-            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN))
+            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
         exceeded &= any_exceeded(self._of_coefficients)
         return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
@@ -209,7 +209,7 @@ class Examination:
     def memory_start(self, at: int) -> int:
         """Return the sample before which loop, filters and estimator have forgotten everything in an evaluation.
 
-        A recursion that starts there gives the same evaluation as one from the beginning, up to `FORGOTTEN`.
+        A recursion that starts there gives the same evaluation as one from the beginning, up to `FORGOTTEN_SHARE`.
         """
         pipeline, tuning = self.pipeline, self.tuning
         end, period = (at + 1) * pipeline.every, int(np.lcm(pipeline.every, pipeline.stride))
@@ -224,7 +224,7 @@ class Examination:
             for rows in outofcore.iter_chunks(learning, end):
                 found = estimating.advance(self.recording.rows(rows)).Psi
                 Psi = found if len(found) else Psi
-            if np.abs(Psi[-1] * tuning.scale[:, None] / tuning.scale).max() <= FORGOTTEN:
+            if np.abs(Psi[-1] * tuning.scale[:, None] / tuning.scale).max() <= FORGOTTEN_SHARE:
                 return first
             memories *= 2.0
 
@@ -271,7 +271,7 @@ class Examination:
 def _settling(pipeline: Pipeline, plant: Plant) -> int:
     """Return how many samples a loop takes to forget its initial state."""
     slowest = float(np.abs(closed_loop_poles(pipeline.loop, plant)).max())
-    return int(np.ceil(np.log(FORGOTTEN) / np.log(slowest))) if 0.0 < slowest < 1.0 else 0
+    return int(np.ceil(np.log(FORGOTTEN_SHARE) / np.log(slowest))) if 0.0 < slowest < 1.0 else 0
 
 
 def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
@@ -381,7 +381,7 @@ def _has_failed_instrument(exam: Examination) -> bool:
         own, shared = own + z.T @ z, shared + z.T @ phi
     if not own.any():
         return False
-    return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < WEAKEST_INSTRUMENT)
+    return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < MIN_INSTRUMENT_EIGENVALUE)
 
 
 def _skipped_share(estimates: Estimates) -> float:

@@ -10,24 +10,16 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
 from servoscope.core.messages import Message, message
 from servoscope.core.number_format import ratio_digits
-from servoscope.detection.result import (
-    UNKNOWN,
-    VIBRATION,
-    Candidate,
-    DiagnosisWarning,
-    FaultEstimate,
-    FaultInterval,
-    RefitSummary,
-    Verdict,
-)
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, RefitSummary, Verdict
 from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.plants import Plant
 
 MIN_CHANGE_STD = 3.0  # standard deviations from which a value has changed
-MOST_LISTED = 3  # values, and rejected candidates
-REJECTED = 0.01  # probability below which a candidate is rejected
+MAX_VALUES_LISTED = 3  # values, and rejected candidates
+MAX_PROBABILITY_REJECTED = 0.01  # probability below which a candidate is rejected
 MIN_LISTED_PROBABILITY = 0.05  # probability below which a second fault, or an explanation, is not mentioned
 
 
@@ -215,7 +207,7 @@ def _largest_changes(
 ) -> tuple[Message, ...]:
     """Return what changed most, the most significant first."""
     by = [abs(v - e) / s if s > 0.0 else 0.0 for v, e, s in zip(values, expected, std, strict=True)]
-    most = sorted((i for i in range(len(by)) if by[i] >= MIN_CHANGE_STD), key=lambda i: -by[i])[:MOST_LISTED]
+    most = sorted((i for i in range(len(by)) if by[i] >= MIN_CHANGE_STD), key=lambda i: -by[i])[:MAX_VALUES_LISTED]
     return tuple(
         message(
             "diagnosis.risen" if values[i] > expected[i] else "diagnosis.fallen",
@@ -265,8 +257,8 @@ def _fit_reason(candidates: Sequence[Candidate], refit: RefitSummary | None) -> 
 
 
 def _rejection_reason(exam: Examination, trace: Trace, candidates: Sequence[Candidate]) -> Message | None:
-    singles = [c for c in candidates[1:] if len(c.faults) == 1 and c.probability < REJECTED]
-    closest = sorted(singles, key=lambda c: c.misfit or 0.0)[:MOST_LISTED]
+    singles = [c for c in candidates[1:] if len(c.faults) == 1 and c.probability < MAX_PROBABILITY_REJECTED]
+    closest = sorted(singles, key=lambda c: c.misfit or 0.0)[:MAX_VALUES_LISTED]
     spelled = next((c for c in closest if c.misfit), None)
     listed = tuple(_rejection(exam, trace, c, c is spelled) for c in closest)
     return message("diagnosis.rejected", candidates=listed) if closest else None

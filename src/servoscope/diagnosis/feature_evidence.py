@@ -15,7 +15,7 @@ from servoscope.core.messages import Message, message
 from servoscope.detection.feature_monitor import FeatureMonitor, SpanScore, hold, smallest_in_a_row
 from servoscope.signals import Recording
 
-LISTED = 3  # features that are named
+MAX_FEATURES_NAMED = 3  # features that are named
 MIN_STD = 2.0  # standard deviations from which a feature is named, the most changed one apart
 
 
@@ -92,7 +92,7 @@ class FeatureEvidence:
         one = self.model.statistics[int(np.argmax(scores))]
         values = span.features.values[one.level]
         off = np.nan_to_num(one.deviations(values))
-        most = np.argsort(-np.abs(off))[:LISTED].tolist()
+        most = np.argsort(-np.abs(off))[:MAX_FEATURES_NAMED].tolist()
         return tuple(
             _describe(FeatureName.of(self.model.layout, int(one.kept[k])), float(values[one.kept[k]]), one.centre[k])
             for k in most

@@ -15,16 +15,17 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.detection.homogeneity import scatter
-from servoscope.detection.result import UNKNOWN
 from servoscope.diagnosis.batch_estimate import estimate_batch_deviation, stretch_begin
 from servoscope.diagnosis.diagnose import diagnose_examination
 from servoscope.diagnosis.examine import Examination
+from servoscope.isolation.candidate import UNKNOWN
 from servoscope.isolation.isolate import misfit_limit
 from servoscope.signals import Recording
 
-DISTINCT = 2.0  # times the limit of a misfit: less means that the direction is known to worse than 35 degrees
+# times the limit of a misfit: less means that the direction is known to worse than 35 degrees
+MIN_DISTINCTNESS_FACTOR = 2.0
 RANK_ONE_ROUNDS = 50  # of the alternation between direction and shares; five are usual
-LIKELY = 0.05  # probability from which another explanation of a labelled recording is noted
+MIN_PROBABILITY_NOTED = 0.05  # probability from which another explanation of a labelled recording is noted
 
 LabelledRecordings = Mapping[str, Sequence[Recording]]
 
@@ -76,7 +77,7 @@ def _learn_fault(name: str, faulty: Sequence[Examination], healthy: FloatArray) 
     if min(found.shares) <= 0.0:
         odd = found.recordings[int(np.argmin(found.shares))]
         raise NotEnoughError(f"{odd} moves theta the other way than the other recordings of {name}: two labels?")
-    if found.distinctness < DISTINCT * misfit_limit(len(healthy)):
+    if found.distinctness < MIN_DISTINCTNESS_FACTOR * misfit_limit(len(healthy)):
         raise NotEnoughError(
             f"the {len(faulty)} recordings of {name} differ from each other as much as from healthy, so nearly any "
             "change would look like it: give them different labels, or record more"
@@ -133,7 +134,10 @@ def _confusion_note(baseline: Baseline, name: str, faulty: Sequence[Examination]
     """Return a note on what else explains the labelled recordings of a fault; None if nothing does."""
     diagnoses = [diagnose_examination(replace(exam, baseline=baseline))[0] for exam in faulty]
     likely = Counter(
-        c.name for each in diagnoses for c in each.candidates if c.name != name and c.probability >= LIKELY
+        c.name
+        for each in diagnoses
+        for c in each.candidates
+        if c.name != name and c.probability >= MIN_PROBABILITY_NOTED
     )
     others = tuple(
         message("learning.mistaken_for", name=other, count=count, recordings=len(faulty))

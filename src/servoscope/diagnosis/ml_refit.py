@@ -11,25 +11,17 @@ import numpy as np
 from servoscope.core.messages import message
 from servoscope.core.number_format import ratio_digits
 from servoscope.detection.onset import Onset
-from servoscope.detection.result import (
-    UNKNOWN,
-    VIBRATION,
-    Candidate,
-    DiagnosisWarning,
-    FaultEstimate,
-    FaultInterval,
-    Mimic,
-    RefitSummary,
-)
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, Mimic, RefitSummary
 from servoscope.diagnosis.warnings import warning_throughout
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.plants import Fault, Plant
 
 if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
     from servoscope.isolation.ml import Hypothesis, OnsetEstimate, RefitResult
     from servoscope.isolation.ml.axis_vibration import AxisVibration
 
-WORTH_LISTING = 1e-3  # probability from which a pair of faults is listed
+MIN_PAIR_PROBABILITY = 1e-3  # probability from which a pair of faults is listed
 MAX_SIZE_DISTANCE = 3.0  # standard deviations between two sizes that are called different
 
 
@@ -51,19 +43,19 @@ def refit_recording(
 
 def vibration_interval(exam: Examination, found: AxisVibration) -> FaultInterval:
     """Return the interval of an axis that swings or rattles: no coefficient changed, so nothing is refitted."""
-    from servoscope.isolation.ml.search import OUTSIDE
+    from servoscope.isolation.ml.search import OUTSIDE_PRIOR
 
     t = exam.recording.t
     low, likely, high = (float(t[k]) for k in found.onset)
     fault = FaultEstimate(name=VIBRATION, parameter=VIBRATION, ratio=found.ratio, interval=found.interval)
-    named = Candidate(name=VIBRATION, probability=1.0 - OUTSIDE, faults=(fault,))
+    named = Candidate(name=VIBRATION, probability=1.0 - OUTSIDE_PRIOR, faults=(fault,))
     assert exam.change is not None
     return FaultInterval(
         detected_at_s=float(t[exam.change.detected]),
         onset_s=(low, likely, high),
         probability=named.probability,
         faults=(fault,),
-        candidates=(named, Candidate(name=UNKNOWN, probability=OUTSIDE)),
+        candidates=(named, Candidate(name=UNKNOWN, probability=OUTSIDE_PRIOR)),
     )
 
 
@@ -73,7 +65,7 @@ def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:
     candidates = [
         _candidate(each, refined.window.plant, least, refined.noise_variance)
         for each in refined.hypotheses
-        if len(each.fitted.faults) == 1 or each.probability >= WORTH_LISTING
+        if len(each.fitted.faults) == 1 or each.probability >= MIN_PAIR_PROBABILITY
     ]
     candidates.append(Candidate(name=UNKNOWN, probability=refined.unknown_probability))
     # where probabilities vanish, the closest comes first

@@ -22,7 +22,7 @@ from servoscope.estimation.frequency_response import FrequencyResponse
 if TYPE_CHECKING:
     from servoscope.estimation.recursion import Recursion
 
-JUDGED = "statistic", "theta", "expected", "covariance"
+JUDGED_COLUMNS = "statistic", "theta", "expected", "covariance"
 
 
 class Monitor:
@@ -374,7 +374,7 @@ class Monitor:
         if not self.fleet:
             columns = {name: values[0] for name, values in columns.items()}
             if motion is not None:
-                columns["statistic"] = motion.soften_statistic(**{name: columns[name] for name in JUDGED})
+                columns["statistic"] = motion.soften_statistic(**{name: columns[name] for name in JUDGED_COLUMNS})
             response, threshold = (response[0][0], response[1][0]), self.baselines[0].limit
         expected = FrequencyResponse(f, columns.pop("H"), columns.pop("covariance of H"))
         trace = Trace(

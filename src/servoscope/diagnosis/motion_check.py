@@ -7,12 +7,12 @@ import numpy as np
 from servoscope.baseline.motion import QUANTITIES
 from servoscope.baseline.plant_fit import saturated_share
 from servoscope.core.messages import Message, message
-from servoscope.detection.result import DiagnosisWarning
-from servoscope.detection.trace import UNSEEN
+from servoscope.detection.trace import UNSEEN_EXCESS
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import DiagnosisWarning
 from servoscope.diagnosis.warnings import warning_throughout
 
-SATURATED = 0.05  # share of the samples with u at a limit that is worth telling
+MIN_SATURATED_SHARE = 0.05  # share of the samples with u at a limit that is worth telling
 
 
 def motion_warnings(exam: Examination) -> list[DiagnosisWarning]:
@@ -25,7 +25,7 @@ def motion_warnings(exam: Examination) -> list[DiagnosisWarning]:
     ratio = np.where(alarm, np.maximum(exam.statistic / exam.baseline.limit, exam.estimates.level), -1.0)
     at = int(np.argmax(ratio))
     withheld = not exam.alarm.any()
-    if not withheld and exam.motion_excess(slice(at, at + 1))[0] < UNSEEN:
+    if not withheld and exam.motion_excess(slice(at, at + 1))[0] < UNSEEN_EXCESS:
         return []
     values = {"quantities": _describe_quantities(exam, at), "saturated": _describe_saturation(exam)}
     key = "warning.motion_withheld" if withheld else "warning.motion_unseen"
@@ -40,7 +40,7 @@ def _describe_quantities(exam: Examination, at: int) -> tuple[Message, ...]:
     excess, (values, _) = exam.motion.excess(seen, one)[0], exam.motion.quantities(one)
     worst = float(np.abs(excess).max())
     found = []
-    for k in np.flatnonzero(np.abs(excess) >= min(UNSEEN, worst)):
+    for k in np.flatnonzero(np.abs(excess) >= min(UNSEEN_EXCESS, worst)):
         least, most = (np.array(x)[:, 1, k] for x in (seen.least, seen.most))
         y = values[0, :, 1, k]
         window = int(np.argmax(y / most if excess[k] > 0.0 else -y / np.maximum(least, np.finfo(np.float64).tiny)))
@@ -58,4 +58,4 @@ def _describe_quantities(exam: Examination, at: int) -> tuple[Message, ...]:
 
 def _describe_saturation(exam: Examination) -> Message | None:
     share = saturated_share(exam.baseline.loop, exam.recording)
-    return message("motion.saturated", share=share) if share > SATURATED else None
+    return message("motion.saturated", share=share) if share > MIN_SATURATED_SHARE else None

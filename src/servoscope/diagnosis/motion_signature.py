@@ -13,11 +13,11 @@ from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 
 BINS = 40  # of position and of speed
-FEWEST = 5  # samples that a bin needs
-SLOW = 0.02  # of the fast speeds (99th percentile), below which direction means nothing
-MOST_ROWS = 50_000  # that are looked at, the newest
+MIN_SAMPLES_PER_BIN = 5  # samples that a bin needs
+SLOW_SPEED_SHARE = 0.02  # of the fast speeds (99th percentile), below which direction means nothing
+MAX_ROWS = 50_000  # that are looked at, the newest
 WINDOW = 0.5  # periods of the cutoff over which a parabola is fitted to the signals
-LEAST_MOTION = 200  # samples in motion
+MIN_MOTION_SAMPLES = 200  # samples in motion
 
 
 class SignatureWidth(NamedTuple):
@@ -46,7 +46,7 @@ class MotionSignature(NamedTuple):
 def motion_signature(recording: Recording, loop: Loop, from_s: float, to_s: float) -> MotionSignature | None:
     """Return the signature of the rows with from_s <= t < to_s; None if they hold too little motion both ways."""
     first, end = np.searchsorted(recording.t, [from_s, to_s])
-    rows = recording[max(int(first), int(end) - MOST_ROWS) : int(end)]
+    rows = recording[max(int(first), int(end) - MAX_ROWS) : int(end)]
     window = 2 * max(2, round(0.5 * WINDOW * loop.sample_rate / loop.cutoff)) + 1
     if rows.samples < 2 * window:
         return None
@@ -59,8 +59,8 @@ def motion_signature(recording: Recording, loop: Loop, from_s: float, to_s: floa
     if not known.any():
         return None
     fast = float(np.quantile(np.abs(v[known]), 0.99))
-    moving = known & (np.abs(v) > SLOW * fast)
-    if min((moving & (v > 0.0)).sum(), (moving & (v < 0.0)).sum()) < LEAST_MOTION / 2:
+    moving = known & (np.abs(v) > SLOW_SPEED_SHARE * fast)
+    if min((moving & (v > 0.0)).sum(), (moving & (v < 0.0)).sum()) < MIN_MOTION_SAMPLES / 2:
         return None
     position = _bin_edges(y[moving])
     speeds = np.linspace(-fast, fast, BINS + 1)
@@ -157,4 +157,4 @@ def _bin_means(at: FloatArray, x: FloatArray, used: BoolArray, edges: FloatArray
     inside = (which >= 0) & (which < BINS)
     counts = np.bincount(which[inside], minlength=BINS)
     sums = np.bincount(which[inside], weights=x[used][inside], minlength=BINS)
-    return np.where(counts >= FEWEST, sums / np.maximum(counts, 1), np.nan)
+    return np.where(counts >= MIN_SAMPLES_PER_BIN, sums / np.maximum(counts, 1), np.nan)

@@ -25,7 +25,7 @@ except ImportError as error:
     raise ImportError("scikit-learn is missing, pip install 'servoscope[notebook]'") from error
 
 Recordings = Sequence[Recording | Source]
-HEALTHY = 1  # what scikit-learn calls an inlier; -1 is an outlier
+INLIER = 1  # what scikit-learn calls an inlier; -1 is an outlier
 
 
 class NoveltyDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
@@ -58,7 +58,7 @@ class NoveltyDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
 
     def fit(self, X: Recordings, y: npt.ArrayLike | None = None) -> Self:
         """Learn a baseline from recordings, or what `read` reads; with labels `y` only from those that are 1."""
-        healthy = np.ones(len(X), bool) if y is None else np.asarray(y) == HEALTHY
+        healthy = np.ones(len(X), bool) if y is None else np.asarray(y) == INLIER
         self.baseline_ = learn(self.loop, [each for each, chosen in zip(X, healthy, strict=True) if chosen])
         self.offset_ = -1.0
         return self
@@ -74,7 +74,7 @@ class NoveltyDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict(self, X: Recordings) -> npt.NDArray[np.int64]:
         """Return 1 for recordings that are like the healthy ones and -1 for others, shape (len(X),)."""
-        return np.where(self.decision_function(X) < 0.0, -HEALTHY, HEALTHY)
+        return np.where(self.decision_function(X) < 0.0, -INLIER, INLIER)
 
     def _excess(self, recording: Recording) -> float:
         exams = (Examination.from_recording(one, recording) for one in self.baseline_.per_point)

@@ -20,7 +20,7 @@ from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 
-LIKELY = 0.05  # probability from which a fault is noted that looks like another operating point
+MIN_PROBABILITY_NOTED = 0.05  # probability from which a fault is noted that looks like another operating point
 
 
 def learn(
@@ -186,7 +186,7 @@ def _resemblance_note(other: Baseline, point: str, recording: Recording) -> Mess
     diagnosis = diagnose(other, recording)
     if diagnosis.verdict == "healthy":
         return message("learning.one_point", recording=recording.name, other=other.point, point=point)
-    likely = [fault for c in diagnosis.candidates if c.probability >= LIKELY for fault in c.faults]
+    likely = [fault for c in diagnosis.candidates if c.probability >= MIN_PROBABILITY_NOTED for fault in c.faults]
     if not likely:
         return None
     faults = tuple(message("learning.size", name=f.name, parameter=f.parameter, ratio=f.ratio) for f in likely)

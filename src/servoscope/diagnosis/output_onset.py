@@ -15,9 +15,9 @@ from servoscope.estimation.instrument import InstrumentTuning, instrument_model
 from servoscope.estimation.noise_model import long_run_inflation
 from servoscope.models.lti import LinearSystem
 
-REACH = 6.0  # memories before the alarm, among which the onset is looked for
-SETTLED = 1e-3  # share of the state at the change that the output has forgotten after the transient
-LONGEST = 2000  # samples of a transient
+MAX_MEMORIES_BEFORE_ALARM = 6.0  # memories before the alarm, among which the onset is looked for
+TRANSIENT_TOLERANCE = 1e-3  # share of the state at the change that the output has forgotten after the transient
+MAX_TRANSIENT_SAMPLES = 2000  # samples of a transient
 AT_ONCE = 512  # switches whose transients are compared together
 LAGS = 50  # samples, over which the output's error may be coloured
 EDGE = 0.01  # probability at the beginning of the search, from which the onset may lie before it
@@ -36,7 +36,7 @@ def refine_onset(exam: Examination, onset: Onset, sample: int, last: int) -> Ons
     tuning = baseline.instrument
     if tuning is None or tuning.source != "input" or baseline.loop.plant.powers[0]:
         return onset
-    begin = max(sample - round(REACH * exam.pipeline.memory * exam.pipeline.stride), 0)
+    begin = max(sample - round(MAX_MEMORIES_BEFORE_ALARM * exam.pipeline.memory * exam.pipeline.stride), 0)
     begin = max(begin, int(np.flatnonzero(recording.restart[: sample + 1])[-1]))
     with contextlib.suppress(NotEnoughError, np.linalg.LinAlgError):
         from_s, to_s = onset.likely_s, float(recording.t[last]) + 0.5 / recording.sample_rate
@@ -55,7 +55,7 @@ def _onset_by_output(
 ) -> Onset | None:
     """Return the most likely switch between two models from `begin` to `sample`, None where it may lie before."""
     recording = exam.recording
-    near = recording.rows(slice(begin, min(sample + LONGEST, recording.samples)))
+    near = recording.rows(slice(begin, min(sample + MAX_TRANSIENT_SAMPLES, recording.samples)))
     broken = np.flatnonzero(near.restart[1:])
     end = int(broken[0]) + 1 if len(broken) else near.samples
     u, y = near.u[:end], near.y[:end]
@@ -66,7 +66,7 @@ def _onset_by_output(
     settling = min(_transient(healthy), len(cost) - 1)
     variance = float(np.mean(before[settling : max(len(cost) // 2, settling + LAGS)] ** 2))
     cost = cost[settling:]
-    weight = np.exp(-(cost - cost.min()) / (2.0 * variance * long_run_inflation(after[-LONGEST:], LAGS)))
+    weight = np.exp(-(cost - cost.min()) / (2.0 * variance * long_run_inflation(after[-MAX_TRANSIENT_SAMPLES:], LAGS)))
     share = np.cumsum(weight) / weight.sum()
     if begin + settling > 0 and share[min(LAGS, len(share) - 1)] > EDGE:
         return None
@@ -86,9 +86,11 @@ def _states(model: LinearSystem, u: FloatArray) -> FloatArray:
 
 
 def _transient(model: LinearSystem) -> int:
-    """Return the samples in which a model forgets its state, at most `LONGEST`."""
+    """Return the samples in which a model forgets its state, at most `MAX_TRANSIENT_SAMPLES`."""
     slowest = float(np.abs(np.linalg.eigvals(model.A)).max(initial=0.0))
-    return min(int(np.ceil(np.log(SETTLED) / np.log(slowest))) if 0.0 < slowest < 1.0 else 1, LONGEST)
+    return min(
+        int(np.ceil(np.log(TRANSIENT_TOLERANCE) / np.log(slowest))) if 0.0 < slowest < 1.0 else 1, MAX_TRANSIENT_SAMPLES
+    )
 
 
 def _switch_costs(before: FloatArray, after: FloatArray, apart: FloatArray, changed: LinearSystem) -> FloatArray:

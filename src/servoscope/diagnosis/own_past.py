@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import message
-from servoscope.detection.result import DiagnosisWarning
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.result import DiagnosisWarning
 
 SHARE = 1.0 / 3.0  # of the recording that counts as its past
 BUDGET = 0.1  # of the budget of false alarms, which this second test adds to that of the first
-SHARPER = 0.7  # of a change that the baseline promises to see: what the past has to promise, or it is not worth asking
+# of a change that the baseline promises to see: what the past has to promise, or it is not worth asking
+MAX_PROMISE_RATIO = 0.7
 
 
 def examine_by_own_past(exam: Examination) -> Examination | None:
@@ -22,11 +22,12 @@ def examine_by_own_past(exam: Examination) -> Examination | None:
     past raises no alarm by the baseline, and the exact plant explains it down to white noise: only then is the scatter
     within a recording what its noise says.
     """
-    if not _scatters(exam.baseline):
+    baseline, recording = exam.baseline, exam.recording
+    # where the exact plant explains all healthy recordings, the refit lets its parameters follow each of them anyway
+    if len(baseline.sources) < 2 or baseline.exact is None or baseline.exact.misfit <= 1.0:
         return None
     from servoscope.learning.learn import learn_baseline
 
-    baseline, recording = exam.baseline, exam.recording
     end_s = float(recording.t[0]) + SHARE * recording.duration_s
     if (exam.alarm & (exam.t(slice(None)) <= end_s)).any():
         return None
@@ -37,7 +38,11 @@ def examine_by_own_past(exam: Examination) -> Examination | None:
         past = learn_baseline(loop, [recording.part(float(recording.t[0]), end_s)])
     except (ServoscopeError, np.linalg.LinAlgError):  # too short, too little motion
         return None
-    if past.exact is None or past.exact.misfit > 1.0 or not _is_sharper(past, baseline):
+    known = {promise.parameter: promise.change or np.inf for promise in baseline.promises}
+    sharper = any(
+        promise.change and promise.change < MAX_PROMISE_RATIO * known[promise.parameter] for promise in past.promises
+    )
+    if past.exact is None or past.exact.misfit > 1.0 or not sharper:
         return None
     return Examination.from_recording(past.model_copy(update={"point": baseline.point}), recording)
 
@@ -48,16 +53,3 @@ def own_past_warning(exam: Examination) -> DiagnosisWarning:
     from_s, to_s = float(recording.t[0]), float(recording.t[0]) + SHARE * recording.duration_s
     text = message("warning.own_past", duration=to_s - from_s)
     return DiagnosisWarning(kind="own_past", from_s=from_s, to_s=to_s, count=1, description=text)
-
-
-def _scatters(baseline: Baseline) -> bool:
-    """Return whether the exact plant, healthy parameters at one value, fails to explain all the healthy recordings.
-
-    Where it does not fail, the refit lets these parameters follow each recording anyway.
-    """
-    return len(baseline.sources) > 1 and baseline.exact is not None and baseline.exact.misfit > 1.0
-
-
-def _is_sharper(past: Baseline, baseline: Baseline) -> bool:
-    known = {promise.parameter: promise.change or np.inf for promise in baseline.promises}
-    return any(promise.change and promise.change < SHARPER * known[promise.parameter] for promise in past.promises)

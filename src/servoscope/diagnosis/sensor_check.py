@@ -9,12 +9,13 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.sensors import find_sensor_deviation, without_sensor
-from servoscope.detection.result import DiagnosisWarning
+from servoscope.diagnosis.result import DiagnosisWarning
 from servoscope.signals import Recording
 
-WORSE = 2.0  # times the residual power of the other sensor, from which the plant says that a sensor is wrong
-LONGEST = 20.0  # memories after the onset that are asked
-FEWEST = 20  # usable samples
+# times the residual power of the other sensor, from which the plant says that a sensor is wrong
+MIN_RESIDUAL_RATIO = 2.0
+MAX_MEMORIES_AFTER_ONSET = 20.0  # memories after the onset that are asked
+MIN_SAMPLES = 20  # usable samples
 
 
 def check_sensors(baseline: Baseline, recording: Recording) -> tuple[Recording, list[DiagnosisWarning]]:
@@ -43,14 +44,16 @@ def wrong_sensor(baseline: Baseline, recording: Recording, onset: int) -> int | 
     An offset shows only where the plant has a stiffness, and a fault of the actuator contradicts both alike.
     """
     loop = baseline.loop
-    rows = recording.rows(slice(onset, onset + round(LONGEST * loop.monitor.memory * loop.sample_rate)))
+    rows = recording.rows(
+        slice(onset, onset + round(MAX_MEMORIES_AFTER_ONSET * loop.monitor.memory * loop.sample_rate))
+    )
     powers = [_residual_power(baseline, rows, rows.channels[name]) for name in loop.columns.outputs]
     return _larger(powers)
 
 
 def _larger(powers: Sequence[float]) -> int | None:
     first, second = powers
-    if max(first, second) > WORSE * min(first, second):
+    if max(first, second) > MIN_RESIDUAL_RATIO * min(first, second):
         return int(second > first)
     return None
 
@@ -60,7 +63,7 @@ def _residual_power(baseline: Baseline, rows: Recording, y: np.ndarray[tuple[int
     restart = rows.restart.copy()
     restart[:1] = True
     found = baseline.pipeline().regression(rows.r, rows.u, y, restart)
-    if found.ok.sum() < FEWEST:
+    if found.ok.sum() < MIN_SAMPLES:
         return 0.0
     residual = found.eta - found.phi @ np.array(baseline.theta)
     return float(np.mean(residual[found.ok] ** 2))

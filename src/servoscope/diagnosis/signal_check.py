@@ -8,10 +8,10 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import Message
-from servoscope.detection.result import Diagnosis, DiagnosisWarning
 from servoscope.detection.signal_defects import SignalDefect, find_corrections
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import undetermined_headline
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning
 from servoscope.diagnosis.warnings import warning_throughout
 from servoscope.signals import Recording
 

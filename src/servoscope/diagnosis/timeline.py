@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from servoscope.detection.onset import Onset
-from servoscope.detection.result import UNKNOWN, Candidate, FaultInterval
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, summarise_refit
+from servoscope.diagnosis.result import FaultInterval
+from servoscope.isolation.candidate import UNKNOWN, Candidate
 
 if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
     from servoscope.isolation.ml import RefitResult, TimelineStretch

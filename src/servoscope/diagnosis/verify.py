@@ -13,13 +13,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.result import Diagnosis, Provenance
 from servoscope.diagnosis.diagnose import diagnose
+from servoscope.diagnosis.result import Diagnosis, Provenance
 from servoscope.signals import Recording
 
 __all__ = ["Verification", "load_diagnosis", "provenance", "verify"]
 
-CLOSE = 1e-6  # relative difference of sizes that another processor may make
+SIZE_TOLERANCE = 1e-6  # relative difference of sizes that another processor may make
 
 
 class Verification(BaseModel):
@@ -101,6 +101,6 @@ def verify(told: Diagnosis, baseline: Baseline, recording: Recording) -> Verific
         differences.append(message("verify.other_faults", then=names[0] or (none,), now=names[1] or (none,)))
     else:
         for old, new in zip(told.faults, again.faults, strict=True):
-            if abs(new.ratio - old.ratio) > CLOSE * abs(old.ratio):
+            if abs(new.ratio - old.ratio) > SIZE_TOLERANCE * abs(old.ratio):
                 remarks.append(message("verify.other_size", parameter=old.parameter, then=old.ratio, now=new.ratio))
     return Verification(same=not differences, differences=tuple(differences), remarks=tuple(remarks), repeated=again)

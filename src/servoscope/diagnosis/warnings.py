@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from servoscope.baseline.plant_fit import MOST_SATURATED, saturated_share
+from servoscope.baseline.plant_fit import MAX_SATURATED_SHARE, saturated_share
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.result import Candidate, DiagnosisWarning
 from servoscope.detection.signal_defects import find_switched_off
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
 from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
+from servoscope.diagnosis.result import DiagnosisWarning
+from servoscope.isolation.candidate import Candidate
 from servoscope.learning.plausibility import negative_coefficients
 
 AT_ONCE = 4096  # evaluations
-VALUES_TRIED = 201  # of a covariate
-ALIKE = 0.95  # squared cosine from which on a change counts as looking like another temperature
+COVARIATE_GRID_SIZE = 201  # of a covariate
+MIN_SQUARED_COSINE = 0.95  # squared cosine from which on a change counts as looking like another temperature
 MIN_SKIPPED_SHARE = 0.01  # share of updates without an instrument from which a warning is given
 NO_PROMISE = 10.0  # relative change; a baseline that detects nothing smaller promises nothing
-WEAKER = 3.0  # a recording that shows only changes this much larger than promised is called undetermined
+MAX_DETECTABLE_RATIO = 3.0  # a recording that shows only changes this much larger than promised is called undetermined
 
 
 def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
@@ -60,7 +61,7 @@ def changes_like_warmth(exam: Examination) -> dict[str, float]:
     found = {}
     for name, d in exam.baseline.fault_directions.items():
         known_d, known_w = np.linalg.solve(exam.covariance(last), np.stack([d, warmth], axis=1)).T
-        if float(d @ known_w) ** 2 >= ALIKE * float(d @ known_d) * float(warmth @ known_w):
+        if float(d @ known_w) ** 2 >= MIN_SQUARED_COSINE * float(d @ known_d) * float(warmth @ known_w):
             found[name] = 2.0 * abs(float(d @ known_w)) / float(d @ known_d)
     return found
 
@@ -75,7 +76,7 @@ def warm_up_warnings(exam: Examination) -> list[DiagnosisWarning]:
 
 def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]) -> list[DiagnosisWarning]:
     """Return warnings about what this recording could not have shown although the baseline promises it."""
-    if (share := saturated_share(exam.baseline.loop, exam.recording)) > MOST_SATURATED:
+    if (share := saturated_share(exam.baseline.loop, exam.recording)) > MAX_SATURATED_SHARE:
         reasons = [message("warning.saturated", share=share)]
     elif not detectable:
         reasons = [message("warning.no_promise")]
@@ -87,7 +88,7 @@ def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]
             if np.isinf(smallest)
             else message("warning.weak", parameter=parameter, smallest=smallest, promised=promised)
             for parameter, (smallest, promised) in detectable.items()
-            if smallest > WEAKER * promised
+            if smallest > MAX_DETECTABLE_RATIO * promised
         ]
     return [warning_throughout(exam, "power", reason) for reason in reasons]
 
@@ -102,7 +103,7 @@ def covariate_warnings(exam: Examination, at: int) -> list[DiagnosisWarning]:
         return []
     logged, found = along.averages[exam.estimates.index[at]], []
     for j, name in enumerate(model.names):
-        values = np.linspace(model.low[j], model.high[j], VALUES_TRIED)
+        values = np.linspace(model.low[j], model.high[j], COVARIATE_GRID_SIZE)
         c = np.tile(logged, (len(values), 1))
         c[:, j] = values
         expected = exam.expected[at] + model.theta(along.theta, c) - model.theta(along.theta, logged)

@@ -20,7 +20,7 @@ from servoscope.models.plants.axis import AxisPlant
 
 TARGET_RATE = 200.0  # Hz; what an axis does faster than that is not its rigid body
 SPEED_SAMPLES = 5  # over which a parabola gives the speed
-FORGOTTEN = 1e-2  # share of its state that the filter may still hold
+MAX_REMAINING_SHARE = 1e-2  # share of its state that the filter may still hold
 RELATIVE_FLOOR = 1e-12  # of y's noise, relative to what the force does to y within a sample
 DOUBLINGS = 30  # of the samples that the steady state is computed over
 
@@ -79,7 +79,7 @@ class AxisFilter:
         numerator, poles = ss2tf(F, inputs, C, np.zeros((1, 2)), 0)
         from_y, _ = ss2tf(F, inputs, C, np.zeros((1, 2)), 1)
         slowest = float(np.abs(np.linalg.eigvals(F)).max())
-        settling = int(np.ceil(np.log(FORGOTTEN) / np.log(min(max(slowest, 0.01), 0.999))))
+        settling = int(np.ceil(np.log(MAX_REMAINING_SHARE) / np.log(min(max(slowest, 0.01), 0.999))))
         # kernels take three poles, of which that of a position may be missing
         to_acceleration, to_y, poles = (
             np.pad(one, (0, derivative)) for one in (numerator[0], poles - from_y[0], poles)
@@ -158,7 +158,7 @@ class AxisSignals:
     def columns(self, plant: AxisPlant) -> FloatArray:
         """Return u and minus what the terms multiply, shape (1 + n, N): times `acceleration_coefficients`, y''."""
         v = np.where(np.abs(self.speed) > plant.sign_speed, self.speed, 0.0)
-        return np.array([self.u, *(-column.value(plant, self.y, v) for column in plant.columns)])
+        return np.array([self.u, *-plant.regressors(self.y, v)])
 
     def moving(self, rest_speed: float, settling: int) -> BoolArray:
         """Return where the axis moves and the filter has forgotten the last rest, reversal and gap, shape (N,).

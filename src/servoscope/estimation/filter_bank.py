@@ -19,7 +19,7 @@ from servoscope.models.lti import (
     state_variable_filter,
     tapped_delay_line,
 )
-from servoscope.models.plants import Plant
+from servoscope.models.plants import SIGN_CUTOFF, Column, Plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class FilterBank:
     # from y (or r) to the velocity whose sign forms the non-linear columns and gates the estimator
     velocity: LinearSystem
     velocity_of_reference: bool  # whether `velocity` takes r instead of y
-    extras: tuple[str, ...]  # non-linear inputs after r, u, y, out of `servoscope.models.plants.EXTRAS`
+    extras: tuple[Column, ...]  # non-linear inputs after r, u, y
     names: tuple[str, ...]  # names of the n coefficients
     # powers of s (or of q for Tustin) of the first coefficients; the others do not enter the iFRF
     powers: tuple[int, ...]
@@ -124,7 +124,7 @@ def closed_loop_system(loop: Loop, plant: Plant) -> LinearSystem:
 
 
 def instrument_system(loop: Loop) -> LinearSystem:
-    """Return r -> y of the nominal closed loop without noise, the instrument of THEORY section 5.
+    """Return r -> y of the nominal closed loop without noise, the instrument (how-it-works, "Noise in the regressor").
 
     Raises LoopError as `closed_loop_system`.
     """
@@ -147,7 +147,7 @@ def _svf_paths(loop: Loop) -> tuple[LinearSystem, LinearSystem, list[LinearSyste
     one = LinearSystem(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)))
     smooth = sample_system(continuous, rate, "foh").output(np.eye(1, order))
     wait = settling_samples(cutoff, order, 1.0 / rate) + math.ceil(loop.delay * rate)
-    return to_eta, to_phi, [one if extra == "one" else smooth for extra in plant.extras], wait
+    return to_eta, to_phi, [one if extra == Column.CONSTANT else smooth for extra in plant.extras], wait
 
 
 def _instrument_path(loop: Loop, instrument: InstrumentModel, to_phi: LinearSystem) -> LinearSystem:
@@ -190,7 +190,7 @@ class InstrumentModel:
 def build_filter_bank(loop: Loop, instrument: InstrumentModel | None = None) -> FilterBank:
     """Turn a loop's settings into constant matrices.
 
-    With `instrument`, z is the same filters applied to its noise-free output (THEORY section 5). Raises LoopError if
+    With `instrument`, z is the same filters applied to its noise-free output (Young, 2011). Raises LoopError if
     the structure does not suit the plant.
     """
     plant = loop.plant
@@ -211,16 +211,16 @@ def build_filter_bank(loop: Loop, instrument: InstrumentModel | None = None) -> 
         # the instrument replaces only the columns of y; friction and offset instrument themselves
         rows = np.r_[np.arange(1 + n), 1 + n + np.arange(n_powers), 1 + n_powers + np.arange(n_extras)]
         C, D = C[rows], D[rows]
-    # second-order differentiator of its own: the sign of a strongly filtered velocity lags (THEORY section 8)
-    cutoff = getattr(plant, "sign_cutoff", None) or 50.0
-    differentiator = state_variable_filter(min(cutoff, 0.25 * loop.sample_rate), 2)
+    # second-order differentiator of its own: the sign of a strongly filtered velocity lags
+    sign = plant.velocity_sign
+    differentiator = state_variable_filter(min(sign.cutoff or SIGN_CUTOFF, 0.25 * loop.sample_rate), 2)
     # of an output that is a speed, its low pass
     velocity = sample_system(differentiator, loop.sample_rate, "foh").output(np.eye(1, 2, 1 - plant.derivative))
     return FilterBank(
         system=LinearSystem(whole.A, whole.B @ route, C, D),
         velocity=velocity,
-        velocity_of_reference=getattr(plant, "sign_from", "output") == "reference",
-        extras=plant.extras,
+        velocity_of_reference=sign.of_reference,
+        extras=tuple(map(Column, plant.extras)),
         names=plant.names if svf else tuple(f"c_{i}" for i in range(n)),
         powers=plant.powers,
         structure=loop.monitor.structure,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 FUNCTIONS = 8  # Laguerre functions of r
 POLES = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99)  # of theirs, per sample, out of which the one that explains y best is taken
 FOLDS = 4  # parts of the samples, in each of which the instrument comes from a model that has not seen it
-SLOWEST = 1e-3  # real part of a pole of the model over its magnitude, below which it would hardly settle
+MIN_POLE_DAMPING = 1e-3  # real part of a pole of the model over its magnitude, below which it would hardly settle
 
 Source = Literal["input", "reference"]
 
@@ -103,7 +103,7 @@ def _stable(polynomial: FloatArray) -> FloatArray:
     if len(polynomial) == 1:
         return polynomial
     roots = P.polyroots(polynomial)
-    real = -np.maximum(np.abs(roots.real), SLOWEST * np.abs(roots))
+    real = -np.maximum(np.abs(roots.real), MIN_POLE_DAMPING * np.abs(roots))
     return np.asarray(P.polyfromroots(real + 1j * roots.imag).real * polynomial[-1])
 
 

@@ -14,15 +14,15 @@ from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, fit_tuning, least_squares
 from servoscope.signals import Recording
 
-ROUNDS = 20  # of refinement; a fit that needs more does not settle
-SETTLED = 1e-3  # relative change of each coefficient of a round, below which it has settled
+MAX_ROUNDS = 20  # of refinement; a fit that needs more does not settle
+ROUND_TOLERANCE = 1e-3  # relative change of each coefficient of a round, below which it has settled
 # stated relative standard deviation, above which an estimate is no better than its bias; near the deviation itself only
 # those would pass that came out too large
-LARGEST_DEVIATION = 0.2
+MAX_RELATIVE_STD = 0.2
 FEEDBACK_LAGS = 6  # samples, from 0 on, in which a controller answers noise in y
 FEEDBACK_ORDER = 20  # of the autoregressions that whiten u and the residual
-FEWEST = 200  # samples of a recording that the question is asked of
-FEEDBACK_BY_CHANCE = 1e-6  # probability with which a u without feedback may be taken for one with it
+MIN_FEEDBACK_SAMPLES = 200  # samples of a recording that the question is asked of
+FEEDBACK_FALSE_ALARMS = 1e-6  # probability with which a u without feedback may be taken for one with it
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class InstrumentalFit:
     @property
     def trusted(self) -> bool:
         """Whether the estimate says enough to take the place of a biased one."""
-        return self.settled and self.deviation <= LARGEST_DEVIATION
+        return self.settled and self.deviation <= MAX_RELATIVE_STD
 
 
 def fit_with_instrument(
@@ -56,14 +56,14 @@ def fit_with_instrument(
     settled, powers = False, len(pipeline.loop.plant.powers)
     monitor = pipeline.loop.monitor.model_copy(update={"estimator": "iv-akf"})
     loop = pipeline.loop.model_copy(update={"monitor": monitor})
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         model = tuning or InstrumentTuning("input", tuple(theta[:powers].tolist()))
         pipeline = Pipeline.of(loop, None, pipeline.still_speed, model)
         regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
         if tuning is not None:
             regressions = _held_out(pipeline, recordings, regressions)
         before, theta = theta, least_squares(_joined(regressions))
-        settled = bool(np.all(np.abs(theta - before)[:powers] <= SETTLED * np.abs(theta[:powers])))
+        settled = bool(np.all(np.abs(theta - before)[:powers] <= ROUND_TOLERANCE * np.abs(theta[:powers])))
         if settled or tuning is not None or not np.isfinite(theta).all():
             break
     if not (np.isfinite(theta).all() and theta[powers - 1]):
@@ -113,12 +113,12 @@ def has_feedback(pipeline: Pipeline, recordings: Sequence[Recording], theta: Flo
         g = wide_pipeline.regression(rec.r, rec.u, rec.y, rec.restart)
         used = np.flatnonzero(g.ok)
         residual, step = (g.eta - g.phi @ theta)[used][1:], np.diff(rec.u[used])
-        if len(step) < FEWEST or not (step.any() and residual.any()):
+        if len(step) < MIN_FEEDBACK_SAMPLES or not (step.any() and residual.any()):
             continue
         a, b = (_whitened(x) for x in (step, residual))
         n = len(a)
         rho = np.array([np.mean(a[lag:] * b[: n - lag]) for lag in range(FEEDBACK_LAGS)])
-        if special.chdtrc(FEEDBACK_LAGS, n * float(rho @ rho)) < FEEDBACK_BY_CHANCE / len(recordings):
+        if special.chdtrc(FEEDBACK_LAGS, n * float(rho @ rho)) < FEEDBACK_FALSE_ALARMS / len(recordings):
             return True
     return False
 

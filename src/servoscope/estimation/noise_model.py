@@ -17,11 +17,11 @@ from servoscope.estimation.filter_bank import FilterBank
 from servoscope.models.lti import LinearSystem, autocovariances, decimate_noise, innovation_gain, scale_to_noise
 
 AR_ORDER = 10
-FLOOR = 1e-9  # of the variance of v: no innovation is smaller
+MIN_VARIANCE_SHARE = 1e-9  # of the variance of v: no innovation is smaller
 RESPONSE_TAIL = 1e-4  # of a closed loop's answer that an autocovariance may leave out
-CANCELLED = 0.05  # of a pole's distance from the unit circle, within which a zero cancels it
-LAGS = 20  # of innovations that should be white
-RESPONSE = 2000  # samples of a whitening filter's answer that are looked at
+CANCELLATION_SHARE = 0.05  # of a pole's distance from the unit circle, within which a zero cancels it
+WHITENESS_LAGS = 20  # of innovations that should be white
+RESPONSE_SAMPLES = 2000  # samples of a whitening filter's answer that are looked at
 LIKELIHOOD_DROP = 1.5  # by which the log-likelihood may fall at the upper bound of a noise
 
 
@@ -101,10 +101,6 @@ class ArmaNoise:
             gamma.append(float(sum(self.a[i] * gamma[j - 1 - i] for i in range(len(self.a))) + moving))
         return np.array(gamma[: lags + 1])
 
-    def autoregression(self, order: int = AR_ORDER) -> ArmaNoise:
-        """Return the autoregression with the same autocovariance up to its order."""
-        return yule_walker(self.autocovariance(order)) if len(self.b) else self
-
 
 def sample_autocovariance(runs: Sequence[FloatArray], lags: int) -> FloatArray:
     """Return the autocovariance of a zero-mean signal at lags 0 ... lags, over several runs, shape (lags + 1,)."""
@@ -137,7 +133,7 @@ def yule_walker(gamma: FloatArray) -> ArmaNoise:
     row = gamma[:-1].copy()
     row[0] *= 1.0 + 1e-9
     a = np.asarray(solve_toeplitz(row, gamma[1:]))
-    variance = max(float(gamma[0] - a @ gamma[1:]), FLOOR * float(gamma[0]))
+    variance = max(float(gamma[0] - a @ gamma[1:]), MIN_VARIANCE_SHARE * float(gamma[0]))
     return ArmaNoise(a, np.zeros(0), gamma[:-1].copy(), variance)
 
 
@@ -166,7 +162,7 @@ def arma_from_white_noise(bank: FilterBank, theta: FloatArray, noise: WhiteNoise
     zeros = np.roots(np.concatenate([moving[::-1], moving[1:]]))
     b = np.real(np.poly(zeros[np.argsort(np.abs(zeros))][:q]))
     variance = float(moving[0] / (b**2).sum())
-    return ArmaNoise(a, b[1:], gamma[:p].copy(), max(variance, FLOOR * float(gamma[0])))
+    return ArmaNoise(a, b[1:], gamma[:p].copy(), max(variance, MIN_VARIANCE_SHARE * float(gamma[0])))
 
 
 def arma_from_system(system: LinearSystem, stride: int) -> ArmaNoise:
@@ -194,7 +190,7 @@ def _cancel_pairs(poles: ComplexArray, zeros: ComplexArray) -> tuple[ComplexArra
     """Leave out poles and zeros that are nearer to each other than a share of their distance from the unit circle."""
     kept, left = [], list(zeros)
     for pole in poles:
-        near = [zero for zero in left if abs(zero - pole) < CANCELLED * (1.0 - abs(pole))]
+        near = [zero for zero in left if abs(zero - pole) < CANCELLATION_SHARE * (1.0 - abs(pole))]
         if near:
             left.remove(min(near, key=lambda zero: abs(zero - pole)))
         else:
@@ -205,18 +201,18 @@ def _cancel_pairs(poles: ComplexArray, zeros: ComplexArray) -> tuple[ComplexArra
 def colour_error(model: ArmaNoise, system: LinearSystem, stride: int) -> float:
     """Return how far a model leaves the output of a system from white noise of unit variance.
 
-    The largest of the error of the variance and the autocorrelations, up to `LAGS`.
+    The largest of the error of the variance and the autocorrelations, up to `WHITENESS_LAGS`.
     """
-    gamma = autocovariances(scale_to_noise(system), LAGS + len(model.a) + RESPONSE, stride)[:, 0, 0]
+    gamma = autocovariances(scale_to_noise(system), WHITENESS_LAGS + len(model.a) + RESPONSE_SAMPLES, stride)[:, 0, 0]
     from servoscope.models.lfilter import lfilter
 
     A, B = model.polynomials
-    impulse = np.zeros(RESPONSE)
+    impulse = np.zeros(RESPONSE_SAMPLES)
     impulse[0] = 1.0
     h = lfilter(A, B, impulse)
-    pairs = np.correlate(h, h, "full")  # of the whitening filter with itself, lags 1 - RESPONSE ... RESPONSE - 1
-    both = np.arange(1 - RESPONSE, RESPONSE)
-    left = np.array([float(pairs @ gamma[np.abs(lag + both)]) for lag in range(LAGS + 1)]) / model.variance
+    pairs = np.correlate(h, h, "full")  # of the whitening filter with itself, by lag
+    both = np.arange(1 - RESPONSE_SAMPLES, RESPONSE_SAMPLES)
+    left = np.array([float(pairs @ gamma[np.abs(lag + both)]) for lag in range(WHITENESS_LAGS + 1)]) / model.variance
     return max(abs(float(left[0]) - 1.0), float(np.abs(left[1:]).max()))
 
 
@@ -261,7 +257,7 @@ def fit_white_noise(system: LinearSystem, runs: Sequence[FloatArray], stride: in
     I = np.concatenate([_periodogram(v)[1:-1] for v in runs])
     S = np.concatenate([_spectra(system, stride, len(v))[1:-1] for v in runs])
     size, level = S.mean(axis=0), float(I.mean())
-    S = S / size + FLOOR
+    S = S / size + MIN_VARIANCE_SHARE
     I = I / level
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:

@@ -18,7 +18,6 @@ from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
 from servoscope.estimation.two_stage import StageOneRunner, StageOneTuning
 from servoscope.estimation.valve import ValveLaw, integer_delay
 from servoscope.models.lti import LinearSystem
-from servoscope.models.plants import EXTRA_COLUMNS
 from servoscope.models.plants.polynomial import PolynomialPlant
 from servoscope.signals import Recording
 
@@ -180,11 +179,11 @@ class Pipeline:
             bank=self._behind_valve.output(rows),
             velocity=bank.velocity,
             v_of_r=bank.velocity_of_reference,
-            codes=tuple(EXTRA_COLUMNS.index(extra) for extra in bank.extras),
+            nonlinear=bank.extras,
             shapes=tuple(x for extra in bank.extras for x in loop.plant.column_shapes.get(extra, ())),
             limits=(-np.inf, np.inf) if unlimited else (loop.input_limits or (-np.inf, np.inf)),
             deadzone=dead,
-            sign_speed=float(getattr(loop.plant, "sign_speed", 0.0)),
+            sign_speed=loop.plant.velocity_sign.dead_speed,
             rest_speed=loop.monitor.rest_speed,
             still_speed=self.still_speed,
             only_moving=loop.monitor.update_when == "moving",

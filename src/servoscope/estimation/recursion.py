@@ -28,6 +28,7 @@ from servoscope.estimation.kernel.cusum import LAGS, CusumConstants, evaluation_
 from servoscope.estimation.kernel.sample_steps import CUSUM_BATCH, HEADER_SIZE, SAMPLE, KernelSizes, KernelSpec
 from servoscope.estimation.kernel.sparse_lti import pack_coefficients, pad_system, pairs_structure, sparsity_pattern
 from servoscope.models.lti import LinearSystem
+from servoscope.models.plants import Column
 
 LANE_COUNT = {"float64": 8, "float32": 16}  # assets side by side: one vector; twice as many leave the first-level cache
 VECTOR_WIDTH = {"float64": 8, "float32": 16}  # numbers in a vector
@@ -59,8 +60,8 @@ class RecursionConstants(NamedTuple):
     off and the rest divided by `basis` (n, n). With `steady` they are chosen so that P_d is the identity, and P stays
     there. `theta` is the baseline's in these coordinates, `origin` the same in physical units.
 
-    `bank` and `velocity` are filters, `codes` the non-linear inputs, `shapes` two numbers for each with a shape,
-    `limits` and `deadzone` of u; `a` (lags,) and `heads` (lags,) are the noise's model as
+    `bank` and `velocity` are filters, `nonlinear` the columns of friction and offset, `shapes` two numbers for each
+    with a shape, `limits` and `deadzone` of u; `a` (lags,) and `heads` (lags,) are the noise's model as
     `moments.propagate_covariance` takes it, `variance` that of v, in updates: of every `stride`-th sample; `extra` is
     the size of the estimator's private state, and `watch` is the sequential test.
     """
@@ -70,7 +71,7 @@ class RecursionConstants(NamedTuple):
     bank: LinearSystem
     velocity: LinearSystem
     v_of_r: bool
-    codes: tuple[int, ...]
+    nonlinear: tuple[Column, ...]
     shapes: tuple[float, ...]
     limits: tuple[float, float]
     deadzone: tuple[float, float]
@@ -293,7 +294,7 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
         shadows.append(pairs_structure(nxs, columns))  # like loops share machine code
     lags = max(len(c.a) for c in constants)
     speed = 0
-    if first.codes or first.only_moving or first.still_speed > 0.0:
+    if first.nonlinear or first.only_moving or first.still_speed > 0.0:
         speed = 2 if first.v_of_r else 1
     start = first.view is None
     frequencies = 0 if first.view is None else len(first.view.response) // 2
@@ -329,7 +330,7 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
         states=len(first.bank.A),
         speed=speed,
         gated=first.only_moving,
-        codes=first.codes,
+        nonlinear=first.nonlinear,
         lags=lags,
         shadow=nxs,
         memory=memory,

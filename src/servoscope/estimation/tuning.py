@@ -23,7 +23,8 @@ from servoscope.estimation.noise_model import (
 from servoscope.estimation.pipeline import Pipeline, Regression, Tuning
 from servoscope.models.lti import solve_scaled
 
-WEAKEST = 1e-14  # smallest eigenvalue of the scaled R_phi, relative to the largest, that still counts as excited
+# smallest eigenvalue of the scaled R_phi, relative to the largest, that still counts as excited
+MIN_EIGENVALUE_RATIO = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class TuningFit:
     explained: float  # share of eta's variance that the model explains, 0 to 1
     dof: float  # effective number of independent residuals
     # of the instrument: smallest real part of the eigenvalues of E[phi phi']^-1 E[z phi'], 1 where z is phi. The
-    # recursion diverges where it is negative (THEORY section 5).
+    # recursion diverges where it is negative.
     strength: float
     rms_eta: float  # root mean square of eta
     # white noises of u and y that fit the residual best; None with two stages, where u does not enter
@@ -111,7 +112,7 @@ def fit_tuning(pipeline: Pipeline, regressions: Sequence[Regression]) -> TuningF
     scaled = R_phi / np.outer(scale, scale)
     own = phi.T @ phi / len(eta) / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(own)
-    if values[0] < WEAKEST * values[-1]:
+    if values[0] < MIN_EIGENVALUE_RATIO * values[-1]:
         weakest = names[int(np.argmax(np.abs(vectors[:, 0])))]
         raise NotEnoughError(f"the recordings do not tell {weakest} from the other coefficients: move more")
     theta = solve_scaled(R_phi, z.T @ eta / len(eta))

@@ -19,7 +19,6 @@ from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.models.discretise import split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.lti import sample_system, state_variable_filter
-from servoscope.models.plants.eha import EHA
 
 ORDER = 3  # of the differentiator: one more than the derivatives it gives
 CUTOFF_RATIO = 2.0  # its cutoff against that of the filter bank, so that p_L does not lag behind the motion
@@ -43,11 +42,7 @@ class ValveConstants(NamedTuple):
 
 def integer_delay(loop: Loop) -> float:
     """Return the part of the loop's delay [s] that `ValveLaw` takes over: whole samples, so that u meets p_L."""
-    return split_delay(loop.delay, loop.sample_rate)[0] / loop.sample_rate if _has_square_root_law(loop) else 0.0
-
-
-def _has_square_root_law(loop: Loop) -> bool:
-    return isinstance(loop.plant, EHA) and loop.plant.valve_law == "square-root"
+    return split_delay(loop.delay, loop.sample_rate)[0] / loop.sample_rate if loop.plant.load_pressure else 0.0
 
 
 class ValveLaw:
@@ -55,12 +50,11 @@ class ValveLaw:
 
     def __init__(self, loop: Loop) -> None:
         self.size = 0
-        plant = loop.plant
-        if not (_has_square_root_law(loop) and isinstance(plant, EHA)):
+        if loop.plant.load_pressure is None:
             return
-        rate = loop.sample_rate
+        rate, (of_y, *of_derivatives) = loop.sample_rate, loop.plant.load_pressure
         cutoff = min(CUTOFF_RATIO * filter_cutoff(loop), 0.25 * rate)
-        moving = np.array([[0.0, plant.b_p, plant.m_p]]) / (plant.A_p * plant.p_s)
+        moving = np.array([[0.0, *of_derivatives]])
         filtered = sample_system(state_variable_filter(cutoff, ORDER), rate, "foh").output(moving)
         limits = loop.input_limits if loop.input_logged == "before_limiter" else None
         low, high = limits or (-np.inf, np.inf)
@@ -68,11 +62,11 @@ class ValveLaw:
             A=np.ascontiguousarray(filtered.A),
             B=np.ascontiguousarray(filtered.B[:, 0]),
             C=np.ascontiguousarray(filtered.C[0]),
-            D=float(filtered.D[0, 0]) + plant.k_p / (plant.A_p * plant.p_s),
+            D=float(filtered.D[0, 0]) + of_y,
             X0=np.ascontiguousarray(filtered.steady[:, 0]),
             low=low,
             high=high,
-            sign=math.copysign(1.0, plant.input_gain),
+            sign=math.copysign(1.0, loop.plant.input_gain),
             delay=split_delay(loop.delay, rate)[0],
         )
         self.size = HEADER_SIZE + len(filtered.A) + self._constants.delay

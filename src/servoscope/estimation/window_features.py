@@ -23,8 +23,8 @@ MOTIONS = ("forward", "backward", "rest")
 SIGNALS = ("u", "e")
 MAX_PHYSICAL = 1e100  # as in the recursion: no physical signal, and it would stay in the filters for ever
 SPEED_TIME = 0.02  # s: time constant behind the speed of the reference
-SMALLEST = np.finfo(np.float64).tiny
-FEWEST = 3  # samples of a motion from which a window speaks for it
+MIN_POSITIVE = np.finfo(np.float64).tiny
+MIN_MOTION_SAMPLES = 3  # samples of a motion from which a window speaks for it
 VECTOR_WIDTH = 8  # numbers in a vector
 HEADER = 8  # numbers of the state before those of the filters; see `_accumulate`
 ROW_HEADER = 3  # numbers of a row before the sums: sample, level, span
@@ -116,7 +116,7 @@ class WindowFeatures:
         bins, powers = 3 * layout.bins, 3 * layout.bins + 2 * len(MOTIONS) * layout.bands
         self._parts = slice(layout.bins), slice(layout.bins, bins), slice(bins, powers), slice(powers, None)
         self._floors = np.array(layout.floors)[:, None, None]
-        self._fewest_heard = max(FEWEST, layout.sample_rate / layout.bands_hz[0] / 4.0)
+        self._fewest_heard = max(MIN_MOTION_SAMPLES, layout.sample_rate / layout.bands_hz[0] / 4.0)
         self.size = HEADER + 8 * layout.bands + layout.levels * (1 + layout.sums)
 
     def start(self) -> FloatArray:
@@ -140,13 +140,15 @@ class WindowFeatures:
         motions = len(MOTIONS)
         counts, levels, powers, speeds = (sums[part] for part in self._parts)
         with np.errstate(divide="ignore", invalid="ignore"):
-            means = np.where(counts >= FEWEST, levels.reshape(2, -1) / counts, np.nan)
+            means = np.where(counts >= MIN_MOTION_SAMPLES, levels.reshape(2, -1) / counts, np.nan)
             of_motion = counts.reshape(motions, -1).sum(axis=1)
             power = np.maximum(powers.reshape(2, motions, -1) / of_motion[:, None], self._floors)
             heard = of_motion >= self._fewest_heard
             logs = np.where(heard[:, None], 0.5 * np.log(power), np.nan)
-            speed = 0.5 * np.log(np.maximum(speeds[:2] / of_motion[:2], SMALLEST))
-        motion = np.concatenate([of_motion / of_motion.sum(), np.where(of_motion[:2] >= FEWEST, speed, np.nan)])
+            speed = 0.5 * np.log(np.maximum(speeds[:2] / of_motion[:2], MIN_POSITIVE))
+        motion = np.concatenate(
+            [of_motion / of_motion.sum(), np.where(of_motion[:2] >= MIN_MOTION_SAMPLES, speed, np.nan)]
+        )
         return np.concatenate([means.ravel(), logs.ravel()]), motion
 
 

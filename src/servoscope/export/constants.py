@@ -126,8 +126,7 @@ def _input_stage(baseline: Baseline) -> str:
     loop = baseline.loop
     if loop.monitor.two_stage != "none":
         return f"[monitor] two_stage = {loop.monitor.two_stage!r}"
-    law = getattr(loop.plant, "valve_law", "linear")
-    return "" if law == "linear" else f"[plant] valve_law = {law!r}"
+    return "[plant] valve_law = 'square-root'" if loop.plant.load_pressure else ""
 
 
 def check_name(name: str) -> None:

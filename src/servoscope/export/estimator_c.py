@@ -20,7 +20,6 @@ from servoscope.core.jit.c_source import c_literal
 __all__ = ["translate_update"]
 
 ARRAYS = ("theta", "P", "P_d", "phi", "z", "K", "extra")
-CONSTANT_ARRAYS = ("P_d", "phi", "z")
 NUMBERS = ("R", "memory", "eta")
 OPERATORS: dict[type[ast.AST], str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 COMPARISONS: dict[type[ast.AST], str] = {

@@ -17,7 +17,7 @@ from servoscope.signals.quality import QualityLimits, QualitySettings, check_blo
 
 __all__ = ["GoldenRun", "golden_signals", "golden_text"]
 
-SHORTEST, LONGEST = 2000, 20_000  # samples
+MIN_GOLDEN_SAMPLES, MAX_GOLDEN_SAMPLES = 2000, 20_000  # samples
 SEED = 27
 FROZEN = {"frozen_y": 1, "frozen_u": 2}
 WAITING, HEALTHY, FAULT = range(3)
@@ -73,7 +73,7 @@ class GoldenRun:
     def of(cls, baseline: Baseline, recursion: Recursion, limit: float, delays: tuple[int, int]) -> GoldenRun:
         """Run a monitor over its golden samples."""
         c = recursion.constants[0]
-        samples = int(np.clip(8 * c.wait + 20 * c.every, SHORTEST, LONGEST))
+        samples = int(np.clip(8 * c.wait + 20 * c.every, MIN_GOLDEN_SAMPLES, MAX_GOLDEN_SAMPLES))
         *signals, restart = golden_signals(baseline, samples)
         with np.errstate(over="ignore"):  # of values that are no physical signal
             r, u, y = (x.astype(recursion.number) for x in signals)

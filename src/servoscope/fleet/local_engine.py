@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from concurrent.futures.process import BrokenProcessPool
-from itertools import islice
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from servoscope.core.workers import create_pool
+from servoscope.core.workers import Progress, WorkerError, WorkerGroup
 from servoscope.fleet.tasks import ExamineTask, LearnTask
 
 Task = LearnTask | ExamineTask
 TaskResult = tuple[Task, dict[str, Any]]
 Engine = Callable[[Sequence[Task]], Iterator[TaskResult]]  # results come as tasks finish, in any order
-TASKS_PER_PROCESS = 2  # tasks handed out per process: enough to keep it busy, few enough to keep memory bounded
 
 
 def local(jobs: int) -> Engine:
@@ -24,12 +20,15 @@ def local(jobs: int) -> Engine:
         if jobs == 1:
             yield from ((task, task.run()) for task in tasks)
             return
-        waiting = iter(tasks)
-        while suspects := (yield from _run_pool(jobs, waiting)):
-            for task in suspects:  # one of them killed its process: alone, it takes no other with it
-                yield task, _run_isolated(task)
+        for task, result in WorkerGroup().map(f"{__name__}:run_task", tasks, jobs):
+            yield task, crash_result(task) if isinstance(result, WorkerError) else result
 
     return run
+
+
+def run_task(_: Progress, task: Task) -> dict[str, Any]:
+    """Run a task in a worker."""
+    return task.run()
 
 
 def crash_result(task: Task) -> dict[str, Any]:
@@ -39,28 +38,3 @@ def crash_result(task: Task) -> dict[str, Any]:
         return {"name": task.name, "error": error, "unused": {}}
     item = task.item
     return {"asset": item.asset, "day": item.day, "stamp": item.stamp, "status": "failed", "error": error}
-
-
-def _run_pool(jobs: int, waiting: Iterator[Task]) -> Generator[TaskResult, None, list[Task]]:
-    """Run tasks until there are none, or a process dies; return those that were under way then."""
-    running: dict[Future[dict[str, Any]], Task] = {}
-    with create_pool(jobs) as pool:
-        try:
-            while True:
-                for task in islice(waiting, TASKS_PER_PROCESS * jobs - len(running)):
-                    running[pool.submit(task.run)] = task
-                if not running:
-                    return []
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    result = future.result()
-                    yield running.pop(future), result
-        except BrokenProcessPool:
-            return list(running.values())
-
-
-def _run_isolated(task: Task) -> dict[str, Any]:
-    with create_pool(1) as pool:
-        try:
-            return pool.submit(task.run).result()
-        except BrokenProcessPool:
-            return crash_result(task)

@@ -7,16 +7,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from servoscope.core.files import atomic_write, make_folder
+from servoscope.core.messages import count_words
 from servoscope.fleet.discoveries import RATE
 from servoscope.fleet.rows import MICRO
 from servoscope.fleet.summary import COMMON, FAILED, Fleet
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_size
 from servoscope.report.page import render_page, write_page
 
-MOST_ROWS = 300  # of a table: a page is read by people
-MOST_NAMES = 20  # in a sentence
-MOST_DAYS = 60  # of the picture of days
-LEAST_SHOWN = 0.05  # probability of a common cause that is worth its row
+MAX_TABLE_ROWS = 300  # of a table: a page is read by people
+MAX_NAMES = 20  # in a sentence
+MAX_DAYS = 60  # of the picture of days
+MIN_PROBABILITY_SHOWN = 0.05  # probability of a common cause that is worth its row
 MIN_EPOCH_S = 1e9  # s since 1970 from which a time is a date, not a time since some start
 TONES = {
     "healthy": "var(--measured)",
@@ -55,14 +56,14 @@ def render_fleet_page(fleet: Fleet, lake: str) -> str:
         causes=[
             (cause, since)
             for cause, since in zip(fleet.causes, fleet.since, strict=True)
-            if cause.probability >= LEAST_SHOWN
+            if cause.probability >= MIN_PROBABILITY_SHOWN
         ],
         ill=[one for one in fleet.assets if one.state not in ("healthy", FAILED)],
         changed=[one for one in fleet.assets if one.before is not None and one.before != one.state],
-        days=sorted({day for some in fleet.states.values() for day in some})[-MOST_DAYS:],
-        shown=[one.asset for one in fleet.assets][:MOST_ROWS],
+        days=sorted({day for some in fleet.states.values() for day in some})[-MAX_DAYS:],
+        shown=[one.asset for one in fleet.assets][:MAX_TABLE_ROWS],
         late=[(asset, format_count(rows)) for asset, rows in late],
-        most=MOST_ROWS,
+        most=MAX_TABLE_ROWS,
         tones=TONES,
         size=lambda one: format_size(one.ratio, *one.interval),
         time=_format_time,
@@ -77,7 +78,7 @@ def headline(fleet: Fleet) -> str:
         named = ", ".join(f"{cause.key} {cause.group}" for cause in fleet.accepted[:3])
         parts.append(f"{shared} common cause{'s' * (shared > 1)} ({named}{', ...' * (shared > 3)})")
     if ill:
-        parts.append(f"{ill} asset{'s' * (ill > 1)} ill by {'themselves' if ill > 1 else 'itself'}")
+        parts.append(f"{count_words(ill, 'asset', 'en')} ill by {'themselves' if ill > 1 else 'itself'}")
     return " and ".join(parts) if parts else "No asset has changed from its healthy baseline"
 
 
@@ -86,9 +87,9 @@ def describe_discoveries(fleet: Fleet) -> str:
     names = fleet.discovered
     if not names:
         return ""
-    listed = ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)
+    listed = ", ".join(names[:MAX_NAMES]) + ", ..." * (len(names) > MAX_NAMES)
     which = f"these {len(names)} have" if len(names) > 1 else "this one has"
-    of = f"Of {len(fleet.assets)} assets, {which} changed: {listed}."
+    of = f"Of {count_words(len(fleet.assets), 'asset', 'en')}, {which} changed: {listed}."
     return f"{of} At most {RATE:.0%} of such names are wrong, on average."
 
 

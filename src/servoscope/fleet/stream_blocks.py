@@ -23,7 +23,7 @@ BLOCKS = "shard int, last_us long, rows binary"  # rows of the assets of a shard
 KEYS = ("asset", "baseline_of")
 ONES = np.uint64(0x0101010101010101)
 SAMPLE_TIME = "dt"  # [s], the column of messages whose time is that of their first sample
-LONGEST = 86_400.0  # s of a message; what claims more would set the clock of the whole stream
+MAX_MESSAGE_S = 86_400.0  # s of a message; what claims more would set the clock of the whole stream
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ def _flatten(batch: pa.RecordBatch, time: str, columns: Columns) -> tuple[IntArr
     if lists and time not in lists:
         number = np.arange(len(t_us)) - np.repeat(np.cumsum(counts) - counts, counts)
         step = number_column(table, SAMPLE_TIME, "sample time")
-        known &= np.abs(step) * np.repeat(counts, counts) < LONGEST  # not so where there is none
+        known &= np.abs(step) * np.repeat(counts, counts) < MAX_MESSAGE_S  # not so where there is none
         t_us = t_us + np.rint(number * np.where(known, step, 0.0) * MICRO).astype(np.int64)
     rows = Rows(t_us, *signals_from_table(table, columns), covariates_from_table(table, columns))
     if known.all():

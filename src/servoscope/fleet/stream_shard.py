@@ -32,7 +32,7 @@ SCHEMA = (
     "level double, late long, result string"
 )
 CHUNK = 8_192  # rows of one entry of the state, about: larger ones cost the collector of the Java machine dearly
-HELD = 128 * CHUNK  # rows that a worker has in memory at a time, about, unless one asset has more
+MAX_ROWS_HELD = 128 * CHUNK  # rows that a worker has in memory at a time, about, unless one asset has more
 FAR_PAST = -(2**62)
 
 
@@ -128,7 +128,7 @@ class StreamShard:
                     state.baseline = baseline
                     waiting[asset].append(rows)
                     held += len(rows)
-            if held >= HELD:
+            if held >= MAX_ROWS_HELD:
                 self._add_entries(waiting)
                 waiting.clear()
                 held = 0
@@ -174,7 +174,7 @@ class StreamShard:
         before = {number for state in self._states.values() for number in state.blocks}
         while assets:
             pending: dict[str, Rows] = {}
-            while assets and sum(map(len, pending.values())) < HELD:
+            while assets and sum(map(len, pending.values())) < MAX_ROWS_HELD:
                 state = self._states[asset := assets.pop(0)]
                 pending[asset] = self._rows(asset, state.processed_until_us, until_us)
                 state.processed_until_us = until_us

@@ -9,22 +9,22 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
-from servoscope.detection.result import UNKNOWN, Candidate, FaultEstimate
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.isolation.posterior import Posterior
 from servoscope.isolation.signature import Signature
 
-GRID = 17  # points along a signature before the minimum is refined
-MISFIT = 1e-3  # probability with which the true fault may fit worse than the limit
-FAR = 1e12  # stands for an infinite misfit
-HOPELESS = 200.0  # excess misfit from which a signature is not refined
-SYSTEMATIC = 2e-3  # share of a signature that nominal parameters and intersample models may be off by
+GRID_POINTS = 17  # points along a signature before the minimum is refined
+MISFIT_BY_CHANCE = 1e-3  # probability with which the true fault may fit worse than the limit
+INFINITE_MISFIT = 1e12  # stands for an infinite misfit
+MAX_EXCESS_MISFIT = 200.0  # excess misfit from which a signature is not refined
+SYSTEMATIC_ERROR_SHARE = 2e-3  # share of a signature that nominal parameters and intersample models may be off by
 
 
 def misfit_limit(n: int) -> float:
     """Return the misfit that a true fault passes in one of a thousand cases, with n coefficients."""
     from scipy import special
 
-    return float(special.chdtri(max(n - 1, 1), MISFIT))
+    return float(special.chdtri(max(n - 1, 1), MISFIT_BY_CHANCE))
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def isolate(
         progress()
         if np.isfinite(misfit):
             # what misses by far even on the grid needs no fine integral: its probability is zero either way
-            fitted.append(search.fit(fine=misfit < min(coarse) + HOPELESS))
+            fitted.append(search.fit(fine=misfit < min(coarse) + MAX_EXCESS_MISFIT))
     if not fitted:
         return (Candidate(name=UNKNOWN, probability=1.0),)
     closest = min(fitted, key=lambda fit: fit.misfit)
@@ -117,7 +117,7 @@ class _SignatureSearch:
         return J, float(np.linalg.slogdet(Sigma)[1])
 
     def _covariance(self, x: float, s: FloatArray) -> FloatArray:
-        Sigma = self.correlation + np.diag((SYSTEMATIC * s) ** 2 + 1e-12)
+        Sigma = self.correlation + np.diag((SYSTEMATIC_ERROR_SHARE * s) ** 2 + 1e-12)
         if self.signature.scatter is not None:
             Sigma = Sigma + self.signature.scatter(x) / np.outer(self.size, self.size)
         return np.asarray(Sigma)
@@ -132,7 +132,7 @@ class _SignatureSearch:
 
     def coarse_misfit(self) -> float:
         """Return the smallest misfit on the grid and a few steps towards the minimum beside its best point."""
-        for x in np.linspace(self.signature.low, self.signature.high, GRID):
+        for x in np.linspace(self.signature.low, self.signature.high, GRID_POINTS):
             self.misfit_at(float(x))
         best = min(self.cache, key=lambda x: self.cache[x][0])
         if np.isfinite(self.cache[best][0]):
@@ -142,20 +142,20 @@ class _SignatureSearch:
     def _refine(self, steps: int) -> None:
         from scipy import optimize
 
-        grid = np.linspace(self.signature.low, self.signature.high, GRID)
+        grid = np.linspace(self.signature.low, self.signature.high, GRID_POINTS)
         i = int(np.argmin([self.misfit_at(float(x)) for x in grid]))
-        bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID - 1)]))
+        bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID_POINTS - 1)]))
         fine = 1e-4 * (bracket[1] - bracket[0])
 
         def misfit(x: float) -> float:  # a parabola through infinity is none: a loop that cannot run is far away
-            return min(self.misfit_at(x), FAR)
+            return min(self.misfit_at(x), INFINITE_MISFIT)
 
         optimize.minimize_scalar(misfit, bounds=bracket, method="bounded", options={"xatol": fine, "maxiter": steps})
 
     def fit(self, fine: bool) -> _SignatureFit:
         """Refine the minimum and integrate over the prior."""
         signature = self.signature
-        width = 2.0 * (signature.high - signature.low) / (GRID - 1)
+        width = 2.0 * (signature.high - signature.low) / (GRID_POINTS - 1)
         if fine:
             self._refine(40)
         best = min(self.cache, key=lambda x: self.cache[x][0])

@@ -9,9 +9,9 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 
-BETWEEN = 9  # points from one that was computed to the next, both included
+REFINED_POINTS = 9  # points from one that was computed to the next, both included
 INTERVAL = 0.025, 0.975
-IMPOSSIBLE = 1e4  # below the top, where a logarithm counts as minus infinity
+MIN_LOG_DENSITY = 1e4  # below the top, where a logarithm counts as minus infinity
 
 
 class Posterior(NamedTuple):
@@ -24,8 +24,8 @@ class Posterior(NamedTuple):
     def from_log_density(cls, x: FloatArray, log_density: FloatArray) -> Self:
         """Integrate; the logarithm runs in straight lines between the points."""
         top = float(log_density.max())
-        dense = np.unique(np.concatenate([np.linspace(a, b, BETWEEN) for a, b in pairwise(x)]))
-        density = np.exp(np.interp(dense, x, np.maximum(log_density, top - IMPOSSIBLE)) - top)
+        dense = np.unique(np.concatenate([np.linspace(a, b, REFINED_POINTS) for a, b in pairwise(x)]))
+        density = np.exp(np.interp(dense, x, np.maximum(log_density, top - MIN_LOG_DENSITY)) - top)
         area = np.concatenate([[0.0], np.cumsum(np.diff(dense) * (density[1:] + density[:-1]) / 2.0)])
         low, high = np.interp(INTERVAL, area / area[-1], dense)
         return cls(top + float(np.log(area[-1])), (float(low), float(high)))

@@ -61,7 +61,7 @@ def _plant_signatures(
         shift = _simulated_shifts(baseline, expectation, onset)
         std = baseline.ratios_std
         return [parameter_signature(f, partial(shift, f.parameter), std.get(f.parameter, 0.0)) for f in faults]
-    if plant.has_physics and plant.kind != "polynomial":
+    if plant.has_physics and not plant.parameters_are_coefficients:
         shift = _nominal_shifts(baseline, learned)
         return [parameter_signature(f, partial(shift, f.parameter)) for f in faults]
     directions = fault_directions(baseline.loop, plant, np.array(baseline.theta))

@@ -14,7 +14,7 @@ from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals, axis_stride
 from servoscope.estimation.tuning import sum_covariance
-from servoscope.isolation.ml.axis_scan import NEAR, largest_changes, scan_limit
+from servoscope.isolation.ml.axis_scan import HEALTHY_MARGIN, largest_changes, scan_limit
 from servoscope.isolation.ml.axis_vibration import BANDS
 from servoscope.isolation.ml.axis_window import LONG_RUN_S, axis_signals
 from servoscope.models.loop import Loop
@@ -22,16 +22,16 @@ from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 
 REST_SHARE = 0.03  # of the speed of motion (rms), below which the axis counts as resting
-LONGEST_FORCE_S = 0.05  # correlation of the unexplained force: a slower one would take over what friction does
+MAX_FORCE_CORRELATION_S = 0.05  # correlation of the unexplained force: a slower one would take over what friction does
 SCATTER = 0.05  # standard deviation of a coefficient's logarithm between recordings, before any is compared
 SCATTER_DOF = 2.0  # recordings that this is worth
-LEAST_SCATTER = 0.01
-ADDED_SHARE = 0.05  # of the force (rms), by which the constant one may differ between recordings and within one
-SEEN = 3.0  # standard deviations from which a coefficient is seen
-COMBINED = 30  # steps in which coefficients and their scatter agree
+MIN_SCATTER = 0.01
+FORCE_OFFSET_SHARE = 0.05  # of the force (rms), by which the constant one may differ between recordings and within one
+MIN_COEFFICIENT_STDS = 3.0  # standard deviations from which a coefficient is seen
+MAX_SCATTER_ROUNDS = 30  # steps in which coefficients and their scatter agree
 FALSE_ALARMS = 1.0 / 200.0  # share of healthy recordings that change within themselves beyond a learned limit
-LEAST_GAIN = 1.0  # of a likelihood ratio whose logarithm counts
-FEWEST_PER_COLUMN = 10  # samples in motion
+MIN_LOG_LIKELIHOOD_GAIN = 1.0  # of a likelihood ratio whose logarithm counts
+MIN_SAMPLES_PER_COLUMN = 10  # samples in motion
 STEPS = 250  # of the search for the noise
 
 
@@ -76,7 +76,7 @@ def rest_speed(signals: Sequence[AxisSignals]) -> float:
 
 def check_motion(recordings: Sequence[Recording], signals: Sequence[AxisSignals], slow: float, columns: int) -> None:
     """Raise NotEnoughError where a recording moves too little for some columns of a regression."""
-    fewest = FEWEST_PER_COLUMN * columns
+    fewest = MIN_SAMPLES_PER_COLUMN * columns
     for recording, one in zip(recordings, signals, strict=True):
         if (usable := int(one.moving(slow, 0).sum())) < fewest:
             raise NotEnoughError(
@@ -100,7 +100,7 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
     start = np.log([0.2 * size, 1.0 / rate, max(float(rough.std()), 1e-12 * size)])
     bounds = [
         (start[0] - 7.0, start[0] + 5.0),
-        tuple(np.log([0.1 / rate, LONGEST_FORCE_S])),
+        tuple(np.log([0.1 / rate, MAX_FORCE_CORRELATION_S])),
         (start[2] - 9.0, start[2] + 3.0),
     ]
 
@@ -163,7 +163,7 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
         i for i, name in enumerate(names) if name == "inertia" or not plant.columns[i - 1].signed or name == "gravity"
     ]
     seen = mean / np.sqrt(np.diag(J @ of_center @ J.T))  # of all recordings together
-    unseen = [i for i in known if seen[i] < SEEN and names[i] != "gravity"]
+    unseen = [i for i in known if seen[i] < MIN_COEFFICIENT_STDS and names[i] != "gravity"]
     of_unseen = tuple(names[i] for i in unseen)
     if 0 in unseen:
         return None, [message("learning.axis_unseen_none", names=of_unseen)]
@@ -182,8 +182,8 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
         noise=noise,
         stride=stride,
         rest_speed=slow,
-        offset_std=ADDED_SHARE * force,
-        drift_std=ADDED_SHARE * force,
+        offset_std=FORCE_OFFSET_SHARE * force,
+        drift_std=FORCE_OFFSET_SHARE * force,
         unseen=dict(zip(of_unseen, off[unseen].tolist(), strict=True)),
     )
     changes, shaken = zip(*(largest_changes(loop, model, one) for one in recordings), strict=True)
@@ -194,7 +194,11 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     ):
         most = max(own)
         # the machine does what the terms do not know, and chance alone is no longer what a change has to exceed
-        limit = score_limit([max(one, LEAST_GAIN) for one in own], FALSE_ALARMS) if NEAR * most > usual else 0.0
+        limit = (
+            score_limit([max(one, MIN_LOG_LIKELIHOOD_GAIN) for one in own], FALSE_ALARMS)
+            if HEALTHY_MARGIN * most > usual
+            else 0.0
+        )
         if limit > usual:
             limits[key] = limit
             notes.append(message(key_message, name=recordings[own.index(most)].name, times=limit / usual))
@@ -212,7 +216,7 @@ def combine_fits(fits: Sequence[AxisFit], n: int) -> tuple[FloatArray, FloatArra
     covariances = np.array([one.covariance[:n, :n] for one in fits])
     stds = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     center, scatter = np.zeros(n), np.full(n, SCATTER)
-    for step in range(COMBINED):
+    for step in range(MAX_SCATTER_ROUNDS):
         weights = np.linalg.inv(covariances + np.diag((scatter * center) ** 2))
         A = np.linalg.inv(weights.sum(axis=0))
         center = A @ np.einsum("kij,kj->i", weights, values)
@@ -235,7 +239,7 @@ def relative_scatter(values: FloatArray, stds: FloatArray, center: FloatArray) -
     beyond = (weight * ((values / center - 1.0) ** 2 - share * own)).sum(axis=0)
     counted = SCATTER_DOF + share * weight.sum(axis=0)
     between = (SCATTER_DOF * SCATTER**2 + np.maximum(beyond, 0.0)) / counted
-    return np.asarray(np.sqrt(np.maximum(between, LEAST_SCATTER**2)))
+    return np.asarray(np.sqrt(np.maximum(between, MIN_SCATTER**2)))
 
 
 def _physical(coefficients: FloatArray, plant: AxisPlant) -> FloatArray:

@@ -24,12 +24,13 @@ from servoscope.learning.axis_fit import (
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.models.plants.axis import AxisPlant
+from servoscope.models.plants.base import CoefficientPlant
 from servoscope.signals import Recording
 
-CURVED = 0.5  # half of the range of y [rad], from which a sine differs from a straight line
+MIN_SINE_RANGE_RAD = 0.5  # half of the range of y [rad], from which a sine differs from a straight line
 SLOW_SHARES = 0.1, 0.3  # of the rms speed, at which Stribeck friction may have fallen to a half
 BLOCK_S = 1.0  # of which the squared innovations are counted as one
-OWN = 2  # nuisances of each recording: force and drift
+NUISANCES_PER_RECORDING = 2  # nuisances of each recording: force and drift
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ def explore_structures(loop: Loop, recordings: Sequence[Recording]) -> tuple[Axi
     """
     if len(recordings) < 2:
         raise NotEnoughError("structures are compared between recordings: give two or more")
-    if loop.plant.kind not in ("axis", "polynomial"):
+    if not isinstance(loop.plant, CoefficientPlant):
         raise LoopError(f'{loop.name}: structures are those of a motor axis, set kind = "axis" in [plant]')
     stride = axis_stride(loop.sample_rate)
     signals = [axis_signals(loop, one, stride) for one in recordings]
@@ -158,7 +159,7 @@ def _candidates(declared: Plant, speed: float, half: float) -> Iterator[AxisPlan
 
 def _may_swing(declared: Plant, half: float) -> bool:
     """Return whether a weight that turns with y would show that its force is a sine."""
-    return half > CURVED and not declared.derivative
+    return half > MIN_SINE_RANGE_RAD and not declared.derivative
 
 
 def _scatter(without: FloatArray) -> FloatArray:
@@ -181,7 +182,7 @@ def _is_plausible(plant: AxisPlant, theta: FloatArray, std: FloatArray) -> bool:
 def _normal(X: FloatArray, e: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
     """Return the normal equations of one recording, whose own force and drift are left free."""
     Q = _own_directions(X)
-    X, e = X[:, :-OWN] - Q @ (Q.T @ X[:, :-OWN]), e - Q @ (Q.T @ e)
+    X, e = X[:, :-NUISANCES_PER_RECORDING] - Q @ (Q.T @ X[:, :-NUISANCES_PER_RECORDING]), e - Q @ (Q.T @ e)
     return X.T @ X / level, X.T @ e / level
 
 
@@ -195,11 +196,11 @@ def _solve(normal: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
 def _left(X: FloatArray, e: FloatArray, theta: FloatArray) -> FloatArray:
     """Return the innovations that coefficients leave, shape (N,); an empty `theta` is found by least squares."""
     Q = _own_directions(X)
-    known, e = X[:, :-OWN] - Q @ (Q.T @ X[:, :-OWN]), e - Q @ (Q.T @ e)
+    known, e = X[:, :-NUISANCES_PER_RECORDING] - Q @ (Q.T @ X[:, :-NUISANCES_PER_RECORDING]), e - Q @ (Q.T @ e)
     if not theta.size:
         theta = _solve([(known.T @ known, known.T @ e)])
     return np.asarray(e - known @ theta)
 
 
 def _own_directions(X: FloatArray) -> FloatArray:
-    return np.linalg.qr(X[:, -OWN:])[0]
+    return np.linalg.qr(X[:, -NUISANCES_PER_RECORDING:])[0]

@@ -8,18 +8,19 @@ from dataclasses import replace
 import numpy as np
 
 from servoscope.baseline.covariates import CovariateModel, CovariatePath
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.errors import NotEnoughError
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, coloured_covariance, fit_tuning, least_squares
 from servoscope.signals import Recording
 
 STRETCH = 2.0  # memories over which coefficients count as constant
-APART = 0.05  # share of the range, by which two values count as two
-HIGHEST_DEGREE = 2
-CLEAR = 10.0  # standard deviations from zero from which a coefficient changes in proportion, as physics do
+DISTINCT_VALUES_SHARE = 0.05  # share of the range, by which two values count as two
+MAX_DEGREE = 2
+# standard deviations from zero from which a coefficient changes in proportion, as physics do
+MIN_PROPORTIONAL_STDS = 10.0
 ROUNDS = 3  # the first finds the noise, in which the covariates had still counted
-FEWEST_PER_COEFFICIENT = 20  # usable samples of a stretch
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of a stretch
 
 
 def fit_covariates(
@@ -71,16 +72,16 @@ def learn_covariates(
     degrees = []
     for j, name in enumerate(names):
         steps = np.diff(np.sort(c[:, j])) if high[j] > low[j] else np.zeros(0)
-        levels = 1 + int((steps > APART * (high[j] - low[j])).sum())
+        levels = 1 + int((steps > DISTINCT_VALUES_SHARE * (high[j] - low[j])).sum())
         wide = high[j] - low[j] > 1e-9 * max(abs(high[j]), abs(low[j]))
         if not wide:
             raise NotEnoughError(
                 f"covariate {name} is {low[j]:.4g} in all that is learned from: record while it varies, or leave it out"
             )
-        degrees.append(HIGHEST_DEGREE if levels == 1 else min(HIGHEST_DEGREE, levels - 1))
+        degrees.append(MAX_DEGREE if levels == 1 else min(MAX_DEGREE, levels - 1))
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     same_sign = (np.sign(theta) == np.sign(theta[0])).all(axis=0)
-    proportional = same_sign & (np.abs(theta) > CLEAR * std).all(axis=0)
+    proportional = same_sign & (np.abs(theta) > MIN_PROPORTIONAL_STDS * std).all(axis=0)
     n, p = theta.shape[1], sum(degrees)
     if len(theta) <= 1 + p:
         raise NotEnoughError(f"{len(theta)} stretches are too few to tell what {', '.join(names)} do: record longer")
@@ -105,7 +106,8 @@ def learn_covariates(
     dispersion = float(np.einsum("mi,mij,mj->", left, W, left)) / (len(theta) * n - B.size)
     sizes = np.tile(size, p)
     spread = max(dispersion, 1.0) * known[n:, n:] * np.outer(sizes, sizes)
-    return blank.model_copy(update={"slopes": _rows(B.reshape(1 + p, n)[1:] * size), "covariance": _rows(spread)})
+    slopes = to_tuples(B.reshape(1 + p, n)[1:] * size)
+    return blank.model_copy(update={"slopes": slopes, "covariance": to_tuples(spread)})
 
 
 def _stretches(
@@ -124,7 +126,7 @@ def _stretches(
             rows = slice(first, first + length)
             part = Regression(g.eta[rows], g.phi[rows], g.z[rows], g.ok[rows])
             c = columns[rows][part.ok]
-            if part.ok.sum() < FEWEST_PER_COEFFICIENT * g.phi.shape[1] or np.isnan(c).all(axis=0).any():
+            if part.ok.sum() < MIN_SAMPLES_PER_COEFFICIENT * g.phi.shape[1] or np.isnan(c).all(axis=0).any():
                 continue
             theta = least_squares(part)
             found.append((np.nanmean(c, axis=0), theta, coloured_covariance(part, fit.tuning)))
@@ -145,7 +147,3 @@ def at_origin(
         shift = model.theta(theta, np.clip(path.values, model.low, model.high)) - theta
         referred.append(replace(g, eta=g.eta - np.einsum("ki,ki->k", g.phi, shift)))
     return referred
-
-
-def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in matrix.tolist())

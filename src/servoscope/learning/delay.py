@@ -17,11 +17,12 @@ from servoscope.models.lti import settling_samples
 from servoscope.signals import Recording
 
 TOLERANCE = 0.3  # rad at the filter's cutoff, beyond which a recording is refused: half a sample at f_s = 10 cutoff
-NOTED = 0.06  # rad; an inverse that is too simple moves the estimate a little, so this is only said
-KNOWN = 0.1  # rad; a delay whose standard deviation is larger is not told: setting it might be as wrong as TOLERANCE
-SIGNIFICANT = 0.1  # share of the residual variance below which a regression's delay is not mentioned
+MIN_PHASE_NOTED = 0.06  # rad; an inverse that is too simple moves the estimate a little, so this is only said
+# rad; a delay whose standard deviation is larger is not told: setting it might be as wrong as TOLERANCE
+MAX_PHASE_STD = 0.1
+MIN_VARIANCE_SHARE = 0.1  # share of the residual variance below which a regression's delay is not mentioned
 NORMAL_95 = 1.96  # standard deviations, half of a 95 % interval
-WRITTEN = ".4g"  # how a delay is written into the loop file, as the message has it
+DELAY_FORMAT = ".4g"  # how a delay is written into the loop file, as the message has it
 
 
 def check_delay(
@@ -29,7 +30,7 @@ def check_delay(
 ) -> tuple[float | None, list[Message]]:
     """Estimate the delay from the longest recording; refuse one that is out of step with the loop file.
 
-    One sample at 100 Hz that the model does not know costs 63 % at 10 Hz (THEORY section 6), so half of it matters.
+    One sample at 100 Hz that the model does not know costs 63 % at 10 Hz, so half of it matters.
     Only the likelihood of y can refuse: least squares with noise in its regressors dates y late, by a sample or more
     under smooth motion. Where the likelihood cannot be written down, as with friction, nothing is refused; nor where
     it tells that there is a delay, but not closely enough to set it.
@@ -40,16 +41,16 @@ def check_delay(
     g = model_order.form_regressors(recording, loop)
     to_rad = 2.0 * np.pi * filter_cutoff(loop)  # at the cutoff
     regression = _regression_delay(loop, recording, g)
-    seconds = regression.seconds if regression is not None and regression.gain >= SIGNIFICANT else None
-    if seconds is not None and loop.delay == 0.0 and -to_rad * seconds >= NOTED:
+    seconds = regression.seconds if regression is not None and regression.gain >= MIN_VARIANCE_SHARE else None
+    if seconds is not None and loop.delay == 0.0 and -to_rad * seconds >= MIN_PHASE_NOTED:
         return seconds, [message("learning.y_early", recording=recording.name, early_ms=-seconds * 1e3)]
     fit = fit_delay(loop, recording, g)
     if fit is None or not fit.white:
         return _unverified(loop, recording, regression, to_rad)
-    if to_rad * fit.std_s > KNOWN:
+    if to_rad * fit.std_s > MAX_PHASE_STD:
         return None, [_delay_rough(loop, recording, fit) if fit.significant else message("learning.delay_unknown")]
     off = to_rad * abs(fit.seconds - loop.delay)
-    if off < NOTED or not fit.significant:
+    if off < MIN_PHASE_NOTED or not fit.significant:
         return fit.seconds, []
     return fit.seconds, [_out_of_step(loop, recording, fit, off > TOLERANCE and not accept)]
 
@@ -63,7 +64,7 @@ def _delay_rough(loop: Loop, recording: Recording, fit: DelayFit) -> Message:
 
 def _out_of_step(loop: Loop, recording: Recording, fit: DelayFit, refuse: bool) -> Message:
     """Return the warning about a delay that is certain, or refuse the recording; the remedy was tried."""
-    written = float(format(fit.seconds, WRITTEN))
+    written = float(format(fit.seconds, DELAY_FORMAT))
     values = {"recording": recording.name, "late_ms": fit.seconds * 1e3, "configured_s": loop.delay}
     if not fit.improves(written):
         return message("learning.delay_unverified", **values)
@@ -78,9 +79,9 @@ def _unverified(
     """Judge by the regression alone, which noise can fake: its delay counts where it is that of the loop file."""
     if regression is None or regression.seconds is None:
         return None, [message("learning.delay_unknown")]
-    if to_rad * abs(regression.seconds - loop.delay) < NOTED:
+    if to_rad * abs(regression.seconds - loop.delay) < MIN_PHASE_NOTED:
         return regression.seconds, []
-    if regression.gain < SIGNIFICANT:
+    if regression.gain < MIN_VARIANCE_SHARE:
         return None, []
     values = {"recording": recording.name, "late_ms": regression.seconds * 1e3, "configured_s": loop.delay}
     return None, [message("learning.delay_unverified", **values)]

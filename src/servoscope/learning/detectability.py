@@ -17,8 +17,8 @@ from servoscope.estimation.tuning import TuningFit
 from servoscope.models.loop import Loop
 from servoscope.models.lti import autocovariances, solve_scaled
 
-WORTH_TELLING = 1.0 / 3.0  # standard deviations that noise in phi may move the iFRF in silence
-WORTH_A_LOOK = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
+MAX_SILENT_BIAS_STDS = 1.0 / 3.0  # standard deviations that noise in phi may move the iFRF in silence
+MAX_T2_PER_COEFFICIENT = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
 
 
 def baseline_misfit(
@@ -51,7 +51,7 @@ def supported_budget(n: int, loop: Loop, dof: float, excess: float) -> float:
     The tail of T^2 is extrapolated from the estimated noise; that is trusted while the noise's own uncertainty raises
     the threshold by less than half, and not at all where healthy data contradict the noise model.
     """
-    if excess > WORTH_A_LOOK:
+    if excess > MAX_T2_PER_COEFFICIENT:
         return SECONDS_PER_YEAR / loop.monitor.memory
     looks = loop.monitor.evaluation_rate, loop.monitor.memory
     for exponent in np.arange(-3.0, 9.0, 0.5):
@@ -93,7 +93,7 @@ def noise_notes(pipeline: Pipeline, fit: TuningFit, estimates: Sequence[Estimate
     """Note where noise in phi moves the iFRF by more than a third of its standard deviation, and what helps."""
     loop = pipeline.loop
     bias, std = noise_bias(pipeline, fit, estimates)
-    if not np.any(bias > WORTH_TELLING * std):
+    if not np.any(bias > MAX_SILENT_BIAS_STDS * std):
         return []
     at = int(np.argmax(bias / np.maximum(std, 1e-12)))
     if simulated:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoscope.baseline.feature_model import (
-    SLACK,
-    WIDER,
+    MIN_WIDENING,
+    WIDENING_SHARE,
     FeatureModel,
     GroupStatistic,
     SpanFeatures,
@@ -20,28 +20,29 @@ from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.estimation.window_features import SPEED_TIME, FeatureLayout, Window, WindowFeatures
+from servoscope.learning.inspection.residual import reference_period
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 
-FEWEST = 4  # recordings whose scatter is believed; fewer have no features
+MIN_RECORDINGS = 4  # recordings whose scatter is believed; fewer have no features
 BANDS = 7
-LOWEST = 4.0  # periods of the lowest band in a window
-HIGHEST = 0.45  # of the sample rate: the highest frequency
-MOST_WINDOWS = 2000  # of a recording that are learned from
-MOST_SAMPLES = 1_000_000  # of a recording, in which a period is looked for
-SHORTEST = 64  # samples of a window
-LONGEST_SPAN = 24  # windows
+MIN_PERIODS_PER_WINDOW = 4.0  # periods of the lowest band in a window
+MAX_FREQUENCY_SHARE = 0.45  # of the sample rate: the highest frequency
+MAX_WINDOWS = 2000  # of a recording that are learned from
+MAX_PERIOD_SEARCH_SAMPLES = 1_000_000  # of a recording, in which a period is looked for
+MIN_WINDOW_SAMPLES = 64  # samples of a window
+MAX_SPAN_WINDOWS = 24  # windows
 EDGES = (1.0 / 32.0, 1.0 / 16.0, 1.0 / 8.0)  # of a period: octaves after a motion began, where friction builds up
 LEVELS = 3  # lengths of windows where motion does not repeat
 REST_SHARE = 0.05  # of the largest speed, below which the reference rests
-SILENT = 1e-9  # share of a signal's power below which a band is silent
+SILENT_BAND_SHARE = 1e-9  # share of a signal's power below which a band is silent
 REPEATS = 0.02  # of the variance: the reference repeats where its difference after a period stays below
 
 
 def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[FeatureModel | None, list[Message]]:
     """Learn the features of healthy recordings; None where there are too few recordings, or too short ones."""
     share = loop.monitor.feature_false_alarms
-    if not share or len(recordings) < FEWEST:
+    if not share or len(recordings) < MIN_RECORDINGS:
         return None, []
     layout = choose_layout(loop, recordings)
     runner = WindowFeatures(layout)
@@ -76,7 +77,7 @@ def _windows(runner: WindowFeatures, recording: Recording) -> list[Window]:
         part = recording.rows(rows)
         found += runner.run(state, part.r, part.u, part.y, part.restart)
         outofcore.release(*recording.columns)
-        if len(found) >= MOST_WINDOWS:
+        if len(found) >= MAX_WINDOWS:
             break
     return found
 
@@ -93,7 +94,7 @@ def _motion_range(spans: Sequence[Sequence[SpanFeatures]]) -> tuple[FloatArray, 
     seen = np.array([span.motion for each in spans for span in each])
     seen = np.where(np.isfinite(seen), seen, np.nanmean(np.where(np.isfinite(seen), seen, 0.0), axis=0))
     low, high = seen.min(axis=0), seen.max(axis=0)
-    wider = WIDER * (high - low) + SLACK
+    wider = WIDENING_SHARE * (high - low) + MIN_WIDENING
     return low - wider, high + wider
 
 
@@ -105,7 +106,7 @@ def choose_layout(loop: Loop, recordings: Sequence[Recording]) -> FeatureLayout:
         window, levels = period * max(1, round(memory * rate / period)), 1
         edges = tuple(share * period / rate for share in EDGES)
     else:
-        window, levels, edges = max(round(memory * rate / 2.0), SHORTEST), LEVELS, ()
+        window, levels, edges = max(round(memory * rate / 2.0), MIN_WINDOW_SAMPLES), LEVELS, ()
     counts = [recording.samples // window for recording in recordings]
     whole = float(np.median(counts))
     first = 1 if whole >= 3.0 else 0  # start-up is unlike what follows, where anything follows
@@ -113,17 +114,20 @@ def choose_layout(loop: Loop, recordings: Sequence[Recording]) -> FeatureLayout:
     powers = [
         float(np.mean([np.var(x) for x in each])) for each in zip(*((r.u, r.r - r.y) for r in recordings), strict=True)
     ]
-    top = HIGHEST * rate
+    top = MAX_FREQUENCY_SHARE * rate
     return FeatureLayout(
         sample_rate=rate,
         window=window,
         levels=levels,
-        span=int(np.clip(whole - first, 1, LONGEST_SPAN)),
+        span=int(np.clip(whole - first, 1, MAX_SPAN_WINDOWS)),
         settling=first * window,
         rest_speed=REST_SHARE * float(speed.max()),
         edges_s=edges,
-        bands_hz=tuple(np.geomspace(min(LOWEST * rate / window, top / 2.0), top, BANDS + 1).tolist()),
-        floors=(SILENT * powers[0] + np.finfo(float).tiny, SILENT * powers[1] + np.finfo(float).tiny),
+        bands_hz=tuple(np.geomspace(min(MIN_PERIODS_PER_WINDOW * rate / window, top / 2.0), top, BANDS + 1).tolist()),
+        floors=(
+            SILENT_BAND_SHARE * powers[0] + np.finfo(float).tiny,
+            SILENT_BAND_SHARE * powers[1] + np.finfo(float).tiny,
+        ),
     )
 
 
@@ -154,30 +158,4 @@ def _period_of(recording: Recording) -> int:
             return int(lengths[0])
     if len(lengths) > 1:
         return 0
-    return _repetition(r[:MOST_SAMPLES])
-
-
-def _repetition(r: FloatArray) -> int:
-    """Return the lag after which a signal repeats: the first at which it has become unlike itself and alike again."""
-    n, x = len(r), r - r.mean()
-    variance = float(x.var())
-    if not variance > 0.0:
-        return 0
-    size = 1 << (2 * n - 1).bit_length()
-    spectrum = np.fft.rfft(x, size)
-    products = np.fft.irfft(spectrum * spectrum.conj(), size)[: n // 2]
-    squares = np.concatenate([[0.0], np.cumsum(x**2)])
-    lags = np.arange(len(products))
-    pairs = n - lags
-    difference = (squares[n - lags] + squares[n] - squares[lags] - 2.0 * products) / pairs
-    unlike = np.flatnonzero(difference > variance)
-    if not len(unlike):
-        return 0
-    alike = np.flatnonzero(difference[unlike[0] :] < REPEATS * variance)
-    if not len(alike):
-        return 0
-    first = unlike[0] + int(alike[0])
-    # the dip is as wide as the motion is smooth: its lowest point is the period
-    after = np.flatnonzero(difference[first:] >= REPEATS * variance)
-    end = first + (int(after[0]) if len(after) else len(difference) - first)
-    return int(first + np.argmin(difference[first:end]))
+    return reference_period(recording.rows(slice(0, MAX_PERIOD_SEARCH_SAMPLES)), 0.5 * REPEATS) or 0

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoscope.baseline.plant_fit import PRIOR
+from servoscope.baseline.plant_fit import PRIOR_STD
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.estimation.tuning import sandwich_covariance, sum_covariance
@@ -21,19 +21,21 @@ from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 
-MOST = 60_000  # samples of a recording that are looked at
+MAX_SAMPLES = 60_000  # samples of a recording that are looked at
 NOISE_PRIOR = 3.0  # standard deviation of the logarithm of the ratio of the noises
 DIFFERENCE = 1e-4  # of that logarithm, for its derivative
 STEPS, ROUNDS = 12, 3  # of a search at one level of the noise, and levels
-LEAST = 1e-3  # of the noise on y relative to that on u, in their usual units: what is quieter was simulated
+MIN_NOISE_RATIO = 1e-3  # of the noise on y relative to that on u, in their usual units: what is quieter was simulated
 FILE_ERROR = 0.2  # standard deviation of the logarithm of a parameter in a loop file that is not right
 STARTS = (-2.0, 2.0)  # standard deviations of the prior, at which a search begins again for each parameter
-UNLIKELY = 1e-3  # probability below which other parameters are not believed
-DOUBTFUL = 0.05  # and below which a file's own are not: four that stand in for twelve wrong ones lead to wrong names
+MIN_PARAMETER_PROBABILITY = 1e-3  # probability below which other parameters are not believed
+# and below which a file's own are not: four that stand in for twelve wrong ones lead to wrong names
+MIN_FILE_PROBABILITY = 0.05
 LAGS = 20
-SILENT = 1e-6  # of the noise's variance: what is quieter was simulated without any
-BELIEVED = 0.1  # autocorrelation of innovations up to which a plant is believed to be of the kind of the loop file
-COLOURED = 4.0  # standard deviations of an autocorrelation, from which innovations are not white
+SILENT_NOISE_SHARE = 1e-6  # of the noise's variance: what is quieter was simulated without any
+# autocorrelation of innovations up to which a plant is believed to be of the kind of the loop file
+MAX_AUTOCORRELATION = 0.1
+MAX_AUTOCORRELATION_STDS = 4.0  # standard deviations of an autocorrelation, from which innovations are not white
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,7 @@ class InnovationFit:
     largest_autocorrelation: float  # of the innovations, up to `LAGS`
     whiteness: float  # the same in standard deviations
 
-    def is_likely(self, spread: FloatArray, unlikely: float = UNLIKELY) -> bool:
+    def is_likely(self, spread: FloatArray, unlikely: float = MIN_PARAMETER_PROBABILITY) -> bool:
         """Whether the prior of a standard deviation per parameter (m,) allows the parameters."""
         from scipy import special
 
@@ -57,12 +59,16 @@ class InnovationFit:
         """Whether other logarithms (m,) are further off than chance puts them in one of a thousand cases."""
         from scipy import special
 
-        if self.largest_autocorrelation > BELIEVED:  # the plant is not of this kind, and its parameters mean little
+        if (
+            self.largest_autocorrelation > MAX_AUTOCORRELATION
+        ):  # the plant is not of this kind, and its parameters mean little
             return False
         if len(x) < len(self.names):  # the loop file itself is wrong, and all of its parameters were fitted
             return True
         off = self.x - x
-        return float(off @ np.linalg.solve(self.covariance, off)) > float(special.chdtri(len(x), UNLIKELY))
+        return float(off @ np.linalg.solve(self.covariance, off)) > float(
+            special.chdtri(len(x), MIN_PARAMETER_PROBABILITY)
+        )
 
 
 def fit_innovations(loop: Loop, recordings: Sequence[Recording], noise: WhiteNoise) -> InnovationFit | None:
@@ -70,12 +76,14 @@ def fit_innovations(loop: Loop, recordings: Sequence[Recording], noise: WhiteNoi
     plant = loop.plant
     if not noise.y_std > 0.0 or loop.hold != "zoh" or not plant.has_physics or not plant.linear or plant.extras:
         return None
-    u_std = max(noise.u_std, LEAST * float(np.mean([rec.u.std() for rec in recordings])))
+    u_std = max(noise.u_std, MIN_NOISE_RATIO * float(np.mean([rec.u.std() for rec in recordings])))
     begin = WhiteNoise(u_std=u_std, y_std=noise.y_std)
-    windows = [RefitWindow.of_healthy(loop, plant, begin, rec).cut(0, min(rec.samples, MOST)) for rec in recordings]
-    near = np.full(len(plant.parameters), PRIOR)
+    windows = [
+        RefitWindow.of_healthy(loop, plant, begin, rec).cut(0, min(rec.samples, MAX_SAMPLES)) for rec in recordings
+    ]
+    near = np.full(len(plant.parameters), PRIOR_STD)
     found = _InnovationSearch(windows, begin, plant.parameters, near).run()
-    if found is None or found.is_likely(near, DOUBTFUL):
+    if found is None or found.is_likely(near, MIN_FILE_PROBABILITY):
         return found
     names = plant.physical_parameters
     spread = FILE_ERROR * np.array([plant.error_factors.get(name, 1.0) for name in names])
@@ -115,7 +123,7 @@ class _InnovationSearch:
 
         for _ in range(ROUNDS):
             e, volume = self._standardised(z)
-            if float(e @ e) < SILENT * self.samples:
+            if float(e @ e) < SILENT_NOISE_SHARE * self.samples:
                 return None
             self.power = float(e @ e * np.exp(volume)) / self.samples
             found = minimise(self.residual, z, self.jacobian, x_scale=self.spread, max_nfev=STEPS, bounds=(-6.0, 6.0))
@@ -161,7 +169,7 @@ class _InnovationSearch:
         largest = largest_autocorrelation(e, LAGS)
         whiteness = largest * math.sqrt(self.samples)
         C: FloatArray = np.asarray(np.linalg.inv(J.T @ J))
-        if whiteness > COLOURED:
+        if whiteness > MAX_AUTOCORRELATION_STDS:
             C = _inflate(C, J, self.residual(z), self.samples)
         level = math.sqrt(float(e @ e) / self.samples)
         return InnovationFit(self.names, z[:-1], C[:-1, :-1], self._noise(z).times(level), largest, whiteness)

@@ -12,7 +12,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.estimation.instrument import Source, unbroken
 from servoscope.estimation.instrumental_fit import (
-    LARGEST_DEVIATION,
+    MAX_RELATIVE_STD,
     InstrumentalFit,
     fit_with_instrument,
     has_feedback,
@@ -24,11 +24,15 @@ from servoscope.models.loop import Loop
 from servoscope.models.lti import solve_scaled
 from servoscope.signals import Recording
 
-SUITABLE = ("akf", "iv-akf")  # estimators in whose place, or as which, one with a learned instrument is set
-SIGNIFICANT = 3.0  # standard deviations between both estimates, above which least squares are called biased
-EXPLAINED = 0.3  # share of the difference that noise in y has to explain, for other causes move both estimates too
+INSTRUMENT_ESTIMATORS = (
+    "akf",
+    "iv-akf",
+)  # estimators in whose place, or as which, one with a learned instrument is set
+MIN_BIAS_STDS = 3.0  # standard deviations between both estimates, above which least squares are called biased
+# share of the difference that noise in y has to explain, for other causes move both estimates too
+MIN_NOISE_SHARE = 0.3
 DIFFERENCES = 6  # order of the differences of y, in which motion no longer shows
-RELEVANT = 0.02  # share of a coefficient by which they are, below which nothing is changed
+MIN_RELATIVE_BIAS = 0.02  # share of a coefficient by which they are, below which nothing is changed
 
 
 def learns_instrument(loop: Loop) -> bool:
@@ -37,8 +41,8 @@ def learns_instrument(loop: Loop) -> bool:
     Where there is friction, what differs is rather its sign, which r or y tell late.
     """
     monitor = loop.monitor
-    suits = monitor.estimator in SUITABLE and monitor.structure == "svf" and monitor.two_stage == "none"
-    linear = loop.plant.kind == "polynomial" and getattr(loop.plant, "friction", "none") == "none"
+    suits = monitor.estimator in INSTRUMENT_ESTIMATORS and monitor.structure == "svf" and monitor.two_stage == "none"
+    linear = loop.plant.parameters_are_coefficients and loop.plant.affine
     return suits and linear and not can_simulate(loop)
 
 
@@ -62,7 +66,7 @@ def learn_instrument(
     if not found.settled:
         return None, [message("learning.instrument_unsettled")]
     if not found.trusted:
-        values = {"coefficient": found.weakest, "deviation": found.deviation, "limit": LARGEST_DEVIATION}
+        values = {"coefficient": found.weakest, "deviation": found.deviation, "limit": MAX_RELATIVE_STD}
         return None, [message("learning.instrument_refused", **values)]
     return found, []
 
@@ -77,8 +81,8 @@ def _is_biased(found: InstrumentalFit, fit: TuningFit, recordings: Sequence[Reco
     theta, std = found.fit.tuning.theta[powers], np.sqrt(np.diag(found.fit.covariance))[powers]
     apart = np.abs(fit.tuning.theta[powers] - theta)
     of_noise = np.abs(_attenuation(found, recordings)[powers])
-    significant = (apart > SIGNIFICANT * std) & (apart > RELEVANT * np.abs(theta))
-    return bool(np.any(significant & (of_noise > EXPLAINED * apart)))
+    significant = (apart > MIN_BIAS_STDS * std) & (apart > MIN_RELATIVE_BIAS * np.abs(theta))
+    return bool(np.any(significant & (of_noise > MIN_NOISE_SHARE * apart)))
 
 
 def _attenuation(found: InstrumentalFit, recordings: Sequence[Recording]) -> FloatArray:

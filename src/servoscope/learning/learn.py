@@ -14,7 +14,7 @@ from servoscope.baseline.expectation import Expectation, reference_path, residua
 from servoscope.baseline.hypothesis import CusumHypothesis
 from servoscope.baseline.motion import learn_motion
 from servoscope.baseline.plant_fit import (
-    MOST_SATURATED,
+    MAX_SATURATED_SHARE,
     can_simulate,
     describe_healthy_plant,
     fault_directions,
@@ -25,7 +25,7 @@ from servoscope.baseline.plant_fit import (
 from servoscope.baseline.records import BaselineSource, digest
 from servoscope.baseline.sensors import learn_sensors
 from servoscope.baseline.threshold import CalibrationFactors, t2_threshold
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
@@ -53,15 +53,15 @@ from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 from servoscope.simulation import reference, simulate
 
-SHORTEST = 10.0  # memories; a shorter baseline is warned about
-FEWEST_PER_COEFFICIENT = 20  # usable samples of every recording
+MIN_MEMORIES = 10.0  # memories; a shorter baseline is warned about
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of every recording
 SPEED_OVER = 0.05  # s over which a speed is measured here
-STILL_SHARE = 0.02  # of the speed of motion, below which an axis stands still
-WEAKEST_INSTRUMENT = 0.05  # below, the instrument says too little of the regressor to be worth its variance
-MOST_SIMULATED = 2e6  # samples behind a nominal baseline
-LEAST_EXPLAINED = 0.9  # share of u's variance
-NOTHING = 1e-9  # of the residual's variance: what is left below is rounding
-UNLIKELY = 1e-3  # probability below which the physics are not believed to hold
+REST_SPEED_SHARE = 0.02  # of the speed of motion, below which an axis stands still
+MIN_INSTRUMENT_EIGENVALUE = 0.05  # below, the instrument says too little of the regressor to be worth its variance
+MAX_SIMULATED_SAMPLES = 2e6  # samples behind a nominal baseline
+MIN_EXPLAINED_SHARE = 0.9  # share of u's variance
+ROUNDING_SHARE = 1e-9  # of the residual's variance: what is left below is rounding
+MIN_PHYSICS_PROBABILITY = 1e-3  # probability below which the physics are not believed to hold
 
 Progress = Callable[[str], None]
 
@@ -84,7 +84,7 @@ def learn_baseline(
     progress("regressors")
     for rec in recordings:
         _check_signals(loop, rec)
-        if (share := saturated_share(loop, rec)) > MOST_SATURATED:
+        if (share := saturated_share(loop, rec)) > MAX_SATURATED_SHARE:
             raise NotEnoughError(
                 f"{rec.name}: u is at a limit in {share:.0%} of the rows: lower the demand, or check input_limits"
             )
@@ -139,7 +139,7 @@ def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
     span = max(1, round(SPEED_OVER * loop.sample_rate))
     speeds = []
     for rec in recordings:
-        source = rec.r if getattr(loop.plant, "sign_from", "output") == "reference" else rec.y
+        source = rec.r if loop.plant.velocity_sign.of_reference else rec.y
         stretch = np.cumsum(rec.restart)
         together = stretch[span:] == stretch[:-span]
         moved = source[span:] if loop.plant.derivative else (source[span:] - source[:-span]) * loop.sample_rate / span
@@ -148,13 +148,13 @@ def still_speed(loop: Loop, recordings: Sequence[Recording]) -> float:
     if not len(speed) or not speed.max() > 0.0:
         return 0.0
     moving = speed[speed > 0.1 * speed.max()]
-    return STILL_SHARE * float(np.sqrt((moving**2).mean()))
+    return REST_SPEED_SHARE * float(np.sqrt((moving**2).mean()))
 
 
 def _tune_pipeline(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline, list[Regression], TuningFit]:
     pipeline = Pipeline.of(loop, two_stage.tune_stage_one(loop, recordings), still_speed(loop, recordings))
     regressions = [pipeline.regression(rec.r, rec.u, rec.y, rec.restart) for rec in recordings]
-    fewest = FEWEST_PER_COEFFICIENT * pipeline.bank.n
+    fewest = MIN_SAMPLES_PER_COEFFICIENT * pipeline.bank.n
     for rec, g in zip(recordings, regressions, strict=True):
         if (usable := int(g.ok.sum())) < fewest:
             raise NotEnoughError(
@@ -171,9 +171,9 @@ def _tune(
     plain = loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"estimator": "akf"})})
     if not learns_instrument(loop):
         pipeline, regressions, fit = _tune_pipeline(loop, recordings)
-        if fit.strength >= WEAKEST_INSTRUMENT:
+        if fit.strength >= MIN_INSTRUMENT_EIGENVALUE:
             return pipeline, regressions, fit, []
-        note = message("learning.weak_instrument", strength=fit.strength, least=WEAKEST_INSTRUMENT)
+        note = message("learning.weak_instrument", strength=fit.strength, least=MIN_INSTRUMENT_EIGENVALUE)
         return *_tune_pipeline(plain, recordings), [note]
     pipeline, regressions, fit = _tune_pipeline(plain, recordings)
     found, notes = learn_instrument(pipeline, recordings, fit)
@@ -191,7 +191,7 @@ def nominal_baseline(loop: Loop, progress: Progress = lambda _: None, duration_s
     """
     if not loop.plant.has_physics or loop.controller is None:
         raise LoopError(f"{loop.name}: a nominal baseline needs [controller] and the plant's nominal values")
-    duration_s = min(duration_s, MOST_SIMULATED / loop.sample_rate)
+    duration_s = min(duration_s, MAX_SIMULATED_SAMPLES / loop.sample_rate)
     healthy, _ = simulate(loop, reference("profile", duration_s, loop.sample_rate))
     pipeline, regressions, fit = _tune_pipeline(loop, [healthy])
     note = message("learning.nominal")
@@ -246,7 +246,7 @@ def _assemble_baseline(
             # what the plant leaves of the residual is noise alone: its colour is known better now
             plant = loop.plant.scaled(healthy.ratios)
             gamma = sample_autocovariance(healthy.residuals, AR_ORDER)
-            silent = not gamma[0] > NOTHING * fit.tuning.R  # simulated without noise, for example
+            silent = not gamma[0] > ROUNDING_SHARE * fit.tuning.R  # simulated without noise, for example
             model = fit.tuning.noise if silent else yule_walker(gamma)
             if pipeline.stage_one is None and not silent:
                 noises = fit_white_noise(residual_system(pipeline, plant), healthy.residuals, pipeline.stride)
@@ -269,7 +269,7 @@ def _assemble_baseline(
             # each reference has its own bias
             deviations_between = fit.each - np.array([e.batch_estimate(plant) for e in expectations])
             ratios_covariance = healthy.covariance
-            if healthy.misfit <= special.chdtri(pipeline.bank.n, UNLIKELY):
+            if healthy.misfit <= special.chdtri(pipeline.bank.n, MIN_PHYSICS_PROBABILITY):
                 # the physics hold: what they say is known better than the coefficients one by one
                 theta, theta_covariance = model_theta, healthy.theta_covariance
                 by_chance = homogeneity.scatter_probability(deviations_between, fit.each_covariance)
@@ -333,12 +333,12 @@ def _assemble_baseline(
     covariance = theta_covariance + factor * between + error
     notes += noise_notes(pipeline, fit, estimates, can_simulate(loop))
     excess, suggestion = detectability.baseline_misfit(estimates, deviations, covariance, fit)
-    if fit.explained < LEAST_EXPLAINED:
+    if fit.explained < MIN_EXPLAINED_SHARE:
         notes.append(message("learning.hardly_explained", share=fit.explained))
     duration = sum(rec.duration_s for rec in recordings)
-    if excess > detectability.WORTH_A_LOOK and loop.monitor.model_error < suggestion:
+    if excess > detectability.MAX_T2_PER_COEFFICIENT and loop.monitor.model_error < suggestion:
         notes.append(message("learning.model_error", excess=excess, model_error=suggestion))
-    if duration < (least := SHORTEST * loop.monitor.memory):
+    if duration < (least := MIN_MEMORIES * loop.monitor.memory):
         notes.append(message("learning.short", duration_s=duration, memory_s=loop.monitor.memory, least_s=least))
     supported = supported_budget(pipeline.bank.n, loop, fit.dof, excess)
     if supported > (budget := loop.monitor.false_alarms_per_year):
@@ -350,9 +350,9 @@ def _assemble_baseline(
         hash=digest(loop, [a for rec in recordings for a in (rec.t, rec.r, rec.u, rec.y)]),
         names=pipeline.bank.names,
         theta=tuple(theta),
-        covariance=_rows(covariance),
+        covariance=to_tuples(covariance),
         scale=tuple(tuning.scale),
-        P_d=_rows(tuning.P_d),
+        P_d=to_tuples(tuning.P_d),
         stage_one=pipeline.stage_one,
         R=tuning.R,
         noise_a=tuple(tuning.noise.a),
@@ -362,7 +362,7 @@ def _assemble_baseline(
         noise=noise,
         ratios=ratios,
         ratios_std=ratios_std,
-        ratios_covariance=_rows(ratios_covariance),
+        ratios_covariance=to_tuples(ratios_covariance),
         model_theta=tuple(model_theta),
         dof=fit.dof,
         limit=limit,
@@ -383,14 +383,10 @@ def _assemble_baseline(
         motion=learn_motion(pipeline, recordings),
         axis=axis,
         covariates=covariates,
-        scatter=_rows(own_scatter) if m > 1 else (),
+        scatter=to_tuples(own_scatter) if m > 1 else (),
     )
     progress("predictor")
     predictor = None if covariates is not None else fit_exact_predictor(baseline, recordings)
     if predictor is not None and predictor.misfit > 1.0:
         notes.append(message("learning.no_refit", misfit=predictor.misfit))
     return baseline.model_copy(update={"exact": predictor, "notes": tuple(notes)})
-
-
-def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(float(x) for x in row) for row in matrix)

@@ -8,13 +8,19 @@ from collections.abc import Sequence
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.learning.inspection.rules import LEAST_EXPLAINED
+from servoscope.learning.inspection.rules import MIN_EXPLAINED_SHARE
 from servoscope.signals import Recording
 from servoscope.signals.readers.wrap import find_wrap
 
 # of a motor axis: what turns motion into force can have no other sign; stiffness and offset can, as gravity does
-POSITIVE = ("inertia", "viscous_friction", "viscous_friction_forward", "viscous_friction_backward", "coulomb_friction")
-CERTAIN = 3.0  # standard deviations below 0
+POSITIVE_COEFFICIENTS = (
+    "inertia",
+    "viscous_friction",
+    "viscous_friction_forward",
+    "viscous_friction_backward",
+    "coulomb_friction",
+)
+MAX_NEGATIVE_STDS = 3.0  # standard deviations below 0
 
 
 def check_wraps(recordings: Sequence[Recording]) -> None:
@@ -33,7 +39,7 @@ def negative_coefficients(baseline: Baseline) -> list[tuple[str, float, float]]:
     each = zip(
         baseline.names, baseline.theta, (math.sqrt(row[i]) for i, row in enumerate(baseline.covariance)), strict=True
     )
-    return [one for one in each if one[0] in POSITIVE and one[1] + CERTAIN * one[2] < 0.0]
+    return [one for one in each if one[0] in POSITIVE_COEFFICIENTS and one[1] + MAX_NEGATIVE_STDS * one[2] < 0.0]
 
 
 def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
@@ -43,14 +49,14 @@ def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
     """
     odd = []
     # an instrument sees through noise of y that leaves more of u than the motion explains
-    if baseline.explained < LEAST_EXPLAINED and baseline.instrument is None:
+    if baseline.explained < MIN_EXPLAINED_SHARE and baseline.instrument is None:
         odd.append(message("learning.unexplained", share=baseline.explained))
     below = [
         message("learning.negative", name=name, value=value, deviation=deviation)
         for name, value, deviation in negative_coefficients(baseline)
     ]
     if below:
-        all_below = len(below) > 1 and len(below) == sum(name in POSITIVE for name in baseline.names)
+        all_below = len(below) > 1 and len(below) == sum(name in POSITIVE_COEFFICIENTS for name in baseline.names)
         advice = "learning.negative_all" if all_below else "learning.negative_some"
         odd.append(message("learning.implausible", coefficients=below, advice=message(advice)))
     if odd and not force:

@@ -10,15 +10,15 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.feature_model import shrink
-from servoscope.baseline.plant_fit import PRIOR
+from servoscope.baseline.plant_fit import PRIOR_STD
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.core.messages import Message, message
 from servoscope.detection.homogeneity import prediction_factor
 
-FEWEST = 5  # machines: of fewer, the scatter between them is mostly chance
+MIN_MACHINES = 5  # machines: of fewer, the scatter between them is mostly chance
 FLOOR = 0.01  # of the uncertainty of a coefficient: less scatter than that is none
-UNLIKELY = 1e-3  # probability below which a machine is none of the population
+MIN_MEMBER_PROBABILITY = 1e-3  # probability below which a machine is none of the population
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +83,13 @@ class Population:
         BaselineError
             If there are fewer than five, or one has other coefficients or another plant than the first.
         """
-        if len(baselines) < FEWEST:
+        if len(baselines) < MIN_MACHINES:
             raise BaselineError(
-                f"a population needs the baselines of at least {FEWEST} like machines, {len(baselines)} given"
+                f"a population needs the baselines of at least {MIN_MACHINES} like machines, {len(baselines)} given"
             )
         first_name, first = next(iter(baselines.items()))
         for name, other in baselines.items():
-            if (other.names, other.loop.plant.kind) != (first.names, first.loop.plant.kind):
+            if (other.names, type(other.loop.plant)) != (first.names, type(first.loop.plant)):
                 raise BaselineError(
                     f"{name}: its coefficients ({', '.join(other.names)}; plant {other.loop.plant.kind}) are not those "
                     f"of {first_name} ({', '.join(first.names)}; plant {first.loop.plant.kind}): no like machine"
@@ -131,7 +131,7 @@ class Population:
         n, k = len(theta), self.machines
         left = max(k - n, 1)
         distance = self.theta.distance(theta, covariance)
-        limit = n * (k - 3.0) / left * float(special.fdtri(n, left, 1.0 - UNLIKELY))
+        limit = n * (k - 3.0) / left * float(special.fdtri(n, left, 1.0 - MIN_MEMBER_PROBABILITY))
         if distance <= limit:
             return True, message("learning.population", machines=self.machines)
         off = (theta - self.theta.mean) / np.sqrt(np.diag(self.theta.covariance + covariance))
@@ -149,7 +149,7 @@ class Population:
         """Return names, logarithms and covariance of parameters with the population's; None where it has others."""
         if self.ratios is None or self.ratios.names != tuple(names):
             return None
-        return self.ratios.names, *self.ratios.combine(x, C, PRIOR)
+        return self.ratios.names, *self.ratios.combine(x, C, PRIOR_STD)
 
 
 def _common_scatter(each: Sequence[Baseline], n: int) -> tuple[FloatArray, float]:
@@ -160,7 +160,7 @@ def _common_scatter(each: Sequence[Baseline], n: int) -> tuple[FloatArray, float
     correlations between coefficients are shrunk towards none (oracle approximating shrinkage).
     """
     known = [one for one in each if len(one.scatter)]
-    if len(known) < FEWEST:
+    if len(known) < MIN_MACHINES:
         return np.zeros((n, n)), 0.0
     degrees = np.array([len(one.sources) - 1.0 for one in known])
     covariances = np.array([_scatter_array(one) for one in known])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import IrregularTimeError, RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.learning.inspection import Inspection, inspect
-from servoscope.learning.inspection.model_order import WORTH_FRICTION, ModelOrderFit
+from servoscope.learning.inspection.model_order import MIN_FRICTION_GAIN, ModelOrderFit
 from servoscope.models.loop import Columns, Loop, MonitorSettings
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, read
@@ -28,11 +29,11 @@ from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
 
 MEMORIES = 10.0  # that a recording to learn from should have at least
-LONGEST_MEMORY_S, LEAST_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
-WORTH = 0.005  # share of u that a higher order or a stiffness has to explain
+MAX_MEMORY_S, MIN_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
+MIN_TERM_GAIN = 0.005  # share of u that a higher order or a stiffness has to explain
 JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
 SPEED_AXIS = {"kind": "axis", "y": "speed", "terms": ["viscous", "coulomb", "offset"]}
-CLEAR = 0.9  # share of u that a plant explains; below it, the choice is in doubt
+MIN_CLEAR_SHARE = 0.9  # share of u that a plant explains; below it, the choice is in doubt
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ class LoopProposal:
                 section = line.section
                 written += ["", f"[{section}]"]
             written.append(f"{line.key} = {line.value}".ljust(40) + f"  # {render(line.why)}")
-        return "\n".join(written) + "\n"
+        # names of columns and files may hold what neither a string nor a comment of TOML may
+        return "".join(re.sub(r"[\0-\x1f\x7f]", lambda sign: f"\\u{ord(sign[0]):04X}", line) + "\n" for line in written)
 
 
 def propose_columns(path: Path, channels: Sequence[ChannelInfo], axis: str | None = None) -> Columns:
@@ -116,7 +118,7 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
     cutoff = number_format.round_down(
         min(found.suggested_cutoff_hz, resampled if isinstance(resampled, float) else math.inf)
     )
-    memory = max(LEAST_PERIODS / cutoff, min(LONGEST_MEMORY_S, recording.duration_s / MEMORIES))
+    memory = max(MIN_PERIODS / cutoff, min(MAX_MEMORY_S, recording.duration_s / MEMORIES))
     memory = number_format.round_down(memory)
     frequencies = [f for f in MonitorSettings().frequencies if f <= cutoff] or [float(f"{cutoff / 2.0:.2g}")]
     settings = {
@@ -161,9 +163,9 @@ def _propose_speed_axis(
     """Return a motor axis whose y is a speed with its lines, nothing where it does not explain u."""
     plain = SPEED_AXIS | {"terms": ["viscous", "offset"]}
     shares = [explained_by(plant) for plant in (SPEED_AXIS, plain)]
-    rubs = 1.0 - shares[0] < (1.0 - WORTH_FRICTION) * (1.0 - shares[1])
+    rubs = 1.0 - shares[0] < (1.0 - MIN_FRICTION_GAIN) * (1.0 - shares[1])
     plant, share = (SPEED_AXIS, shares[0]) if rubs else (plain, shares[1])
-    if share < CLEAR:
+    if share < MIN_CLEAR_SHARE:
         return {}, ()
     explained = message("init.axis", share=100.0 * share)
     return plant, (
@@ -185,12 +187,12 @@ def _propose_polynomial(
     order, stiffness, share = best.order, best.stiffness, best.explained
     # beside friction, a higher order and a stiffness may explain what friction leaves over: the simpler plant is taken
     for simpler in ((order, False), (order - 1, False)):
-        if simpler[0] and (found := explained_by(plant_of(*simpler))) > share - WORTH:
+        if simpler[0] and (found := explained_by(plant_of(*simpler))) > share - MIN_TERM_GAIN:
             order, stiffness, share = *simpler, found
     explained = message("init.explained", share=100.0 * share)
     return plant_of(order, stiffness), (
         ProposalLine("plant", "kind", '"polynomial"', message("init.kind")),
-        ProposalLine("plant", "order", str(order), explained, share < CLEAR),
+        ProposalLine("plant", "order", str(order), explained, share < MIN_CLEAR_SHARE),
         ProposalLine("plant", "friction", json.dumps(best.friction), _friction_reason(best.friction)),
         ProposalLine(
             "plant", "stiffness", json.dumps(stiffness), message("init.stiffness" if stiffness else "init.free")

@@ -10,17 +10,17 @@ import numpy as np
 from servoscope.baseline.covariates import CovariateModel, WarmUp
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import NotEnoughError
-from servoscope.detection.warm_up import BLOCK, NAME, BlockSums, WarmUpFit, fit_course
+from servoscope.detection.warm_up import BLOCK_MEMORIES, NAME, BlockSums, WarmUpFit, fit_course
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit
-from servoscope.learning.covariates import CLEAR, STRETCH, refer_to_covariates
+from servoscope.learning.covariates import MIN_PROPORTIONAL_STDS, STRETCH, refer_to_covariates
 from servoscope.models.lti import solve_scaled
 from servoscope.signals import Recording
 
-CONSTANTS_TRIED = 16  # time constants before the best is refined
-LONGEST = 20.0  # durations of a recording
+TIME_CONSTANT_GRID_SIZE = 16  # time constants before the best is refined
+MAX_DURATIONS = 20.0  # durations of a recording
 ROUNDS = 2  # courses make a model of the coefficients, which makes better courses
-LEAST = 5.0  # standard deviations by which the warmest recording has to warm
+MIN_WARMING_STDS = 5.0  # standard deviations by which the warmest recording has to warm
 
 
 def fit_warm_up(
@@ -49,7 +49,7 @@ def fit_warm_up(
         ]
         model, referred, fit_there = refer_to_covariates(pipeline, carried, regressions, fit, (NAME,))
         theta = fit_there.tuning.theta
-    if max(np.ptp(one.course) / one.std.max() for one in courses) < LEAST:
+    if max(np.ptp(one.course) / one.std.max() for one in courses) < MIN_WARMING_STDS:
         raise NotEnoughError("no recording warms up enough to tell what warmth does: record a start from cold")
     return model.model_copy(update={"warm_up": warm_up}), referred, fit_there, carried
 
@@ -58,7 +58,7 @@ def _principal_direction(sums: Sequence[BlockSums], fit: TuningFit) -> tuple[Flo
     """Return the coefficients in the middle of what the stretches show, and a straight line through them."""
     found, whose = [], []
     for i, each in enumerate(sums):
-        blocks = max(round(STRETCH / BLOCK), 1)
+        blocks = max(round(STRETCH / BLOCK_MEMORIES), 1)
         for first in range(0, len(each.first) - blocks + 1, blocks):
             A, b = each.normal[first : first + blocks].sum(axis=0), each.moment[first : first + blocks].sum(axis=0)
             if np.linalg.matrix_rank(A / np.sqrt(np.outer(np.diag(A), np.diag(A)))) == len(A):
@@ -68,7 +68,9 @@ def _principal_direction(sums: Sequence[BlockSums], fit: TuningFit) -> tuple[Flo
         raise NotEnoughError("too short to tell what a warm-up does: record longer, from a cold start on")
     theta, A = (np.array(column) for column in zip(*found, strict=True))
     std = np.sqrt(fit.tuning.R * np.array([np.diag(np.linalg.inv(one)) for one in A]))
-    proportional = (np.sign(theta) == np.sign(theta[0])).all(axis=0) & (np.abs(theta) > CLEAR * std).all(axis=0)
+    proportional = (np.sign(theta) == np.sign(theta[0])).all(axis=0) & (
+        np.abs(theta) > MIN_PROPORTIONAL_STDS * std
+    ).all(axis=0)
     size = np.where(proportional, theta.mean(axis=0), 1.0)
     y = np.where(proportional, np.log(np.abs(np.where(proportional, theta, 1.0))), theta)
     root = np.linalg.cholesky((A * np.outer(size, size)).mean(axis=0)).T
@@ -107,7 +109,7 @@ def _with_time_constant(
     def cost(log_s: float) -> float:
         return sum(fit_course(each, made(log_s), theta, model).cost for each in sums)
 
-    tried = np.linspace(np.log(sums[0].seconds), np.log(LONGEST * duration_s), CONSTANTS_TRIED)
+    tried = np.linspace(np.log(sums[0].seconds), np.log(MAX_DURATIONS * duration_s), TIME_CONSTANT_GRID_SIZE)
     best = int(np.argmin([cost(one) for one in tried]))
     bounds = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
     return made(float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.01}).x))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -17,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from servoscope.core.errors import LoopError
+from servoscope.core.errors import LoopError, ObsoleteSettingWarning
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
 from servoscope.core.settings_errors import describe_error
 from servoscope.core.short_repr import ShortRepr
@@ -27,7 +28,8 @@ DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
 FEATURE_FALSE_ALARMS = 0.005
 COVARIATE_HOLD_S = 600.0  # a thermometer may tell rarely, and only what has changed
 RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # names that mean something else
-LONGEST_DELAY = 100  # samples; a longer one is a delay in ms given as s, as a rule
+MAX_DELAY_SAMPLES = 100  # samples; a longer one is a delay in ms given as s, as a rule
+MIN_FREQUENCY_SHARE = 1e-6  # of the sample rate: a slower filter would take millions of samples to settle
 
 Interval = tuple[Finite, Finite]
 
@@ -119,7 +121,7 @@ class MonitorSettings(Settings):
     rest_speed: NonNegative = 0.0  # speed [output per s] below which the output counts as resting
     evaluation_rate: Positive = 10.0  # how often iFRF, residual and statistic are evaluated [Hz]
     # when the sequential test decides: once per ``evaluation``, by what the updates since the one before sum up to, or
-    # at every ``update`` of the estimator; that takes more time, and alarms come up to an evaluation earlier
+    # at every ``update`` of the estimator, as baselines of earlier versions do; obsolete in loop files
     sequential_step: Literal["update", "evaluation"] = "evaluation"
     # monitored frequencies [Hz]
     frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
@@ -188,10 +190,8 @@ class Loop(ShortRepr, Settings):
             slow = {"frequencies": frequencies, "evaluation_rate": evaluation}
             kept = {key: value for key, value in slow.items() if key not in monitor.model_fields_set}
             updates["monitor"] = monitor.model_copy(update=kept)
-        if isinstance(plant, plants.Plant) and "sign_cutoff" not in plant.model_fields_set:
-            sign_cutoff = getattr(plant, "sign_cutoff", None)
-            if sign_cutoff is not None and sign_cutoff >= rate / 2:
-                updates["plant"] = plant.model_copy(update={"sign_cutoff": rate / 4})
+        if isinstance(plant, plants.Plant):
+            updates["plant"] = plant.with_sample_rate(rate)
         return {**data, **updates}
 
     @model_validator(mode="after")
@@ -223,12 +223,16 @@ class Loop(ShortRepr, Settings):
         nyquist = self.sample_rate / 2
         checked = [("[monitor] cutoff", self.monitor.cutoff)]
         checked += [("[monitor] frequencies", frequency) for frequency in self.monitor.frequencies]
-        checked += [("[plant] sign_cutoff", getattr(self.plant, "sign_cutoff", None))]
+        checked += [("[plant] sign_cutoff", self.plant.velocity_sign.cutoff)]
         for key, frequency in checked:
             if frequency is not None and frequency >= nyquist:
                 raise ValueError(
                     f"{key}: {frequency:g} Hz is not below the Nyquist frequency of {nyquist:g} Hz"
                     f" (sample_rate = {self.sample_rate:g} Hz), lower it"
+                )
+            if frequency is not None and frequency < MIN_FREQUENCY_SHARE * self.sample_rate:
+                raise ValueError(
+                    f"{key}: {frequency:g} Hz is below a millionth of sample_rate = {self.sample_rate:g} Hz, raise it"
                 )
         if len(set(self.monitor.frequencies)) < len(self.monitor.frequencies):
             raise ValueError("[monitor] frequencies: a frequency stands twice, remove one")
@@ -251,8 +255,8 @@ class Loop(ShortRepr, Settings):
                 '[monitor] rest_speed: missing, update_when = "moving" needs the speed below which the axis rests '
                 "(inspect tells one), or input_deadzone"
             )
-        if self.delay * self.sample_rate > LONGEST_DELAY:
-            raise ValueError(f"delay: {self.delay:g} s is more than {LONGEST_DELAY} samples, give it in seconds")
+        if self.delay * self.sample_rate > MAX_DELAY_SAMPLES:
+            raise ValueError(f"delay: {self.delay:g} s is more than {MAX_DELAY_SAMPLES} samples, give it in seconds")
         for key, interval in (("input_limits", self.input_limits), ("input_deadzone", self.input_deadzone)):
             if interval is not None and interval[0] >= interval[1]:
                 raise ValueError(f"{key}: [{interval[0]:g}, {interval[1]:g}] must be [lo, hi] with lo below hi")
@@ -271,7 +275,7 @@ class Loop(ShortRepr, Settings):
     @property
     def needs_reference(self) -> bool:
         """Whether r has a part in the loop; elsewhere u may stand for it in recordings that have none."""
-        of_sign = getattr(self.plant, "sign_from", "output") == "reference"
+        of_sign = self.plant.velocity_sign.of_reference
         return self.controller is not None or self.monitor.two_stage != "none" or of_sign
 
     def _shown_facts(self) -> dict[str, object]:
@@ -300,9 +304,21 @@ class Loop(ShortRepr, Settings):
         Raises LoopError if the file cannot be read, is not TOML, or a setting in it is wrong.
         """
         path = Path(path)
-        return cls.from_dict(
-            parse_toml(read_toml_text(path, "loop file", LoopError), path, LoopError), source=str(path)
-        )
+        return cls.from_text(read_toml_text(path, "loop file", LoopError), str(path))
+
+    @classmethod
+    def from_text(cls, text: str, source: str) -> Loop:
+        """Return the loop that the text of a loop file describes; error messages call it `source`."""
+        settings = parse_toml(text, source, LoopError)
+        monitor = settings.get("monitor")
+        if isinstance(monitor, Mapping) and "sequential_step" in monitor:
+            warnings.warn(
+                f"{source}: [monitor] sequential_step: is no setting any more, leave it out: the sequential test "
+                "decides once per evaluation, and a higher evaluation_rate makes its alarms faster",
+                ObsoleteSettingWarning,
+                stacklevel=2,
+            )
+        return cls.from_dict(settings, source)
 
     @classmethod
     def from_dict(cls, mapping: Mapping[str, Any], source: str = "loop") -> Loop:

@@ -14,9 +14,9 @@ from servoscope.core.arrays import FloatArray
 from servoscope.models.discretise import discretise
 from servoscope.models.plants import StateSpace
 
-ITERATIONS = 20_000  # of a Riccati equation, at most
-SETTLED = 1e-12  # relative change of its solution at which it has settled
-ROUNDING = 1e-12  # relative: smaller parts of a sum do not show
+MAX_RICCATI_ITERATIONS = 20_000  # of a Riccati equation, at most
+RICCATI_TOLERANCE = 1e-12  # relative change of its solution at which it has settled
+ROUNDING_TOLERANCE = 1e-12  # relative: smaller parts of a sum do not show
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +121,11 @@ def innovation_gain(
         P = np.asarray(solve_discrete_are(A.T, C.T, Q, R, s=S))
     except np.linalg.LinAlgError:  # a zero at the unit circle: the recursion itself, which needs no spectrum
         P = Q
-        for _ in range(ITERATIONS):
+        for _ in range(MAX_RICCATI_ITERATIONS):
             K = np.linalg.solve(C @ P @ C.T + R, (A @ P @ C.T + S).T).T
             following = A @ P @ A.T + Q - K @ (A @ P @ C.T + S).T
             change, P = np.abs(following - P).max(), (following + following.T) / 2.0
-            if change <= SETTLED * np.abs(P).max():
+            if change <= RICCATI_TOLERANCE * np.abs(P).max():
                 break
     variance = C @ P @ C.T + R
     return np.asarray(np.linalg.solve(variance, (A @ P @ C.T + S).T).T), np.asarray(variance)
@@ -214,7 +214,7 @@ def _gramian_factor(A: FloatArray, B: FloatArray) -> FloatArray:
         more = power @ L
         U, s, _ = np.linalg.svd(np.hstack([L, more]), full_matrices=False)
         L, power = np.asarray(U * s, dtype=np.float64), power @ power
-        if np.all(np.abs(more).max(axis=1) <= ROUNDING * np.abs(L).max(axis=1)):
+        if np.all(np.abs(more).max(axis=1) <= ROUNDING_TOLERANCE * np.abs(L).max(axis=1)):
             return L
 
 
@@ -264,7 +264,7 @@ def sample_system(
 def state_variable_filter(cutoff: float, order: int) -> StateSpace:
     """Build the continuous state-variable filter: outputs ``s^i F(s) w`` for i < order, F = (1 + s/lambda)^-order.
 
-    Source: Young, Garnier and Gilson, direct continuous-time identification; THEORY of this project, section 3.
+    Source: Young, Garnier and Gilson, direct continuous-time identification; how-it-works, "Filter bank".
 
     `cutoff`: lambda / (2 pi) [Hz]; `order`: number of outputs, one more than the highest derivative; returns tuple
     of numpy.ndarray: a, B, C; the state is kept in powers of s/lambda so that all of it is of one size.

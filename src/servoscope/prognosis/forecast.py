@@ -16,12 +16,12 @@ from servoscope.prognosis.wear import WearPosterior, fit_wear
 
 Outlook = Literal["forecast", "reached", "none"]
 POINTS = 120  # values that are fitted; longer series are thinned to that
-LEAST_POINTS = 8
+MIN_POINTS = 8
 # A history without wear exceeds these odds at any of its looks with a probability of 1 / 20 at most (Ville 1939: odds
 # are a martingale there).
-LEAST_ODDS = 20.0
-MANY = 1000.0  # odds beyond which their number says nothing more
-SURE_OF_DIRECTION = 0.95
+MIN_ODDS = 20.0
+MAX_ODDS_SHOWN = 1000.0  # odds beyond which their number says nothing more
+MIN_DIRECTION_PROBABILITY = 0.95
 DRAWS, STEPS = 2000, 200
 HORIZON = 10.0  # how far is looked ahead, in lengths of the history
 DAY_S = 86400.0
@@ -112,8 +112,8 @@ def prognose(series: SizeSeries, limit: float, coverage: float = 0.9) -> Prognos
         "to_t": last,
     }
     about = {"name": series.name, "limit": limit}
-    if len(np.unique(series.t)) < LEAST_POINTS:
-        headline = message("prognosis.few", **about, points=series.t.size, least=LEAST_POINTS)
+    if len(np.unique(series.t)) < MIN_POINTS:
+        headline = message("prognosis.few", **about, points=series.t.size, least=MIN_POINTS)
         return Prognosis(**asked, outlook="none", headline=headline)
     # The same values always lead to the same sentence.
     rng = np.random.default_rng(0)
@@ -133,7 +133,7 @@ def prognose(series: SizeSeries, limit: float, coverage: float = 0.9) -> Prognos
     history = message("prognosis.history", points=series.t.size, span=_span(last - first))
     reasons = [
         message("prognosis.level", name=series.name, level=_estimate(value), rate=_estimate(rate)),
-        message("prognosis.odds" if odds < MANY else "prognosis.certain", history=history, odds=odds),
+        message("prognosis.odds" if odds < MAX_ODDS_SHOWN else "prognosis.certain", history=history, odds=odds),
         *(
             message("prognosis.effect", name=series.name, covariate=each, size=_estimate(effects[each]))
             for each in effects
@@ -142,8 +142,8 @@ def prognose(series: SizeSeries, limit: float, coverage: float = 0.9) -> Prognos
     asked |= {"value": value, "rate_per_day": rate, "odds": odds, "effects": effects, "reasons": reasons}
     if float(np.mean(drawn.passage == 0.0)) > 0.5:
         return Prognosis(**asked, outlook="reached", headline=message("prognosis.reached", **about, value=value[1]))
-    if odds < LEAST_ODDS or towards < SURE_OF_DIRECTION:
-        key = "receding" if odds >= LEAST_ODDS and towards < 1.0 - SURE_OF_DIRECTION else "steady"
+    if odds < MIN_ODDS or towards < MIN_DIRECTION_PROBABILITY:
+        key = "receding" if odds >= MIN_ODDS and towards < 1.0 - MIN_DIRECTION_PROBABILITY else "steady"
         return Prognosis(**asked, outlook="none", headline=message(f"prognosis.{key}", **about, history=history))
     passage = shortest_interval(drawn.passage * posterior.length_s, coverage)
     remaining = tuple(each if math.isfinite(each) else None for each in passage)

@@ -21,10 +21,10 @@ from servoscope.core.arrays import FloatArray
 from servoscope.prognosis.series import SizeSeries
 
 POPULATION, ROUNDS = 600, 8
-LEAST_SIZE = 80.0  # effective size of a population that the next one is drawn around
+MIN_EFFECTIVE_SIZE = 80.0  # effective size of a population that the next one is drawn around
 DEFENCE = 0.15  # share of each later round that is drawn from the prior: no region is lost for good
 SPREAD = 0.6  # of a kernel: share of the population's covariance, as a factor of its root
-DIFFUSE = 10.0  # standard deviation of the first level, in ranges of the values
+PRIOR_LEVEL_STD = 10.0  # standard deviation of the first level, in ranges of the values
 RATE = 2.0  # of the rate: ranges of the values in one history
 
 
@@ -155,7 +155,7 @@ def filter_series(courses: Courses, scaled: ScaledSeries) -> tuple[FloatArray, F
     n, g = 2 + len(scaled.inputs), courses.start.size
     # courses last: each step then runs through whole rows
     x, P = np.zeros((n, g)), np.zeros((n, n, g))
-    P[0, 0], P[1, 1] = DIFFUSE**2, np.where(np.isfinite(courses.start), RATE**2, 0.0)
+    P[0, 0], P[1, 1] = PRIOR_LEVEL_STD**2, np.where(np.isfinite(courses.start), RATE**2, 0.0)
     P[range(2, n), range(2, n)] = 1.0
     R = np.square(courses.noise)
     # what moves the state is worked out for all values at once: a step is short, and its overhead would be most of it
@@ -217,11 +217,11 @@ def _normalised(log_weight: FloatArray) -> FloatArray:
 def _tempered(log_weight: FloatArray) -> FloatArray:
     """Return weights, flattened by a power until enough points have a share."""
     low, high = 0.0, 1.0
-    if 1.0 / np.square(_normalised(log_weight)).sum() >= LEAST_SIZE:
+    if 1.0 / np.square(_normalised(log_weight)).sum() >= MIN_EFFECTIVE_SIZE:
         return _normalised(log_weight)
     for _ in range(20):
         middle = 0.5 * (low + high)
-        enough = 1.0 / np.square(_normalised(middle * log_weight)).sum() >= LEAST_SIZE
+        enough = 1.0 / np.square(_normalised(middle * log_weight)).sum() >= MIN_EFFECTIVE_SIZE
         low, high = (middle, high) if enough else (low, middle)
     return _normalised(low * log_weight)
 

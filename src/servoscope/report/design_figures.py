@@ -1,4 +1,4 @@
-"""The figures of a study before deployment: radii, delays, precision of sizes; imported late."""
+"""The figures of a study before deployment: radii, precision of sizes; imported late."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from servoscope.report.plotting import COLOURS, plot_style
 
 WIDTH = 9.0  # inches
 TONES = ("#1f5fa8", "#c6501c", "#7d8894", "#1c2530")  # one per fault, then again dashed
-DASHES = ("-", "--", ":")
 RULE = COLOURS["rule"]
-LARGEST = 30.0  # standard deviation that is worth showing
+MAX_STD_SHOWN = 30.0  # standard deviation that is worth showing
 
 
 def format_log_ratio(value: float) -> str:
@@ -62,44 +61,22 @@ def plot_radii(study: DesignStudy) -> Figure:
 
 
 @plot_style()
-def plot_delays(study: DesignStudy) -> Figure:
-    """Draw by when half of all changes are announced, against their size."""
-    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
-    ax = figure.subplots()
-    lines = [(f.name, d, getattr(f, d)) for f in study.faults.values() for d in ("up", "down")]
-    for i, (name, direction, side) in enumerate(lines):
-        known = [(abs(math.log(a.ratio)), a.half_s) for a in side.delays if a.half_s is not None]
-        if known:
-            tone, dash = TONES[i // 2 % len(TONES)], DASHES[i % 2]
-            ax.plot(*zip(*known, strict=True), dash, color=tone, marker=".", label=f"{name} {direction}")
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: format_log_ratio(x)))
-    ax.yaxis.set_major_formatter("{x:g}")
-    ax.set_xlabel("size of the change")
-    ax.set_ylabel("half are detected by [s]")
-    _add_grid_and_legend(figure, ax, columns=4)
-    return figure
-
-
-@plot_style()
 def plot_size_precision(study: DesignStudy) -> Figure:
     """Draw how the standard deviation of each size falls with the seconds after the onset."""
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     ax = figure.subplots()
     for i, fault in enumerate(study.faults.values()):
         tone = TONES[i % len(TONES)]
-        for key, dash, label in (("alone_learned", "-", fault.name), ("together_learned", ":", "")):
-            known = [(each.seconds, std) for each in fault.sizes if (std := getattr(each, key)) is not None]
-            if known:
-                ax.plot(*zip(*known, strict=True), dash, color=tone, marker="." if label else "", label=label)
+        known = [(each.seconds, each.std) for each in fault.sizes if each.std is not None]
+        if known:
+            ax.plot(*zip(*known, strict=True), color=tone, marker=".", label=fault.name)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.xaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{100.0 * x:g} %"))
     ax.set_xlabel("time after the onset [s]")
     ax.set_ylabel("standard deviation")
-    ax.set_ylim(top=min(ax.get_ylim()[1], LARGEST))
+    ax.set_ylim(top=min(ax.get_ylim()[1], MAX_STD_SHOWN))
     _add_grid_and_legend(figure, ax, columns=4)
     return figure
 

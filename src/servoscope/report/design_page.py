@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from servoscope.design import DesignStudy
+from servoscope.design import BaselineStudy, DesignStudy
 from servoscope.report.format_values import (
     DASH,
     format_change,
@@ -14,7 +14,7 @@ from servoscope.report.format_values import (
 )
 from servoscope.report.page import ResultTable, render_page, say, write_page
 
-UNKNOWABLE = 10.0  # standard deviation from which a number says nothing
+MAX_STD_SHOWN = 10.0  # standard deviation from which a number says nothing
 
 
 def write_design_page(path: str | Path, study: DesignStudy) -> None:
@@ -32,11 +32,6 @@ def render_design_page(study: DesignStudy) -> str:
 
     u, y = format_number(study.noise_u_std, 3), format_number(study.noise_y_std, 3)
     after = format_clock_time(study.after_s, 0)
-    drawn = (
-        design_figures.plot_radii(study),
-        design_figures.plot_delays(study),
-        design_figures.plot_size_precision(study),
-    )
     return render_page(
         "design.html",
         title=f"Before deployment: {study.loop}",
@@ -47,16 +42,12 @@ def render_design_page(study: DesignStudy) -> str:
             say("report.design.noise", u=u, y=y),
             say("report.design.false_alarms", count=study.false_alarms_per_year),
         ),
-        gain=format_number(study.frequencies.gain, 3),
-        radii=render_svg(drawn[0], "f0"),
-        delays=render_svg(drawn[1], "f1"),
-        precision=render_svg(drawn[2], "f2"),
+        radii=render_svg(design_figures.plot_radii(study), "f0"),
+        precision=render_svg(design_figures.plot_size_precision(study), "f1"),
         faults=faults_table(study),
         limits=limits_table(study),
         cosines=cosines_table(study),
         mimics=mimics_table(study, described=True),
-        frequencies=frequencies_table(study),
-        dither=dither_table(study),
     )
 
 
@@ -76,6 +67,19 @@ def faults_table(study: DesignStudy) -> ResultTable:
     return ResultTable(head, rows, words=2)
 
 
+def learned_table(study: BaselineStudy) -> ResultTable:
+    """Return from which size on each fault is detected and named, by a baseline alone."""
+
+    def size(change: float | None) -> str:
+        return format_percent(change) if change is not None and change < MAX_STD_SHOWN else "never"
+
+    rows = [
+        (name, fault.parameter, size(fault.detectable), size(fault.isolable), fault.nearest)
+        for name, fault in study.faults.items()
+    ]
+    return ResultTable(("Change", "Parameter", "Detected from", "Named from", "Else taken for"), rows, words=2)
+
+
 def limits_table(study: DesignStudy) -> ResultTable:
     """Return from which size on the loop no longer does its work, in both directions of each fault."""
     rows = [
@@ -86,7 +90,7 @@ def limits_table(study: DesignStudy) -> ResultTable:
     return ResultTable(("Change, as a ratio to healthy", "Tracking lost at", "Stability lost at"), rows)
 
 
-def cosines_table(study: DesignStudy) -> ResultTable:
+def cosines_table(study: DesignStudy | BaselineStudy) -> ResultTable:
     """Return how alike small changes look, each against each."""
     names = tuple(study.faults)
     rows = [(one, *(f"{study.cosines[one][other]:.3f}".replace("-", "−") for other in names)) for one in names]
@@ -116,26 +120,6 @@ def mimics_table(study: DesignStudy, *, described: bool = False) -> ResultTable:
     return ResultTable(head, rows, words=2)
 
 
-def frequencies_table(study: DesignStudy) -> ResultTable:
-    """Return the standard deviation of each size as the iFRF of one frequency shows it."""
-    compared = [("monitored", each) for each in study.frequencies.own] + [("best", x) for x in study.frequencies.best]
-    rows = [
-        (kind, f"{each.frequency_hz:g} Hz", *(format_std(each.apart[name]) for name in study.faults))
-        for kind, each in compared
-    ]
-    return ResultTable(("Std. dev. of each size", "Frequency", *study.faults), rows)
-
-
-def dither_table(study: DesignStudy) -> ResultTable:
-    """Return from which size on each fault is named with a sine on the reference."""
-    rows = []
-    for each in study.dither:
-        name = f"{format_percent(each.share)} at {each.frequency_hz:g} Hz" if each.share else "none"
-        radii = (format_change(each.radius[fault]) for fault in study.faults)
-        rows.append((name, format_number(each.extra_u_rms, 3), *radii))
-    return ResultTable(("Sine on the reference", "Adds to u (rms)", *(f"{name} from" for name in study.faults)), rows)
-
-
 def format_std(value: float | None) -> str:
     """Return a relative standard deviation, as far as it says anything."""
-    return f"{100.0 * value:.3g} %" if value is not None and value < UNKNOWABLE else DASH
+    return f"{100.0 * value:.3g} %" if value is not None and value < MAX_STD_SHOWN else DASH

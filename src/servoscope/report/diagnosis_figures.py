@@ -12,16 +12,17 @@ from matplotlib.patches import Patch
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.messages import translate
-from servoscope.detection.result import Candidate, Diagnosis, FaultEstimate
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.result import Diagnosis
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, FrequencyResponse
+from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.report.format_values import axis_scale, text_symbol, time_axis_unit
 from servoscope.report.plotting import COLOURS, envelope, plot_style, robust_range, visible_spans
 from servoscope.signals import Recording
 
 WIDTH = 9.0  # inches; the page scales pictures to its own width
-MOST_POINTS = 1500  # of a path in the complex plane
-ROOM = 2.5  # times the range of 98 % of a path: so far the axes give way to the wildest 2 %
+MAX_PATH_POINTS = 1500  # of a path in the complex plane
+MAX_AXES_FACTOR = 2.5  # times the range of 98 % of a path: so far the axes give way to the wildest 2 %
 PAPER, INK, MUTED, RULE = COLOURS["paper"], COLOURS["ink"], COLOURS["muted"], COLOURS["rule"]
 MEASURED, HEALTHY, ALARM = COLOURS["measured"], COLOURS["healthy"], COLOURS["alarm"]
 REFERENCE = COLOURS["reference"]
@@ -214,7 +215,7 @@ def _plane(ax: Axes, trace: Trace, i: int, usable: BoolArray, onset: float) -> N
         return
     last = int(rows[-1])
     path = trace.ifrf.H[:, i]
-    thin = rows[:: max(1, len(rows) // MOST_POINTS)]
+    thin = rows[:: max(1, len(rows) // MAX_PATH_POINTS)]
     for part, colour in ((thin[trace.t[thin] <= onset], MEASURED), (thin[trace.t[thin] > onset], ALARM)):
         ax.plot(path[part].real, path[part].imag, color=colour, linewidth=0.7, alpha=0.45)
     shown = [np.stack([path[rows].real, path[rows].imag], axis=-1)]
@@ -236,8 +237,8 @@ def _plane(ax: Axes, trace: Trace, i: int, usable: BoolArray, onset: float) -> N
         ax.plot(H.real, H.imag, marker, markersize=5.5, mfc=face, mec=edge, zorder=4)
         shown.append(np.array([[H.real, H.imag]]))
     certain = np.vstack(shown[1:]) if len(shown) > 1 else shown[0]
-    ax.set_xlim(robust_range(shown[0][:, 0], certain[:, 0], room=ROOM))
-    ax.set_ylim(robust_range(shown[0][:, 1], certain[:, 1], room=ROOM))
+    ax.set_xlim(robust_range(shown[0][:, 0], certain[:, 0], room=MAX_AXES_FACTOR))
+    ax.set_ylim(robust_range(shown[0][:, 1], certain[:, 1], room=MAX_AXES_FACTOR))
     ax.locator_params(nbins=4)
     ax.grid(visible=True, color=RULE, linewidth=0.6)
 

@@ -10,12 +10,13 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import translate
-from servoscope.detection.result import UNKNOWN, Candidate, Diagnosis, FaultEstimate, RefitSummary, ResponsePoint
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.checks import checks_of_fault
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
 from servoscope.diagnosis.motion_signature import SignatureWidth, compare_signatures
+from servoscope.diagnosis.result import Diagnosis, RefitSummary, ResponsePoint
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.loop import Loop
 from servoscope.report.format_values import (
     describe_candidate,
@@ -36,7 +37,7 @@ from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 
-UNLIKELY = 0.05  # a candidate below this probability is not in the headline
+MIN_PROBABILITY_IN_HEADLINE = 0.05  # a candidate below this probability is not in the headline
 LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
 
 
@@ -126,7 +127,7 @@ def _recording_size(diagnosis: Diagnosis, loop: Loop) -> list[str]:
     samples, rate = format_count(diagnosis.samples), format_quantity(loop.sample_rate)
     size = [say("report.samples", samples=samples, rate=rate), format_clock_time(diagnosis.duration_s)]
     count = len(diagnosis.warnings)
-    return [*size, say("report.warnings" if count > 1 else "report.warning", count=count)] if count else size
+    return [*size, say("report.warnings", count=count)] if count else size
 
 
 def _fault_notes(diagnosis: Diagnosis, words: Mapping[str, str]) -> Iterator[str]:
@@ -145,7 +146,7 @@ def _headline(diagnosis: Diagnosis, words: Mapping[str, str]) -> str:
         return say("report.headline.faults", faults=[describe_fault(fault, words) for fault in diagnosis.faults])
     if diagnosis.candidates and diagnosis.candidates[0].name == UNKNOWN:
         return say("report.headline.unknown")
-    likely = [c for c in diagnosis.candidates if c.name != UNKNOWN and c.probability >= UNLIKELY]
+    likely = [c for c in diagnosis.candidates if c.name != UNKNOWN and c.probability >= MIN_PROBABILITY_IN_HEADLINE]
     if len(likely) < 2:
         return say("report.headline.open")
     if all(len(candidate.faults) > 1 for candidate in likely):
@@ -191,7 +192,7 @@ def _checks(diagnosis: Diagnosis, loop: Loop, words: Mapping[str, str]) -> Itera
     """Yield what to look at on the machine, the likeliest first."""
     if diagnosis.verdict != "fault":
         return
-    for candidate in (each for each in diagnosis.candidates if each.probability >= UNLIKELY):
+    for candidate in (each for each in diagnosis.candidates if each.probability >= MIN_PROBABILITY_IN_HEADLINE):
         odds = format_probability(candidate.probability)
         for fault in candidate.faults:
             what, places = describe_fault(fault, words), [str(each) for each in checks_of_fault(loop, fault.name)]

@@ -11,7 +11,7 @@ import numpy as np
 from servoscope.core import number_format
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import translate
-from servoscope.detection.result import UNKNOWN, Candidate, FaultEstimate
+from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 
 GREEK = {"theta": "θ", "beta": "β", "rho": "ρ"}
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")

@@ -10,12 +10,13 @@ from matplotlib.figure import Figure
 
 from servoscope.learning.inspection import Inspection
 from servoscope.learning.inspection.inspect import InspectionTraces
+from servoscope.report.diagnosis_figures import plot_signals
 from servoscope.report.format_values import time_axis_unit
 from servoscope.report.plotting import COLOURS, envelope, plot_style, robust_range, visible_spans
 from servoscope.signals import Recording
 
 WIDTH, ROW = 9.0, 1.9  # inches
-OF = {"r": COLOURS["healthy"], "u": COLOURS["care"], "y": COLOURS["measured"]}
+COLOUR_OF_SIGNAL = {"r": COLOURS["healthy"], "u": COLOURS["care"], "y": COLOURS["measured"]}
 ALARM, MUTED = COLOURS["alarm"], COLOURS["muted"]
 
 
@@ -40,26 +41,20 @@ def _two_rows(*, share_x: bool) -> tuple[Figure, Axes, Axes]:
 
 @plot_style()
 def _plot_signals(inspection: Inspection, recording: Recording) -> Figure:
-    figure, top, bottom = _two_rows(share_x=True)
+    figure = plot_signals(recording)
+    top, _, bottom = figure.axes
     unit, factor = time_axis_unit(recording.duration_s)
-    t = recording.t / factor
-    for axis, name in ((top, "r"), (top, "y"), (bottom, "u")):
-        line = envelope(t, getattr(recording, name), recording.restart)
-        axis.plot(*line, color=OF[name], linewidth=0.9, label=name)
     limits = inspection.saturation
     for value in (limits.low, limits.high) if limits is not None else ():
         if value is not None:
             bottom.axhline(value, color=ALARM, linewidth=0.8, linestyle="--")
     if inspection.dead_zone is not None:
-        bottom.axhspan(inspection.dead_zone.low, inspection.dead_zone.high, color=OF["u"], alpha=0.12)
+        bottom.axhspan(inspection.dead_zone.low, inspection.dead_zone.high, color=COLOUR_OF_SIGNAL["u"], alpha=0.12)
     shown = [defect for defect in recording.defects if defect.kind not in ("clock", "jitter")]
     low = np.array([defect.from_s for defect in shown]) / factor
     high = np.array([max(defect.to_s, defect.from_s + 1e-3) for defect in shown]) / factor
-    for begin, end in visible_spans(t, low, high):
+    for begin, end in visible_spans(recording.t / factor, low, high):
         top.axvspan(begin, end, color=ALARM, alpha=0.25)
-    figure.legend(*top.get_legend_handles_labels(), loc="outside upper left", ncols=2)
-    top.set_ylabel("r, y")
-    bottom.set_ylabel("u")
     bottom.set_xlabel(f"time [{unit}]; red: defects")
     return figure
 
@@ -71,14 +66,14 @@ def _plot_spectra(inspection: Inspection, traces: InspectionTraces) -> Figure:
     if s is not None:
         for name, power in (("r", s.R), ("u", s.U), ("y", s.Y)):
             amplitude = np.sqrt(np.maximum(power, 1e-12 * max(float(power.max()), 1e-300)))
-            top.loglog(s.f, amplitude / amplitude.max(), color=OF[name], linewidth=1.0, label=name)
-        bottom.semilogx(s.f, s.coherence_u, color=OF["u"], linewidth=1.0, label="r to u")
-        bottom.semilogx(s.f, s.coherence_y, color=OF["y"], linewidth=1.0, label="r to y")
+            top.loglog(s.f, amplitude / amplitude.max(), color=COLOUR_OF_SIGNAL[name], linewidth=1.0, label=name)
+        bottom.semilogx(s.f, s.coherence_u, color=COLOUR_OF_SIGNAL["u"], linewidth=1.0, label="r to u")
+        bottom.semilogx(s.f, s.coherence_y, color=COLOUR_OF_SIGNAL["y"], linewidth=1.0, label="r to y")
     for axis in (top, bottom):
         for monitored in inspection.frequencies:
             axis.axvline(monitored.frequency_hz, color=COLOURS["ink"], linewidth=0.8, linestyle=":")
         if inspection.band is not None:
-            axis.axvspan(inspection.band.low_hz, inspection.band.high_hz, color=OF["y"], alpha=0.08)
+            axis.axvspan(inspection.band.low_hz, inspection.band.high_hz, color=COLOUR_OF_SIGNAL["y"], alpha=0.08)
         axis.legend(loc="lower left")
     top.set_ylabel("amplitude density,\nrelative to its peak")
     bottom.set_ylabel("coherence")
@@ -92,11 +87,13 @@ def _plot_residual(traces: InspectionTraces, recording: Recording) -> Figure:
     figure, top, bottom = _two_rows(share_x=False)
     unit, factor = time_axis_unit(recording.duration_s)
     v = np.where(traces.used, traces.v, np.nan)
-    top.plot(*envelope(recording.t / factor, v, recording.restart), color=OF["u"], linewidth=0.8)
+    top.plot(*envelope(recording.t / factor, v, recording.restart), color=COLOUR_OF_SIGNAL["u"], linewidth=0.8)
     top.set_ylim(robust_range(v, room=5.0))
     top.set_ylabel("residual\n(filtered u)")
     top.set_xlabel(f"time [{unit}]")
-    bottom.plot(np.arange(traces.rho.size) / recording.sample_rate, traces.rho, color=OF["y"], linewidth=1.0)
+    bottom.plot(
+        np.arange(traces.rho.size) / recording.sample_rate, traces.rho, color=COLOUR_OF_SIGNAL["y"], linewidth=1.0
+    )
     bound = 2.0 / np.sqrt(max(int(traces.used.sum()), 1))
     bottom.axhspan(-bound, bound, color=MUTED, alpha=0.2)
     bottom.set_ylabel("autocorrelation")

@@ -13,8 +13,8 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
-from servoscope.detection.result import Diagnosis
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.result import Diagnosis
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.frequency_response import frequency_response
 from servoscope.learning.inspection import Inspection

@@ -1,1 +1,1 @@
-"""The source paper reproduced, benchmarks, scoring of detectors."""
+"""The source paper reproduced."""

@@ -24,13 +24,14 @@ from servoscope.service.assets.checkpoint import StreamPosition, unpack_state
 from servoscope.service.assets.examination import compile_examination
 from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.assets.outlook import AssetLimits
-from servoscope.service.assets.reception import UNHEARD
+from servoscope.service.assets.reception import UNHEARD_RECEPTION
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
 from servoscope.service.publishers.base import StatusPublisher
 from servoscope.service.sources.base import BlockSource, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.store import CheckpointRow, Store
+from servoscope.service.store.engine import parse_store_url
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
     if not config.is_shard:  # the whole file was checked
         check_actions(config, assets)
     sources, publishers = _build_sources(config, assets), _build_publishers(config)
-    url, rules = config.store.url, config.store.rules
-    store = Store.open(url, config.folder, write=True, network=rules, has_lock=config.is_shard)
+    store = Store.open(config.store.url, config.folder, write=True, has_lock=config.is_shard)
     try:
         store.acquire_lock([config.name, *assets])
         rows = store.checkpoints([config.name, *assets])
@@ -73,7 +73,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
         store.take_over(config.name, assets)
         resume_assets(groups, assets, store, rows, restarted)
         for name, source in sources.items():
-            source.open(resume_positions(config, name, assets))
+            open_source(config, name, source, assets)
         for publisher in publishers.values():
             publisher.open({name: row["status"] for name, row in rows.items()})
     except BaseException:
@@ -116,7 +116,7 @@ def resume_assets(
             behind |= {name} if left else set()
         if not asset.heard:
             asset.expect(time.time())
-            asset.reception = UNHEARD
+            asset.reception = UNHEARD_RECEPTION
     # their checkpoints waited; all that they lead to is the state after them
     deque(groups.process(uncounted), maxlen=0)
     for name, number in store.last_residuals(behind).items():
@@ -141,6 +141,14 @@ def check_service_file(config: ServiceFile) -> list[str]:
     sources = _build_sources(config, assets)
     _build_publishers(config)
     return [f"[sources] {name}: {line}" for name, source in sources.items() for line in source.preview()]
+
+
+def open_source(config: ServiceFile, name: str, source: BlockSource, assets: Mapping[str, Asset]) -> None:
+    """Open a source of a service that runs; beside a store in a file it may note what must survive the process."""
+    url, client = parse_store_url(config.store.url, config.folder), config.client_names()["sources", name]
+    prefix = f"{url.database}." if url.get_backend_name() == "sqlite" else ""  # else: in the folder where it runs
+    source.state_file = Path(f"{prefix}{client}.in-hand")
+    source.open(resume_positions(config, name, assets))
 
 
 def resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:

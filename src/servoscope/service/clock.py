@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 
 class SteadyClock:
@@ -10,14 +11,20 @@ class SteadyClock:
 
     Dates, delays and retries of one run agree with each other that way. The rate still follows a time server, which
     corrects the monotonic clock's rate too; what is left out are steps, and the next start takes them.
+
+    Parameters
+    ----------
+    monotonic
+        Returns the time that has passed since some moment [s].
     """
 
-    def __init__(self) -> None:
-        self._start = time.time() - time.monotonic()
+    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self.monotonic = monotonic
+        self._start = time.time() - monotonic()
 
     def now(self) -> float:
         """Return the time (epoch, s)."""
-        return self._start + time.monotonic()
+        return self._start + self.monotonic()
 
     def latest(self) -> float:
         """Return the later of that and of the machine's clock (epoch, s): what is ahead of both is in the future.

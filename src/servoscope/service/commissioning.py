@@ -16,7 +16,7 @@ from servoscope.service.config import ServiceFile
 from servoscope.service.sources.block import Block
 
 POLL_S = 0.05
-ENOUGH_BLOCKS = 3  # of an asset: they tell its rate
+MIN_BLOCKS_FOR_RATE = 3  # of an asset: they tell its rate
 RATE_ERROR = 0.05  # relative: from there on a rate is another one
 
 
@@ -55,7 +55,7 @@ def listen(config: ServiceFile, seconds: float) -> list[CommissioningRow]:
                         logs[one.asset].refuse(now, one.reason)
                     else:
                         strange[name] = one.reason
-            if all(len(blocks[name]) >= ENOUGH_BLOCKS for name in assets):
+            if all(len(blocks[name]) >= MIN_BLOCKS_FOR_RATE for name in assets):
                 break
             time.sleep(POLL_S)
         rows = []

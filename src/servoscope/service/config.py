@@ -10,14 +10,14 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, PrivateAttr, model_validator
 
 from servoscope.core.errors import ConfigError
-from servoscope.core.settings import NonEmptyStr, NonNegative, Settings
+from servoscope.core.settings import NonEmptyStr, NonNegative, Settings, drop_obsolete
 from servoscope.service.access import WebSettings
 from servoscope.service.actions import ActionSettings
 from servoscope.service.alarms import AlarmSettings
 from servoscope.service.assets.outlook import PrognosisSettings, SizeLimit
 from servoscope.service.config_types import Address, FileSettings, Name, Seconds
 from servoscope.service.kinds import PUBLISHERS, SOURCES, parse_tables
-from servoscope.service.network import ConnectionSettings, NetworkSettings, apply_network
+from servoscope.service.network import NetworkSettings, apply_network
 from servoscope.service.opcua.settings import OpcuaNodes
 from servoscope.service.publishers.base import PublisherSettings
 from servoscope.service.sources.base import SourceSettings
@@ -42,7 +42,7 @@ class ServiceSettings(Settings):
     log: Literal["debug", "info", "warning", "error"] = "info"  # what is logged, at least
 
 
-class StoreSettings(ConnectionSettings):
+class StoreSettings(Settings):
     """Where history goes, and for how long."""
 
     # A file for SQLite, relative to the service file, or ``postgresql://user@host/database``
@@ -52,6 +52,12 @@ class StoreSettings(ConnectionSettings):
     # how long diagnoses, alarms, audit, commands and deliveries are kept; None: for ever
     event_days: Seconds | None = None
     size_days: Seconds = 7300.0  # how long sizes and coefficients are kept, thinned to one a day
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_network(cls, data: Any) -> Any:
+        remedy = "is no setting any more: url names the server, and with ?sslmode=verify-full it proves its identity"
+        return drop_obsolete(data, {"network": f"[store] network: {remedy}"})
 
 
 class DiagnosisSettings(Settings):

@@ -20,7 +20,7 @@ from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
 from servoscope.service.store.series import last_renewal, query_sizes
 
-LATEST_BASELINES = 64  # that the process keeps parsed: a hall may have one for each of thousands of assets
+MAX_CACHED_BASELINES = 64  # that the process keeps parsed: a hall may have one for each of thousands of assets
 MAX_ATTEMPTS = 2  # of a diagnosis that takes its process down with it
 TASK = "servoscope.service.diagnosis_worker:diagnose_packed_blocks"
 PROGNOSIS_TASK = "servoscope.service.assets.outlook:prognose_in_worker"
@@ -88,6 +88,6 @@ def diagnose_packed_blocks(
     return diagnose_blocks(_parse_baseline(baseline), name, blocks).model_dump(mode="json")
 
 
-@lru_cache(LATEST_BASELINES)
+@lru_cache(MAX_CACHED_BASELINES)
 def _parse_baseline(text: str) -> Baseline:
     return Baseline.model_validate(json.loads(text))

@@ -59,7 +59,8 @@ class Housekeeping:
         self._service = service
         self._executed: set[int] = set()  # commands whose outcome is not yet stored
         self._rejections = RejectionCounter()
-        self._next_retention = self._next_rejections = 0.0
+        self._next_retention = 0.0
+        self._next_rejections: dict[tuple[str, str], float] = {}  # by asset and kind, monotonic [s]
         # by asset, until when on its clock its sizes are thinned, and until when they are to be
         self._thinned: dict[str, float] = {}
         self._to_thin: dict[str, float] = {}
@@ -98,7 +99,7 @@ class Housekeeping:
             self._service.writer.batch.deliveries[one.key] = row
 
     def _store_rejections(self) -> None:
-        """Store what came from outside and could not be used: at once, then once a minute."""
+        """Store what came from outside and could not be used: at once, then once a minute, for each of its kinds."""
         for name, source in self._service.sources.items():
             for one in source.rejections.take():
                 self._service.metrics.record_rejection(name, one)
@@ -106,10 +107,11 @@ class Housekeeping:
                     self._service.note_refusal(one.asset, one.reason)
                 self._rejections.add(one.asset or name, one.kind, one.reason, one.count)
         now = time.monotonic()
-        if now < self._next_rejections:
-            return
         for one in self._rejections.take():
-            self._next_rejections = now + REJECTIONS_EVERY_S
+            if now < self._next_rejections.get((one.asset, one.kind), 0.0):
+                self._rejections.add(one.asset, one.kind, one.reason, one.count)
+                continue
+            self._next_rejections[one.asset, one.kind] = now + REJECTIONS_EVERY_S
             log("warning", "refused", of=one.asset, kind=one.kind, count=one.count, why=one.reason)
             document = {"kind": one.kind, "count": one.count, "why": one.reason}
             self._service.writer.add(one.asset, [audit_row("refused", document)])

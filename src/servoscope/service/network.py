@@ -1,4 +1,4 @@
-"""Whom the service connects to: networks that are refused to it, and the certificates of encrypted connections."""
+"""Whom the service connects to: the rule for internal addresses, and the certificates of encrypted connections."""
 
 from __future__ import annotations
 
@@ -6,34 +6,37 @@ import socket
 import ssl
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from servoscope.core.errors import ConfigError
-from servoscope.core.networks import INTERNAL, check_network, is_member
-from servoscope.core.settings import NonEmptyStr, Settings
+from servoscope.core.networks import Network, is_internal, is_member
+from servoscope.core.settings import NonEmptyStr, Settings, drop_obsolete
 
-
-def _check_rule(value: str) -> str:
-    return value if value == INTERNAL else check_network(value)
-
-
-NetworkRule = Annotated[str, Field(strict=True), AfterValidator(_check_rule)]
+OBSOLETE = {
+    "refused": "[network] refused: is no setting any more, write internal = false, which keeps connections from all "
+    "internal addresses but those in allowed; a firewall keeps them from public ones"
+}
 
 
 class NetworkSettings(Settings):
     """The section `[network]`: which addresses webhooks, brokers and servers may have."""
 
-    # Networks, or ``internal``: all that is not public. What is in `allowed` may be reached, else what is in `refused`
-    # may not, and everything else may.
-    allowed: tuple[NetworkRule, ...] = ()
-    refused: tuple[NetworkRule, ...] = ()
+    internal: Annotated[bool, Field(strict=True)] = True  # whether addresses may be reached that are not public
+    allowed: tuple[Network, ...] = ()  # networks and addresses that may be reached nevertheless
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_refused(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and data.get("refused"):
+            data = {"internal": False, **data}
+        return drop_obsolete(data, OBSOLETE)
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:
-        if self.allowed and not self.refused:
-            raise ValueError('refused: missing, allowed names exceptions of it: write refused = ["0.0.0.0/0", "::/0"]')
+        if self.allowed and self.internal:
+            raise ValueError("allowed: names exceptions of internal = false, add it")
         return self
 
     def resolve(self, host: str, port: int) -> str:
@@ -41,13 +44,13 @@ class NetworkSettings(Settings):
 
         Raises OSError if there is none, or none that may be reached.
         """
-        if not self.refused:
+        if self.internal:
             return host
-        found = [str(one[4][0]) for one in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
-        permitted = (one for one in found if is_member(one, self.allowed) or not is_member(one, self.refused))
+        resolved = [str(entry[4][0]) for entry in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
+        permitted = (address for address in resolved if is_member(address, self.allowed) or not is_internal(address))
         address = next(permitted, None)
         if address is None:
-            raise PermissionError(f"{found[0]} is in a network that [network] refuses")
+            raise PermissionError(f"{resolved[0]} is an internal address, which [network] refuses")
         return address
 
 

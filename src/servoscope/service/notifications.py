@@ -23,6 +23,7 @@ from servoscope.service.alarms import (
     Notification,
     OperatorCommand,
     advance_flood,
+    alarm_kind,
     initial_alarm_state,
     notify_transition,
     step_alarm,
@@ -76,7 +77,17 @@ class Notifier:
     def status(self) -> dict[str, Any]:
         """What people are shown of the service itself."""
         flood = {"since": self._flood.since, "counted": self._flood.counted, "held": len(self._flood.held)}
-        alarms = {name: {"state": one.state.value, "since": one.since} for name, one in self._service_alarms.items()}
+        definitions = self._alarms.definitions  # a service file may have lost one of which a state is left
+        alarms = {
+            name: {
+                "state": one.state.value,
+                "since": one.since,
+                "priority": definitions[kind].priority if (kind := alarm_kind(name)) in definitions else None,
+                "cause": one.cause,
+                "until": one.shelved_until,
+            }
+            for name, one in self._service_alarms.items()
+        }
         return {"service": True, "flood": flood, "alarms": alarms}
 
     def notify(self, transitions: Iterable[AlarmTransition], details: Mapping[str, Any], now: float) -> list[TableRow]:

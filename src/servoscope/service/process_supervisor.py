@@ -12,7 +12,7 @@ from contextlib import suppress
 
 from servoscope.service.log import log
 
-FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0  # before it is started again
+MIN_WAIT_S, MAX_WAIT_S = 1.0, 60.0  # before it is started again
 STABLE_S = 60.0  # after which the waits begin anew
 
 
@@ -80,7 +80,7 @@ class ProcessSupervisor:
         self._thread.join()
 
     def _supervise(self) -> None:
-        wait = FIRST_WAIT_S
+        wait = MIN_WAIT_S
         while not self._stop_event.is_set():
             start = time.monotonic()
             command = [sys.executable, "-m", "servoscope", *self._command()]
@@ -110,7 +110,7 @@ class ProcessSupervisor:
             if self._stop_event.is_set() or (self._may_end and not code):
                 return
             log("error", f"{self.name} ended, started again soon", code=code, seconds=wait)
-            wait = FIRST_WAIT_S if time.monotonic() - start > STABLE_S else min(2.0 * wait, LONGEST_WAIT_S)
+            wait = MIN_WAIT_S if time.monotonic() - start > STABLE_S else min(2.0 * wait, MAX_WAIT_S)
             self._stop_event.wait(wait)
 
 

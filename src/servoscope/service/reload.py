@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.service.assets.asset import Asset
@@ -15,26 +15,20 @@ from servoscope.service.build import (
     build_publisher,
     build_source,
     check_actions,
+    open_source,
     resume_assets,
-    resume_positions,
     source_assets,
 )
 from servoscope.service.config import ServiceFile
 from servoscope.service.log import log
 from servoscope.service.notifications import Notifier
 
-
-class Reload(NamedTuple):
-    """What a service runs with from now on, and what has changed by it."""
-
-    config: ServiceFile
-    components: ServiceComponents
-    changes: dict[str, list[str]]  # names: assets added, removed, changed and begun anew; sources and outlets opened
+Changes = dict[str, list[str]]  # names: assets added, removed, changed and begun anew; sources and outlets opened
 
 
 def reload_components(
     config: ServiceFile, before: ServiceFile, running: ServiceComponents, commit: Callable[[], None]
-) -> Reload:
+) -> tuple[ServiceComponents, Changes]:
     """Change from what runs by the file `before` to what `config` names.
 
     `commit` stores all that is in hand. Until all that may fail has succeeded, nothing is closed: after a
@@ -45,9 +39,9 @@ def reload_components(
     assets = build_assets(config)
     if not config.is_shard:  # the whole file was checked
         check_actions(config, assets)
-    for name, one in running.assets.items():
-        if name in assets and _is_same(name, (before, one), (config, assets[name])):
-            assets[name] = one
+    kept = [name for name in assets if name in running.assets]
+    same = [name for name in kept if _identity(config, assets, name) == _identity(before, running.assets, name)]
+    assets |= {name: running.assets[name] for name in same}  # their states and windows stay where they are
     sources = {
         name: running.sources[name]
         if name in running.sources
@@ -78,9 +72,9 @@ def reload_components(
     except ServoscopeError:
         store.acquire_lock([config.name, *running.assets])
         raise
-    for name, one in new.items():
-        if name in running.assets:
-            one.reception = running.assets[name].reception
+    changed = [name for name in new if name in running.assets]
+    for name in changed:
+        new[name].reception = running.assets[name].reception
     for source in running.sources.values():
         if source not in sources.values():
             source.close()
@@ -89,7 +83,7 @@ def reload_components(
             publisher.close()
     opened = [name for name, one in sources.items() if one is not running.sources.get(name)]
     for name in opened:
-        sources[name].open(resume_positions(config, name, assets))
+        open_source(config, name, sources[name], assets)
     outlets = [name for name, one in publishers.items() if one is not running.publishers.get(name)]
     for name in outlets:
         try:
@@ -99,22 +93,17 @@ def reload_components(
     changes = {
         "added": [name for name in new if name not in running.assets],
         "removed": [name for name in running.assets if name not in assets],
-        "changed": [name for name in new if name in running.assets],
+        "changed": changed,
         "anew": list(anew),
         "opened": [*opened, *outlets],
     }
-    components = ServiceComponents(assets, groups, notifier, sources, publishers, store, anew)
-    return Reload(config, components, changes)
+    return ServiceComponents(assets, groups, notifier, sources, publishers, store, anew), changes
 
 
-def _is_same(name: str, running: tuple[ServiceFile, Asset], new: tuple[ServiceFile, Asset]) -> bool:
-    """Return whether an asset is followed as before, so that its state and its window can stay where they are."""
-
-    def followed(config: ServiceFile, asset: Asset) -> tuple[Any, ...]:
-        settings = config.assets[name]
-        return asset.policy, settings.group, settings.source, asset.baseline.model_dump_json()
-
-    return followed(*running) == followed(*new)
+def _identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tuple[Any, ...]:
+    """Return all on which it depends how an asset is followed."""
+    settings, asset = config.assets[name], assets[name]
+    return asset.policy, settings.group, settings.source, asset.baseline.model_dump_json()
 
 
 def _source_identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tuple[Any, ...]:

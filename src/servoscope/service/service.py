@@ -12,14 +12,14 @@ import numpy as np
 
 from servoscope import __version__
 from servoscope.core.errors import ServoscopeError, StoreUnavailableError
-from servoscope.core.messages import message, render
+from servoscope.core.messages import count_words, message, render
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.assets.examination_schedule import PendingDiagnosis
 from servoscope.service.assets.groups import QuietBlocks
-from servoscope.service.assets.reception import FOLLOWED, ReceptionLog
+from servoscope.service.assets.reception import RECEPTION_OK, ReceptionClock, ReceptionLog
 from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.build import ServiceComponents
 from servoscope.service.clock import SteadyClock
@@ -37,7 +37,7 @@ from servoscope.service.writer import StoreWriter
 
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
 MAX_PAUSE_S = 0.05
-LEAST_TURN_S = 0.25  # blocks that came within a turn are followed together, which costs a fraction of one by one
+MIN_TURN_S = 0.25  # blocks that came within a turn are followed together, which costs a fraction of one by one
 HOUSEKEEPING_EVERY_S = 1.0
 PROGNOSIS_RETRY_S = 60.0  # after one that failed
 
@@ -45,32 +45,33 @@ PROGNOSIS_RETRY_S = 60.0  # after one that failed
 class Service:
     """Runs until it is stopped, or until all sources have ended; it closes its components at the end."""
 
-    def __init__(self, config: ServiceFile, components: ServiceComponents) -> None:
+    def __init__(
+        self, config: ServiceFile, components: ServiceComponents, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        """`monotonic`: returns the time by which turns and silences are measured [s]."""
         self._take_components(config, components)
         self.writer = StoreWriter(self.store, config.name, config.service.buffer)
         self.metrics = ServiceMetrics(self)
-        self.clock = SteadyClock()
+        self.clock = SteadyClock(monotonic)
         actions = config.actions.resolve_paths(config.folder)
         self.dispatcher = OutboxDispatcher(self.store, config.name, actions, self.clock)
         self._diagnosis_worker = DiagnosisWorker()
         self._diagnosis_jobs: dict[tuple[str, PendingDiagnosis], Future[StoredDiagnosis]] = {}
         self._prognosis_jobs: dict[str, Future[Prognosis]] = {}
         self._prognosis_from: dict[str, float] = {}  # by asset, before when none is asked for again, monotonic [s]
-        # s: that it has been ready for blocks; a sensor is not silent because the service is busy, or its buffer full
-        self._listening_s = 0.0
+        self._listening = ReceptionClock(monotonic())
         self._receptions = {name: ReceptionLog(heard_before=asset.heard) for name, asset in self.assets.items()}
         self._housekeeping = Housekeeping(self)
         self._next_commit = self._next_housekeeping = 0.0
         self._stopping = self._is_behind = False  # _is_behind: whether the last turn left blocks for the next
         self._reload_from: Path | None = None
         self.layers = components.groups.layers
-        self.last_turn = time.monotonic()  # a service that hangs is not alive
+        self.last_turn = monotonic()  # a service that hangs is not alive
 
     def _take_components(self, config: ServiceFile, components: ServiceComponents) -> None:
         self.config, self._components = config, components
-        self.sources, self.store = components.sources, components.store
-        self.assets, self.notifier = components.assets, components.notifier
-        self._groups, self._publishers = components.groups, components.publishers
+        self.sources, self.store, self._publishers = components.sources, components.store, components.publishers
+        self.assets, self.notifier, self._groups = components.assets, components.notifier, components.groups
         # those of which a full diagnosis may be pending, in order
         self._awaiting = {name: None for name, one in self.assets.items() if one.pending_diagnoses}
 
@@ -117,10 +118,8 @@ class Service:
         finally:
             self.dispatcher.stop()
             self._diagnosis_worker.close()
-            for source in self.sources.values():
-                source.close()
-            for publisher in self._publishers.values():
-                publisher.close()
+            for close in [one.close for kind in (self.sources, self._publishers) for one in kind.values()]:
+                close()
             self.store.close()
         log("info", "stopped", service=self.config.name, why=self._stop_reason)
 
@@ -133,34 +132,35 @@ class Service:
 
     @property
     def _systemd_status(self) -> str:
-        return f"STATUS={len(self.assets)} assets, {self.degraded_reason or 'all followed'}"
+        return f"STATUS={count_words(len(self.assets), 'asset')}, {self.degraded_reason or 'all followed'}"
 
     def _reload(self, path: Path) -> None:
         """Change to what the service file says now; where that cannot be used, go on as before."""
         notify_systemd("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
-            found = reload_components(self.config.load_again(path), self.config, self._components, self._commit_all)
+            config = self.config.load_again(path)
+            components, changes = reload_components(config, self.config, self._components, self._commit_all)
         except ServoscopeError as error:
             log("error", "reload refused", why=str(error))
             self.writer.add(self.config.name, [audit_row("reload refused", {"why": str(error)})])
             notify_systemd("READY=1", f"STATUS=reload refused: {error}")
             return
         before = self.assets
-        self._take_components(found.config, found.components)
-        self.writer.capacity = found.config.service.buffer
-        set_level(found.config.service.log)
-        self.dispatcher.change(found.config.actions.resolve_paths(found.config.folder))
+        self._take_components(config, components)
+        self.writer.capacity = config.service.buffer
+        set_level(config.service.log)
+        self.dispatcher.change(config.actions.resolve_paths(config.folder))
         # a diagnosis that is still due is asked for again
         jobs = self._diagnosis_jobs.items()
         self._diagnosis_jobs = {key: job for key, job in jobs if self.assets.get(key[0]) is before[key[0]]}
         self._prognosis_jobs = {name: job for name, job in self._prognosis_jobs.items() if name in self.assets}
         self._receptions = {
-            name: self._receptions.get(name) or ReceptionLog(heard_before=asset.heard, now=self._listening_s)
+            name: self._receptions.get(name) or ReceptionLog(heard_before=asset.heard, now=self._listening.seconds)
             for name, asset in self.assets.items()
         }
-        self._add_restarts(found.components)
-        log("info", "reloaded", **found.changes)
-        self.writer.add(self.config.name, [audit_row("reloaded", found.changes)])
+        self._add_restarts(components)
+        log("info", "reloaded", **changes)
+        self.writer.add(self.config.name, [audit_row("reloaded", changes)])
         notify_systemd("READY=1", self._systemd_status)
 
     @property
@@ -168,10 +168,9 @@ class Service:
         return render(message("service.stopped_asked" if self._stopping else "service.stopped_ended"))
 
     def _run_once(self) -> None:
-        before, self.last_turn = self.last_turn, time.monotonic()
-        now = self.last_turn
-        if self.writer.free:
-            self._listening_s += min(now - before, 2.0 * MAX_PAUSE_S)
+        self.last_turn = now = self.clock.monotonic()
+        if not self._is_behind:  # else what came is heard later, and the time until now counts with it
+            self._listening.advance(now, self.config.quality.silent_s, is_free=bool(self.writer.free))
         self._is_behind = False
         for source in self.sources.values():
             self.layers.enter("decode")
@@ -210,8 +209,8 @@ class Service:
                 document = {"sequence": block.sequence, "why": str(result)}
                 result = StepResult([audit_row("block refused", document)], [])
             elif result.refusal is None:
-                self._receptions[block.asset].hear(self._listening_s)
-                asset.reception = FOLLOWED
+                self._receptions[block.asset].hear(self._listening.seconds)
+                asset.reception = RECEPTION_OK
             else:
                 source.rejections.add(block.asset, *result.refusal)
             self.handle_result(asset, result)
@@ -220,7 +219,7 @@ class Service:
     def _store_quiet(self, found: QuietBlocks) -> None:
         for asset, (number, *_, samples, regular) in zip(found.assets, found.packed, strict=True):
             self.writer.add_block(asset.name, number, samples, regular)
-            self._receptions[asset.name].hear(self._listening_s)
+            self._receptions[asset.name].hear(self._listening.seconds)
         for place, row in found.history:
             self.writer.add(found.assets[place].name, [row])
         self.writer.set_checkpoints(found.assets, [one.completed_at for one in found.blocks])
@@ -261,7 +260,7 @@ class Service:
 
     def _run_prognoses(self) -> None:
         """Ask for the prognoses that are due, and take the results of those that are done."""
-        now, free = time.monotonic(), not self._exhausted
+        now, free = self.clock.monotonic(), not self._exhausted
         for name, asset in self.assets.items():
             job, limits = self._prognosis_jobs.get(name), asset.policy.limits
             if job is None and free and limits and now >= self._prognosis_from.get(name, 0.0):
@@ -282,7 +281,7 @@ class Service:
 
     def note_refusal(self, name: str, why: str) -> None:
         """Note that something of an asset came and could not be used."""
-        self._receptions[name].refuse(self._listening_s, why)
+        self._receptions[name].refuse(self._listening.seconds, why)
 
     def _check_reception(self) -> None:
         """Look how each asset is heard, and advance the clocks of those that are not, as fast as their samples' run."""
@@ -291,20 +290,24 @@ class Service:
         troubles = {name: (source.trouble, source.asset_troubles) for name, source in self.sources.items()}
         fresh_s = min(HOUSEKEEPING_EVERY_S, self.config.quality.silent_s)
         for name, asset in self.assets.items():
-            source = asset.source
-            reception, before, (trouble, of_assets) = self._receptions[name], asset.reception, troubles[source]
-            if before is FOLLOWED and name not in of_assets and reception.is_fresh(self._listening_s, fresh_s):
+            reception, before, (trouble, of_assets) = self._receptions[name], asset.reception, troubles[asset.source]
+            fresh = name not in of_assets and reception.is_fresh(self._listening.seconds, fresh_s)
+            if fresh and before is RECEPTION_OK:
                 continue  # nearly all of them, nearly always
-            pause_s = self.sources[source].pause_s
-            patience_s, own = self.config.quality.silent_s + pause_s, of_assets.get(name)
-            if not math.isinf(self.sources[source].next_block_s):
-                asset.reception = reception.evaluate(self._listening_s, patience_s, trouble, own)
-            silence, result = reception.silence_s(self._listening_s), StepResult([], [])
+            source, own = self.sources[asset.source], of_assets.get(name)
+            pause_s, silence = source.pause_s, reception.silence_s(self._listening.seconds)
             is_expected = math.isinf(pause_s) or (silence < pause_s and not asset.heard)
+            if is_expected and not asset.heard and own is None and not trouble:
+                asset.reception = RECEPTION_OK  # its first samples may still come in time
+            elif not math.isinf(source.next_block_s):
+                patience_s = self.config.quality.silent_s + max(asset.policy.pause_s, 0.0 if trouble else pause_s)
+                asset.reception = reception.evaluate(self._listening.seconds, patience_s, trouble, own)
+            has_changed = asset.reception != before
             if silence >= HOUSEKEEPING_EVERY_S and not is_expected:
-                result = asset.advance_time(silence * self.sources[source].clock_rate)
+                result = asset.advance_time(silence * source.clock_rate)
                 self.handle_result(asset, result)
-            if result.rows or asset.reception != before:
+                has_changed |= bool(result.rows)
+            if has_changed:
                 self.writer.set_checkpoint(asset)
 
     @property
@@ -375,9 +378,9 @@ class Service:
     @property
     def _pause_s(self) -> float:
         """How long to sleep before the next turn [s]."""
-        now = time.monotonic()
+        now = self.clock.monotonic()
         # what is measured now is gathered for a while, unless each block is to be stored soon, or a turn was full
-        gather_s = min(LEAST_TURN_S, 0.5 * self.config.service.commit_every_s) if not self._is_behind else 0.0
+        gather_s = min(MIN_TURN_S, 0.5 * self.config.service.commit_every_s) if not self._is_behind else 0.0
         rest_s = max(0.0, self.last_turn + gather_s - now)
         nexts = (max(one.next_block_s, rest_s * (one.clock_rate == 1.0)) for one in self.sources.values())
         due = min(nexts, default=math.inf) if self.writer.free else math.inf  # none: a worker that lost its last asset

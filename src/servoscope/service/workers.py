@@ -14,6 +14,7 @@ from json import loads
 from pathlib import Path
 
 from servoscope.core.errors import ServoscopeError
+from servoscope.core.messages import count_words
 from servoscope.service.build import check_restarted, check_service_file
 from servoscope.service.config import ServiceFile
 from servoscope.service.health import STALL_S
@@ -22,7 +23,7 @@ from servoscope.service.process_supervisor import ProcessSupervisor
 from servoscope.service.store import Store
 from servoscope.service.systemd import notify_systemd
 
-LOOK_EVERY_S = 1.0
+POLL_INTERVAL_S = 1.0
 ANSWER_S = 5.0  # in which a worker answers
 # of metrics that several workers have under one name: how they are put together, where that is not their sum
 COMBINATIONS: dict[str, Callable[[float, float], float]] = {
@@ -184,14 +185,14 @@ class WorkerPool:
     def run(self, announce: Callable[[], None] = lambda: None) -> None:
         """Run until it is stopped, or all workers have nothing left to do; `announce` is called when all have begun."""
         settings = self.config.store
-        store = Store.open(settings.url, self.config.folder, write=True, network=settings.rules)
+        store = Store.open(settings.url, self.config.folder, write=True)
         try:
             # of a file the workers inherit the lock: it ends with the last of them. A server locks each asset.
             store.acquire_lock(())
             files = () if store.lock_file is None else (store.lock_file,)
             self._start(files)
             next_look, is_announced = time.monotonic() + STALL_S, False
-            while not self._stopping.wait(LOOK_EVERY_S) and not all(one.supervisor.done for one in self._workers):
+            while not self._stopping.wait(POLL_INTERVAL_S) and not all(one.supervisor.done for one in self._workers):
                 self.last_turn = time.monotonic()
                 notify_systemd("WATCHDOG=1")
                 if not is_announced and all(one.has_begun or one.supervisor.done for one in self._workers):
@@ -214,7 +215,8 @@ class WorkerPool:
 
     @property
     def _systemd_status(self) -> str:
-        return f"STATUS={len(self.config.assets)} assets, {len(self._workers)} workers"
+        counts = count_words(len(self.config.assets), "asset"), count_words(len(self._workers), "worker")
+        return f"STATUS={', '.join(counts)}"
 
     def _start(self, files: Sequence[int]) -> None:
         """Start a worker for each shard that has assets and none yet."""

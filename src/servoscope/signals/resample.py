@@ -13,9 +13,9 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from servoscope.core.errors import RecordingError
 
 SPLINE_ERROR = 5.0 / 384.0  # times (omega h)^4: of a cubic spline through a sine (Hall and Meyer, 1976, theorem 5)
-LARGEST_ERROR = 0.01  # of a sine at the cutoff, up to which a step between stamps is bridged
-MOST_UNBRIDGED = 0.2  # share of the time that may lie in longer steps
-LONGEST_USUAL = 10.0  # samples: a longer step is a gap, whatever the cutoff
+MAX_SPLINE_ERROR = 0.01  # of a sine at the cutoff, up to which a step between stamps is bridged
+MAX_UNBRIDGED_SHARE = 0.2  # share of the time that may lie in longer steps
+MAX_STEP_SAMPLES = 10.0  # samples: a longer step is a gap, whatever the cutoff
 OVERLAP = 64  # rows beside a piece: a spline forgets a row by a factor of 3.7 per row, so by 10^36
 PIECE_ROWS = 1 << 18
 
@@ -35,14 +35,14 @@ class ResampleTarget(NamedTuple):
         rate = self.rate or float(f"{measured:.4g}")
         full = self._replace(rate=rate, cutoff=self.cutoff or rate / 10.0)
         steps = np.diff(t)
-        usual = float(np.quantile(steps[steps < LONGEST_USUAL / measured], 0.999))
+        usual = float(np.quantile(steps[steps < MAX_STEP_SAMPLES / measured], 0.999))
         if self.cutoff == 0.0 and usual > full.longest_step():
             full = full._replace(cutoff=full.cutoff * full.longest_step() / usual)
         return full
 
     def longest_step(self) -> float:
         """Return the longest step between stamps that is bridged [s]."""
-        return float((LARGEST_ERROR / SPLINE_ERROR) ** 0.25 / (2.0 * math.pi * self.cutoff))
+        return float((MAX_SPLINE_ERROR / SPLINE_ERROR) ** 0.25 / (2.0 * math.pi * self.cutoff))
 
     def error(self, step: float) -> float:
         """Return how far a spline over steps of this length is off at the cutoff, as a share of the amplitude."""
@@ -81,13 +81,13 @@ def resample_rows(
     within = run[1:] == run[:-1]
     longest = target.longest_step() * (1.0 + 1e-6)
     apart = within & (steps > longest)
-    if steps[apart].sum() > MOST_UNBRIDGED * steps[within].sum():
+    if steps[apart].sum() > MAX_UNBRIDGED_SHARE * steps[within].sum():
         usual = float(np.quantile(steps[within], 0.9))
         fitting = number_format.round_down(target.cutoff * longest / usual)
         raise RecordingError(
             f"{name}: steps of {1e3 * usual:.3g} ms between rows are too long for a cutoff of {target.cutoff:g} Hz:"
             f" resampled, it would be off by {target.error(usual):.2g} of its size there (allowed"
-            f" {LARGEST_ERROR:g}); set [monitor] cutoff to {fitting:g} Hz or lower, or log faster"
+            f" {MAX_SPLINE_ERROR:g}); set [monitor] cutoff to {fitting:g} Hz or lower, or log faster"
         )
     cuts = np.flatnonzero(apart | ~within) + 1
     usual = float(np.median(steps[within & ~apart]))

@@ -13,14 +13,14 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 
 MAX_WIDTH = 10  # samples
 MAX_NORMAL_WIDTH = 3  # samples; wider ones must be enormous
-WIDE_SPIKE_FACTOR = 10.0  # times the range of the signal
+MIN_WIDE_SPIKE_FACTOR = 10.0  # times the range of the signal
 LOCAL_STEP_FACTOR = 6.0  # times the upper quartile of the local steps: about 9 standard deviations of white noise
 QUANTUM_FACTOR = 4.0  # times the median step that is not zero, so that an encoder's counts at rest are no spikes
 NEIGHBOURS = 20  # samples on either side that define what is normal
 STEP_SHARE = 0.02  # of the reference's range: smaller steps do not make u kick
 REACTION_SAMPLES = 3  # samples in which u may kick after a step of r
 PASSES = 30
-FEW = 500  # samples that are enough to guess two levels
+LEVEL_SAMPLES = 500  # samples that are enough to guess two levels
 CHUNK_PLACES = 512  # that are looked at together: each of them brings the pages around it into memory
 _NO_ROWS = np.empty(0, dtype=np.intp)
 
@@ -86,14 +86,14 @@ def _is_quiet(x: FloatArray, run: npt.NDArray[np.int32], share: float) -> bool:
     """
     if not 2 * NEIGHBOURS <= x.size <= outofcore.CHUNK_ROWS:
         return False
-    some = x[:: max(1, x.size // FEW)]
+    some = x[:: max(1, x.size // LEVEL_SAMPLES)]
     place = some.size // 20
     low, high = np.partition(some, [place, some.size - 1 - place])[[place, some.size - 1 - place]].tolist()
     enough, span = 0.01 * x.size + 1.0, high - low
     if span <= 0.0 or min(np.count_nonzero(x <= low), np.count_nonzero(x >= high)) <= enough:
         return False
     steps = np.abs(x[1:] - x[:-1])
-    highest, modest, enormous = float(steps.max()), share * span, WIDE_SPIKE_FACTOR * span
+    highest, modest, enormous = float(steps.max()), share * span, MIN_WIDE_SPIKE_FACTOR * span
     if highest <= modest:
         return True
     if highest > enormous:
@@ -130,7 +130,7 @@ def _find_spikes_once(
     moving = moving[moving > 0.0]
     outofcore.release(z)
     quantum = float(np.median(moving)) if moving.size > NEIGHBOURS else 0.0
-    modest, enormous = max(share * span, QUANTUM_FACTOR * quantum), WIDE_SPIKE_FACTOR * span
+    modest, enormous = max(share * span, QUANTUM_FACTOR * quantum), MIN_WIDE_SPIKE_FACTOR * span
     least = min(modest, enormous) if span > 0.0 else modest
     # a spike is entered by a high step, or stands where a run starts
     highest = 0.0

@@ -18,7 +18,7 @@ from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.errors import SimulationError
 from servoscope.core.jit import kernel, subroutine
 from servoscope.models.discretise import transition
-from servoscope.models.plants import Plant
+from servoscope.models.plants import Column, Plant
 
 if TYPE_CHECKING:
     from servoscope.models.loop import Loop
@@ -202,15 +202,15 @@ def axis_constants(plants: Sequence[Plant], loop: Loop) -> AxisConstants:
         stiffness=stiffness,
         coulomb=coulomb,
         offset=offset,
-        stribeck=np.array([each.pop("stribeck_v", (0.0, 0.0, 0.0))[:2] for each in columns]),
-        load=np.array([each.pop("load_v", (0.0, 0.0, 0.0)) for each in columns]),
+        stribeck=np.array([each.pop(Column.STRIBECK, (0.0, 0.0, 0.0))[:2] for each in columns]),
+        load=np.array([each.pop(Column.LOAD, (0.0, 0.0, 0.0)) for each in columns]),
         waves=np.array([list(each.values()) for each in columns]).reshape(len(plants), -1, 3),
         steps=SUB_STEPS,
         speed=bool(loop.plant.derivative),
     )
 
 
-def _shaped_columns(plant: Plant) -> dict[str, tuple[float, float, float]]:
+def _shaped_columns(plant: Plant) -> dict[Column, tuple[float, float, float]]:
     """Return coefficient, factor and phase of each column that has a shape."""
     coefficients = dict(zip(plant.extras, plant.theta()[len(plant.powers) :].tolist(), strict=True))
     return {

@@ -33,9 +33,8 @@ if TYPE_CHECKING:
     from servoscope.simulation.nonlinear_eha_kernels import RigConstants
 
 REFERENCE_C = 40.0  # degC at which the plant's parameters hold
-MAX_RATE_STEP = (
-    0.5  # largest rate times sub-step: on the reference rig y is then within 1e-5 m, a thirtieth of its noise
-)
+# largest rate times sub-step: on the reference rig y is then within 1e-5 m, a thirtieth of its noise
+MAX_RATE_STEP = 0.5
 
 
 @dataclass(frozen=True)
@@ -193,8 +192,9 @@ def nonlinear_run(loop: Loop, plants: Sequence[Plant], settings: ControllerConst
     actuators = [plant for plant in plants if isinstance(plant, EHA)]
     rows = np.array([[_flow_gain(p, p.p_s), 1.0 / p.p_s, p.C_ie, p.b_p, 1.0 / p.capacity] for p in actuators])
     first = actuators[0]
-    root = first.valve_law == "square-root"
-    rig = replace(Rig.ideal(), load_pressure_flow=root, coulomb=first.coulomb, static=first.coulomb)
+    rig = replace(
+        Rig.ideal(), load_pressure_flow=first.load_pressure is not None, coulomb=first.coulomb, static=first.coulomb
+    )
     physics = _rig_constants(first, rig, loop, rows)
     return lambda which, *signals: run_rig(physics, settings, rows[which], *signals)
 
@@ -213,7 +213,8 @@ def _parameters(plant: EHA, plan: PlantSchedule, rig: Rig, temperature: FloatArr
     above = temperature - REFERENCE_C
     thickness = np.exp(-rig.viscosity_per_k * above)
     factor = {"C_ie": 1.0 / thickness, "b_p": thickness, "beta": 1.0 - rig.stiffness_per_k * above}
-    healthy = {name: getattr(plant, name) * factor.get(name, np.ones_like(above)) for name in plant.parameters}
+    nominal = plant.model_dump(include=set(plant.parameters))
+    healthy = {name: nominal[name] * factor.get(name, np.ones_like(above)) for name in plant.parameters}
     ratios = plant.expand_rays(plan.ratios)
     return {
         name: values * ratios[name][plan.plant_index] if name in ratios else values for name, values in healthy.items()

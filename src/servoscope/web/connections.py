@@ -39,10 +39,10 @@ class ConnectionTable:
     def __init__(self, most: int, most_per_address: int, proxies: Sequence[str] = ()) -> None:
         self._most, self._most_per_address, self._proxies = most, most_per_address, proxies
         self.cut: Counter[str] = Counter()  # connections that were closed, by the reason
-        self._hosts: dict[LimitedProtocol, str] = {}  # of all that are open
+        self._hosts: dict[HttpProtocol, str] = {}  # of all that are open
         self._counts: Counter[str] = Counter()
         self._handshakes: dict[tuple[str, int], socket.socket] = {}  # that TLS has not ended, by client; oldest first
-        self._waiting: dict[LimitedProtocol, None] = {}  # for a request; who has waited longest stands first
+        self._waiting: dict[HttpProtocol, None] = {}  # for a request; who has waited longest stands first
 
     def begin_handshake(self, connection: socket.socket, client: tuple[str, int]) -> None:
         """Count a connection that has to agree on TLS first; where there are too many, the oldest gives way."""
@@ -58,7 +58,7 @@ class ConnectionTable:
                 break
         self._handshakes[client] = connection
 
-    def add(self, connection: LimitedProtocol, client: tuple[str, int]) -> bool:
+    def add(self, connection: HttpProtocol, client: tuple[str, int]) -> bool:
         """Count a new connection; return whether there is room for it."""
         self._handshakes.pop(client, None)
         host = "" if is_member(client[0], self._proxies) else client[0]
@@ -72,7 +72,7 @@ class ConnectionTable:
         self._counts[host] += 1
         return has_room
 
-    def remove(self, connection: LimitedProtocol) -> None:
+    def remove(self, connection: HttpProtocol) -> None:
         """Forget a connection, known or not."""
         self._waiting.pop(connection, None)
         if (host := self._hosts.pop(connection, None)) is not None:
@@ -80,7 +80,7 @@ class ConnectionTable:
             if not self._counts[host]:
                 del self._counts[host]
 
-    def mark(self, connection: LimitedProtocol, *, waiting: bool) -> None:
+    def mark(self, connection: HttpProtocol, *, waiting: bool) -> None:
         """Note whether a connection waits for a request."""
         if not waiting:
             self._waiting.pop(connection, None)
@@ -108,7 +108,7 @@ class TlsListener(socket.socket):
         return connection, client
 
 
-class LimitedProtocol(H11Protocol):
+class HttpProtocol(H11Protocol):
     """One connection of a server whose connections a table counts."""
 
     HEADER_S = 10.0  # within which the header of a request has to be complete

@@ -13,6 +13,7 @@ import uvicorn
 
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
+from servoscope.core.sandbox import find_user
 from servoscope.core.workers import ProcessLimits
 from servoscope.service.access import Sessions, Users, WebSettings
 from servoscope.service.access.allowed_hosts import split_address
@@ -20,14 +21,14 @@ from servoscope.service.config import ServiceFile
 from servoscope.service.process_supervisor import call_at_end_of_stdin
 from servoscope.service.store import Store
 from servoscope.web.app import create_app
-from servoscope.web.connections import ConnectionTable, LimitedProtocol, TlsListener
+from servoscope.web.connections import ConnectionTable, HttpProtocol, TlsListener
 from servoscope.web.dependencies import Context, SingleSignOn
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
 from servoscope.web.storage import FileStorage
 from servoscope.web.upload_storage import UploadStorage
 
-STORE_PATIENCE = 5.0  # s
+STORE_TIMEOUT_S = 5.0  # s
 STOPS_WITHIN_S = 5
 BACKLOG = 1024
 SEND_BUFFER = 1 << 17  # bytes of each connection; Linux takes them twice
@@ -69,6 +70,8 @@ def run_server(
         file = folder / str(settings.users)
         what = "has no users" if file.exists() else "no such file"
         raise ConfigError(f"{file}: {what}, add one: servoscope users add NAME --users {file}")
+    if settings.job_user is not None:
+        find_user(settings.job_user)
     hub, storage = EventHub(store), FileStorage(folder / settings.folder)
     context = Context(
         settings=settings,
@@ -77,7 +80,7 @@ def run_server(
         storage=storage,
         uploads=UploadStorage(storage),
         event_hub=hub,
-        jobs=JobQueue(ProcessLimits(settings.job_s, settings.job_memory_mb)),
+        jobs=JobQueue(ProcessLimits(settings.job_s, settings.job_memory_mb), settings.job_user),
         users=users,
         sessions=Sessions(settings.session_hours * 3600.0),
         single_sign_on=_create_single_sign_on(settings, folder),
@@ -115,7 +118,7 @@ def _create_single_sign_on(settings: WebSettings, folder: Path) -> SingleSignOn 
 
 def _uvicorn_config(context: Context, tls: dict[str, Any]) -> uvicorn.Config:
     settings = context.settings
-    protocol: Any = partial(LimitedProtocol, context.connections)  # uvicorn calls it as it calls a class
+    protocol: Any = partial(HttpProtocol, context.connections)  # uvicorn calls it as it calls a class
     return uvicorn.Config(
         create_app(context),
         http=protocol,

@@ -22,7 +22,7 @@ from servoscope.web.schemas.responses import StorageKind, StorageRecord, UploadR
 RecordType = TypeVar("RecordType", bound=StorageRecord)
 TEMPORARY_KINDS: tuple[StorageKind, ...] = ("uploads", "learnings")  # kept for some days
 NAME = re.compile(r"\w[\w.-]{0,99}")
-ABOUT = "about.json"
+ABOUT_FILE = "about.json"
 
 
 class FileStorage:
@@ -55,7 +55,7 @@ class FileStorage:
 
     def publish(self, record: RecordType) -> RecordType:
         """Complete something new with its record, so that other requests find it; return the record."""
-        atomic_write(self._root / record.kind / record.id / ABOUT, record.model_dump_json().encode())
+        atomic_write(self._root / record.kind / record.id / ABOUT_FILE, record.model_dump_json().encode())
         return record
 
     def read(self, model: type[RecordType], id_: str) -> RecordType:
@@ -97,6 +97,6 @@ class FileStorage:
 
 def _read_record(folder: Path, model: type[RecordType]) -> RecordType | None:
     try:
-        return model.model_validate_json((folder / ABOUT).read_bytes())
+        return model.model_validate_json((folder / ABOUT_FILE).read_bytes())
     except (OSError, ValidationError):
         return None

@@ -12,12 +12,14 @@ from rich.text import Text
 from servoscope.cli.render.results import COLOURS, INDENT, print_facts, print_notes, print_table, print_title
 from servoscope.core.messages import translate, translate_range
 from servoscope.core.number_format import format_ratios, format_short
-from servoscope.detection.result import Candidate, Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary
+from servoscope.isolation.candidate import Candidate
 from servoscope.report.format_values import format_duration, format_probability
 from servoscope.report.page import say
 
-MOST_WARNINGS = 12
-LEAST_SHOWN = 0.01  # probability below which a candidate has no line; the explanation says why it was rejected
+MAX_WARNINGS = 12
+# probability below which a candidate has no line; the explanation says why it was rejected
+MIN_PROBABILITY_SHOWN = 0.01
 
 
 def print_diagnosis(out: Console, d: Diagnosis, details: bool = False) -> None:
@@ -39,7 +41,7 @@ def print_diagnosis(out: Console, d: Diagnosis, details: bool = False) -> None:
     if d.explanation:
         out.print(f"  {translate('Why')}:")
         print_notes(out, d.explanation, "blue", "-")
-    shown = [c for i, c in enumerate(d.candidates) if c.probability >= LEAST_SHOWN or not i]
+    shown = [c for i, c in enumerate(d.candidates) if c.probability >= MIN_PROBABILITY_SHOWN or not i]
     if details or len(shown) > 1:  # what else it could be concerns everybody
         _print_candidates(out, shown)
     if details and d.refit is not None:
@@ -99,7 +101,7 @@ def _print_warnings(out: Console, warnings: Sequence[DiagnosisWarning]) -> None:
         when = f"{w.from_s:.6g} s" if w.from_s == w.to_s else translate_range(f"{w.from_s:.6g} to {w.to_s:.6g} s")
         # What the recording can show at all is no matter of time.
         texts.append(str(w.message) if w.kind == "power" else f"{when}: {w.message}")
-    more = len(texts) - MOST_WARNINGS
+    more = len(texts) - MAX_WARNINGS
     if more > 1:
-        texts[MOST_WARNINGS:] = [say("cli.more_warnings", count=more)]
+        texts[MAX_WARNINGS:] = [say("cli.more_warnings", count=more)]
     print_notes(out, texts)

@@ -8,14 +8,15 @@ from rich.console import Console
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, print_facts, print_notes, print_table
+from servoscope.core.messages import count_words
 from servoscope.core.number_format import format_ratios
 from servoscope.report.format_values import DASH, format_probability
 
 if TYPE_CHECKING:
     from servoscope.fleet import Fleet
 
-MOST_SHOWN = 20
-LEAST_SHOWN = 0.05  # probability of a common cause that is worth its line
+MAX_ASSETS_SHOWN = 20
+MIN_PROBABILITY_SHOWN = 0.05  # probability of a common cause that is worth its line
 
 
 def print_fleet(out: Console, f: Fleet) -> None:
@@ -23,12 +24,16 @@ def print_fleet(out: Console, f: Fleet) -> None:
     from servoscope.fleet.report import describe_discoveries, headline
 
     colour = COLOURS["fault" if f.count("fault") or f.accepted else "healthy"]
-    out.print(Text.assemble((f"{len(f.assets)} assets", "bold"), ": ", (headline(f), f"bold {colour}")))
+    out.print(Text.assemble((count_words(len(f.assets), "asset", "en"), "bold"), ": ", (headline(f), f"bold {colour}")))
     if told := describe_discoveries(f):
         out.print(told, soft_wrap=True)
     states = ("healthy", "fault", "common cause", "undetermined", "failed")
     print_facts(out, [(state, str(f.count(state))) for state in states if f.count(state)])
-    shared = [(cause, since) for cause, since in zip(f.causes, f.since, strict=True) if cause.probability > LEAST_SHOWN]
+    shared = [
+        (cause, since)
+        for cause, since in zip(f.causes, f.since, strict=True)
+        if cause.probability > MIN_PROBABILITY_SHOWN
+    ]
     if shared:
         rows = []
         for cause, since in shared:
@@ -39,11 +44,12 @@ def print_fleet(out: Console, f: Fleet) -> None:
     ill = [one for one in f.assets if one.state not in ("healthy", "failed")]
     if ill:
         own = [
-            (one.asset, one.day, one.state, format_probability(one.probability), one.said) for one in ill[:MOST_SHOWN]
+            (one.asset, one.day, one.state, format_probability(one.probability), one.said)
+            for one in ill[:MAX_ASSETS_SHOWN]
         ]
         print_table(out, ("asset", "day", "state", "own", ""), own, words=5)
-    if len(ill) > MOST_SHOWN:
-        print_notes(out, [f"{len(ill) - MOST_SHOWN} more are ill, see the report"])
+    if len(ill) > MAX_ASSETS_SHOWN:
+        print_notes(out, [f"{len(ill) - MAX_ASSETS_SHOWN} more are ill, see the report"])
     lost = [f"{asset} {day}: {why}" for asset, day, why in f.failed]
     lost += [f"{name}, not learned: {why}" for name, why in f.unlearned.items()]
-    print_notes(out, lost[:MOST_SHOWN])
+    print_notes(out, lost[:MAX_ASSETS_SHOWN])

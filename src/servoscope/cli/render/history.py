@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 OLD_S = 60.0
 TIME_COLUMNS = ("t", "at", "created", "onset", "since", "due", "asked", "from", "until", "time")
 OUTCOME = 80  # characters that are shown of a receiver's answer
-WIDE = 110  # columns of a terminal, and 9 for each frequency
+MIN_COLUMNS_OF_WIDE_TABLE = 110  # columns of a terminal, and 9 for each frequency
 
 NE107 = {
     "good": "green",
@@ -43,7 +43,7 @@ def asset_table(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
     """Return a table of assets: verdict, since when, residuals, alarms; on a wide terminal more of each."""
     followed = {name: row for name, row in statuses.items() if not row["status"].get("service")}
     frequencies = sorted({f for row in followed.values() for f, *_ in row["status"].get("residual", ())})
-    wide = width >= WIDE + 9 * len(frequencies)
+    wide = width >= MIN_COLUMNS_OF_WIDE_TABLE + 9 * len(frequencies)
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("asset", "verdict", "since (UTC)", *(("T²/limit", "test") if wide else ())):
         table.add_column(name, justify="right" if name in ("T²/limit", "test") else "left", no_wrap=True)
@@ -160,7 +160,7 @@ def row_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Tabl
     """Return a table of some columns of rows; times as dates."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in columns:
-        table.add_column(plain_name(name), overflow="fold", no_wrap=name in ("t", "at", "created", "due", "asset"))
+        table.add_column(plain_name(name), overflow="fold", no_wrap=name in (*TIME_COLUMNS, "asset"))
     for row in rows:
         table.add_row(
             *(_format_cell(name, _delivery_subject(row) if name == "subject" else row.get(name)) for name in columns)

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from servoscope.learning.inspection import Inspection
     from servoscope.models.loop import Columns
     from servoscope.report.page import ResultTable
-    from servoscope.research.bench import BenchmarkResult
     from servoscope.signals import Recording
     from servoscope.signals.readers import ChannelInfo
     from servoscope.simulation import Truth
@@ -262,18 +261,3 @@ def print_claims(out: Console, claims: Iterable[tuple[str, str, str]]) -> None:
     for claim, measured, verdict in claims:
         out.print(Text.assemble((verdict, COLOURS[verdict]), f": {claim}"))
         out.print(Padding(Text(measured, style="dim"), INDENT))
-
-
-def print_benchmark(out: Console, result: BenchmarkResult) -> None:
-    """Print what was measured of speed: per sample, beside what it is compared with, and single numbers."""
-    rows = []
-    for figure in result.figures:
-        median, low, high = (f"{x:.1f}" if x < 1000.0 else f"{x:.0f}" for x in figure.ns)
-        ratio = "" if figure.ratio is None else f"{figure.ratio:.3g}"
-        error = "" if figure.error is None else f"{figure.error:.0e}"
-        rows.append((figure.name, median, f"{low}-{high}", ratio, error))
-    print_table(out, ("ns per sample", "median", "quartiles", "times", "error"), rows)
-    print_notes(out, [say("cli.bench")], "dim", " ")
-    out.print()
-    for name, number in result.facts.items():
-        out.print(f"{name}: {number:.4g}")

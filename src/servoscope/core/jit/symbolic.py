@@ -182,19 +182,19 @@ def sqrt(x: Any) -> Any:
     return x.call("sqrt", x) if isinstance(x, Float) else np.sqrt(x)
 
 
-WIDEST = 2000.0  # angle of `sine`; larger ones count as this
+MAX_SINE_ANGLE = 2000.0  # angle of `sine`; larger ones count as this
 HALVINGS = 12
 SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in (5, 4, 3, 2, 1, 0))
 COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in (5, 4, 3, 2, 1, 0))
 
 
 def sine(x: Any) -> Any:
-    """Return sin(x) to 1e-8 for angles up to `WIDEST`, by additions and multiplications alone, the same everywhere.
+    """Return sin(x) to 1e-8 for angles up to `MAX_SINE_ANGLE`, by sums and products alone, the same everywhere.
 
     Taylor's polynomials of x/2^12, then ``sin 2a = 2 sin a cos a``, ``cos 2a = 1 - 2 sin^2 a``: no function of a C
     library is called, no two of which agree to the last bit.
     """
-    a = minimum(maximum(x, -WIDEST), WIDEST) * 0.5**HALVINGS
+    a = minimum(maximum(x, -MAX_SINE_ANGLE), MAX_SINE_ANGLE) * 0.5**HALVINGS
     square = a * a
     s, c = SINE[0], COSINE[0]
     for of_sine, of_cosine in zip(SINE[1:], COSINE[1:], strict=True):

@@ -37,7 +37,9 @@ __all__ = [
     "Message",
     "MessageField",
     "MessageText",
+    "add_words",
     "catalogue",
+    "count_words",
     "current_language",
     "languages",
     "message",
@@ -52,6 +54,7 @@ __all__ = [
 
 FOLDER = files("servoscope.core.messages")
 SETTING = "SERVOSCOPE_LANGUAGE"
+WORD_SOURCES: list[Callable[[str], Mapping[str, str]]] = []
 PLAIN_TEXT = "text"  # the key of a message that is its text: from outside, or of a file of an earlier version
 
 
@@ -230,6 +233,8 @@ class _Renderer(string.Formatter):
             value = render(value, self._language)
         if isinstance(value, (list, tuple)):
             return self._join([self.format_field(each, "") for each in value], spec or "list")
+        if spec.startswith("#"):
+            return count_words(value, spec[1:], self._language)
         if spec in FORMATS:
             return FORMATS[spec](value)
         return str(super().format_field(value, spec))
@@ -254,6 +259,12 @@ def render(given: Message, language: str | None = None) -> str:
         return str(given.values["text"])
     language = language or current_language()
     return _Renderer(language).vformat(template(given.key, language), (), given.values)
+
+
+def count_words(count: float | str, noun: str, language: str | None = None) -> str:
+    """Return a number of things, 1 row or 2 rows; `noun` is a name of the section ``count`` of the catalogue."""
+    one, _, several = render(message(f"count.{noun}", count=count), language).partition("|")
+    return one if str(count) == "1" else several
 
 
 def template(key: str, language: str) -> str:
@@ -288,7 +299,15 @@ def translate_range(cell: str) -> str:
 @functools.cache
 def catalogue(language: str = "en") -> Mapping[str, str]:
     """Return the templates of a language by key."""
-    return dict(_flatten(tomllib.loads(FOLDER.joinpath(f"{language}.toml").read_text(encoding="utf-8"))))
+    own = tomllib.loads(FOLDER.joinpath(f"{language}.toml").read_text(encoding="utf-8"))
+    words = {f"word.{english}": text for source in WORD_SOURCES for english, text in source(language).items()}
+    return {**words, **dict(_flatten(own))}
+
+
+def add_words(source: Callable[[str], Mapping[str, str]]) -> None:
+    """Let a function return further words of a language by their English; where it knows a word itself, that counts."""
+    WORD_SOURCES.append(source)
+    catalogue.cache_clear()
 
 
 def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:

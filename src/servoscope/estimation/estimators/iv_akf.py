@@ -16,7 +16,7 @@ def update(
     theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
     phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
 ) -> int:  # fmt: skip
-    """Take one step with the symmetric gain of THEORY section 5 (Young, 2011): phi is in e alone.
+    """Take one step with the symmetric instrumental gain (Young, 2011): phi is in e alone.
 
     K = P z/(R + z' P z), P by (11) with z. No noise of phi is in gain or covariance: to skip samples by the sign of
     phi' P z would be to choose them by their noise, which is a bias. A residual out of all proportion is refused

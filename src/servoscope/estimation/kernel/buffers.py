@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 MIN_POOLED_BYTES = 1 << 20  # bytes from which it pays
-MAX_SPARE = 2  # arrays that are kept: a service still holds one result when it asks for the next
+MAX_SPARE_ARRAYS = 2  # arrays that are kept: a service still holds one result when it asks for the next
 
 
 class BufferPool:
@@ -34,5 +34,5 @@ class BufferPool:
         return array.reshape(shape)
 
     def _reclaim(self, piece: npt.NDArray[np.uint8]) -> None:
-        if len(self._spare) < MAX_SPARE:
+        if len(self._spare) < MAX_SPARE_ARRAYS:
             self._spare.append(piece)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from servoscope.core.jit import Bool, dot, fma, maximum, minimum, sine, where
+from servoscope.core.jit import Bool, dot, fma, maximum, minimum, where
 from servoscope.estimation.kernel import sparse_lti
 from servoscope.estimation.kernel.cusum import (
     CLIP,
@@ -22,6 +22,7 @@ from servoscope.estimation.kernel.cusum import (
 )
 from servoscope.estimation.kernel.sparse_lti import SparsityPattern
 from servoscope.estimation.moments import propagate_covariance, propagate_initial_share
+from servoscope.models.plants.columns import COLUMN_FORMS, Column
 
 # counters at the head of a state row
 ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, STILL, WHITENED, CROSSED = range(8)
@@ -31,8 +32,8 @@ CUSUM_BATCH = 8  # the number of CUSUMs is rounded up to this, so that few kerne
 MISSING, HELD, USED, BETWEEN = -1.0, 0.0, 1.0, 2.0
 # Of the speed of a reference, as shares of the parts that cancel in it: what rounding leaves, and where it counts as
 # standing still. The differentiator's tail falls to no less than a fifth from sample to sample: it cannot jump the gap.
-ROUNDING, STANDING = 1e-14, 1e-12
-LEAST_SPEED = 1e-30  # below, a reference that rests at 0 stands still
+ROUNDING_SHARE, STANDSTILL_SHARE = 1e-14, 1e-12
+MIN_SPEED = 1e-30  # below, a reference that rests at 0 stands still
 MAX_PHYSICAL = 1e100  # larger is no physical signal; its square would overflow and stay in the state for ever
 TILE = 16  # largest number of samples that are fetched together
 
@@ -46,7 +47,7 @@ class KernelSizes(NamedTuple):
     states: int
     speed: int
     gated: bool
-    codes: tuple[int, ...]
+    nonlinear: tuple[Column, ...]
     lags: int
     shadow: int
     memory: int
@@ -166,7 +167,7 @@ class SampleSteps:
                 s[self.to.velocity + j] = c[self.at.velocity + 9 + j] * source
             speed, parts = self._speed(c, s, source)
             if self.size.speed == 2:
-                speed = where(abs(speed) <= ROUNDING * parts, 0.0, speed)
+                speed = where(abs(speed) <= ROUNDING_SHARE * parts, 0.0, speed)
         w = self._inputs(c, r, u, y, speed)
         for k in range(self.size.states):
             s[self.to.x + k] = dot([c[self.at.steady + k * len(w) + j] for j in range(len(w))], w)
@@ -192,9 +193,9 @@ class SampleSteps:
             if self.size.speed == 2:
                 # a reference stands still exactly: the filter is stopped before the sign of its tail, that of the last
                 # motion, is lost in rounding, which differs from machine to machine; without a motion it is 0
-                stands = abs(speed) <= STANDING * parts + LEAST_SPEED
+                stands = abs(speed) <= STANDSTILL_SHARE * parts + MIN_SPEED
                 ahead = [where(stands, old, new) for old, new in zip(x, ahead, strict=True)]
-                speed = where(abs(speed) <= ROUNDING * parts, 0.0, speed)
+                speed = where(abs(speed) <= ROUNDING_SHARE * parts, 0.0, speed)
             for j in range(2):
                 s[self.to.velocity + j] = ahead[j]
         w = self._inputs(c, r, u, y, speed)
@@ -314,31 +315,13 @@ class SampleSteps:
 
     def _inputs(self, c: Any, r: Any, u: Any, y: Any, speed: Any) -> list[Any]:
         """Return the bank's inputs: r, u within its limits, y, and the columns of friction and offset."""
-        w, shaped = [r, minimum(maximum(u, c[self.at.low]), c[self.at.high]), y], 0
-        for kind in self.size.codes:
-            if kind == 0:
-                w.append(where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0)))
-            elif kind < 3:
-                w.append(maximum(speed, 0.0) if kind == 1 else minimum(speed, 0.0))
-            elif kind == 3:
-                w.append(1.0)
-            else:
-                w.append(self._shaped_input(c, self.at.shapes + 2 * shaped, kind, y, speed))
-                shaped += 1
+        w, k = [r, minimum(maximum(u, c[self.at.low]), c[self.at.high]), y], self.at.shapes
+        for column in self.size.nonlinear:
+            form = COLUMN_FORMS[column]
+            shape = (c[k], c[k + 1]) if form.shaped else ()
+            w.append(form.trace(y, speed, lambda: c[self.at.sign_speed], *shape))
+            k += len(shape)
         return w
-
-    def _shaped_input(self, c: Any, k: int, kind: int, y: Any, speed: Any) -> Any:
-        """Return Stribeck friction at a speed scaled by c[k], or the sine of y scaled by c[k] and moved by c[k + 1].
-
-        Friction that grows with a load has the magnitude of that sine, and the sign of the speed.
-        """
-        if kind in (5, 6, 7):
-            return sine(fma(c[k], y, c[k + 1]))
-        sign = where(abs(speed) <= c[self.at.sign_speed], 0.0, where(speed > 0.0, 1.0, -1.0))
-        if kind == 4:
-            slow = c[k] * speed
-            return sign / fma(slow, slow, 1.0)
-        return sign * abs(sine(fma(c[k], y, c[k + 1])))
 
     def _mean_square(self, c: Any, s: Any, residual: Any) -> Any:
         return fma(fma(residual, residual, -s[self.to.power]), c[self.at.share], s[self.to.power])

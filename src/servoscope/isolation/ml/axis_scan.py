@@ -10,7 +10,7 @@ import numpy as np
 from servoscope.baseline.axis_model import AxisModel
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
-from servoscope.isolation.ml.axis_vibration import BANDS, LEAST, AxisVibration, find_vibration
+from servoscope.isolation.ml.axis_vibration import BANDS, MIN_AMPLITUDE_RATIO, AxisVibration, find_vibration
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.onset import ChangeCosts
@@ -21,10 +21,10 @@ from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 
 FALSE_ALARMS = 1e-4  # share of healthy recordings that are called changed
-TRIM = 0.05  # of a stretch at both ends, in which no onset is looked for
-ONSETS = 400  # that are tried
-MOST = 40_000  # samples of a stretch
-NEAR = 1.5  # times as far as the furthest, a further healthy recording may well come
+EDGE_SHARE = 0.05  # of a stretch at both ends, in which no onset is looked for
+MAX_ONSETS = 400  # that are tried
+MAX_SAMPLES = 40_000  # samples of a stretch
+HEALTHY_MARGIN = 1.5  # times as far as the furthest, a further healthy recording may well come
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,9 @@ def largest_changes(loop: Loop, model: AxisModel, recording: Recording) -> tuple
         found = _likeliest_change(window, faults)
         if found is not None:
             gains.append(found.gain)
-            vibration = find_vibration(window, found.healthy.residual, scan_limit(BANDS) / NEAR, LEAST / NEAR)
+            vibration = find_vibration(
+                window, found.healthy.residual, scan_limit(BANDS) / HEALTHY_MARGIN, MIN_AMPLITUDE_RATIO / HEALTHY_MARGIN
+            )
             shaken.append(0.0 if vibration is None else vibration.statistic)
     return max(gains), max(shaken)
 
@@ -98,7 +100,7 @@ def scan_limit(faults: int, false_alarms: float = FALSE_ALARMS) -> float:
     1 - t (James, James and Siegmund, 1987), times the number of faults.
     """
     x = np.linspace(5.0, 60.0, 2000)
-    range_ = 2.0 * np.log((1.0 - TRIM) / TRIM)
+    range_ = 2.0 * np.log((1.0 - EDGE_SHARE) / EDGE_SHARE)
     probability = faults * np.sqrt(x / (2.0 * np.pi)) * np.exp(-x / 2.0) * (range_ * (1.0 - 1.0 / x) + 2.0 / x)
     return float(x[np.argmax(probability <= false_alarms)])
 
@@ -129,7 +131,7 @@ class _ChangeFit:
 
 
 def _stretches(loop: Loop, model: AxisModel, recording: Recording) -> Iterator[AxisWindow]:
-    most = MOST * model.stride
+    most = MAX_SAMPLES * model.stride
     for first in range(0, max(recording.samples - most // 2, 1), most // 2):
         rows = recording.rows(slice(first, min(first + most, recording.samples)))
         yield AxisWindow.of_healthy(loop, model, rows, first)
@@ -141,10 +143,10 @@ def _likeliest_change(window: AxisWindow, faults: tuple[Fault, ...]) -> _ChangeF
     healthy = fit_hypothesis(window, [], never, np.zeros(m), [np.zeros(0)], free=True)
     moving = np.cumsum(window.counted)
     share = moving / max(moving[-1], 1)
-    inside = np.flatnonzero((share >= TRIM) & (share <= 1.0 - TRIM) & window.counted)
-    if len(inside) < ONSETS // 10 or not faults:
+    inside = np.flatnonzero((share >= EDGE_SHARE) & (share <= 1.0 - EDGE_SHARE) & window.counted)
+    if len(inside) < MAX_ONSETS // 10 or not faults:
         return None
-    onsets = inside[:: max(1, len(inside) // ONSETS)]
+    onsets = inside[:: max(1, len(inside) // MAX_ONSETS)]
     best: tuple[float, Fault, int, float] | None = None
     for fault in faults:
         start = replace(healthy, faults=(fault,), x=np.zeros(1))

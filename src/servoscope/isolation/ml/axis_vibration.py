@@ -17,13 +17,13 @@ from servoscope.isolation.posterior import INTERVAL
 
 BLOCK_S = 1.0
 BANDS = 5  # octaves below half the sample rate
-FEWEST = 15  # blocks
-LEAST = 2.0  # times the healthy amplitude: by less than that the noise of a sound machine may wander
-EDGE = 5  # blocks at both ends, in which no onset is looked for
-MOVED = 0.25  # share of a block's samples that have to count
+MIN_BLOCKS = 15  # blocks
+MIN_AMPLITUDE_RATIO = 2.0  # times the healthy amplitude: by less than that the noise of a sound machine may wander
+EDGE_BLOCKS = 5  # blocks at both ends, in which no onset is looked for
+MIN_COUNTED_SHARE = 0.25  # share of a block's samples that have to count
 LAGS = 8  # samples of the autocovariance by which a vibration is told from noise
-TINY = 1e-9  # of squares left; a simulation without noise leaves none
-NOISY = 0.3  # of what was added, that louder noise leaves unexplained at least where it is none
+MIN_SQUARES = 1e-9  # of squares left; a simulation without noise leaves none
+MIN_NOISE_SHARE = 0.3  # of what was added, that louder noise leaves unexplained at least where it is none
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class _BandEnergies:
         speed = window.signals.speed
         acceleration = np.gradient(speed) * rate
         starts = range(0, window.samples - size + 1, size)
-        begin = np.array([k for k in starts if counted[k : k + size].sum() >= MOVED * size], dtype=np.int64)
+        begin = np.array([k for k in starts if counted[k : k + size].sum() >= MIN_COUNTED_SHARE * size], dtype=np.int64)
         rows = begin[:, None] + np.arange(size)
         power = np.abs(np.fft.rfft(e[rows] * np.hanning(size), axis=1)) ** 2
         power /= counted[rows].sum(axis=1)[:, None]
@@ -69,17 +69,17 @@ class _BandEnergies:
         """Return steps of the first `count` blocks' logarithms, their deviations and squares left, (onsets, BANDS)."""
         motion, _ = np.linalg.qr(self.motion[:count])
         energies = self.energies[:count] - motion @ (motion.T @ self.energies[:count])
-        at = np.arange(EDGE, count - EDGE + 1)
+        at = np.arange(EDGE_BLOCKS, count - EDGE_BLOCKS + 1)
         step = (np.arange(count) >= at[:, None]).astype(np.float64)
         step -= step @ motion @ motion.T
         length = (step**2).sum(axis=1)[:, None]
         size = step @ energies / length
-        left = np.maximum((energies**2).sum(axis=0) - size**2 * length, TINY)
+        left = np.maximum((energies**2).sum(axis=0) - size**2 * length, MIN_SQUARES)
         return size, np.sqrt(left / (count - motion.shape[1] - 1) / length), left
 
 
 def find_vibration(
-    window: AxisWindow, residual: FloatArray, limit: float, least: float = LEAST
+    window: AxisWindow, residual: FloatArray, limit: float, least: float = MIN_AMPLITUDE_RATIO
 ) -> AxisVibration | None:
     """Return since when a band of the innovations is louder than the motion explains, None where none is.
 
@@ -89,20 +89,20 @@ def find_vibration(
     e = residual[: window.samples]
     blocks = _BandEnergies.of(window, e)
     count = len(blocks.begin)
-    if count < FEWEST:
+    if count < MIN_BLOCKS:
         return None
     sizes, stds, left = blocks.steps(count)
     t = sizes / stds
     k, band = np.unravel_index(int(np.argmax(t)), t.shape)
-    begin = blocks.begin[EDGE + int(k)]
+    begin = blocks.begin[EDGE_BLOCKS + int(k)]
     size, std = float(sizes[k, band]), float(stds[k, band])
     ratio, low, high = (float(np.exp(0.5 * (size + way * std))) for way in (0.0, -1.96, 1.96))
     if ratio < least or t[k, band] ** 2 <= limit or _is_noise(window, e, int(begin)):
         return None
-    told = next(n for n in range(FEWEST, count + 1) if n == count or _largest(blocks, n) ** 2 > limit)
+    told = next(n for n in range(MIN_BLOCKS, count + 1) if n == count or _largest(blocks, n) ** 2 > limit)
     likelihood = (left[:, band] / left[:, band].min()) ** (-0.5 * count)
     share = np.cumsum(likelihood) / likelihood.sum()
-    first, last = (int(blocks.begin[EDGE + int(np.searchsorted(share, q))]) for q in INTERVAL)
+    first, last = (int(blocks.begin[EDGE_BLOCKS + int(np.searchsorted(share, q))]) for q in INTERVAL)
     # a change may come anywhere within a block
     onset = (max(first - blocks.size, 0), int(begin), min(last + blocks.size, window.samples - 1))
     detected = max(int(blocks.begin[told - 1]) + blocks.size - 1, int(begin))
@@ -129,4 +129,4 @@ def _is_noise(window: AxisWindow, e: FloatArray, begin: int) -> bool:
     shapes = [autocovariance(lfilter(b, f.poles, impulse)) for b in (f.to_y, f.to_acceleration)]
     columns = np.array([shape / shape[0] for shape in shapes]).T
     _, missed = nnls(columns, after - before)
-    return bool(missed < NOISY * np.linalg.norm(after - before))
+    return bool(missed < MIN_NOISE_SHARE * np.linalg.norm(after - before))

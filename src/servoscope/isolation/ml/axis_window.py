@@ -28,13 +28,16 @@ from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 
-ADDED = ("offset", "drift")  # nuisances of every recording: a constant force, and its change from end to end
+RECORDING_NUISANCES = (
+    "offset",
+    "drift",
+)  # nuisances of every recording: a constant force, and its change from end to end
 LONG_RUN_S = 0.5  # over which the scores may hang together
 
 
 @dataclass(frozen=True, eq=False)
 class AxisWindow(ChangeWindow):
-    """What the filter of a motor axis sees; `names` are the logarithms of parameters, then `ADDED`."""
+    """What the filter of a motor axis sees; `names` are the logarithms of parameters, then `RECORDING_NUISANCES`."""
 
     plant: AxisPlant
     model: AxisModel
@@ -63,7 +66,7 @@ class AxisWindow(ChangeWindow):
         return cls(
             model.plant(loop.plant),
             prior,
-            (*model.parameters, *ADDED),
+            (*model.parameters, *RECORDING_NUISANCES),
             first,
             signals.u,
             signals.y,

@@ -10,7 +10,7 @@ from servoscope.isolation.ml.kernels import Array, samples_since_restart
 from servoscope.isolation.ml.least_squares import minimise_from_grid
 from servoscope.isolation.ml.window import RefitWindow
 
-TRIED = 33  # gaps, in even ratios, before the best is refined
+GAP_COUNT = 33  # gaps, in even ratios, before the best is refined
 
 
 @kernel
@@ -67,5 +67,5 @@ def fit_backlash(window: RefitWindow, onset: int) -> float:
         return float(e @ e)
 
     smallest, largest = 0.1 * window.factory.noise.y_std, 0.5 * float(np.ptp(window.y))
-    tried: FloatArray = np.linspace(np.log(smallest), np.log(max(largest, 2.0 * smallest)), TRIED)
+    tried: FloatArray = np.linspace(np.log(smallest), np.log(max(largest, 2.0 * smallest)), GAP_COUNT)
     return 2.0 * float(np.exp(minimise_from_grid(cost, tried, 1e-3)))

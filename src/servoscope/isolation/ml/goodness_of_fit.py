@@ -12,7 +12,7 @@ from servoscope.estimation.tuning import sum_covariance
 from servoscope.isolation.ml.least_squares import normalise_columns, orthonormal_basis
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 
-MISFIT = 1e-3  # probability with which a true hypothesis may fit worse than the limit
+MISFIT_BY_CHANCE = 1e-3  # probability with which a true hypothesis may fit worse than the limit
 
 
 @dataclass(frozen=True)
@@ -65,5 +65,5 @@ def score_test(
         statistic = float(total @ np.linalg.solve(sum_covariance(scores, coloured), total))
     else:
         statistic = float((scores.sum(axis=0) ** 2).sum()) / noise_variance
-    limit = float(special.chdtri(max(dof, 1), MISFIT)) + shift**2 / noise_variance
+    limit = float(special.chdtri(max(dof, 1), MISFIT_BY_CHANCE)) + shift**2 / noise_variance
     return GoodnessOfFit(statistic, dof, limit)

@@ -13,14 +13,15 @@ from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 from servoscope.isolation.posterior import Posterior
 from servoscope.models.plants import Fault
 
-STEPS = 12  # of the search, at most
-UNSEEN = 3.0  # standard deviations below which a size is as good as none
-REACH = 5.0  # standard deviations of the size over which its likelihood is integrated
+MAX_STEPS = 12  # of the search, at most
+MIN_SIZE_STDS = 3.0  # standard deviations below which a size is as good as none
+SIZE_STDS = 5.0  # standard deviations of the size over which its likelihood is integrated
 POINTS = 31
-AT_BOUND = 1e-6
-NEARLY_ZERO = 1e-4  # of all logarithms where a search begins
+BOUND_TOLERANCE = 1e-6
+START_LOGARITHM = 1e-4  # of all logarithms where a search begins
 EPSILON = float(np.finfo(np.float64).eps)
-IN_REACH = 60.0  # of the sum of squares: what is further off than the best one has no probability worth telling
+# of the sum of squares: what is further off than the best one has no probability worth telling
+MAX_EXCESS_SQUARES = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +99,8 @@ def fit_hypothesis(
         return HypothesisFit((), profile, d, np.zeros(0), float(e @ e), np.zeros((0, 0)), np.zeros((len(e), 0)), e)
     ends = []
     for x in starts:
-        z = np.clip(np.concatenate([d, x])[held:], lowest + AT_BOUND, highest - AT_BOUND)
-        if np.abs(z).max() < NEARLY_ZERO:  # the first step is as long as the start, and as long as it likes from 0
+        z = np.clip(np.concatenate([d, x])[held:], lowest + BOUND_TOLERANCE, highest - BOUND_TOLERANCE)
+        if np.abs(z).max() < START_LOGARITHM:  # the first step is as long as the start, and as long as it likes from 0
             z = np.zeros_like(z)
         try:
             found = minimise(
@@ -112,7 +113,7 @@ def fit_hypothesis(
                 xtol=1e-7 if free else 1e-4,
                 # only where nothing shows at all: the search divides by the length of a gradient that is zero
                 gtol=EPSILON,
-                max_nfev=STEPS,
+                max_nfev=MAX_STEPS,
             )
         except ValueError as error:  # residuals that are no numbers
             raise np.linalg.LinAlgError(str(error)) from None
@@ -137,7 +138,7 @@ def refit_contenders_jointly(
     for f in fitted:
         jacobian = window.jacobian(np.concatenate([f.d, f.x]), f.names, f.profile)
         promised.append(f.cost - explained_sum_of_squares(jacobian, f.residual))
-    limit = min(J, *promised) + IN_REACH * noise_variance
+    limit = min(J, *promised) + MAX_EXCESS_SQUARES * noise_variance
     return [refit_jointly(window, f) if limit >= promise else f for f, promise in zip(fitted, promised, strict=True)]
 
 
@@ -164,7 +165,7 @@ class SizePrior:
         m = window.nuisance_count
         J = window.jacobian(np.zeros(m + 1), (fault.parameter,), profile)
         (low,), (high,) = log_ratio_bounds([fault])
-        return cls(fault, min(UNSEEN * last_unknown_std(J), (high - low) / 4.0))
+        return cls(fault, min(MIN_SIZE_STDS * last_unknown_std(J), (high - low) / 4.0))
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Return the logarithm of the prior density at x, shape as x."""
@@ -217,7 +218,7 @@ def _evidence_along_size(
     m = window.nuisance_count
     (low,), (high,) = log_ratio_bounds(found.faults)
     best = float(found.x[0])
-    reach = min(REACH * float(np.sqrt(found.covariance[0, 0] * noise_variance)), high - low)
+    reach = min(SIZE_STDS * float(np.sqrt(found.covariance[0, 0] * noise_variance)), high - low)
     sizes = np.unique(np.clip(best + reach * np.linspace(-1.0, 1.0, POINTS), low, high))
     H = found.jacobian.T @ found.jacobian
     follow = -np.linalg.solve(H[:m, :m], H[:m, m]) if m else np.zeros(0)

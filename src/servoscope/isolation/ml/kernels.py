@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ Array = npt.NDArray[Any]  # float64, or complex128 for complex-step derivatives
 @kernel
 def innovations(
     A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, plants: IntArray, onset: int, duration: int,
-    u: Array, y: Array, restart: BoolArray, known: Array, states: Array,
+    u: Array, y: Array, restart: BoolArray,
 ) -> Array:  # fmt: skip
     """Return e(k) = y(k) - y_hat(k | k-1) in standard deviations, shape (V, N), through changes of the plant.
 
@@ -26,9 +25,6 @@ def innovations(
     samples later on; in between it goes through the others, evenly and in straight lines. The state goes on. All are
     multiplied by one factor, the geometric mean of the deviations relative to the first plant's, so that the sum of
     squares ranks hypotheses as the likelihood does whose noise is known but for a common factor.
-
-    `known` (N,), `states` (N + 1, n): innovations and states of plant 0 all the way, as `run_plant` returns them; empty
-    where they are not known.
     """
     N, V, last = len(y), plants.shape[0], plants.shape[1] - 1
     e, age = np.empty((V, N), A.dtype), samples_since_restart(restart, S.shape[1])
@@ -36,19 +32,11 @@ def innovations(
     begin, end = min(onset, N), min(onset + duration, N)
     if last == 0:
         begin = N
-    youngest = S.shape[1] - 1
-    for k in range(begin, N):
-        youngest = min(youngest, age[k])
-    by, log_S = inverse_std(S, youngest), log_variances(S, youngest)
+    by, log_S = 1.0 / np.sqrt(S), np.log(S)
     for v in range(V):
         if v > 0 and plants[v, 0] == plants[v - 1, 0]:  # up to the change it is the variant before
             e[v, :begin], x[v] = e[v - 1, :begin], x[v - 1]
             continue
-        if plants[v, 0] == 0 and len(known):
-            e[v, :begin], x[v] = known[:begin], states[begin]
-            continue
-        if begin > 0:
-            fill_inverse_std(by, S, plants[v, 0], 0)
         run_constant_plant(A, b, b_late, c, K, by, plants, 0, v, v + 1, 0, begin, age, u, y, restart, x, x_next, e, 0)
     run_drifting_plant(
         A, b, b_late, c, K, by, plants, V, onset, duration, begin, end, age, u, y, restart, x, x_next, e, 0
@@ -65,20 +53,6 @@ def innovations(
 
 
 @kernel
-def run_plant(
-    A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, u: Array, y: Array, restart: BoolArray
-) -> tuple[Array, Array]:
-    """Return innovations of one plant in standard deviations, shape (N,), and the states before them, (N + 1, n)."""
-    N, n = len(y), A.shape[1]
-    x, x_next, e, states = np.zeros((1, n)), np.zeros(n), np.zeros((1, N)), np.zeros((N + 1, n))
-    age, by, plants = samples_since_restart(restart, S.shape[1]), inverse_std(S, 0), np.zeros((1, 1), np.int64)
-    for k in range(N):
-        run_constant_plant(A, b, b_late, c, K, by, plants, 0, 0, 1, k, k + 1, age, u, y, restart, x, x_next, e, 0)
-        states[k + 1] = x[0]
-    return e[0], states
-
-
-@kernel
 def samples_since_restart(restart: BoolArray, L: int) -> IntArray:
     """Return the samples since a restart, as far as the gains change with them, shape (N,)."""
     age = np.empty(len(restart), np.int64)
@@ -87,32 +61,6 @@ def samples_since_restart(restart: BoolArray, L: int) -> IntArray:
         j = 0 if restart[k] else min(j + 1, L - 1)
         age[k] = j
     return age
-
-
-@functools.partial(subroutine, heap=True)
-def inverse_std(S: Array, youngest: int) -> Array:
-    """Return 1/sqrt(S) from that many samples after a restart on, shape (P, L)."""
-    by: Array = np.empty_like(S)
-    for p in range(S.shape[0]):
-        fill_inverse_std(by, S, p, youngest)
-    return by
-
-
-@subroutine
-def fill_inverse_std(by: Array, S: Array, p: int, youngest: int) -> None:
-    """Put 1/sqrt(S[p]) into by[p] from an age on; most of a settled gain's are the same."""
-    for j in range(youngest, S.shape[1]):
-        by[p, j] = by[p, j - 1] if j > youngest and S[p, j] == S[p, j - 1] else 1.0 / np.sqrt(S[p, j])
-
-
-@functools.partial(subroutine, heap=True)
-def log_variances(S: Array, youngest: int) -> Array:
-    """Return log S from that many samples after a restart on, shape (P, L)."""
-    logs: Array = np.empty_like(S)
-    for p in range(S.shape[0]):
-        for j in range(youngest, S.shape[1]):
-            logs[p, j] = logs[p, j - 1] if j > youngest and S[p, j] == S[p, j - 1] else np.log(S[p, j])
-    return logs
 
 
 @subroutine

@@ -8,13 +8,13 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 
-RANK = 1e-7  # of a column's length, below which it says nothing new
-SMALLEST = 1e-300  # length of a column that is not zero
+RANK_TOLERANCE = 1e-7  # of a column's length, below which it says nothing new
+MIN_LENGTH = 1e-300  # length of a column that is not zero
 
 
 def normalise_columns(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return columns (N, k) of length one, and the lengths that they had, shape (k,)."""
-    size = np.maximum(np.linalg.norm(columns, axis=0), SMALLEST)
+    size = np.maximum(np.linalg.norm(columns, axis=0), MIN_LENGTH)
     return columns / size, size
 
 
@@ -25,8 +25,8 @@ def orthonormal_basis(columns: FloatArray) -> FloatArray:
     if not columns.shape[1]:
         return columns
     each, size = normalise_columns(columns)
-    Q, R, _ = qr(each[:, size > RANK], mode="economic", pivoting=True)
-    return np.asarray(Q[:, np.abs(np.diag(R)) > RANK])
+    Q, R, _ = qr(each[:, size > RANK_TOLERANCE], mode="economic", pivoting=True)
+    return np.asarray(Q[:, np.abs(np.diag(R)) > RANK_TOLERANCE])
 
 
 def explained_sum_of_squares(J: FloatArray, residual: FloatArray) -> float:

@@ -13,15 +13,15 @@ from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 from servoscope.isolation.posterior import INTERVAL
 
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
-SHORTEST_S = 0.2  # of a drift that is not called a step
-STEPLIKE = 0.5  # probability of a step, before anything is known
-STEPS = 400  # onsets of a step that are tried at first, at most
-RATIO = 1.6  # of one duration to the next, at first
-PER_DURATION = 4  # onsets that are tried within the duration of a drift
-CLOSER = 3  # times closer together they are in each further look
+MIN_DRIFT_S = 0.2  # of a drift that is not called a step
+STEP_PRIOR = 0.5  # probability of a step, before anything is known
+MAX_STEP_ONSETS = 400  # onsets of a step that are tried at first, at most
+DURATION_RATIO = 1.6  # of one duration to the next, at first
+ONSETS_PER_DURATION = 4  # onsets that are tried within the duration of a drift
+REFINEMENT_FACTOR = 3  # times closer together they are in each further look
 LOOKS = 5
-NEGLIGIBLE = 1e-4  # of the largest posterior, that a further look may leave out
-ALIKE = 7.35  # of the cost: what the true onset reaches in 95 % of the cases (Hansen, 2000, table 1)
+POSTERIOR_SHARE = 1e-4  # of the largest posterior, that a further look may leave out
+ONSET_COST_QUANTILE = 7.35  # of the cost: what the true onset reaches in 95 % of the cases (Hansen, 2000, table 1)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def onset_posterior(
     share = np.cumsum((likelihood * prior)[order])
     low, high = (int(onsets[order][np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
     # at rest no onset is better than another: what is nearly as likely as the best belongs to it, its edge too
-    alike = onsets[cost <= cost.min() + ALIKE * noise_variance]
+    alike = onsets[cost <= cost.min() + ONSET_COST_QUANTILE * noise_variance]
     low, high = min(low, int(alike.min())), max(high, int(alike.max()))
     # the best of so many drifts beats the best step easily: all of them together are compared
     steps = overs == 0
@@ -86,7 +86,7 @@ def onset_posterior(
 
 def _step_grid(table: ChangeCosts, latest: int, noise_variance: float) -> _ChangeGrid:
     """Try steps everywhere, and at every sample where they are likely."""
-    apart = max(1, latest // STEPS)
+    apart = max(1, latest // MAX_STEP_ONSETS)
     onsets = np.arange(0, latest + 1, apart)
     cost, moved = table.costs(onsets, np.zeros_like(onsets))
     if apart > 1:
@@ -96,7 +96,7 @@ def _step_grid(table: ChangeCosts, latest: int, noise_variance: float) -> _Chang
         onsets = np.unique((near[:, None] + np.arange(1 - apart, apart)).ravel())
         onsets = onsets[(onsets >= 0) & (onsets <= latest)]
         cost, moved = table.costs(onsets, np.zeros_like(onsets))
-    return _ChangeGrid(onsets, np.zeros_like(onsets), cost, np.full(len(onsets), STEPLIKE), moved)
+    return _ChangeGrid(onsets, np.zeros_like(onsets), cost, np.full(len(onsets), STEP_PRIOR), moved)
 
 
 def _ramp_grid(table: ChangeCosts, latest: int, noise_variance: float) -> _ChangeGrid | None:
@@ -104,12 +104,12 @@ def _ramp_grid(table: ChangeCosts, latest: int, noise_variance: float) -> _Chang
 
     The middle of a drift is known better than its ends, so looks are laid out by middle and duration.
     """
-    shortest, longest = SHORTEST_S * table.window.sample_rate, table.window.samples - 1
+    shortest, longest = MIN_DRIFT_S * table.window.sample_rate, table.window.samples - 1
     if longest <= 2.0 * shortest:
         return None
-    count = int(np.ceil(np.log(longest / shortest) / np.log(RATIO))) + 1
+    count = int(np.ceil(np.log(longest / shortest) / np.log(DURATION_RATIO))) + 1
     durations = np.geomspace(shortest, longest, count)
-    ratio, share = float(durations[1] / durations[0]), 1.0 / PER_DURATION
+    ratio, share = float(durations[1] / durations[0]), 1.0 / ONSETS_PER_DURATION
     points = np.concatenate([_row(d, latest, share) for d in durations])
     for look in range(LOOKS):
         onsets, overs = _round_to_samples(points)
@@ -119,14 +119,14 @@ def _ramp_grid(table: ChangeCosts, latest: int, noise_variance: float) -> _Chang
             return None
         cost, moved = table.costs(onsets, overs)
         width = np.maximum(points[:, 1] * share, 1.0) * np.log(ratio)
-        prior = (1.0 - STEPLIKE) * width / np.log(longest / shortest)
+        prior = (1.0 - STEP_PRIOR) * width / np.log(longest / shortest)
         grids = _ChangeGrid(onsets, overs, cost, prior, moved)
         worth = cost <= cost.min() + _negligible_cost(noise_variance)
         if look == LOOKS - 1 or worth.sum() > 40 or points[worth, 1].max() * share <= 1.0:
             break
         ranked = np.argsort(cost)[: max(int(worth.sum()), 12)]
         points = np.unique(np.concatenate([_ramps_around(points[i], ratio, share) for i in ranked]), axis=0)
-        ratio, share = ratio ** (1.0 / CLOSER), share / CLOSER
+        ratio, share = ratio ** (1.0 / REFINEMENT_FACTOR), share / REFINEMENT_FACTOR
     return grids
 
 
@@ -138,9 +138,9 @@ def _row(duration: float, latest: int, share: float) -> FloatArray:
 
 def _ramps_around(point: FloatArray, ratio: float, share: float) -> FloatArray:
     """Return drifts around one, in the cell that it stands for and those beside it; the grid is common to all."""
-    k = np.arange(-CLOSER + 1, CLOSER)
-    middles = point[0] + point[1] * share * k / CLOSER
-    durations = point[1] * ratio ** (k / CLOSER)
+    k = np.arange(-REFINEMENT_FACTOR + 1, REFINEMENT_FACTOR)
+    middles = point[0] + point[1] * share * k / REFINEMENT_FACTOR
+    durations = point[1] * ratio ** (k / REFINEMENT_FACTOR)
     both = np.stack(np.meshgrid(middles, durations), axis=-1).reshape(-1, 2)
     return np.asarray(np.round(both, 3))
 
@@ -152,7 +152,7 @@ def _round_to_samples(points: FloatArray) -> tuple[IntArray, IntArray]:
 
 def _negligible_cost(noise_variance: float) -> float:
     """Return the cost above the smallest from which a change is negligible."""
-    return 2.0 * float(np.log(1.0 / NEGLIGIBLE)) * noise_variance
+    return 2.0 * float(np.log(1.0 / POSTERIOR_SHARE)) * noise_variance
 
 
 class ChangeCosts:

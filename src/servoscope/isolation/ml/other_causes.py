@@ -14,10 +14,9 @@ from servoscope.isolation.ml.backlash import backlash_of_width, fit_backlash
 from servoscope.isolation.ml.hypothesis import HypothesisFit
 from servoscope.isolation.ml.least_squares import minimise_from_grid, solve_least_squares
 from servoscope.isolation.ml.predictor import Predictor
-from servoscope.isolation.ml.start_values import fit_further_parameters
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow, delayed, speed_sign
 
-TRIED = 9  # delays up to one further sample, before the best is refined
+DELAY_COUNT = 9  # delays up to one further sample, before the best is refined
 UNITS = {"delay": "s", "backlash": "of y", "sensor_offset": "of y", "coulomb_friction": "of u", "input_offset": "of u"}
 
 
@@ -106,7 +105,7 @@ class CauseWindow:
             return float(left @ left)
 
         latest = 1.0 - factory.fractional_delay_s * rate
-        return minimise_from_grid(cost, np.linspace(0.0, latest, TRIED), 1e-4) / rate
+        return minimise_from_grid(cost, np.linspace(0.0, latest, DELAY_COUNT), 1e-4) / rate
 
     def _later_input(self, onset: int, later_s: float) -> FloatArray:
         window = self.window
@@ -118,13 +117,6 @@ class CauseWindow:
         residual = np.append(e, np.zeros(window.nuisance_count))
         step, _ = solve_least_squares(J, residual)
         return np.asarray(residual + J @ step)
-
-
-def parameter_causes(
-    window: ChangeWindow, profile: ChangeProfile, best: HypothesisFit, noise_variance: float
-) -> list[OtherCause]:
-    """Return the parameters outside the list of faults, each as if it alone had changed."""
-    return list(map(parameter_cause, fit_further_parameters(window, profile, best, noise_variance)))
 
 
 def parameter_cause(fitted: HypothesisFit) -> OtherCause:

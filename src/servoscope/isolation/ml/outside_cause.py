@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from servoscope.core.arrays import FloatArray, IntArray
-from servoscope.isolation.ml.hypothesis import IN_REACH, HypothesisFit, refit_jointly
-from servoscope.isolation.ml.onset import ALIKE, NEGLIGIBLE, OnsetEstimate, onset_posterior
-from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes_at, parameter_cause, parameter_causes
-from servoscope.isolation.ml.search import LOOKS, RefitResult
-from servoscope.isolation.ml.timeline import INCONSTANT, bridge_height
+from servoscope.isolation.ml.hypothesis import MAX_EXCESS_SQUARES, HypothesisFit, refit_jointly
+from servoscope.isolation.ml.onset import ONSET_COST_QUANTILE, POSTERIOR_SHARE, OnsetEstimate, onset_posterior
+from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes_at, parameter_cause
+from servoscope.isolation.ml.search import MAX_LOOKS, RefitResult
+from servoscope.isolation.ml.start_values import fit_further_parameters
+from servoscope.isolation.ml.timeline import MAX_BRIDGE, bridge_height
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 from servoscope.isolation.posterior import INTERVAL
 
-AS_WELL = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
-NEARLY_ALL = 0.95  # of what the healthy plant does not explain
-QUIET = 1.15  # variance of the innovations up to which nothing but noise is left
-COARSE = 24  # onsets that are tried at first
+FIT_TOLERANCE = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
+MIN_EXPLAINED_SHARE = 0.95  # of what the healthy plant does not explain
+MAX_WHITE_VARIANCE = 1.15  # variance of the innovations up to which nothing but noise is left
+FIRST_ONSETS = 24  # onsets that are tried at first
 STRIDES = 256, 64, 16, 4, 1  # samples by which an onset is moved then,
-REACH = 4  # and at most so many times
+MAX_MOVES = 4  # and at most so many times
 POINTS = 33  # of the likelihood of the onset on either side of the best
 
 
@@ -38,11 +39,11 @@ def find_other_causes(refined: RefitResult, since: ChangeProfile | None = None) 
         if since is None:  # the onset of an explanation that is none may mean nothing
             earlier = _all_causes(refined, causes, ChangeProfile(refined.initial_onset))
             found = min(found, earlier, key=lambda each: min(cause.cost for cause in each))
-        most = window.samples + (1.0 - NEARLY_ALL) * (causes.healthy_cost - window.samples)
-        enough = min(max(most, QUIET * window.samples), best.cost)
+        most = window.samples + (1.0 - MIN_EXPLAINED_SHARE) * (causes.healthy_cost - window.samples)
+        enough = min(max(most, MAX_WHITE_VARIANCE * window.samples), best.cost)
         limit = min([cause.cost for cause in found if enough >= cause.cost], default=-np.inf)
     return sorted(
-        (c for c in found if limit + AS_WELL * refined.noise_variance >= c.cost), key=lambda cause: cause.cost
+        (c for c in found if limit + FIT_TOLERANCE * refined.noise_variance >= c.cost), key=lambda cause: cause.cost
     )
 
 
@@ -54,7 +55,7 @@ def find_outside_onset(refined: RefitResult) -> OnsetEstimate | None:
     """
     window, causes = refined.window, CauseWindow(refined.window)
     starts = {min(refined.best.fitted.profile.onset, refined.latest), refined.initial_onset}
-    everywhere = {*starts, *np.linspace(0, refined.latest, COARSE).astype(int).tolist()}
+    everywhere = {*starts, *np.linspace(0, refined.latest, FIRST_ONSETS).astype(int).tolist()}
     tried = [(causes.fit(name, k), k) for name in causes.nonlinear for k in sorted(starts)]
     tried += [(causes.fit(name, k), k) for name in causes.disturbances for k in sorted(everywhere)]
     cause, onset = min(tried, key=lambda one: one[0].cost)
@@ -65,23 +66,21 @@ def find_outside_onset(refined: RefitResult) -> OnsetEstimate | None:
         found, cause = _disturbance_onset(causes, cause, onset, refined.latest)
     variance = cause.cost / window.used
     e = cause.residual[: window.samples]
-    quiet = variance <= QUIET and bridge_height(e**2 / variance - 1.0) <= INCONSTANT
-    return found if quiet and cause.cost + IN_REACH * variance < refined.best.fitted.cost else None
+    quiet = variance <= MAX_WHITE_VARIANCE and bridge_height(e**2 / variance - 1.0) <= MAX_BRIDGE
+    return found if quiet and cause.cost + MAX_EXCESS_SQUARES * variance < refined.best.fitted.cost else None
 
 
 def _all_causes(refined: RefitResult, causes: CauseWindow, profile: ChangeProfile) -> list[OtherCause]:
     window, best = refined.window, refined.best.fitted
-    others = (
-        list(map(parameter_cause, refined.other_parameters))
-        if profile == best.profile
-        else parameter_causes(window, profile, best, refined.noise_variance)
-    )
-    return [*others, *causes_at(causes, profile.onset + profile.duration // 2)]
+    parameters: Sequence[HypothesisFit] = refined.other_parameters
+    if profile != best.profile:
+        parameters = fit_further_parameters(window, profile, best, refined.noise_variance)
+    return [*map(parameter_cause, parameters), *causes_at(causes, profile.onset + profile.duration // 2)]
 
 
 def _parameter_onset(window: ChangeWindow, fitted: HypothesisFit, latest: int) -> tuple[OnsetEstimate, OtherCause]:
     """Find onset and size of a parameter in turns."""
-    for _ in range(LOOKS):
+    for _ in range(MAX_LOOKS):
         found = onset_posterior(window, fitted, latest, fitted.cost / window.used, drifts=False)
         if found.profile == fitted.profile:
             break
@@ -97,10 +96,10 @@ def _disturbance_onset(
     def cost(k: int) -> float:
         return causes.fit(cause.name, k, cause.value).cost
 
-    for _ in range(LOOKS):
+    for _ in range(MAX_LOOKS):
         before = onset
         for stride in STRIDES:
-            moved = np.clip(onset + stride * np.arange(-REACH, REACH + 1), 0, latest)
+            moved = np.clip(onset + stride * np.arange(-MAX_MOVES, MAX_MOVES + 1), 0, latest)
             onset = int(min(np.unique(moved).tolist(), key=cost))
         cause = causes.fit(cause.name, onset)
         if onset == before:
@@ -112,7 +111,7 @@ def _disturbance_onset(
 
 def _onset_interval(cost: Callable[[int], float], onset: int, latest: int, variance: float) -> tuple[int, int]:
     """Return the 95 % interval of an onset, by the same rule as `onset_posterior`."""
-    least, negligible = cost(onset), 2.0 * float(np.log(1.0 / NEGLIGIBLE)) * variance
+    least, negligible = cost(onset), 2.0 * float(np.log(1.0 / POSTERIOR_SHARE)) * variance
     ends = []
     for way, edge in ((-1, 0), (1, latest)):
         step = 1
@@ -125,5 +124,5 @@ def _onset_interval(cost: Callable[[int], float], onset: int, latest: int, varia
     width = np.gradient(onsets.astype(np.float64)) if len(onsets) > 1 else np.ones(1)
     share = np.cumsum(np.exp(-0.5 * costs / variance) * width)
     low, high = (int(onsets[np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
-    alike = onsets[costs <= ALIKE * variance]
+    alike = onsets[costs <= ONSET_COST_QUANTILE * variance]
     return min(low, int(alike.min())), max(high, int(alike.max()))

@@ -7,8 +7,8 @@ import numpy as np
 from servoscope.core.jit import kernel, subroutine
 from servoscope.isolation.ml.kernels import Array
 
-SETTLED = 1e-6  # relative change of the gain from which it stays as it is
-SMALL = 0.25  # norm of a matrix up to which so many terms of the exponential are exact to the last digit
+GAIN_TOLERANCE = 1e-6  # relative change of the gain from which it stays as it is
+MAX_SERIES_NORM = 0.25  # norm of a matrix up to which so many terms of the exponential are exact to the last digit
 TERMS = 13
 
 
@@ -70,7 +70,7 @@ def exponentiate(M: Array, E: Array, power: Array) -> None:
         for k in range(n):
             total += abs(M[i, k])
         norm = max(norm, total)
-    while norm > SMALL and halvings < 64:
+    while norm > MAX_SERIES_NORM and halvings < 64:
         norm *= 0.5
         halvings += 1
     part = 0.5**halvings
@@ -117,7 +117,7 @@ def gains(A: Array, Q: Array, c: Array, r: float, P: Array, K: Array, S: Array) 
             K[j, i] = total * by
             if j > 0:
                 ratio = abs(K[j, i].real - K[j - 1, i].real)
-                settled = settled and ratio <= SETTLED * abs(K[j, i].real)
+                settled = settled and ratio <= GAIN_TOLERANCE * abs(K[j, i].real)
         if j > n and settled:
             for later in range(j + 1, L):
                 S[later] = s

@@ -8,7 +8,7 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel
-from servoscope.isolation.ml.kernels import Array, inverse_std, run_constant_plant, samples_since_restart
+from servoscope.isolation.ml.kernels import Array, run_constant_plant, samples_since_restart
 from servoscope.isolation.ml.predictor import Predictor
 from servoscope.isolation.ml.window import RefitWindow
 
@@ -57,7 +57,7 @@ def sequence_cost(
 ) -> float:  # fmt: skip
     """Return what `SequenceCost` does: plant v, from 1 on, holds from sample bounds[v - 1] to bounds[v]."""
     V, n = b.shape
-    age, by = samples_since_restart(restart, S.shape[1]), inverse_std(S, 0)
+    age, by = samples_since_restart(restart, S.shape[1]), 1.0 / np.sqrt(S)
     plants = np.arange(V).reshape(V, 1)
     x, x_next, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, len(y)))
     cost = 0.0
@@ -83,7 +83,7 @@ def switching_costs(
     plant at a sample.
     """
     V, n, N = b.shape[0], b.shape[1], len(y)
-    age, by = samples_since_restart(restart, S.shape[1]), inverse_std(S, 0)
+    age, by = samples_since_restart(restart, S.shape[1]), 1.0 / np.sqrt(S)
     plants = np.arange(V).reshape(V, 1)
     x, x_next, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, 1))
     cost: Array = prices.copy()

@@ -17,8 +17,8 @@ from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.models.plants.base import StateSpace
 
-LONGEST = 1024  # samples after a restart until the gain stays as it is
-LOUD = 3.0  # standard deviations of u that the unknown first state may come from
+MAX_GAIN_SAMPLES = 1024  # samples after a restart until the gain stays as it is
+FIRST_STATE_STDS = 3.0  # standard deviations of u that the unknown first state may come from
 DOUBLINGS = 8  # 2^8 samples before a restart that it may come from
 
 
@@ -45,41 +45,23 @@ class Predictor(NamedTuple):
         y: FloatArray,
         restart: BoolArray,
         plants: IntArray | None = None,
-        known: HealthyRun | None = None,
     ) -> Array:
         """Return the innovations of a recording in standard deviations under a change of the plant.
 
         Shape (N,), or (V, N) for V variants of the change, the rows of `plants` (V, p): which ones it goes through.
-        `known`: the first plant's run.
         """
         from servoscope.isolation.ml.kernels import innovations
 
-        each = np.arange(len(self.b))[None] if plants is None else plants
-        before = (np.zeros(0), np.zeros((0, 0))) if known is None else (known.e, known.states)
-        e: Array = innovations(*self, each, onset, duration, u, y, restart, *before)
+        rows = np.arange(len(self.b))[None] if plants is None else plants
+        e: Array = innovations(*self, rows, onset, duration, u, y, restart)
         return e[0] if plants is None else e
-
-    def run(self, u: FloatArray, y: FloatArray, restart: BoolArray) -> HealthyRun:
-        """Take the first plant all the way."""
-        from servoscope.isolation.ml.kernels import run_plant
-
-        return HealthyRun(self, *run_plant(*self, u, y, restart))
-
-
-class HealthyRun(NamedTuple):
-    """What a healthy plant predicts all the way: its predictor, innovations (N,), and states (N + 1, n)."""
-
-    predictor: Predictor
-    e: FloatArray
-    states: FloatArray
 
 
 class PlantVariants(NamedTuple):
-    """Variants of a change: predictors in a row, which of them each goes through, (V, p), and the first one's run."""
+    """Variants of a change: predictors in a row, and which of them each goes through, (V, p)."""
 
     predictor: Predictor
     plants: IntArray
-    run: HealthyRun | None  # None where variants differ in their healthy plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +110,7 @@ class PredictorFactory:
         F, g, c = (np.ascontiguousarray(part, dtype=kind) for part in (F, g, c))
         samples, late = split_delay(self.fractional_delay_s + later_s, self.loop.sample_rate)
         A, b, b_late = np.empty_like(F), np.empty_like(g), np.empty_like(g)
-        K, S = np.empty((len(g), LONGEST, g.shape[1]), kind), np.empty((len(g), LONGEST), kind)
+        K, S = np.empty((len(g), MAX_GAIN_SAMPLES, g.shape[1]), kind), np.empty((len(g), MAX_GAIN_SAMPLES), kind)
         noise = noise or self.noise
         variances = noise.u_std**2, noise.y_std**2
         P = self.initial_covariance.astype(kind)
@@ -152,7 +134,7 @@ class PredictorFactory:
         """Covariance of the first state after a restart, (n, n): what a loud and white u would have left."""
         d = discretise(self.loop.plant.state_space(), self.loop.sample_rate, hold="zoh")
         A, b, c = d.A * self.scale / self.scale[:, None], d.b_now / self.scale, d.c * self.scale
-        P, power = (LOUD * self.u_std) ** 2 * np.outer(b, b), A
+        P, power = (FIRST_STATE_STDS * self.u_std) ** 2 * np.outer(b, b), A
         for _ in range(DOUBLINGS):
             P, power = P + power @ P @ power.T, power @ power
         return np.asarray(P + (self.noise.y_std**2 / (c @ c) ** 2) * np.outer(c, c))

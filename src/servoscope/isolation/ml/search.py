@@ -13,7 +13,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.goodness_of_fit import GoodnessOfFit, misspecification_columns, score_test
 from servoscope.isolation.ml.hypothesis import (
-    IN_REACH,
+    MAX_EXCESS_SQUARES,
     HypothesisEvidence,
     HypothesisFit,
     SizePrior,
@@ -31,13 +31,13 @@ from servoscope.signals import Recording
 BEFORE_S = 60.0  # of healthy motion before the onset
 AFTER_S = 240.0  # of motion with the change
 MAX_WINDOW_SAMPLES = 40_000  # samples in a window
-PAIRS = 0.02  # probability that two faults come at once, before anything is known
-OUTSIDE = 0.01  # and that it is a parameter outside the list of faults
-LOOKS = 4  # for the onset, each with the sizes that fit the one before
-FAR = 100.0  # variances by which a fit at another onset is worse if that onset is none
-WORTH_A_LOOK = 1.0  # of the sum of squares that a look gained, for another one
-HOPELESS = 10.0  # of what noise leaves unexplained at most, from which a pair is not followed to its onset
-SHARP = 20  # samples of an onset's interval, up to which the step is loud
+PAIR_PRIOR = 0.02  # probability that two faults come at once, before anything is known
+OUTSIDE_PRIOR = 0.01  # and that it is a parameter outside the list of faults
+MAX_LOOKS = 4  # for the onset, each with the sizes that fit the one before
+ONSET_MISFIT_VARIANCES = 100.0  # variances by which a fit at another onset is worse if that onset is none
+MIN_LOOK_GAIN = 1.0  # of the sum of squares that a look gained, for another one
+MAX_PAIR_MISFIT = 10.0  # of what noise leaves unexplained at most, from which a pair is not followed to its onset
+MAX_SHARP_ONSET_SAMPLES = 20  # samples of an onset's interval, up to which the step is loud
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class _HypothesisSearch:
             everything = self._follow_onset([*singles, *pairs])
         best = self._update_noise_variance(everything)
         everything = [self._refit_own_onset(f, best) for f in everything]
-        if found.high - found.low <= SHARP and not found.profile.duration:
+        if found.high - found.low <= MAX_SHARP_ONSET_SAMPLES and not found.profile.duration:
             found, everything = self._sharpen_onset(found, everything)
         self.settled = True
         best = self._update_noise_variance(everything)
@@ -169,7 +169,7 @@ class _HypothesisSearch:
             for way in (-step, step):
                 while 0 <= best.profile.onset + way <= self.latest:
                     moved = self._refit_jointly(self._refit_at(best, ChangeProfile(best.profile.onset + way)))
-                    if best.cost - WORTH_A_LOOK * self.noise_variance < moved.cost:
+                    if best.cost - MIN_LOOK_GAIN * self.noise_variance < moved.cost:
                         break
                     best = moved
         profile = best.profile
@@ -191,12 +191,12 @@ class _HypothesisSearch:
     ) -> tuple[OnsetEstimate, HypothesisFit]:
         """Find the onset and the sizes of the best hypothesis in turns if it is a pair."""
         best = self._update_noise_variance(fitted)
-        for _ in range(LOOKS if len(best.faults) > 1 else 0):
+        for _ in range(MAX_LOOKS if len(best.faults) > 1 else 0):
             found = self._onset(best)
             after = self._refit_at(best, found.profile)
             gained, best = best.cost - after.cost, after
             # a pair that is far off at its own onset is not the truth, whatever further looks gain
-            if gained < WORTH_A_LOOK * self.noise_variance or self._misfit(best) > HOPELESS:
+            if gained < MIN_LOOK_GAIN * self.noise_variance or self._misfit(best) > MAX_PAIR_MISFIT:
                 break
         self.profile = found.profile
         return found, best
@@ -209,7 +209,7 @@ class _HypothesisSearch:
 
     def _is_hopeless(self, fitted: HypothesisFit) -> bool:
         """Whether a hypothesis is far off, the healthy parameters following too."""
-        return self._misfit(fitted) > HOPELESS and self._misfit(self._refit_jointly(fitted)) > HOPELESS
+        return self._misfit(fitted) > MAX_PAIR_MISFIT and self._misfit(self._refit_jointly(fitted)) > MAX_PAIR_MISFIT
 
     def _misfit(self, fitted: HypothesisFit) -> float:
         """Return what a hypothesis leaves unexplained, in units of what noise leaves at most."""
@@ -229,14 +229,14 @@ class _HypothesisSearch:
         )
         singles = self._fit_each_fault(ChangeProfile(begin), d, grids)
         for drifts in (False, True):
-            for _ in range(LOOKS):
+            for _ in range(MAX_LOOKS):
                 best = self._update_noise_variance(singles)
                 found = self._onset(best, drifts)
                 if found.profile == self.profile:
                     break
                 singles = self._fit_each_fault(found.profile, d, grids, singles)
                 gained = best.cost - self._update_noise_variance(singles).cost
-                if gained < WORTH_A_LOOK * self.noise_variance:
+                if gained < MIN_LOOK_GAIN * self.noise_variance:
                     break
         return found, singles
 
@@ -283,11 +283,13 @@ class _HypothesisSearch:
         return fitted if profile == fitted.profile else self._refit_jointly(self._refit_at(fitted, profile))
 
     def _is_contender(self, fitted: HypothesisFit, best: HypothesisFit) -> bool:
-        return IN_REACH * self.noise_variance >= fitted.cost - best.cost
+        return MAX_EXCESS_SQUARES * self.noise_variance >= fitted.cost - best.cost
 
     def _best(self, fitted: Sequence[HypothesisFit]) -> HypothesisFit:
         """Return the closest hypothesis; a second fault must be worth its freedom."""
-        return min(fitted, key=lambda f: f.cost + 2.0 * np.log(1.0 / PAIRS) * (len(f.names) - 1) * self.noise_variance)
+        return min(
+            fitted, key=lambda f: f.cost + 2.0 * np.log(1.0 / PAIR_PRIOR) * (len(f.names) - 1) * self.noise_variance
+        )
 
     def _update_noise_variance(self, fitted: Sequence[HypothesisFit]) -> HypothesisFit:
         """Return the closest hypothesis, and take the variance of the noise from it."""
@@ -305,18 +307,20 @@ class _HypothesisSearch:
     def _onset(self, fitted: HypothesisFit, drifts: bool = True) -> OnsetEstimate:
         found = onset_posterior(self.window, fitted, self.latest, self.noise_variance, drifts)
         begin = fitted.profile.onset
-        if not self.window.follows or abs(found.profile.onset - begin) <= SHARP:
+        if not self.window.follows or abs(found.profile.onset - begin) <= MAX_SHARP_ONSET_SAMPLES:
             return found
         # a size that is large, and healthy parameters that follow, are not linear so far from where they were fitted
-        is_worse = self._refit_at(fitted, found.profile).cost > fitted.cost + FAR * self.noise_variance
+        is_worse = (
+            self._refit_at(fitted, found.profile).cost > fitted.cost + ONSET_MISFIT_VARIANCES * self.noise_variance
+        )
         return OnsetEstimate(fitted.profile, begin, begin, found.size_std) if is_worse else found
 
     def _weigh(self, fitted: Sequence[HypothesisFit], found: OnsetEstimate) -> RefitResult:
         window, n = self.window, len(self.faults)
         scales = {fault: SizePrior.from_window(window, fault, found.profile) for fault in self.faults}
         own = n - len(self.rays)
-        several = PAIRS if own > 1 else 0.0
-        prior = {1: (1.0 - several - OUTSIDE) / n, 2: several / max(own * (own - 1) / 2, 1)}
+        several = PAIR_PRIOR if own > 1 else 0.0
+        prior = {1: (1.0 - several - OUTSIDE_PRIOR) / n, 2: several / max(own * (own - 1) / 2, 1)}
         best = self._update_noise_variance(fitted)
         # tempered, more of them are within reach than were when they were fitted
         fitted = [
@@ -338,7 +342,7 @@ class _HypothesisSearch:
         # unknown: what nothing explains, or what a parameter outside the list explains better
         others = fit_further_parameters(window, fitted[likeliest].profile, fitted[likeliest], self.noise_variance)
         rivals = [
-            self._evidence(f, {}).log - np.log(len(others) / OUTSIDE)
+            self._evidence(f, {}).log - np.log(len(others) / OUTSIDE_PRIOR)
             for f in others
             if f.has_free_nuisances and self._is_contender(f, best)
         ]

@@ -18,19 +18,19 @@ from servoscope.isolation.ml.start_values import SizeGrid
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.models.plants import Fault
 
-SWITCH = 60.0  # price of a switch in -2 log likelihood: its time is free
-FREEDOM = 15.0  # and of each fault of the plant that it leads to: its size is free
-ROUNDS = 4  # of sizes and sequences in turns, at most
-SHORTEST = 25  # samples of a stretch that is fitted,
-SMALLEST = 20  # and share of the window, as 1 over so much; shorter ones that follow each other are fitted as one
-FEW = 12  # stretches, beyond which a sequence explains nothing
-QUIET = 1.15  # mean square of the innovations up to which nothing but noise is left
+SWITCH_PRICE = 60.0  # price of a switch in -2 log likelihood: its time is free
+SIZE_PRICE = 15.0  # and of each fault of the plant that it leads to: its size is free
+MAX_ROUNDS = 4  # of sizes and sequences in turns, at most
+MIN_STRETCH_SAMPLES = 25  # samples of a stretch that is fitted,
+WINDOW_DIVISOR = 20  # and share of the window, as 1 over so much; shorter ones that follow each other are fitted as one
+MAX_STRETCHES = 12  # stretches, beyond which a sequence explains nothing
+MAX_WHITE_VARIANCE = 1.15  # mean square of the innovations up to which nothing but noise is left
 LEVEL = 0.3  # standard deviation of the logarithm of a parameter while it differs from healthy, when a change is dated
-INCONSTANT = 2.2  # sup of a Brownian bridge that is passed in one of ten thousand cases
+MAX_BRIDGE = 2.2  # sup of a Brownian bridge that is passed in one of ten thousand cases
 STRIDES = 16, 1, 16, 1  # samples by which a change is moved,
-REACH = 16  # and at most so many times
-WORTH_A_ROUND = 1.0  # that a round of sizes and sequences gained, for another one
-WHOLE = ChangeProfile(0)
+MAX_MOVES = 16  # and at most so many times
+MIN_ROUND_GAIN = 1.0  # that a round of sizes and sequences gained, for another one
+FROM_START = ChangeProfile(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ def is_constant(single: RefitResult) -> bool:
     e, J = best.residual[:N] / np.sqrt(single.noise_variance), best.jacobian[:N, -len(best.x) :]
     since = best.profile.onset
     scores = [*(J * e[:, None])[since:].T, (e**2 - 1.0)]
-    return max(map(bridge_height, scores)) <= INCONSTANT
+    return max(map(bridge_height, scores)) <= MAX_BRIDGE
 
 
 def bridge_height(score: FloatArray) -> float:
@@ -100,29 +100,32 @@ class _TimelineSearch:
     def __init__(
         self, window: RefitWindow, faults: Sequence[Fault], healthy: int, progress: Callable[[], None]
     ) -> None:
-        self.window = window if healthy < SHORTEST else _learn_from_past(window, healthy)
+        self.window = window if healthy < MIN_STRETCH_SAMPLES else _learn_from_past(window, healthy)
         self.faults, self.progress = faults, progress
         self.known = np.zeros(self.window.nuisance_count)
         self.grids = [SizeGrid.from_window(self.window, fault, self.known) for fault in faults]
-        self.shortest = max(SHORTEST, window.samples // SMALLEST)
+        self.shortest = max(MIN_STRETCH_SAMPLES, window.samples // WINDOW_DIVISOR)
 
     def run(self, single: HypothesisFit) -> tuple[TimelineStretch, ...]:
         change = ChangedPlant(single.faults, single.x)
         grids = zip(self.faults, self.grids, strict=True)
         plants = [ChangedPlant((fault,), np.array([x])) for fault, grid in grids for x in grid.sizes]
         best = self._sequence([HEALTHY, change, *plants])
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ROUNDS):
             known = {id(one): one for one in best.plants if one.faults}
             fitted = list(self._fit_stretches(best))
             sequence = self._sequence([HEALTHY, *known.values(), *(one for _, each in fitted for one in each)])
             found = min(sequence, self._place([(k, each[0]) for k, each in fitted]), key=lambda one: one.cost)
-            if found.cost > best.cost - WORTH_A_ROUND:
+            if found.cost > best.cost - MIN_ROUND_GAIN:
                 break
             best = found
-        if best.cost > self._cost_of(single) + _price(change) or best.likelihood > QUIET * self.window.samples:
+        if (
+            best.cost > self._cost_of(single) + _price(change)
+            or best.likelihood > MAX_WHITE_VARIANCE * self.window.samples
+        ):
             return ()
         best = self._drop_needless(best)
-        if not 2 < len(best.plants) + bool(best.plants[0].faults) <= FEW:
+        if not 2 < len(best.plants) + bool(best.plants[0].faults) <= MAX_STRETCHES:
             return ()
         return tuple(self._explain([*best.starts, self.window.samples], best.plants))
 
@@ -135,10 +138,12 @@ class _TimelineSearch:
         self.progress()
         path = likeliest_sequence(self.window, [*map(self._predictor, plants)], np.array([*map(_price, plants)]))
         starts = [*np.flatnonzero(np.diff(path, prepend=-1)).tolist(), self.window.samples]
-        return self._place([(k, plants[path[k]]) for k, end in pairwise(starts) if end - k >= SHORTEST or not k])
+        return self._place(
+            [(k, plants[path[k]]) for k, end in pairwise(starts) if end - k >= MIN_STRETCH_SAMPLES or not k]
+        )
 
     def _predictor(self, plant: ChangedPlant) -> Predictor:
-        return self.window.predictor(self.known, [fault.parameter for fault in plant.faults], plant.x, WHOLE)
+        return self.window.predictor(self.known, [fault.parameter for fault in plant.faults], plant.x, FROM_START)
 
     def _place(self, stretches: Sequence[tuple[int, ChangedPlant]]) -> PlantSequence:
         """Return a sequence whose changes are where they are likeliest; neighbours that are the same become one."""
@@ -153,7 +158,7 @@ class _TimelineSearch:
 
         for stride in STRIDES:
             for i in range(1, len(starts)):
-                steps = stride * np.arange(-REACH, REACH + 1)
+                steps = stride * np.arange(-MAX_MOVES, MAX_MOVES + 1)
                 bounds[i] += int(steps[np.argmin([moved(i, int(by)) for by in steps])])
         return PlantSequence(tuple(bounds[:-1]), tuple(plants), cost(bounds[:-1]))
 
@@ -161,7 +166,7 @@ class _TimelineSearch:
         """Return a sequence in which every stretch is worth its price: else it is that of a neighbour, or healthy."""
         ends = [*found.starts[1:], self.window.samples]
         for i, (plant, begin, end) in enumerate(zip(found.plants, found.starts, ends, strict=True)):
-            short = bool(i) and end - begin < SHORTEST
+            short = bool(i) and end - begin < MIN_STRETCH_SAMPLES
             if not plant.faults and not short:
                 continue
             others = [HEALTHY, *found.plants[max(i - 1, 0) : i], *found.plants[i + 1 : i + 2]]
@@ -186,23 +191,23 @@ class _TimelineSearch:
         long = [(begin, end) for begin, end in pairwise(starts) if end - begin >= self.shortest]
         bounds = sorted({0, self.window.samples, *(k for both in long for k in both)})
         for begin, end in pairwise(bounds):
-            guard = SHORTEST if end - begin > 4 * SHORTEST else 0
+            guard = MIN_STRETCH_SAMPLES if end - begin > 4 * MIN_STRETCH_SAMPLES else 0
             part = self.window.cut(begin + guard * (begin > 0), end - guard * (end < self.window.samples))
-            healthy = fit_hypothesis(part, [], WHOLE, self.known, [np.zeros(0)], free=False)
+            healthy = fit_hypothesis(part, [], FROM_START, self.known, [np.zeros(0)], free=False)
             fitted = [
-                fit_hypothesis(part, [fault], WHOLE, self.known, grid.local_minima(part, WHOLE), free=False)
+                fit_hypothesis(part, [fault], FROM_START, self.known, grid.local_minima(part, FROM_START), free=False)
                 for fault, grid in zip(self.faults, self.grids, strict=True)
             ]
-            if min(one.cost for one in fitted) > part.samples + SWITCH:
+            if min(one.cost for one in fitted) > part.samples + SWITCH_PRICE:
                 fitted += list(self._fit_pairs(part, fitted))
-            ranked = sorted([healthy, *fitted], key=lambda one: one.cost + FREEDOM * len(one.x))
+            ranked = sorted([healthy, *fitted], key=lambda one: one.cost + SIZE_PRICE * len(one.x))
             yield begin, [ChangedPlant(one.faults, one.x) if one.faults else HEALTHY for one in ranked]
 
     def _fit_pairs(self, part: RefitWindow, singles: Sequence[HypothesisFit]) -> Iterator[HypothesisFit]:
         for one, other in combinations(singles, 2):
             self.progress()
             starts = [np.append(one.x, 0.0), np.append(0.0, other.x)]
-            yield fit_hypothesis(part, [*one.faults, *other.faults], WHOLE, self.known, starts, free=False)
+            yield fit_hypothesis(part, [*one.faults, *other.faults], FROM_START, self.known, starts, free=False)
 
     def _explain(self, bounds: Sequence[int], each: Sequence[ChangedPlant]) -> Iterator[TimelineStretch]:
         begins = [(0, 0, 0)]
@@ -214,7 +219,7 @@ class _TimelineSearch:
                 yield TimelineStretch(begin, None)
                 continue
             # what may belong to the neighbours is left out, unless nothing would remain
-            first, last = (begin[2], end) if end - begin[2] >= SHORTEST else (first, last)
+            first, last = (begin[2], end) if end - begin[2] >= MIN_STRETCH_SAMPLES else (first, last)
             yield TimelineStretch(begin, fit_stretch(self.window.cut(first, last), self.faults, self.progress))
 
     def _date(
@@ -239,7 +244,7 @@ class _TimelineSearch:
 
 
 def _price(plant: ChangedPlant) -> float:
-    return SWITCH + FREEDOM * len(plant.x)
+    return SWITCH_PRICE + SIZE_PRICE * len(plant.x)
 
 
 def _learn_from_past(window: RefitWindow, healthy: int) -> RefitWindow:

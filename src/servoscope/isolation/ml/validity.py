@@ -14,10 +14,10 @@ from servoscope.isolation.ml.goodness_of_fit import misspecification_columns, sc
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.signals import Recording
 
-MOST = 60_000  # samples of a recording that are looked at
-SPLIT = 20.0  # times more or less noise on u, relative to that on y, than the recursion's residual shows
+MAX_SAMPLES = 60_000  # samples of a recording that are looked at
+NOISE_RATIO_RANGE = 20.0  # times more or less noise on u, relative to that on y, than the recursion's residual shows
 BISECTIONS = 6
-SILENT = 1e-6  # of the noise; what is quieter was simulated without any
+MIN_NOISE_SHARE = 1e-6  # of the noise; what is quieter was simulated without any
 
 
 def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> ExactPredictorFit | None:
@@ -35,7 +35,7 @@ def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> 
         return None
 
     known = baseline.model_copy(update={"exact": ExactPredictorFit(noise=noise, misfit=0.0)})
-    whole = [RefitWindow.from_recording(known, rec, 0, min(rec.samples, MOST)) for rec in recordings]
+    whole = [RefitWindow.from_recording(known, rec, 0, min(rec.samples, MAX_SAMPLES)) for rec in recordings]
 
     def windows(u_std: float, y_std: float) -> list[RefitWindow]:
         heard = WhiteNoise(u_std, y_std)
@@ -55,9 +55,9 @@ def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> 
 
     samples = sum(window.samples for window in whole)
     usual = max(noise.u_std / noise.y_std, 1e-3 * float(np.mean([rec.u.std() for rec in recordings])) / noise.y_std)
-    if parts(0.0)[0] < SILENT * samples:
+    if parts(0.0)[0] < MIN_NOISE_SHARE * samples:
         return None
-    reach = float(np.log(SPLIT))
+    reach = float(np.log(NOISE_RATIO_RANGE))
     split = float(minimize_scalar(cost, bounds=(-reach, reach), method="bounded", options={"xatol": 0.02}).x)
     # a minute hardly tells how loud n_u is: too much of it costs little, too little makes slow errors look certain
     likely, high = cost(split), reach

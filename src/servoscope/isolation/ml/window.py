@@ -14,14 +14,14 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.kernels import Array
-from servoscope.isolation.ml.predictor import HealthyRun, PlantVariants, Predictor, PredictorFactory
+from servoscope.isolation.ml.predictor import PlantVariants, Predictor, PredictorFactory
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
-LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
-PIECES = 8  # of a drift, within which the predictor changes in straight lines
-TINY = 1e-30  # complex step
+MISSED_LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
+DRIFT_PIECES = 8  # of a drift, within which the predictor changes in straight lines
+COMPLEX_STEP = 1e-30  # complex step
 SENSOR_GAIN = "sensor_gain"
 """What stands among the parameters for a factor on y as measured."""
 
@@ -39,7 +39,7 @@ class ChangeProfile:
     @property
     def shares(self) -> FloatArray:
         """Shares of the change that the plants after the healthy one have, shape (p - 1,); in between it is linear."""
-        return np.arange(1, PIECES + 1) / PIECES if self.duration else np.ones(1)
+        return np.arange(1, DRIFT_PIECES + 1) / DRIFT_PIECES if self.duration else np.ones(1)
 
 
 DRIFT = ChangeProfile(0, 1)  # whenever it comes, however long it takes
@@ -112,7 +112,7 @@ class ChangeWindow(abc.ABC):
         added to u; offsets of both.
         """
         moving, ones = delayed(speed_sign(self.y), 1), np.ones(self.samples)
-        lagged = [delayed(x, lag) for x in (self.u, self.y) for lag in range(1, LAGS + 1)]
+        lagged = [delayed(x, lag) for x in (self.u, self.y) for lag in range(1, MISSED_LAGS + 1)]
         return [*lagged, moving, ones], [moving, ones]
 
     def cut(self, first: int, end: int) -> Self:
@@ -167,10 +167,10 @@ class ChangeWindow(abc.ABC):
 
         By complex steps: no difference is taken, so nothing is lost by rounding (Squire and Trapp, 1998).
         """
-        moved = (z + 1j * TINY * np.eye(len(z)))[by]
+        moved = (z + 1j * COMPLEX_STEP * np.eye(len(z)))[by]
         if not len(moved):
             return np.zeros((self.samples + self.nuisance_count, 0))
-        return np.asarray(self.residuals(moved, names, profile).imag.T / TINY)
+        return np.asarray(self.residuals(moved, names, profile).imag.T / COMPLEX_STEP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +224,6 @@ class RefitWindow(ChangeWindow):
         d, x = z[:, :m], z[:, m:]
         new = np.append(True, (d[1:] != d[:-1]).any(axis=1))
         own = np.cumsum(new) - 1  # the healthy ones come first
-        run = self._healthy_run(d[0].real) if not own[-1] and not d.imag.any() else None
-        new[0] = run is None
         count = int(new.sum())
         # a column of logarithms for each name, one row per plant
         faulty = (shares[None, :, None] * x[:, None]).reshape(len(z) * len(shares), len(names))
@@ -236,22 +234,7 @@ class RefitWindow(ChangeWindow):
         output_gains = factors.pop(SENSOR_GAIN, np.ones(len(healthy)))
         spaces = self.plant.state_spaces(self.plant.expand_rays(factors), len(healthy))
         after = own[-1] + 1 + np.arange(len(faulty)).reshape(len(z), len(shares))
-        made, plants = self.factory.predictors(spaces, output_gains), np.column_stack([own, after])
-        return PlantVariants(made if run is None else Predictor.concatenate([run.predictor, made]), plants, run)
-
-    @cached_property
-    def _healthy_runs(self) -> dict[bytes, HealthyRun]:
-        return {}
-
-    def _healthy_run(self, d: FloatArray) -> HealthyRun:
-        """Return a healthy plant all the way; the last one is kept, for a search tries many sizes beside it."""
-        key = d.tobytes()
-        if key not in self._healthy_runs:
-            factors = self.plant.expand_rays(dict(zip(self.names, np.exp(d)[:, None], strict=True)))
-            predictor = self.factory.predictors(self.plant.state_spaces(factors, 1), np.ones(1))
-            self._healthy_runs.clear()
-            self._healthy_runs[key] = predictor.run(self.u, self.y, self.restart)
-        return self._healthy_runs[key]
+        return PlantVariants(self.factory.predictors(spaces, output_gains), np.column_stack([own, after]))
 
     def innovations(self, predictor: Predictor, profile: ChangeProfile) -> Array:
         """Return the innovations in standard deviations, shape (N,)."""
@@ -259,8 +242,8 @@ class RefitWindow(ChangeWindow):
 
     def variant_innovations(self, variants: PlantVariants, profile: ChangeProfile) -> Array:
         """Return the innovations of each in standard deviations, shape (V, N)."""
-        predictor, plants, run = variants
-        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart, plants, run)
+        predictor, plants = variants
+        return predictor.innovations(profile.onset, profile.duration, self.u, self.y, self.restart, plants)
 
     def disturbance_response(
         self, predictor: Predictor, profile: ChangeProfile, u: FloatArray, y: FloatArray

@@ -13,12 +13,12 @@ from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.signals import Recording
 
 FRACTIONS = 4  # of a sample, between which the residual variance is a parabola
-EARLIEST = -3  # samples; negative: u is logged after it acted
-LATEST_S = 0.05  # s, and at least
-LATEST = 8  # samples
+MIN_DELAY_SAMPLES = -3  # samples; negative: u is logged after it acted
+MAX_DELAY_S = 0.05  # s, and at least
+MIN_MAX_DELAY_SAMPLES = 8  # samples
 CHI2_95_1DOF = 3.841458820694124  # chi-square quantile, 1 degree of freedom
 PARABOLA = 1e-12  # curvature relative to the variance below which there is none
-WIDEST = 1.5  # samples that the interval may span in total
+MAX_INTERVAL_SAMPLES = 1.5  # samples that the interval may span in total
 PRIOR = 0.3  # standard deviation of a coefficient around its nominal value, relative to it
 FLOOR = 0.005  # share of eta (rms) that the intersample model of y alone leaves unexplained
 
@@ -53,14 +53,14 @@ def estimate_delay(
     carries most of u are left out, and what they would explain counts as delay.
     """
     rate, configured = recording.sample_rate, g.loop.delay * recording.sample_rate
-    latest = max(LATEST, math.ceil(LATEST_S * rate), math.ceil(configured) + 4)
+    latest = max(MIN_MAX_DELAY_SAMPLES, math.ceil(MAX_DELAY_S * rate), math.ceil(configured) + 4)
     stretch = np.cumsum(recording.restart)
     rows = np.flatnonzero(fitted.used)
     # One set of rows for all delays: those that stay in their stretch for each of them.
-    early, late = rows - latest - 1, rows - EARLIEST
+    early, late = rows - latest - 1, rows - MIN_DELAY_SAMPLES
     inside = (early >= 0) & (late < recording.samples)
     rows = rows[inside]
-    rows = rows[(stretch[rows - latest - 1] == stretch[rows]) & (stretch[rows - EARLIEST] == stretch[rows])]
+    rows = rows[(stretch[rows - latest - 1] == stretch[rows]) & (stretch[rows - MIN_DELAY_SAMPLES] == stretch[rows])]
     rows = rows[g.ok[rows - latest - 1]]
     if rows.size < 20 * (len(which) + 2):
         return Delay(configured_samples=configured, words=message("inspection.delay_few_samples"))
@@ -68,7 +68,7 @@ def estimate_delay(
     delays, variances = [], []
     for part in range(FRACTIONS):
         shifted = form_regressors(recording, g.loop, part / FRACTIONS / rate)
-        for whole in range(EARLIEST, latest + 1):
+        for whole in range(MIN_DELAY_SAMPLES, latest + 1):
             eta = np.concatenate([shifted.eta[rows - whole], goal])
             left = eta - Q @ (Q.T @ eta)
             delays.append(whole + part / FRACTIONS)
@@ -118,7 +118,7 @@ def _locate_minimum(d: FloatArray, J: FloatArray, configured: float, independent
     low = min(samples - half, float(d[below[0]])) if below.size else samples - half
     high = max(samples + half, float(d[below[-1]])) if below.size else samples + half
     gain = 1.0 - least / float(np.interp(configured, d, J))
-    if high - low > WIDEST:
+    if high - low > MAX_INTERVAL_SAMPLES:
         words = message("inspection.delay_flat", low=low, high=high)
         return Delay(low_samples=low, high_samples=high, configured_samples=configured, words=words)
     return Delay(

@@ -18,36 +18,37 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.estimation.tuning import sum_covariance
-from servoscope.isolation.ml.predictor import LONGEST, PredictorFactory
+from servoscope.isolation.ml.predictor import MAX_GAIN_SAMPLES, PredictorFactory
 from servoscope.isolation.ml.window import plant_input
-from servoscope.learning.inspection.delay import LATEST, LATEST_S
+from servoscope.learning.inspection.delay import MAX_DELAY_S, MIN_MAX_DELAY_SAMPLES
 from servoscope.learning.inspection.model_order import Regressors, fit_regression
 from servoscope.models.discretise import split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.lti import settling_samples
-from servoscope.models.plants import Plant
+from servoscope.models.plants import Column, Plant
 from servoscope.signals import Recording
 
 PRIOR = 0.3  # standard deviation of the logarithm of a parameter that the loop file gives
-VAGUE = 3.0  # and of a coefficient that least squares found: noise in its regressors may have made it a tenth
+# and of a coefficient that least squares found: noise in its regressors may have made it a tenth
+COEFFICIENT_LOG_STD = 3.0
 NOISE_PRIOR = 3.0  # of the logarithm of the ratio of the noises
-USUAL = 1e-3  # noise on u, of its standard deviation, at which the search begins
-QUIETEST = 1e-9  # noise on y, of its standard deviation: what is quieter was simulated without any
-MOST = 60_000  # samples that are looked at
-FEWEST = 200  # usable samples
+START_NOISE_SHARE = 1e-3  # noise on u, of its standard deviation, at which the search begins
+MIN_NOISE_SHARE = 1e-9  # noise on y, of its standard deviation: what is quieter was simulated without any
+MAX_SAMPLES = 60_000  # samples that are looked at
+MIN_SAMPLES = 200  # usable samples
 # samples, delays at which a search begins; from one that is further off it may end with another plant
 TRIALS = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 2.5, 3, 3.5, 4, 5, 6, 8, 11, 16, 22, 32, 45, 64, 90)
 SCAN_STEPS, STEPS = 2, 60  # of Gauss and Newton
-LONGEST_STEP = 0.5  # of a logarithm, and samples of delay
-NEAR = 0.1  # of -2 log likelihood per sample, within which a second delay is looked at closely
-CONVERGED = 1e-2  # of -2 log likelihood
+MAX_STEP = 0.5  # of a logarithm, and samples of delay
+MAX_COST_GAP = 0.1  # of -2 log likelihood per sample, within which a second delay is looked at closely
+COST_TOLERANCE = 1e-2  # of -2 log likelihood
 DIFFERENCE = 1e-5  # of a logarithm, for derivatives
 DIFFERENCE_DELAY = 1e-3  # samples
-CERTAIN_RATIO = 16.0  # twice the logarithm of a likelihood ratio, and
-CERTAIN_STD = 4.0  # standard deviations, above which a delay is certain
-WHITE = 0.1  # largest autocorrelation of innovations that are called white
+MIN_CERTAIN_LOG_RATIO = 16.0  # twice the logarithm of a likelihood ratio, and
+MIN_CERTAIN_STDS = 4.0  # standard deviations, above which a delay is certain
+MAX_WHITE_AUTOCORRELATION = 0.1  # largest autocorrelation of innovations that are called white
 LAGS = 20
-HEAVIEST = 1e6  # damping at which a search gives up
+MAX_DAMPING = 1e6  # damping at which a search gives up
 
 
 @dataclass(frozen=True)
@@ -63,13 +64,13 @@ class DelayFit:
     @property
     def white(self) -> bool:
         """Whether plant, noise and delay leave nothing but noise."""
-        return self.largest_autocorrelation < WHITE
+        return self.largest_autocorrelation < MAX_WHITE_AUTOCORRELATION
 
     @property
     def significant(self) -> bool:
         """Whether the configured delay is certainly wrong."""
         off = abs(self.seconds - self.search.loop.delay)
-        return self.ratio > CERTAIN_RATIO and off > CERTAIN_STD * self.std_s
+        return self.ratio > MIN_CERTAIN_LOG_RATIO and off > MIN_CERTAIN_STDS * self.std_s
 
     def improves(self, delay_s: float) -> bool:
         """Return whether a delay, as it would be written into the loop file, is likelier than the configured one."""
@@ -101,7 +102,7 @@ def fit_delay(loop: Loop, recording: Recording, regressors: Regressors | None = 
 def _initial_plant(loop: Loop, regressors: Regressors | None) -> tuple[Plant, float] | None:
     """Return the plant that the search begins with, and the standard deviation of its logarithms."""
     plant = loop.plant
-    if not plant.linear or set(plant.extras) - {"one"}:
+    if not plant.affine:
         return None
     if plant.has_physics:
         return plant, PRIOR
@@ -115,7 +116,7 @@ def _initial_plant(loop: Loop, regressors: Regressors | None) -> tuple[Plant, fl
     coefficients = {name: float(value) for name, value in zip(g.bank.names, fit.theta, strict=True)}
     if any(not value > 0.0 for name, value in coefficients.items() if name != "offset"):
         return None
-    return plant.model_copy(update={"coefficients": coefficients}), VAGUE
+    return plant.model_copy(update={"coefficients": coefficients}), COEFFICIENT_LOG_STD
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +140,9 @@ class DelaySearch:
     @classmethod
     def from_recording(cls, loop: Loop, recording: Recording, plant: Plant, spread: float) -> DelaySearch | None:
         """Prepare the search; None where too few samples are left."""
-        rate, end = loop.sample_rate, min(recording.samples, MOST)
+        rate, end = loop.sample_rate, min(recording.samples, MAX_SAMPLES)
         configured = math.ceil(loop.delay * rate)
-        latest = max(LATEST, math.ceil(LATEST_S * rate), configured + 4)
+        latest = max(MIN_MAX_DELAY_SAMPLES, math.ceil(MAX_DELAY_S * rate), configured + 4)
         u = plant_input(loop, recording.u)[:end]
         restart = recording.restart[:end].copy()
         restart[0] = True
@@ -149,13 +150,13 @@ class DelaySearch:
         begin = np.maximum.accumulate(np.where(restart, at, 0))
         rows = np.flatnonzero(at - begin > latest)
         y_std = _white_noise_std(recording.y[:end], restart)
-        if len(rows) < FEWEST or not y_std > 0.0:
+        if len(rows) < MIN_SAMPLES or not y_std > 0.0:
             return None
         names = (*(p for p in plant.parameters if p != "input_gain"), *plant.causes)
         names = tuple(name for name in names if name != "offset")
-        offset = float(u.std()) if "one" in plant.extras else 0.0
+        offset = float(u.std()) if Column.CONSTANT in plant.extras else 0.0
         base = loop.model_copy(update={"plant": plant, "delay": 0.0})
-        noise = WhiteNoise(u_std=USUAL * float(u.std()), y_std=y_std)
+        noise = WhiteNoise(u_std=START_NOISE_SHARE * float(u.std()), y_std=y_std)
         factory = PredictorFactory.from_input(base, noise, recording.u)
         prior = [spread] * len(names) + [NOISE_PRIOR] + [1.0] * bool(offset)
         first = np.diff(rows, prepend=-2) != 1
@@ -169,7 +170,7 @@ class DelaySearch:
         with np.errstate(all="ignore"):
             scanned = [self._fit(np.append(nothing, k), SCAN_STEPS, held=True) for k in trials]
             scanned.sort(key=lambda end: end.cost)
-            near = [end for end in scanned[:2] if end.cost <= scanned[0].cost + NEAR * len(self.y)]
+            near = [end for end in scanned[:2] if end.cost <= scanned[0].cost + MAX_COST_GAP * len(self.y)]
             ends = [self._search_freely(end) for end in near or scanned[:1]]
             best = min(ends, key=lambda end: end.cost)
             if not np.isfinite(best.cost):
@@ -223,12 +224,12 @@ class DelaySearch:
     def age(self) -> IndexArray:
         """Samples since a restart, as far as the gains change with them, shape (N,)."""
         at = np.arange(len(self.y))
-        return np.minimum(at - np.maximum.accumulate(np.where(self.restart, at, 0)), LONGEST - 1)
+        return np.minimum(at - np.maximum.accumulate(np.where(self.restart, at, 0)), MAX_GAIN_SAMPLES - 1)
 
     @property
     def _nominal_offset(self) -> float:
-        coefficients = getattr(self.plant, "coefficients", None) or {}
-        return float(coefficients.get("offset", 0.0)) / self.plant.input_gain
+        nominal = dict(zip(self.plant.names, self.plant.theta(), strict=True)) if self.plant.has_physics else {}
+        return float(nominal.get("offset", 0.0)) / self.plant.input_gain
 
     def _point(self, z: FloatArray) -> _Point:
         if not np.isfinite(z).all():  # LAPACK would say so on the terminal
@@ -271,10 +272,10 @@ class DelaySearch:
             if not held and ((at.z[-1] <= 0.0 and g[-1] > 0.0) or (at.z[-1] >= self.latest and g[-1] < 0.0)):
                 g, H = g[:-1], H[:-1, :-1]  # at its bound, and held there
             after = at
-            while damping < HEAVIEST:
+            while damping < MAX_DAMPING:
                 step = np.linalg.solve(H + damping * np.diag(np.diag(H)), -g)
                 z = at.z.copy()
-                z[: len(step)] += np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+                z[: len(step)] += np.clip(step, -MAX_STEP, MAX_STEP)
                 z[-1] = min(max(z[-1], 0.0), self.latest)
                 after = self._point(z)
                 if after.cost < at.cost:
@@ -283,7 +284,7 @@ class DelaySearch:
                 damping *= 10.0
                 after = at
             gained, at = at.cost - after.cost, after
-            if gained < CONVERGED:
+            if gained < COST_TOLERANCE:
                 break
         return at
 
@@ -293,7 +294,7 @@ class DelaySearch:
         The innovations bend where the delay passes a whole sample, and a search may be stuck beside the bend.
         """
         end = self._fit(start.z, STEPS, held=False)
-        if not np.isfinite(end.cost) or largest_autocorrelation(end.residual, LAGS) < WHITE:
+        if not np.isfinite(end.cost) or largest_autocorrelation(end.residual, LAGS) < MAX_WHITE_AUTOCORRELATION:
             return end
         whole = self._fit(np.append(end.z[:-1], round(end.z[-1])), STEPS, held=True)
         return min(end, self._fit(whole.z, STEPS, held=False), key=lambda each: each.cost)
@@ -317,4 +318,4 @@ def _white_noise_std(y: FloatArray, restart: BoolArray) -> float:
     """Return a first guess of the noise of y, from what its second differences jump by."""
     jumps = np.diff(y, 2)[~restart[2:]]
     guess = float(np.median(np.abs(jumps))) / (0.6745 * math.sqrt(6.0)) if jumps.size else 0.0
-    return max(guess, QUIETEST * float(y.std()))
+    return max(guess, MIN_NOISE_SHARE * float(y.std()))

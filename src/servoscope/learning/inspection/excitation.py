@@ -10,10 +10,10 @@ from servoscope.core.arrays import FloatArray
 from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.signals import Recording
 
-COHERENT = 0.8
-LEAST_SEGMENTS = 4
-LEAST_PERIODS = 3.5  # of the reference; with fewer, segments differ by what part of the motion they hold
-NOTHING = 1e-12  # share of the largest power below which r is said to have none
+MIN_COHERENCE = 0.8
+MIN_SEGMENTS = 4
+MIN_PERIODS = 3.5  # of the reference; with fewer, segments differ by what part of the motion they hold
+SILENT_POWER_SHARE = 1e-12  # share of the largest power below which r is said to have none
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def spectra(recording: Recording, period: int | None = None) -> Spectra | None:
     sizes = np.array([stop - start for start, stop in stretches])
     length = _length(sizes, recording.samples)
     whole = (period or 0) * max(1, length // (period or 1))
-    if whole >= 16 and sum(max(0, 2 * (size // whole) - 1) for size in sizes) >= LEAST_SEGMENTS:
+    if whole >= 16 and sum(max(0, 2 * (size // whole) - 1) for size in sizes) >= MIN_SEGMENTS:
         length = whole
     if length < 16:
         return None
@@ -78,12 +78,12 @@ def spectra(recording: Recording, period: int | None = None) -> Spectra | None:
         for begin in range(start, stop - length + 1, length // 2):
             part = signals[:, begin : begin + length]
             rows.append(np.fft.rfft((part - part.mean(axis=1, keepdims=True)) * window, axis=1))
-    if len(rows) < LEAST_SEGMENTS:
+    if len(rows) < MIN_SEGMENTS:
         return None
     X = np.stack(rows)[:, :, 1:]  # (segments, 3, F), without the mean
     power = scale * np.mean(np.abs(X) ** 2, axis=0)
     cross = scale * np.mean(np.conj(X[:, :1]) * X[:, 1:], axis=0)
-    floor = NOTHING * power.max(axis=1, keepdims=True) + 1e-150
+    floor = SILENT_POWER_SHARE * power.max(axis=1, keepdims=True) + 1e-150
     raw = np.abs(cross) ** 2 / (np.maximum(power[:1], floor[:1]) * np.maximum(power[1:], floor[1:]))
     # Half-overlapping Hann segments hold about 0.9 independent ones each; noise alone shows 1/K.
     K = max(0.9 * len(rows), 2.0)
@@ -107,7 +107,7 @@ def usable_band(s: Spectra) -> Band | None:
     # A line here and there that fails does not end a band, nor does one that passes by chance make one.
     padded = np.pad(both, 2, mode="edge")
     smooth = np.median(np.stack([padded[i : i + both.size] for i in range(5)]), axis=0)
-    good = np.concatenate([[False], smooth >= COHERENT, [False]])
+    good = np.concatenate([[False], smooth >= MIN_COHERENCE, [False]])
     edges = np.flatnonzero(good[1:] != good[:-1]).reshape(-1, 2)
     if not edges.size:
         return None

@@ -37,7 +37,7 @@ from servoscope.signals import MIN_SAMPLES, Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 
-LEAST_USED = 0.1  # share of the samples that must be left when rest is left out
+MIN_USED_SHARE = 0.1  # share of the samples that must be left when rest is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +226,7 @@ def _check_delay(found: delay.Delay, recording: Recording, loop: Loop | None, g:
     rate = recording.sample_rate
     samples, half = exact.seconds * rate, 1.96 * exact.std_s * rate
     low, high = samples - half, samples + half
-    if 2.0 * half > delay.WIDEST:
+    if 2.0 * half > delay.MAX_INTERVAL_SAMPLES:
         words = message("inspection.delay_flat", low=low, high=high)
         return delay.Delay(low_samples=low, high_samples=high, configured_samples=found.configured_samples, words=words)
     words = message("inspection.delay_value", samples=samples, ms=1e3 * exact.seconds, low=low, high=high)
@@ -247,7 +247,7 @@ def _motion_mask(g: Regressors, at_rest: BoolArray) -> BoolArray:
     last = np.where(at_rest, np.arange(at_rest.size), -g.bank.wait - 1)
     moving = np.arange(at_rest.size) - np.maximum.accumulate(last) > g.bank.wait
     for mask in (moving, ~at_rest):
-        if (g.ok & mask).sum() >= max(LEAST_USED * at_rest.size, 100):
+        if (g.ok & mask).sum() >= max(MIN_USED_SHARE * at_rest.size, 100):
             return np.asarray(mask)
     return np.ones_like(at_rest)
 

@@ -13,11 +13,12 @@ from servoscope.estimation.pipeline import Pipeline
 from servoscope.estimation.tuning import sandwich_covariance
 from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.models.loop import Loop, MonitorSettings
+from servoscope.models.plants import Column
 from servoscope.models.plants.polynomial import FrictionKind, PolynomialPlant
 from servoscope.signals import Recording
 
-WORTH = 0.02  # share of the unexplained variance that one more power of s must take away
-WORTH_FRICTION = 0.2  # and that Coulomb friction must: its sign is never quite right
+MIN_ORDER_GAIN = 0.02  # share of the unexplained variance that one more power of s must take away
+MIN_FRICTION_GAIN = 0.2  # and that Coulomb friction must: its sign is never quite right
 FAST_SIGN = 50.0  # Hz, of the differentiator behind sign(y')
 
 
@@ -129,7 +130,7 @@ def fit_regression(
 def column_indices(g: Regressors, order: int, friction: FrictionKind, stiffness: bool = True) -> IndexArray:
     """Return which columns of the most general inverse belong to a smaller one."""
     n_powers = len(g.bank.powers)
-    extras = [i + n_powers for i, extra in enumerate(g.bank.extras) if friction == "coulomb" or extra != "sign_v"]
+    extras = [i + n_powers for i, extra in enumerate(g.bank.extras) if friction == "coulomb" or extra != Column.SIGN]
     return np.array([*range(0 if stiffness else 1, order + 1), *extras], dtype=np.intp)
 
 
@@ -152,16 +153,16 @@ def select_order(g: Regressors, used: BoolArray, block: int) -> tuple[tuple[Mode
         return (), None
     best = tried[0]
     for candidate in tried[1:]:
-        if 1.0 - candidate.explained < (1.0 - WORTH) * (1.0 - best.explained):
+        if 1.0 - candidate.explained < (1.0 - MIN_ORDER_GAIN) * (1.0 - best.explained):
             best = candidate
     rough = attempt(best.order, "coulomb", True)
     if rough is not None:
         tried.append(rough)
-        if 1.0 - rough.explained < (1.0 - WORTH_FRICTION) * (1.0 - best.explained):
+        if 1.0 - rough.explained < (1.0 - MIN_FRICTION_GAIN) * (1.0 - best.explained):
             best = rough
     loose = attempt(best.order, best.friction, False)
     if loose is not None:
         tried.append(loose)
-        if 1.0 - best.explained > (1.0 - WORTH) * (1.0 - loose.explained):
+        if 1.0 - best.explained > (1.0 - MIN_ORDER_GAIN) * (1.0 - loose.explained):
             best = loose
     return tuple(tried), best

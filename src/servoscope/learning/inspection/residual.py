@@ -11,11 +11,11 @@ from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.signals import Recording
 
 LAGS = 20
-SIGNIFICANT = 0.01  # probability below which a residual is called structured
+MAX_WHITE_PROBABILITY = 0.01  # probability below which a residual is called structured
 REPEATS = 0.002  # relative structure function of r at its period
-DIFFERS = 0.2  # and what it must have exceeded before
+MIN_AUTOCORRELATION = 0.2  # and what it must have exceeded before
 
-LONGEST_PAUSE = 60.0  # s
+MAX_PAUSE_S = 60.0  # s
 
 
 class Residual(InspectionModel):
@@ -39,10 +39,10 @@ class Residual(InspectionModel):
 def to_uniform_grid(recording: Recording, x: FloatArray, mask: BoolArray) -> tuple[FloatArray, BoolArray]:
     """Put x, shape (N,), on the uniform grid of sample times; what is missing or masked is 0 and False.
 
-    A pause counts as `LONGEST_PAUSE` at most: nothing repeats across a longer one, and a night would fill the memory.
+    A pause counts as `MAX_PAUSE_S` at most: nothing repeats across a longer one, and a night would fill the memory.
     """
     steps = np.round(np.diff(recording.t) * recording.sample_rate)
-    slots = np.concatenate([[0], np.cumsum(np.clip(steps, 1, LONGEST_PAUSE * recording.sample_rate))]).astype(np.int64)
+    slots = np.concatenate([[0], np.cumsum(np.clip(steps, 1, MAX_PAUSE_S * recording.sample_rate))]).astype(np.int64)
     values = np.zeros(int(slots[-1]) + 1)
     there = np.zeros(values.size, dtype=bool)
     values[slots[mask]] = x[mask]
@@ -59,10 +59,10 @@ def autocovariance_with_gaps(x: FloatArray, there: BoolArray) -> tuple[FloatArra
     return sums / np.maximum(pairs, 1.0), pairs
 
 
-def reference_period(recording: Recording) -> int | None:
+def reference_period(recording: Recording, tolerance: float = REPEATS) -> int | None:
     """Return the period of r in samples; None if it does not repeat, twice at least.
 
-    The smallest lag at which the structure function E[(r(k+p) - r(k))^2] / (2 var r) comes back to 0.
+    The smallest lag at which the structure function E[(r(k+p) - r(k))^2] / (2 var r) comes back below a tolerance.
     """
     every = np.ones(recording.samples, dtype=bool)
     r, there = to_uniform_grid(recording, recording.r - recording.r.mean(), every)
@@ -77,14 +77,14 @@ def reference_period(recording: Recording) -> int | None:
     pairs = np.maximum(pairs, 1.0)
     half = r.size // 2 + 1
     S = ((squares + before) / pairs / 2.0 - products)[:half] / spread
-    left = np.flatnonzero(S > DIFFERS)
+    left = np.flatnonzero(S > MIN_AUTOCORRELATION)
     if not left.size:
         return None
-    back = np.flatnonzero(S[left[0] :] < REPEATS)
+    back = np.flatnonzero(S[left[0] :] < tolerance)
     if not back.size:
         return None
     first = int(left[0] + back[0])
-    out = np.flatnonzero(S[first:] >= REPEATS)
+    out = np.flatnonzero(S[first:] >= tolerance)
     last = first + int(out[0]) if out.size else S.size
     return first + int(np.argmin(S[first:last]))
 
@@ -130,14 +130,14 @@ def analyse_residual(
     relative = math.sqrt(variance / max(float(eta[used].var()), np.finfo(np.float64).tiny))
     far = float(np.median(np.abs(faded[memory : 3 * memory]))) if rho.size > 3 * memory else 0.0
     structured = max(repeating - 2.0 * (std or 0.0), 0.0) if repeating is not None else far
-    if p_value is not None and p_value > SIGNIFICANT and repeating is None:
+    if p_value is not None and p_value > MAX_WHITE_PROBABILITY and repeating is None:
         structured = 0.0
     reach = min(rho.size, 50 * memory)
     below = np.flatnonzero(np.abs(faded[:reach]) < 0.1)
     residual = Residual(
         relative=relative,
         p_value=p_value,
-        white=None if p_value is None else p_value > SIGNIFICANT,
+        white=None if p_value is None else p_value > MAX_WHITE_PROBABILITY,
         correlation_s=float(below[0] if below.size else reach) / recording.sample_rate,
         period_s=None if period is None else period / recording.sample_rate,
         repeating=repeating,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from servoscope.core.messages import Message, MessageText, message
 from servoscope.learning.inspection.delay import Delay
-from servoscope.learning.inspection.excitation import LEAST_PERIODS, Band, FrequencyExcitation
+from servoscope.learning.inspection.excitation import MIN_PERIODS, Band, FrequencyExcitation
 from servoscope.learning.inspection.model_order import ModelOrderFit
 from servoscope.learning.inspection.residual import Residual
 from servoscope.learning.inspection.signals import (
@@ -91,7 +91,7 @@ class InspectionMeasurements(InspectionModel):
     @property
     def coherent(self) -> bool:
         """Whether the recording holds enough periods of the reference to judge coherence."""
-        return self.periods is None or self.periods >= LEAST_PERIODS
+        return self.periods is None or self.periods >= MIN_PERIODS
 
 
 def describe_order(fit: ModelOrderFit) -> Message:

@@ -16,17 +16,17 @@ FindingSeverity = Literal["stop", "care", "note"]
 InspectionVerdict = Literal["usable", "usable with care", "not usable"]
 
 MEMORY_S = 5.0  # of the estimator, without a loop
-LEAST_EXPLAINED, WELL_EXPLAINED = 0.5, 0.9
-STILL, MOSTLY_STILL, HALF_STILL = 0.97, 0.8, 0.5
+MIN_EXPLAINED_SHARE, GOOD_EXPLAINED_SHARE = 0.5, 0.9
+STILL_SHARE, MOSTLY_STILL_SHARE, HALF_STILL_SHARE = 0.97, 0.8, 0.5
 SNR = 3.0
-PRECISE = 0.05  # relative standard deviation of the iFRF that the estimator's memory should allow
+MAX_RELATIVE_STD = 0.05  # relative standard deviation of the iFRF that the estimator's memory should allow
 CONDITION = 1e3
-FEW_BITS = 8.0
+MIN_BITS = 8.0
 DELAY_TOLERANCE = 0.1  # samples
 DELAY_GAIN = 0.1  # share of the residual variance below which a delay is not mentioned
-LEAST_MEMORIES = 10.0
+MIN_MEMORIES = 10.0
 MODEL_ERROR = 0.005
-DETECTABLE = 7.0  # root of a usual threshold: a change of so many standard deviations is detected
+DETECTABLE_STDS = 7.0  # root of a usual threshold: a change of so many standard deviations is detected
 
 _Finding = tuple[str, FindingSeverity, Message]
 
@@ -77,8 +77,10 @@ def is_at_rest(m: InspectionMeasurements) -> bool:
     if m.rest is None:
         return False
     commanded = not any(q.signal == "r" and q.values < 2 for q in m.quantisation)
-    noise = m.band is None and (m.fit is None or m.fit.explained < LEAST_EXPLAINED)
-    return m.rest.share > STILL or (noise and m.rest.share > (MOSTLY_STILL if commanded else HALF_STILL))
+    noise = m.band is None and (m.fit is None or m.fit.explained < MIN_EXPLAINED_SHARE)
+    return m.rest.share > STILL_SHARE or (
+        noise and m.rest.share > (MOSTLY_STILL_SHARE if commanded else HALF_STILL_SHARE)
+    )
 
 
 def _inspection(key: str, **values: Any) -> Message:
@@ -87,7 +89,7 @@ def _inspection(key: str, **values: Any) -> Message:
 
 def _is_weakly_excited(m: InspectionMeasurements, at: FrequencyExcitation) -> bool:
     """Return whether a frequency is too weak; without a period the regression may vouch for it, coherence says less."""
-    precise = at.relative_std_memory is not None and at.relative_std_memory <= PRECISE
+    precise = at.relative_std_memory is not None and at.relative_std_memory <= MAX_RELATIVE_STD
     return at.snr is not None and at.snr < SNR and not (m.periods is None and precise)
 
 
@@ -127,12 +129,12 @@ def _recommendations(m: InspectionMeasurements, loop: Loop | None) -> Iterator[M
         yield _inspection("set_limits", limits=ends)
     excited = [at for at in m.frequencies if at.relative_std_memory is not None and (at.snr is None or at.snr >= SNR)]
     worst = max((at.relative_std_memory or 0.0 for at in excited), default=0.0)
-    if worst > PRECISE:
-        yield _inspection("set_memory", memory_s=_memory_s(loop) * min((worst / PRECISE) ** 2, 20.0))
+    if worst > MAX_RELATIVE_STD:
+        yield _inspection("set_memory", memory_s=_memory_s(loop) * min((worst / MAX_RELATIVE_STD) ** 2, 20.0))
     lacking = [f"{at.frequency_hz:g}" for at in m.frequencies if _is_weakly_excited(m, at)]
     if lacking and loop is not None:
         yield _inspection("drop_frequencies", frequencies=lacking)
-    coarse = [q.signal for q in m.quantisation if q.signal != "r" and (q.effective_bits or 99.0) < FEW_BITS]
+    coarse = [q.signal for q in m.quantisation if q.signal != "r" and (q.effective_bits or 99.0) < MIN_BITS]
     if coarse:
         yield _inspection("log_finer", signals=coarse)
     if m.residual is not None and m.residual.period_s is None:
@@ -165,7 +167,7 @@ def _signal_findings(m: InspectionMeasurements, loop: Loop | None, constant: tup
             values = {"signal": q.signal, "step": q.step, "bits": q.effective_bits, "repeated": q.repeated}
             yield (
                 "quantisation",
-                "care" if q.effective_bits < FEW_BITS else "note",
+                "care" if q.effective_bits < MIN_BITS else "note",
                 _inspection("quantisation", **values),
             )
     at = m.saturation
@@ -182,7 +184,7 @@ def _signal_findings(m: InspectionMeasurements, loop: Loop | None, constant: tup
 
 
 def _excitation_findings(m: InspectionMeasurements, loop: Loop | None) -> Iterator[_Finding]:
-    if m.rest is not None and m.rest.share > MOSTLY_STILL:
+    if m.rest is not None and m.rest.share > MOSTLY_STILL_SHARE:
         yield "rest", "care", _inspection("no_motion", share=m.rest.share)
     elif m.rest is not None and m.rest.share > 0.05:
         unit = (loop.plant.units[0] if loop is not None else "") or _inspection("units_of_y")
@@ -198,15 +200,15 @@ def _excitation_findings(m: InspectionMeasurements, loop: Loop | None) -> Iterat
         if at.snr is not None and at.snr < SNR:
             severity = monitored if _is_weakly_excited(m, at) else "note"
             yield "frequency", severity, _inspection("weak_frequency", frequency_hz=at.frequency_hz, snr=at.snr)
-        elif at.relative_std_memory is not None and at.relative_std_memory > 2.0 * PRECISE:
+        elif at.relative_std_memory is not None and at.relative_std_memory > 2.0 * MAX_RELATIVE_STD:
             values = {"frequency_hz": at.frequency_hz, "relative_std": at.relative_std_memory}
             yield "frequency", monitored, _inspection("imprecise_frequency", **values)
     if m.fit is not None and m.fit.condition > CONDITION:
         text = _inspection("conditioning", weakest=m.fit.weakest, condition=m.fit.condition)
         yield "conditioning", "care", text
     memory, lasts = _memory_s(loop), m.sampling.duration_s
-    if lasts < LEAST_MEMORIES * memory:
-        wanted = _inspection("learning_duration", duration_s=LEAST_MEMORIES * memory, memory_s=memory)
+    if lasts < MIN_MEMORIES * memory:
+        wanted = _inspection("learning_duration", duration_s=MIN_MEMORIES * memory, memory_s=memory)
         key = "shorter_than_memory" if lasts < memory else "short_to_learn"
         yield "short", "care" if lasts < memory else "note", _inspection(key, duration_s=lasts, wanted=wanted)
 
@@ -216,8 +218,8 @@ def _model_findings(m: InspectionMeasurements, loop: Loop | None) -> Iterator[_F
         yield "short", "stop", _inspection("no_fit")
         return
     explained = m.fit.explained
-    if explained < WELL_EXPLAINED:
-        severity: FindingSeverity = "stop" if explained < LEAST_EXPLAINED else "care"
+    if explained < GOOD_EXPLAINED_SHARE:
+        severity: FindingSeverity = "stop" if explained < MIN_EXPLAINED_SHARE else "care"
         yield "explained", severity, _inspection("hardly_explained", share=explained, model=m.fit.model)
     else:
         yield "explained", "note", _inspection("explained", share=explained, model=m.fit.model)
@@ -260,7 +262,7 @@ def _residual_findings(residual: Residual, fit: InverseModelFit) -> Iterator[_Fi
         )
         yield "residual", "care" if missing and residual.model_error > 0.05 else "note", text
     if residual.model_error > MODEL_ERROR:
-        hidden = DETECTABLE * residual.model_error / max(fit.leading_share, 1e-3)
+        hidden = DETECTABLE_STDS * residual.model_error / max(fit.leading_share, 1e-3)
         below = _inspection("changes_below", percent=100.0 * hidden)
         size = below if hidden < 1.0 else _inspection("changes_below_factor_two")
         coefficient = fit.leading.replace("_", " ")

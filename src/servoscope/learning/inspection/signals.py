@@ -14,13 +14,16 @@ from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.defects import mask_spans
 
-FINEST = 1e-7  # share of the range below which a step is rounding of the file, not of the sensor
+MIN_STEP_SHARE = 1e-7  # share of the range below which a step is rounding of the file, not of the sensor
 ON_GRID = 0.98  # share of values that must be whole steps
 PLATEAU = 5  # samples in a row at the very extreme before u is said to be at a limit
-RESTING = 0.02  # share of the fast speeds (99th percentile) below which the output rests
-SHORTEST_REST = 0.25  # s: turning round is not rest
+REST_SPEED_SHARE = 0.02  # share of the fast speeds (99th percentile) below which the output rests
+MIN_REST_S = 0.25  # s: turning round is not rest
 BINS = 40  # of |u|, to look for a dead zone
-SELDOM, MOSTLY = 0.1, 0.5  # shares of moving samples inside a dead zone and just outside it
+MAX_SHARE_INSIDE_DEAD_ZONE, MIN_SHARE_OUTSIDE_DEAD_ZONE = (
+    0.1,
+    0.5,
+)  # shares of moving samples inside a dead zone and just outside it
 
 
 class InspectionModel(BaseModel):
@@ -139,7 +142,7 @@ def quantisation(signal: Literal["r", "u", "y"], x: FloatArray) -> Quantisation:
 def _step(values: FloatArray, span: float) -> float | None:
     """Return the step of the grid that sorted values stand on, None if they do not."""
     gaps = np.diff(values)
-    gaps = gaps[gaps > FINEST * span]
+    gaps = gaps[gaps > MIN_STEP_SHARE * span]
     if gaps.size < 2:
         return None
     smallest = float(gaps.min())
@@ -188,8 +191,8 @@ def saturation(recording: Recording, loop: Loop | None) -> Saturation:
 
 def detect_rest(recording: Recording, v: FloatArray, noise: float) -> tuple[BoolArray, Rest]:
     """Find where the output rests."""
-    speed = max(RESTING * float(np.quantile(np.abs(v), 0.99)), 3.0 * noise)
-    shortest = max(round(SHORTEST_REST * recording.sample_rate), 5)
+    speed = max(REST_SPEED_SHARE * float(np.quantile(np.abs(v), 0.99)), 3.0 * noise)
+    shortest = max(round(MIN_REST_S * recording.sample_rate), 5)
     slow = np.abs(v) <= speed
     at_rest = np.zeros_like(slow)
     for start, stop in mask_spans(slow):
@@ -210,7 +213,7 @@ def dead_zone(u: FloatArray, v: FloatArray, speed: float) -> DeadZone | None:
     if edges[0] is None or edges[1] is None:
         return None
     inside = (u >= -edges[0]) & (u <= edges[1])
-    if moving[inside].mean() > SELDOM:
+    if moving[inside].mean() > MAX_SHARE_INSIDE_DEAD_ZONE:
         return None
     return DeadZone(low=-edges[0], high=edges[1], samples=int(inside.sum()))
 
@@ -225,12 +228,12 @@ def _edge(u: FloatArray, moving: BoolArray, expected: float) -> float | None:
     moved = np.bincount(bins, weights=moving, minlength=BINS + 1)
     share = moved / np.maximum(counts, 1)
     reach = 0
-    while reach < BINS and counts[reach] >= 10 and share[reach] <= SELDOM:
+    while reach < BINS and counts[reach] >= 10 and share[reach] <= MAX_SHARE_INSIDE_DEAD_ZONE:
         reach += 1
     edge = reach * top / BINS
     # Between the two lies what starts to move: friction at rest is not sharp.
     outside = share[reach : reach + 10][counts[reach : reach + 10] > 0]
-    if reach < 2 or edge < 3.0 * expected or not outside.size or outside.mean() < MOSTLY:
+    if reach < 2 or edge < 3.0 * expected or not outside.size or outside.mean() < MIN_SHARE_OUTSIDE_DEAD_ZONE:
         return None
     return edge
 

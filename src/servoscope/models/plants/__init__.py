@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import inspect
@@ -11,9 +12,22 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from servoscope.core.errors import LoopError
-from servoscope.models.plants.base import EXTRA_COLUMNS, Fault, FaultRay, Plant, StateSpace
+from servoscope.core.messages import add_words
+from servoscope.models.plants.base import SIGN_CUTOFF, Fault, FaultRay, Plant, StateSpace, VelocitySign
+from servoscope.models.plants.columns import Column
 
-__all__ = ["EXTRA_COLUMNS", "Fault", "FaultRay", "Plant", "StateSpace", "parse_plant", "plant_class", "plant_kinds"]
+__all__ = [
+    "SIGN_CUTOFF",
+    "Column",
+    "Fault",
+    "FaultRay",
+    "Plant",
+    "StateSpace",
+    "VelocitySign",
+    "parse_plant",
+    "plant_class",
+    "plant_kinds",
+]
 
 ENTRY_POINTS = "servoscope.plants"  # of other packages: name is the kind, object the subclass of `Plant`
 
@@ -41,8 +55,23 @@ def plant_class(kind: object) -> type[Plant]:
     found = next((each for each in entry_points(group=ENTRY_POINTS) if each.name == kind), None)
     if found is None:
         raise LoopError(f"[plant] kind = {kind!r}: unknown, choose from {', '.join(plant_kinds())}")
-    loaded: type[Plant] = found.load()
+    try:
+        loaded: type[Plant] = found.load()
+    except Exception as error:  # whatever another package raises
+        raise LoopError(f"[plant] kind = {kind!r}: its package is broken, repair or remove it ({error})") from error
     return loaded
+
+
+def translated_words(language: str) -> dict[str, str]:
+    """Return the words of all plants in a language by their English; those of plants in this folder come first."""
+    words: dict[str, str] = {}
+    for kind in [*entry_points(group=ENTRY_POINTS).names, *_built_in()]:
+        with contextlib.suppress(LoopError):  # it matters to loops of that plant alone
+            words |= plant_class(kind).translations.get(language, {})
+    return words
+
+
+add_words(translated_words)
 
 
 def parse_plant(mapping: Mapping[str, Any]) -> Plant:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from servoscope.core.arrays import FloatArray
-from servoscope.models.plants.base import CoefficientPlant, Fault, StateSpace
+from servoscope.models.plants.base import SIGN_CUTOFF, CoefficientPlant, Fault, StateSpace, read_translations
+from servoscope.models.plants.columns import COLUMN_FORMS, Column
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-LATER = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
+NOT_DUMPED = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 TermName = Literal[
     "stiffness",
@@ -30,62 +31,84 @@ TermName = Literal[
 
 @dataclass(frozen=True)
 class AxisColumn:
-    """One coefficient of a term: what it multiplies, as a function of position and speed."""
+    """One coefficient of a term and what it multiplies."""
 
     coefficient: str
-    column: int | str  # power of s, or one of `EXTRA_COLUMNS`
-    value: Callable[[AxisPlant, FloatArray, FloatArray], FloatArray]  # of y and y', shapes (N,)
+    column: int | Column  # power of s, or a function of position and speed
     degree: int = 0  # 1 where it grows with y or y' in proportion
     signed: bool = False  # whether the coefficient may be negative
 
 
 TERMS: dict[str, tuple[AxisColumn, ...]] = {
-    "stiffness": (AxisColumn("stiffness", 0, lambda _, y, v: y, 1),),
-    "viscous": (AxisColumn("viscous_friction", 1, lambda _, y, v: v, 1),),
+    "stiffness": (AxisColumn("stiffness", 0, 1),),
+    "viscous": (AxisColumn("viscous_friction", 1, 1),),
     "viscous_by_direction": (
-        AxisColumn("viscous_friction_forward", "forward_v", lambda _, y, v: np.maximum(v, 0.0), 1),
-        AxisColumn("viscous_friction_backward", "backward_v", lambda _, y, v: np.minimum(v, 0.0), 1),
+        AxisColumn("viscous_friction_forward", Column.FORWARD, 1),
+        AxisColumn("viscous_friction_backward", Column.BACKWARD, 1),
     ),
-    "coulomb": (AxisColumn("coulomb_friction", "sign_v", lambda _, y, v: np.sign(v)),),
+    "coulomb": (AxisColumn("coulomb_friction", Column.SIGN),),
     # Stribeck's fall of friction with speed by Hess and Soom (1990), which needs no exponential
-    "stribeck": (
-        AxisColumn(
-            "stribeck_friction", "stribeck_v", lambda p, y, v: np.sign(v) / (1.0 + (v / (p.stribeck_speed or 1.0)) ** 2)
-        ),
-    ),
-    "offset": (AxisColumn("offset", "one", lambda _, y, v: np.ones_like(y), signed=True),),
-    "gravity": (AxisColumn("gravity", "sin_y", lambda p, y, v: np.sin(y - p.hanging_at), signed=True),),
+    "stribeck": (AxisColumn("stribeck_friction", Column.STRIBECK),),
+    "offset": (AxisColumn("offset", Column.CONSTANT, signed=True),),
+    "gravity": (AxisColumn("gravity", Column.SINE, signed=True),),
     # friction of a gear in proportion to the weight that it carries (Bittencourt and Gunnarsson, 2012)
-    "load_friction": (
-        AxisColumn("load_friction", "load_v", lambda p, y, v: np.abs(np.sin(y - p.hanging_at)) * np.sign(v)),
-    ),
+    "load_friction": (AxisColumn("load_friction", Column.LOAD),),
     "cogging": (
-        AxisColumn("cogging_sin", "cogging_sin", lambda p, y, v: np.sin(p.wave_number * y), signed=True),
-        AxisColumn("cogging_cos", "cogging_cos", lambda p, y, v: np.cos(p.wave_number * y), signed=True),
+        AxisColumn("cogging_sin", Column.COGGING_SIN, signed=True),
+        AxisColumn("cogging_cos", Column.COGGING_COS, signed=True),
     ),
 }
 """What may act on an axis besides its inertia, by the name that a loop file declares."""
 
 OF_POSITION = "stiffness", "gravity", "load_friction", "cogging"
 
-# parameter -> name of the fault, and all that does the same to u and y
+MOVED_MASS_CHECKS = "what is moved: workpiece, tool, coupling"
+# parameter -> name of the fault, all that does the same to u and y, and what to check
 FAULTS = {
-    "inertia": ("payload", "more moved mass: a payload, a coupling, a tool"),
-    "viscous_friction": ("lubrication", "more friction at speed: thick, cold or too much lubricant, a tight seal"),
-    "coulomb_friction": ("dry_friction", "more friction at any speed: a dragging brake, a tight guide, dry bearings"),
-    "stribeck_friction": ("stick_slip", "more friction at low speed: worn or missing lubricant"),
-    "stiffness": ("stiffness", "more force for the same way: a stiffer spring"),
-    "gravity": ("gravity", "more weight without more inertia: a balance that has lost its force"),
-    "input_gain": ("motor_constant", "more u for the same force: weak motor, magnets or amplifier"),
+    "inertia": ("payload", "more moved mass: a payload, a coupling, a tool", MOVED_MASS_CHECKS),
+    "viscous_friction": (
+        "lubrication",
+        "more friction at speed: thick, cold or too much lubricant, a tight seal",
+        "lubricant: amount, kind, temperature; seals that are too tight",
+    ),
+    "coulomb_friction": (
+        "dry_friction",
+        "more friction at any speed: a dragging brake, a tight guide, dry bearings",
+        "brake: does it open fully; guides and bearings: dirt, preload, alignment",
+    ),
+    "stribeck_friction": (
+        "stick_slip",
+        "more friction at low speed: worn or missing lubricant",
+        "lubricant of guides and screw; wear of the guide",
+    ),
+    "stiffness": (
+        "stiffness",
+        "more force for the same way: a stiffer spring",
+        "springs, stops and cables that hold the axis",
+    ),
+    "gravity": (
+        "gravity",
+        "more weight without more inertia: a balance that has lost its force",
+        "weight balance: pressure, spring, counterweight",
+    ),
+    "input_gain": (
+        "motor_constant",
+        "more u for the same force: weak motor, magnets or amplifier",
+        "motor and amplifier: temperature, phases, current limit; force or torque constant after an exchange",
+    ),
 }
 BY_DIRECTION = "viscous_friction_forward", "viscous_friction_backward"
 
 # where a payload has weight and a known place
 PAYLOAD_FAULTS = {
-    "moved_mass": ("payload", "more moved mass: a payload, a tool"),
-    "inertia": ("inertia", "more inertia without more weight: a coupling, a flywheel, a balanced load"),
+    "moved_mass": ("payload", "more moved mass: a payload, a tool", MOVED_MASS_CHECKS),
+    "inertia": (
+        "inertia",
+        "more inertia without more weight: a coupling, a flywheel, a balanced load",
+        MOVED_MASS_CHECKS,
+    ),
 }
-EARTH = 9.81  # m/s^2
+GRAVITY_ACCELERATION = 9.81  # m/s^2
 
 
 def _as_tuple(value: Any) -> Any:
@@ -98,6 +121,8 @@ class AxisPlant(CoefficientPlant):
     Where y is a speed, y' and y'' are y itself and its derivative.
     """
 
+    translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
+
     kind: Literal["axis"] = "axis"
     terms: Annotated[tuple[TermName, ...], BeforeValidator(_as_tuple)] = ("viscous", "coulomb", "offset")
     # speed [output per s] at which the term ``stribeck`` has fallen to a half
@@ -107,15 +132,15 @@ class AxisPlant(CoefficientPlant):
     # output at which the load of the term ``gravity`` hangs, in rad
     hanging_at: Finite = 0.0
     # distance of a payload from the joint [m], with input_gain u in N m; 1 on a linear axis, with input_gain u in N
-    payload_arm: Annotated[Positive | None, LATER] = None
+    payload_arm: Annotated[Positive | None, NOT_DUMPED] = None
     # what the output is: a position, or a speed, as drives log it; then no term can depend on the position
-    y: Annotated[Literal["position", "speed"], LATER] = "position"
+    y: Annotated[Literal["position", "speed"], NOT_DUMPED] = "position"
     # speed [output per s] below which sign(y') is not trusted and set to 0
     sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
     # where the sign of the recursion comes from: the measured output, or the reference where y is noisy or slow
     sign_from: Literal["output", "reference"] = "output"
     # cutoff [Hz] of the differentiator behind the sign
-    sign_cutoff: Positive = 50.0
+    sign_cutoff: Positive = SIGN_CUTOFF
     # nominal values by name, all of `names`; `learn` needs none
     coefficients: dict[str, Finite] | None = None
 
@@ -151,13 +176,13 @@ class AxisPlant(CoefficientPlant):
     def columns(self) -> tuple[AxisColumn, ...]:
         """The columns of all terms, powers of s first."""
         each = [column for term in TERMS if term in self.terms for column in TERMS[term]]
-        return tuple(sorted(each, key=lambda column: isinstance(column.column, str)))
+        return tuple(sorted(each, key=lambda column: isinstance(column.column, Column)))
 
     @property
     def names(self) -> tuple[str, ...]:
         """Coefficients of the powers, inertia last among them, then the others."""
         linear = [column.coefficient for column in self.columns if isinstance(column.column, int)]
-        others = [column.coefficient for column in self.columns if isinstance(column.column, str)]
+        others = [column.coefficient for column in self.columns if isinstance(column.column, Column)]
         return (*linear, "inertia", *others)
 
     @property
@@ -172,25 +197,33 @@ class AxisPlant(CoefficientPlant):
         return int(self.y == "speed")
 
     @property
-    def extras(self) -> tuple[str, ...]:
+    def extras(self) -> tuple[Column, ...]:
         """Columns of the other terms."""
-        return tuple(column.column for column in self.columns if isinstance(column.column, str))
+        return tuple(column.column for column in self.columns if isinstance(column.column, Column))
 
     @property
-    def column_shapes(self) -> Mapping[str, tuple[float, float]]:
+    def column_shapes(self) -> Mapping[Column, tuple[float, float]]:
         """Factors and phases of Stribeck friction, gravity and cogging."""
+        wave_number = 2.0 * np.pi / (self.period or 1.0)
         return {
-            "stribeck_v": (1.0 / (self.stribeck_speed or 1.0), 0.0),
-            "sin_y": (1.0, -self.hanging_at),
-            "load_v": (1.0, -self.hanging_at),
-            "cogging_sin": (self.wave_number, 0.0),
-            "cogging_cos": (self.wave_number, 0.5 * np.pi),
+            Column.STRIBECK: (1.0 / (self.stribeck_speed or 1.0), 0.0),
+            Column.SINE: (1.0, -self.hanging_at),
+            Column.LOAD: (1.0, -self.hanging_at),
+            Column.COGGING_SIN: (wave_number, 0.0),
+            Column.COGGING_COS: (wave_number, 0.5 * np.pi),
         }
 
-    @property
-    def wave_number(self) -> float:
-        """2 pi over the period of the cogging."""
-        return 2.0 * np.pi / (self.period or 1.0)
+    def regressors(self, y: FloatArray, v: FloatArray) -> FloatArray:
+        """Return what the coefficients of `columns` multiply, shape (columns, N), of y and y', shapes (N,)."""
+        columns, shapes = [term.column for term in self.columns], self.column_shapes
+        return np.array(
+            [
+                COLUMN_FORMS[column].values(y, v, *shapes.get(column, ()))
+                if isinstance(column, Column)
+                else (y, v)[column]
+                for column in columns
+            ]
+        )
 
     @property
     def unwatched(self) -> tuple[str, ...]:
@@ -206,7 +239,9 @@ class AxisPlant(CoefficientPlant):
         told = FAULTS | PAYLOAD_FAULTS if self._lifts else FAULTS
         known |= {"moved_mass"} & {*told}
         return tuple(
-            self._fault(name, parameter, words) for parameter, (name, words) in told.items() if parameter in known
+            self._fault(name, parameter, words, checks)
+            for parameter, (name, words, checks) in told.items()
+            if parameter in known
         )
 
     @property
@@ -241,7 +276,7 @@ class AxisPlant(CoefficientPlant):
         """
         assert self.payload_arm is not None
         own = coefficients["gravity"]
-        weight = np.sign(np.real(own)) * inertia * EARTH / self.payload_arm
+        weight = np.sign(np.real(own)) * inertia * GRAVITY_ACCELERATION / self.payload_arm
         coefficients["inertia"] += inertia
         coefficients["gravity"] += weight
         if "load_friction" in coefficients:

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import abc
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
+from servoscope.models.plants.columns import Column
 
 StateSpace = tuple[FloatArray, FloatArray, FloatArray]
 
-BEYOND = 1.5  # times the logarithms of the full size of a fault ray, as far as it is searched
-
-EXTRA_COLUMNS = (
-    *("sign_v", "forward_v", "backward_v", "one"),
-    *("stribeck_v", "sin_y", "cogging_sin", "cogging_cos", "load_v"),
-)
-"""Columns beyond the powers of s: sign(y'), max(y', 0), min(y', 0), the constant one, and those with a shape: Stribeck
-friction, sines of y, and friction that follows the magnitude of a sine."""
+MAX_RAY_SIZE = 1.5  # times the logarithms of the full size of a fault ray, as far as it is searched
+SIGN_CUTOFF = 50.0  # Hz
 
 
 def matrices(rows: Sequence[Sequence[Any]], count: int) -> Any:
@@ -48,6 +45,20 @@ class Fault:
     parameter: str  # the parameter that moves, for example ``C_ie``
     ratio_range: tuple[float, float]  # smallest and largest ratio to the nominal value that is searched
     words: str  # what the fault means to the person who reads the report
+    checks: str = ""  # what to check on the machine for it
+
+
+class VelocitySign(NamedTuple):
+    """Where the sign of y' comes from, of which the columns of friction are made."""
+
+    of_reference: bool = False  # from r instead of y
+    cutoff: float | None = None  # of the differentiator behind it [Hz]; None: `SIGN_CUTOFF`
+    dead_speed: float = 0.0  # speed up to which the sign is not trusted and is 0 [output per s]
+
+
+def read_translations(module: str) -> Mapping[str, Mapping[str, str]]:
+    """Return the TOML file beside a module of a plant: by language, words by their English."""
+    return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True)
@@ -69,7 +80,7 @@ class FaultRay:
     @property
     def fault(self) -> Fault:
         """The ray as a fault, whose parameter has the name of the ray."""
-        ends = sorted((1.0, self.full[0][1] ** BEYOND))
+        ends = sorted((1.0, self.full[0][1] ** MAX_RAY_SIZE))
         words = " with ".join(f"{name} x {ratio:g}" for name, ratio in self.full)
         return Fault(self.name, self.name, (ends[0], ends[1]), f"{words} at full size")
 
@@ -82,6 +93,11 @@ class Plant(BaseModel, abc.ABC):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    # by language, as "de": names, words and checks of its faults and the words of its causes, by their English
+    translations: ClassVar[Mapping[str, Mapping[str, str]]] = {}
+    # whether its parameters are its coefficients and the input gain, so that a healthy estimate gives their ratios
+    parameters_are_coefficients: ClassVar[bool] = False
 
     kind: str  # name of the plant in a loop file
     # factor on u as recorded, before anything else is done with it, for example a torque constant
@@ -106,14 +122,31 @@ class Plant(BaseModel, abc.ABC):
         return 0
 
     @property
-    def extras(self) -> tuple[str, ...]:
-        """Columns after the powers, out of `EXTRA_COLUMNS`."""
+    def extras(self) -> tuple[Column, ...]:
+        """Columns after the powers."""
         return ()
 
     @property
-    def column_shapes(self) -> Mapping[str, tuple[float, float]]:
-        """By column of Stribeck friction or of a sine: factor on y' or on y, and phase."""
+    def column_shapes(self) -> Mapping[Column, tuple[float, float]]:
+        """By column that is shaped (`COLUMN_FORMS`): factor on y' or on y, and phase."""
         return {}
+
+    @property
+    def velocity_sign(self) -> VelocitySign:
+        """Where the sign of y' comes from."""
+        return VelocitySign()
+
+    def with_sample_rate(self, rate: float) -> Self:
+        """Return the same plant with defaults that suit a sample rate [Hz]."""
+        return self
+
+    @property
+    def load_pressure(self) -> tuple[float, float, float] | None:
+        """What y, y' and y'' contribute to p_L/p_s of a valve whose flow is K_q u sqrt(1 - sign(u) p_L/p_s).
+
+        None: the flow is proportional to u.
+        """
+        return None
 
     @property
     def units(self) -> tuple[str, str]:
@@ -124,13 +157,18 @@ class Plant(BaseModel, abc.ABC):
     def coefficient_units(self) -> tuple[str, ...]:
         """Units of the n coefficients, in u and y themselves where theirs are not known."""
         of_y, of_u = self.units[0] or "y", self.units[1] or ("u" if self.input_gain == 1.0 else "input_gain u")
-        extra = [f"{of_u} s/{of_y}" if name in ("forward_v", "backward_v") else of_u for name in self.extras]
+        extra = [f"{of_u} s/{of_y}" if name in (Column.FORWARD, Column.BACKWARD) else of_u for name in self.extras]
         return (*(f"{of_u}{('', ' s', ' s²', ' s³', ' s⁴')[power]}/{of_y}" for power in self.powers), *extra)
 
     @property
     def linear(self) -> bool:
         """Whether it is linear but for `extras`, which are simulated and regressed as what they are."""
         return True
+
+    @property
+    def affine(self) -> bool:
+        """Whether it is linear but for a constant."""
+        return self.linear and set(self.extras) <= {Column.CONSTANT}
 
     @property
     @abc.abstractmethod
@@ -263,13 +301,27 @@ class CoefficientPlant(Plant):
     }
     DEFAULT_RANGE: ClassVar[tuple[float, float]] = (0.1, 10.0)
 
-    if TYPE_CHECKING:  # a field of each plant, at the place that it has in its loop file
+    if TYPE_CHECKING:  # fields of each plant, at the place that they have in its loop file
         coefficients: dict[str, float] | None
+        sign_speed: float
+        sign_from: Literal["output", "reference"]
+        sign_cutoff: float
 
     @property
     def has_physics(self) -> bool:
         """Whether nominal coefficients are given."""
         return self.coefficients is not None
+
+    @property
+    def velocity_sign(self) -> VelocitySign:
+        """As its settings say."""
+        return VelocitySign(self.sign_from == "reference", self.sign_cutoff, self.sign_speed)
+
+    def with_sample_rate(self, rate: float) -> Self:
+        """Return the same plant; a `sign_cutoff` that nobody set lies below the Nyquist frequency."""
+        if "sign_cutoff" in self.model_fields_set or self.sign_cutoff < rate / 2:
+            return self
+        return self.model_copy(update={"sign_cutoff": rate / 4})
 
     def theta(self) -> FloatArray:
         """Nominal coefficients, shape (n,) [u per output per s^power]."""
@@ -281,5 +333,5 @@ class CoefficientPlant(Plant):
             raise LoopError("[plant] coefficients: missing, simulation and nominal values need them")
         return self.coefficients
 
-    def _fault(self, name: str, parameter: str, words: str) -> Fault:
-        return Fault(name, parameter, self.RATIO_RANGES.get(parameter, self.DEFAULT_RANGE), words)
+    def _fault(self, name: str, parameter: str, words: str, checks: str) -> Fault:
+        return Fault(name, parameter, self.RATIO_RANGES.get(parameter, self.DEFAULT_RANGE), words, checks)

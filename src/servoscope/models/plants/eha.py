@@ -1,4 +1,4 @@
-"""Electrohydraulic actuator: voice-coil current [A] to load displacement [m], THEORY section 1."""
+"""Electrohydraulic actuator: voice-coil current [A] to load displacement [m]."""
 
 from __future__ import annotations
 
@@ -11,17 +11,36 @@ import numpy.typing as npt
 from pydantic import Field
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import LoopError
 from servoscope.core.settings import NonNegative
-from servoscope.models.plants.base import Fault, Plant, StateSpace, matrices
+from servoscope.models.plants.base import Fault, Plant, StateSpace, matrices, read_translations
 
 PlausiblePositive = Annotated[float, Field(gt=1e-30, lt=1e30, allow_inf_nan=False)]  # SI values beyond are typos
 
 FAULTS = (
-    Fault("pump", "p_s", (0.3, 3.0), "pump or valve gain (p_s cannot be told from K_m, C_d, W, rho)"),
-    Fault("leakage", "C_ie", (0.3, 5.0), "internal leakage"),
-    Fault("friction", "b_p", (0.2, 100.0), "friction"),
-    Fault("contamination", "beta", (0.001, 30.0), "oil contamination (bulk modulus)"),
+    Fault(
+        "pump",
+        "p_s",
+        (0.3, 3.0),
+        "pump or valve gain (p_s cannot be told from K_m, C_d, W, rho)",
+        "supply pressure and filter; valve and its amplifier: zero, current, contamination",
+    ),
+    Fault(
+        "leakage",
+        "C_ie",
+        (0.3, 5.0),
+        "internal leakage",
+        "piston seal and valve edges: warm cylinder, drift under load with the valve shut, oil return flow",
+    ),
+    Fault(
+        "friction", "b_p", (0.2, 100.0), "friction", "rod seal, guide and bearing: alignment, lubrication, side load"
+    ),
+    Fault(
+        "contamination",
+        "beta",
+        (0.001, 30.0),
+        "oil contamination (bulk modulus)",
+        "oil: air in it, foam, water, age; oil level and suction line",
+    ),
 )
 
 OTHER_CAUSES = {"m_p": "another mass", "k_p": "another stiffness of the load", "A_p": "another piston area"}
@@ -43,6 +62,7 @@ class EHA(Plant):
     has_physics: ClassVar[bool] = True
     faults: ClassVar[tuple[Fault, ...]] = FAULTS
     causes: ClassVar[Mapping[str, str]] = OTHER_CAUSES
+    translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
 
     kind: Literal["eha"] = "eha"
     m_p: PlausiblePositive  # mass [kg]
@@ -73,6 +93,14 @@ class EHA(Plant):
     def linear(self) -> bool:
         """Whether `state_space` says all: no square root, no Coulomb friction."""
         return self.valve_law == "linear" and self.coulomb == 0.0
+
+    @property
+    def load_pressure(self) -> tuple[float, float, float] | None:
+        """By the balance of forces p_L = (m_p y'' + b_p y' + k_p y)/A_p."""
+        if self.valve_law == "linear":
+            return None
+        k, b, m = (value / (self.A_p * self.p_s) for value in (self.k_p, self.b_p, self.m_p))
+        return k, b, m
 
     @property
     def flow_gain(self) -> float:
@@ -124,75 +152,3 @@ class EHA(Plant):
         """Inverse frequency response H(j 2 pi f) [A/m] at frequencies [Hz], same shape as `f_hz`, eq. (2)."""
         s = 2j * np.pi * np.asarray(f_hz, dtype=np.float64)
         return np.asarray(np.polyval(self.theta()[::-1], s), dtype=np.complex128)
-
-    def kappa_from_theta(self, theta: npt.ArrayLike) -> dict[str, float]:
-        """Recover p_s, C_ie, b_p and beta from the four coefficients, exactly and for simultaneous faults.
-
-        The remaining parameters (m_p, k_p, A_p, V_o, rho, C_d, W, K_m) are taken as known. With a spring::
-
-            g = theta_3 k_p/(theta_0 m_p)                                   (= capacity/C_ie)
-            b_p = (k_p theta_2/theta_0 - m_p)/g
-            C_ie = A_p^2/(k_p theta_1/theta_0 - g k_p - b_p)
-            V_o/(2 beta) = g C_ie,   K_q = C_ie k_p/(theta_0 A_p)
-
-        Without one, theta_0 = 0 and three coefficients cannot fix four parameters: K_q is taken as known too,
-        so that p_s stays at its nominal value, and the other three follow::
-
-            V_o/(2 beta) = theta_3 A_p K_q/m_p
-            C_ie b_p = A_p K_q theta_1 - A_p^2,   V_o/(2 beta) b_p + C_ie m_p = A_p K_q theta_2
-
-        The last two are a quadratic in C_ie with two positive solutions as a rule: the one closer to the
-        nominal C_ie (in its logarithm) is returned. Where a change of the gain is to be told as well, one
-        of the four must be known from elsewhere.
-
-        Parameters
-        ----------
-        theta
-            Coefficients, shape (4,), in the order of `names`.
-
-        Raises LoopError if no positive parameters belong to these coefficients.
-        """
-        theta_0, theta_1, theta_2, theta_3 = (float(value) for value in np.asarray(theta, dtype=np.float64))
-        if self.k_p > 0.0:
-            kappa = self._with_spring(theta_0, theta_1, theta_2, theta_3)
-        else:
-            kappa = self._without_spring(theta_1, theta_2, theta_3)
-        if not all(np.isfinite(value) and value > 0.0 for value in kappa.values()):
-            raise LoopError(f"theta = {np.asarray(theta)}: no actuator has these coefficients")
-        return kappa
-
-    def from_theta(self, theta: npt.ArrayLike) -> Self:
-        """Return the same actuator with the p_s, C_ie, b_p and beta of `kappa_from_theta`."""
-        return self.model_copy(update=self.kappa_from_theta(theta))
-
-    def _with_spring(self, theta_0: float, theta_1: float, theta_2: float, theta_3: float) -> dict[str, float]:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            compliance = np.float64(self.k_p) / theta_0
-            g = theta_3 * compliance / self.m_p
-            b_p = (theta_2 * compliance - self.m_p) / g
-            C_ie = self.A_p**2 / (theta_1 * compliance - g * self.k_p - b_p)
-            return {
-                "p_s": self._supply(C_ie * compliance / self.A_p),
-                "C_ie": float(C_ie),
-                "b_p": float(b_p),
-                "beta": float(self.V_o / (2.0 * g * C_ie)),
-            }
-
-    def _without_spring(self, theta_1: float, theta_2: float, theta_3: float) -> dict[str, float]:
-        scale = self.A_p * self.flow_gain
-        capacity = scale * theta_3 / self.m_p
-        product, total = scale * theta_1 - self.A_p**2, scale * theta_2
-        # m_p C_ie^2 - total C_ie + capacity product = 0; a discriminant below zero by rounding only is a
-        # double root.
-        root = np.sqrt(max(total**2 - 4.0 * self.m_p * capacity * product, 0.0))
-        large = (total + root) / (2.0 * self.m_p)
-        small = capacity * product / (self.m_p * large) if large > 0.0 else np.nan
-        candidates = [value for value in (large, small) if value > 0.0]
-        C_ie = min(candidates, key=lambda value: abs(np.log(value / self.C_ie)), default=np.nan)
-        beta = self.V_o / (2.0 * capacity) if capacity > 0.0 else np.nan
-        return {"p_s": self.p_s, "C_ie": float(C_ie), "b_p": float(product / C_ie), "beta": float(beta)}
-
-    def _supply(self, flow_gain: float) -> float:
-        if not flow_gain > 0.0:
-            return float("nan")
-        return float(self.rho * (flow_gain / (self.K_m * self.C_d * self.W)) ** 2)

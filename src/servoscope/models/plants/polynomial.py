@@ -3,21 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from servoscope.models.plants.base import CoefficientPlant, Fault, StateSpace, matrices
+from servoscope.models.plants.base import (
+    SIGN_CUTOFF,
+    CoefficientPlant,
+    Fault,
+    StateSpace,
+    matrices,
+    read_translations,
+)
+from servoscope.models.plants.columns import Column
 
 POWER_NAMES = ("stiffness", "viscous_friction", "inertia", "jerk", "snap")
 EXTRA_NAMES = {
-    "sign_v": "coulomb_friction",
-    "forward_v": "viscous_friction_forward",
-    "backward_v": "viscous_friction_backward",
-    "one": "offset",
+    Column.SIGN: "coulomb_friction",
+    Column.FORWARD: "viscous_friction_forward",
+    Column.BACKWARD: "viscous_friction_backward",
+    Column.CONSTANT: "offset",
+}
+FRICTION_COLUMNS = {
+    "none": (),
+    "coulomb": (Column.SIGN,),
+    "directional": (Column.FORWARD, Column.BACKWARD, Column.SIGN),
 }
 INPUT_GAIN_WORDS = "more u for the same motion (weak motor, magnet or amplifier, or all coefficients up together)"
+DIRECTION_CHECKS = "lubricant and seals; a load that acts in one direction only"
+CHECKS = {
+    "stiffness": "springs, stops and cables that hold the axis",
+    "inertia": "what is moved: workpiece, tool, coupling",
+    "viscous_friction": "lubricant: amount, kind, temperature; seals that are too tight",
+    "viscous_friction_forward": DIRECTION_CHECKS,
+    "viscous_friction_backward": DIRECTION_CHECKS,
+    "coulomb_friction": "brake: does it open fully; guides and bearings: dirt, preload, alignment",
+    "input_gain": "motor, amplifier and supply: temperature, voltage, pressure; scale of u in the log",
+    "offset": "weight or force that acts on the axis; zero of amplifier or valve",
+}
 
 FrictionKind = Literal["none", "coulomb", "directional"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -25,6 +49,9 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 class PolynomialPlant(CoefficientPlant):
     """Plant whose inverse is a polynomial in s, plus Coulomb friction, friction per direction and a constant."""
+
+    translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
+    parameters_are_coefficients: ClassVar[bool] = True
 
     kind: Literal["polynomial"] = "polynomial"
     order: Annotated[int, Field(ge=1, le=4)]  # highest power of s, 1 to 4; a motor axis has 2
@@ -37,7 +64,7 @@ class PolynomialPlant(CoefficientPlant):
     # where the sign comes from: the measured output, or the reference where y is noisy or slow
     sign_from: Literal["output", "reference"] = "output"
     # cutoff [Hz] of the differentiator behind the sign
-    sign_cutoff: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 50.0
+    sign_cutoff: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = SIGN_CUTOFF
     # nominal values by name, all of `names`; needed for simulation and for a nominal baseline only
     coefficients: dict[str, Finite] | None = None
 
@@ -63,7 +90,7 @@ class PolynomialPlant(CoefficientPlant):
     @property
     def _leading(self) -> tuple[str, ...]:
         if self.order == 1 and self.friction == "directional":
-            return EXTRA_NAMES["forward_v"], EXTRA_NAMES["backward_v"]
+            return EXTRA_NAMES[Column.FORWARD], EXTRA_NAMES[Column.BACKWARD]
         return (POWER_NAMES[self.order],)
 
     @property
@@ -78,10 +105,9 @@ class PolynomialPlant(CoefficientPlant):
         return tuple(p for p in range(first, self.order + 1) if p != 1 or self.friction != "directional")
 
     @property
-    def extras(self) -> tuple[str, ...]:
+    def extras(self) -> tuple[Column, ...]:
         """Friction by direction, sign and constant as far as present."""
-        friction = {"none": (), "coulomb": ("sign_v",), "directional": ("forward_v", "backward_v", "sign_v")}
-        return (*friction[self.friction], *(("one",) if self.offset else ()))
+        return (*FRICTION_COLUMNS[self.friction], *((Column.CONSTANT,) if self.offset else ()))
 
     @property
     def unwatched(self) -> tuple[str, ...]:
@@ -97,8 +123,8 @@ class PolynomialPlant(CoefficientPlant):
     @property
     def faults(self) -> tuple[Fault, ...]:
         """One per coefficient, and the input gain, which scales them all."""
-        single = tuple(self._fault(name, name, name.replace("_", " ")) for name in self.names)
-        return (*single, self._fault("input_gain", "input_gain", INPUT_GAIN_WORDS))
+        words = {name: name.replace("_", " ") for name in self.names} | {"input_gain": INPUT_GAIN_WORDS}
+        return tuple(self._fault(name, name, text, CHECKS.get(name, "")) for name, text in words.items())
 
     def scaled(self, factors: Mapping[str, Any]) -> Self:
         """Return the same plant with coefficients multiplied; ``input_gain`` multiplies all of them.

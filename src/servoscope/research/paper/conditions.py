@@ -17,7 +17,6 @@ from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 
 DURATION = 60.0  # s
 FAULT_AT = 30.0  # s
-PERIOD = 10.0  # s, of the reference
 FREQUENCIES = (1.0, 10.0, 20.0)  # Hz, of Gamma
 SIZES = {
     "p_s": (0.6, 0.8, 1.2, 1.4),

@@ -19,10 +19,10 @@ from servoscope.signals import Recording
 
 INITIAL_COVARIANCE_FACTOR = 100.0  # P(0)/P_d: where the recursion starts from zero it must not believe it
 MARGIN = 1.5  # prescribed thresholds, relative to the largest healthy residual
-HOLD = 1.0  # s that a residual has to stay beyond its threshold
+MIN_EXCEEDANCE_S = 1.0  # s that a residual has to stay beyond its threshold
 SETTLING_S = 20.0  # s after which the evaluator listens
 GRID = 121  # sizes along a signature
-REACH = {parameter: (min(sizes) / 2.0, max(sizes) * 2.0) for parameter, sizes in SIZES.items()}
+RATIO_RANGES = {parameter: (min(sizes) / 2.0, max(sizes) * 2.0) for parameter, sizes in SIZES.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,11 +119,11 @@ class Evaluator:
     def evaluate(self, course: ResidualTrace) -> EvaluatorResult:
         """Detect: one residual beyond its threshold for a second. Isolate at the end of the course."""
         beyond = (np.abs(course.gamma) > self.thresholds).any(axis=1) & (course.t > SETTLING_S)
-        hold = round(HOLD / float(course.t[1] - course.t[0]))
+        hold = round(MIN_EXCEEDANCE_S / float(course.t[1] - course.t[0]))
         lasting = np.convolve(beyond, np.ones(hold), mode="full")[: len(beyond)] >= hold - 0.5
         if not lasting.any():
             return EvaluatorResult(None, None, None)
-        Gamma = course.between(float(course.t[-1]) - HOLD, np.inf).gamma.mean(axis=0)
+        Gamma = course.between(float(course.t[-1]) - MIN_EXCEEDANCE_S, np.inf).gamma.mean(axis=0)
         fault, ratio = self.nearest_signature(Gamma)
         return EvaluatorResult(float(course.t[int(np.argmax(lasting))]), fault, ratio)
 
@@ -143,7 +143,7 @@ def nominal_signatures(loop: Loop) -> dict[str, tuple[FloatArray, ComplexArray]]
     healthy = nominal_theta(loop)
     found = {}
     for fault in loop.plant.faults:
-        low, high = np.log(REACH[fault.parameter])
+        low, high = np.log(RATIO_RANGES[fault.parameter])
         sizes = np.exp(np.linspace(low, high, GRID))
         faulty = [loop.plant.with_ratios({fault.parameter: float(size)}) for size in sizes]
         theta = np.array([nominal_theta(loop, plant) for plant in faulty])

@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from servoscope.core.files import atomic_write, make_folder
-from servoscope.core.workers import available_cores, create_pool
+from servoscope.core.workers import WorkerError, WorkerGroup, available_cores
 from servoscope.research.paper import claims, jobs
 from servoscope.research.paper.claims import Claim
 from servoscope.research.paper.jobs import SeedJob
@@ -22,7 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".svg")
-FIGURE_COUNT = 17  # figures that are drawn
+DRAWINGS = ("figure-1", "figure-3")  # files of this package: the actuator, and the diagnostic around its loop
+FIGURE_COUNT = 17  # drawings and figures
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 StepCallback = Callable[[str], None]
@@ -63,37 +63,25 @@ def run_jobs(work: Sequence[SeedJob], processes: int) -> Iterator[tuple[SeedJob,
     if processes <= 1:
         yield from ((job, jobs.run_job(job)) for job in work)
         return
-    with _one_thread_each(), create_pool(processes) as pool:
-        futures = {pool.submit(jobs.run_job, job): job for job in work}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
+    pool = WorkerGroup(environment={**os.environ, **dict.fromkeys(ONE_THREAD, "1")})
+    for job, found in pool.map(f"{__name__}:run_in_worker", work, processes):
+        if isinstance(found, WorkerError):
+            raise found
+        yield job, found
 
 
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let processes that start within use one thread for linear algebra each: more only get into each other's way."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def run_in_worker(_: StepCallback, job: SeedJob) -> dict[str, float]:
+    """Do one job in a worker."""
+    return jobs.run_job(job)
 
 
 def list_figures(found: Reproduction) -> Iterator[tuple[str, Callable[[], Figure]]]:
     """Yield the name of each figure and what draws it: for the paper's method, and for the default on the same data."""
     from servoscope.research.paper import charts, figures
-    from servoscope.research.paper.drawings import figure_1, figure_3
     from servoscope.research.paper.table import table_2_residuals
 
     seed, metrics = found.seeds[0], found.metrics
-    yield "figure-1", figure_1
     yield "figure-2", figures.figure_2
-    yield "figure-3", figure_3
     yield "figure-4", lambda: figures.figure_4(seed)
     for version in figures.METHODS:
         method = figures.METHODS[version][-1]
@@ -117,6 +105,11 @@ def write_reproduction(found: Reproduction, folder: Path, told: StepCallback = l
 
     make_folder(folder)
     written = []
+    for name in DRAWINGS:
+        for suffix in SUFFIXES:
+            written.append(folder / f"{name}{suffix}")
+            atomic_write(written[-1], files(__package__).joinpath(written[-1].name).read_bytes())
+        told(name)
     for name, draw in list_figures(found):
         figure = draw()
         for suffix in SUFFIXES:

@@ -32,17 +32,6 @@ def sensitivity_of_G(plant: EHA, f_hz: npt.ArrayLike) -> ComplexArray:
     return np.asarray(-sensitivity_of_H(plant, f_hz) / H**2)
 
 
-def numerical_sensitivity(plant: EHA, f_hz: npt.ArrayLike, *, inverse: bool, step: float = 1e-5) -> ComplexArray:
-    """Return the same by central differences in log kappa, for comparison."""
-    f = np.atleast_1d(np.asarray(f_hz, dtype=np.float64))
-    power = 1.0 if inverse else -1.0
-    rows = []
-    for parameter in plant.parameters:
-        up, down = (plant.with_ratios({parameter: float(np.exp(h))}) for h in (step, -step))
-        rows.append((up.frequency_response(f) ** power - down.frequency_response(f) ** power) / (2.0 * step))
-    return np.array(rows)
-
-
 def angle_between(a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
     """Return the angle between two directions in the complex plane as lines, 0 to 90 degrees."""
     turned = np.angle(np.asarray(a) * np.conj(np.asarray(b)))

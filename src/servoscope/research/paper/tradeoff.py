@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.research.paper import metrics
 from servoscope.research.paper.conditions import FAULT_AT, FREQUENCIES, TRACKING_CASE, OperatingConditions, paper_loop
@@ -12,7 +10,7 @@ from servoscope.research.paper.tracking import TUNING_SEED_OFFSET
 
 ESTIMATORS = ("akf", "dfrls", "kf", "rls")
 MEMORIES = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0)  # s; N = 100 ... 1200, l of RLS 0.99 ... 0.9992
-FEW = (1.0, 3.0, 8.0)
+MEMORIES_BESIDE_NOMINAL = (1.0, 3.0, 8.0)
 CONDITIONS = (
     OperatingConditions(),
     OperatingConditions("multisine"),
@@ -52,7 +50,7 @@ def trade_off_curve(
 def trade_off_metrics(conditions: OperatingConditions, seed: int) -> dict[str, float]:
     """Return all curves of one operating condition as flat numbers, ``condition|estimator|column|memory``."""
     flat: dict[str, float] = {}
-    memories = MEMORIES if conditions == OperatingConditions() else FEW
+    memories = MEMORIES if conditions == OperatingConditions() else MEMORIES_BESIDE_NOMINAL
     for estimator in ESTIMATORS:
         for column, values in trade_off_curve(estimator, conditions, seed, memories).items():
             for memory, value in zip(memories, values, strict=True):
@@ -62,7 +60,7 @@ def trade_off_metrics(conditions: OperatingConditions, seed: int) -> dict[str, f
 
 def curve_column(flat: dict[str, float], conditions: OperatingConditions, estimator: str, name: str) -> list[float]:
     """Return one column of `trade_off_metrics`, by memory."""
-    memories = MEMORIES if conditions == OperatingConditions() else FEW
+    memories = MEMORIES if conditions == OperatingConditions() else MEMORIES_BESIDE_NOMINAL
     return [flat[f"{conditions}|{estimator}|{name}|{memory:g}"] for memory in memories]
 
 
@@ -84,14 +82,3 @@ def ifrf_rise_time(generator: ResidualGenerator, faulty: ResidualTrace) -> float
     turn = generator.pipeline.bank.E(FREQUENCIES[:1]) @ nominal_theta(loop, fault_plant)
     level = complex(faulty.between(20.0, FAULT_AT).H[:, 0].mean())
     return metrics.rise_time(faulty.t, faulty.H[:, 0], FAULT_AT, level, level * complex(turn[0] / generator.nominal[0]))
-
-
-def best_estimator(
-    medians: dict[str, float], conditions: OperatingConditions, name: str
-) -> tuple[str, dict[str, float]]:
-    """Return which estimator is quietest at equal rise time, and each one's CV relative to the AKF's."""
-    relative = {"akf": 1.0}
-    for other in ESTIMATORS[1:]:
-        relative[other] = 1.0 / cv_ratio(medians, conditions, name, "akf", other)
-    known = {each: value for each, value in relative.items() if np.isfinite(value)}
-    return min(known, key=lambda each: known[each]), relative

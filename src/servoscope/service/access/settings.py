@@ -35,6 +35,7 @@ class WebSettings(Settings):
     # processor time [s] and memory [MB] of one diagnosis, learning or design
     job_s: Positive = 300.0
     job_memory_mb: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1000.0)] = 4000.0
+    job_user: NonEmptyStr | None = None  # account that jobs run as, where the server runs as root
 
     @model_validator(mode="after")
     def _safe(self) -> Self:

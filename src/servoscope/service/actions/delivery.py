@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
 import json
@@ -11,7 +12,7 @@ import ssl
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -142,22 +143,47 @@ def _post(row: OutboxEntry, sink: WebhookSettings) -> str:
         # by the clock of the machine, which receivers compare with theirs
         stamp = str(int(time.time()))
         headers |= {"X-Servoscope-Timestamp": stamp, "X-Servoscope-Signature": signature(secret, stamp, body)}
+    loop = asyncio.new_event_loop()
     try:
-        target = _checked_request(sink)
-        # Redirects are not followed: the event goes where the configuration says, or nowhere. The answer's body is
-        # not read: it might never end.
-        with (
-            httpx.Client(verify=target.verify, timeout=sink.timeout_s, trust_env=target.trust_env) as client,
-            client.stream(
-                "POST", target.url, content=body, headers=headers | target.headers, extensions=target.extensions
-            ) as response,
-        ):
-            status, wait = response.status_code, response.headers.get("Retry-After", "")
+        status, wait = loop.run_until_complete(_request(sink, body, headers))
+    except TimeoutError:
+        raise _DeliveryError(f"{show_address(sink.url)}: timed out after {sink.timeout_s:g} s") from None
     except (httpx.HTTPError, httpx.InvalidURL, ConfigError, OSError) as error:
-        raise _DeliveryError(f"{show_address(sink.url)}: {error or type(error).__name__}") from None
+        raise _DeliveryError(f"{show_address(sink.url)}: {_root_cause(error)}") from None
+    finally:
+        loop.close()  # it does not wait for a name server that does not answer
     if not 200 <= status < 300:
         raise _DeliveryError(f"{show_address(sink.url)}: answered {status}", float(wait) if wait.isdecimal() else 0.0)
     return f"answered {status}"
+
+
+def _root_cause(error: BaseException) -> str:
+    """Return what has led to an error, in words: the libraries above the socket say that a connection has failed."""
+    while (before := error.__cause__ or error.__context__) is not None:
+        error = before
+    if isinstance(error, ConnectionError) and error.errno:
+        return os.strerror(error.errno)
+    return str(error) or type(error).__name__
+
+
+async def _request(sink: WebhookSettings, body: bytes, headers: Mapping[str, str]) -> tuple[int, str]:
+    """Return the status of the answer, and its Retry-After; raises TimeoutError after the sink's `timeout_s`.
+
+    The limits of httpx hold for each read, of which a receiver that drips causes many.
+    """
+    import httpx
+
+    async with asyncio.timeout(sink.timeout_s):
+        target = await asyncio.to_thread(_checked_request, sink)
+        # Redirects are not followed: the event goes where the configuration says, or nowhere. The answer's body is
+        # not read: it might never end.
+        async with (
+            httpx.AsyncClient(verify=target.verify, timeout=None, trust_env=target.trust_env) as client,
+            client.stream(
+                "POST", target.url, content=body, headers={**headers, **target.headers}, extensions=target.extensions
+            ) as response,
+        ):
+            return response.status_code, response.headers.get("Retry-After", "")
 
 
 class _Target(NamedTuple):
@@ -179,7 +205,7 @@ def _checked_request(sink: WebhookSettings) -> _Target:
 
     url = httpx.URL(sink.url)
     verify = sink.create_tls_context(Path(), url.host) if sink.has_certificates else True
-    if not sink.rules.refused:
+    if sink.rules.internal:
         return _Target(url, {}, {}, verify, True)
     address = sink.rules.resolve(url.host, url.port or (443 if url.scheme == "https" else 80))
     name = {"sni_hostname": url.host}  # the certificate is compared with it

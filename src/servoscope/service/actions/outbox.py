@@ -51,11 +51,6 @@ class DeliveryAttempt:
     detail: str  # the answer, in one line
     retry_entry: OutboxEntry | None = None  # replaces the entry in the outbox; None: it is delivered or given up
 
-    @property
-    def is_final_failure(self) -> bool:
-        """Whether it will never be delivered."""
-        return not self.delivered and self.retry_entry is None
-
 
 def transition_entries(
     settings: ActionSettings,

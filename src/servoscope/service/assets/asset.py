@@ -35,8 +35,8 @@ from servoscope.service.assets.examination_schedule import (
 )
 from servoscope.service.assets.outlook import AssetLimits, Outlook, PrognosisSettings, single_fault
 from servoscope.service.assets.recent_blocks import PackedBlock, RecentBlocks
-from servoscope.service.assets.reception import FOLLOWED, Reception
-from servoscope.service.assets.records import REPEATABLE, BlockRefusal, StepResult, TableRow, transition_row
+from servoscope.service.assets.reception import RECEPTION_OK, Reception
+from servoscope.service.assets.records import REPEATABLE_TABLES, BlockRefusal, StepResult, TableRow, transition_row
 from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
 from servoscope.service.assets.status import AssetStatus, asset_metadata, asset_status
 from servoscope.service.config import DiagnosisSettings
@@ -81,7 +81,7 @@ class Asset(StateHolder):
         self._alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
         self._window = RecentBlocks(name, policy.diagnosis.window_s, self._rate)
         self._result = StepResult([], [])
-        self._reception = FOLLOWED
+        self._reception = RECEPTION_OK
         self._ticked = False  # whether silence has changed the state since the last block
 
     def move_state(self, states: AssetStates, row: int) -> None:
@@ -89,7 +89,7 @@ class Asset(StateHolder):
         state = self.take_state()
         since, until = rest_period(state.examination)
         from_s, to_s = self._alarms.standstill(state, self.reception)
-        undisturbed = self.reception == FOLLOWED and not self._ticked
+        undisturbed = self.reception == RECEPTION_OK and not self._ticked
         rest = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
         self._move_to(states.put(row, state, rest if undisturbed else rest._replace(until=-math.inf)))
 
@@ -207,10 +207,11 @@ class Asset(StateHolder):
         self._examine()
         self._advance_alarms(self._current.position.t)
         self._window.trim(self._current.position.t, self._current.pending_diagnoses)
-        after, undisturbed, self._ticked = self._current, self.reception == FOLLOWED and not self._ticked, False
+        undisturbed = self.reception == RECEPTION_OK and not self._ticked
+        after, self._ticked = self._current, False
         nothing_else = after.alarms is before.alarms and after.examination is before.examination
-        repeatable = nothing_else and undisturbed and REPEATABLE.issuperset(row.table for row in self._result.rows)
-        return self._result._replace(repeatable=repeatable)
+        usual_rows = REPEATABLE_TABLES.issuperset(row.table for row in self._result.rows)
+        return self._result._replace(repeatable=nothing_else and undisturbed and usual_rows)
 
     def keep(self, block: PackedBlock) -> None:
         """Keep the samples of a quiet block whose state is there."""
@@ -242,7 +243,7 @@ class Asset(StateHolder):
             quality_state, changed = quality.tick(self._limits, state.quality, now)
             self._ticked |= bool(changed)
         self.state = replace(state, quality=quality_state)
-        if changed or self.reception != FOLLOWED or "silent" in quality.active_findings(quality_state):
+        if changed or self.reception != RECEPTION_OK or "silent" in quality.active_findings(quality_state):
             self._advance_alarms(now)
         return self._result
 

@@ -15,8 +15,9 @@ from servoscope.baseline.covariates import hold_last
 from servoscope.core.errors import RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
-from servoscope.detection.result import FaultEstimate, Verdict
-from servoscope.detection.warm_up import FOLLOWED
+from servoscope.detection.warm_up import COURSE_CHANNELS
+from servoscope.diagnosis.result import Verdict
+from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
 
@@ -200,7 +201,7 @@ def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) 
     Raises RecordingError if they cannot be used as one.
     """
     t, r, u, y, *covariates = np.concatenate([block.signals for block in blocks], axis=1)
-    names = baseline.logged_covariates if baseline.covariates is None or baseline.logged_covariates else FOLLOWED
+    names = baseline.logged_covariates if baseline.covariates is None or baseline.logged_covariates else COURSE_CHANNELS
     told = {name: np.where(np.isfinite(c), c, np.nan) for name, c in zip(names, covariates, strict=False)}
     hold_s, rate = baseline.loop.monitor.covariate_hold_s, baseline.loop.sample_rate
     if (

@@ -10,6 +10,7 @@ from servoscope.core.messages import message, render
 ReceptionState = Literal["followed", "unheard", "silent", "slow", "refused"]
 STATES: tuple[ReceptionState, ...] = get_args(ReceptionState)
 ALARMED_STATES: tuple[ReceptionState, ...] = ("unheard", "slow", "refused")  # silence is a finding of data quality
+MAX_TURN_S = 5.0  # between two polls: after a longer time the service was stopped
 
 
 class AssetTrouble(NamedTuple):
@@ -33,8 +34,25 @@ class Reception:
         return "" if self.state == "followed" else render(message("service.reception.sentence", why=self.why))
 
 
-FOLLOWED = Reception("followed")
-UNHEARD = Reception("unheard", render(message("service.reception.unheard")))
+RECEPTION_OK = Reception("followed")
+UNHEARD_RECEPTION = Reception("unheard", render(message("service.reception.unheard")))
+
+
+class ReceptionClock:
+    """Counts the time in which a silence is that of an asset: the service has polled what came, and had room for it.
+
+    Of one step of it at most `MAX_TURN_S` count, and half of the patience: a process that was suspended has not read
+    its connections yet.
+    """
+
+    def __init__(self, now: float) -> None:
+        self.seconds, self._counted_at = 0.0, now
+
+    def advance(self, now: float, silent_s: float, *, is_free: bool) -> None:
+        """Count until now, by the monotonic clock [s]; `silent_s`: the patience; `is_free`: whether there was room."""
+        if is_free:
+            self.seconds += min(now - self._counted_at, MAX_TURN_S, 0.5 * silent_s)
+        self._counted_at = now
 
 
 class ReceptionLog:
@@ -72,7 +90,7 @@ class ReceptionLog:
         if trouble is not None:
             return Reception(*trouble)
         if self._heard and self.silence_s(now) <= patience_s:
-            return FOLLOWED
+            return RECEPTION_OK
         if now - refused_at <= patience_s:
             return Reception("refused", refusal)
         state: ReceptionState = "silent" if self._heard else "unheard"

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from servoscope.service.alarms import AlarmDefinition, AlarmTransition
 
 # tables of what the samples and the state before them lead to, whenever and however often that is computed
-REPEATABLE = frozenset({"recent", "residuals", "sizes"})
+REPEATABLE_TABLES = frozenset({"recent", "residuals", "sizes"})
 
 
 class TableRow(NamedTuple):

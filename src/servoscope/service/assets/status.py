@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import message, render
-from servoscope.detection.result import FaultEstimate
+from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import (
     FAULT_ALARM,
     AlarmDefinition,
@@ -25,7 +25,7 @@ from servoscope.service.alarms import (
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition
 from servoscope.service.assets.examination_schedule import ExaminationState
 from servoscope.service.assets.outlook import Outlook, OutlookWord, current_outlook
-from servoscope.service.assets.reception import FOLLOWED, Reception, ReceptionState
+from servoscope.service.assets.reception import RECEPTION_OK, Reception, ReceptionState
 from servoscope.service.assets.residual_history import EvaluationStatus
 from servoscope.signals import quality
 
@@ -35,7 +35,7 @@ class _StatusRecord(BaseModel):
 
 
 class AlarmStatus(_StatusRecord):
-    """An alarm; the service's own ones have no priority and no cause."""
+    """An alarm; the service's own ones of version 0.1 have no priority and no cause."""
 
     state: LifecycleState
     since: float  # [UTC s]
@@ -137,7 +137,7 @@ def asset_metadata(baseline: Baseline, group: str, window_s: float, source: str 
     )
 
 
-def asset_summary(examination: ExaminationState, findings: Iterable[str], reception: Reception = FOLLOWED) -> str:
+def asset_summary(examination: ExaminationState, findings: Iterable[str], reception: Reception = RECEPTION_OK) -> str:
     """Return the last examination's sentence, unless data quality or what is wrong with the reception overrules it."""
     if reception.sentence:
         return reception.sentence
@@ -149,7 +149,7 @@ def asset_summary(examination: ExaminationState, findings: Iterable[str], recept
 def asset_verdict(examination: ExaminationState, findings: Iterable[str], reception: Reception) -> str:
     """Return the verdict that holds, with what data quality and the reception leave of the last examination's."""
     verdict = quality.limit_verdict(examination.verdict, findings)
-    if verdict == "healthy" and reception != FOLLOWED:
+    if verdict == "healthy" and reception != RECEPTION_OK:
         verdict = "undetermined"  # nobody knows what it does now
     if verdict == "undetermined" and examination.fault_at is not None:
         verdict = "fault"  # it was seen on sound data, and nothing has shown since that it has gone
@@ -178,7 +178,7 @@ def asset_status(
     state: AssetState,
     definitions: Mapping[str, AlarmDefinition],
     metadata: AssetMetadata,
-    reception: Reception = FOLLOWED,
+    reception: Reception = RECEPTION_OK,
 ) -> AssetStatus:
     """Return the status of an asset."""
     examination, findings = state.examination, quality.active_findings(state.quality)
@@ -224,7 +224,7 @@ def asset_status(
                 else {}
             ),
             **({} if (outlook := current_outlook(state.outlook, examination.faults)) is None else {"outlook": outlook}),
-            **({} if reception == FOLLOWED else {"reception": reception.state}),
+            **({} if reception == RECEPTION_OK else {"reception": reception.state}),
             **{key: getattr(evaluation, key) for key in evaluation.model_fields_set},
         }
     )

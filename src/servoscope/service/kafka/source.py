@@ -118,9 +118,9 @@ class KafkaSource(MessageSource):
         self._topics = sorted({topic.partition("/")[0] for topic in settings.payload.topics})
         if fixed := [topic for topic in self._topics if "{" in topic]:
             raise ConfigError(f"payload.topics: {fixed[0]!r}: names may stand behind / only, in the message's key")
-        if settings.rules.refused:
+        if not settings.rules.internal:
             raise ConfigError(
-                "[network] refuses addresses, which Kafka's client cannot be held to: allow it by a table"
+                "[network] refuses internal addresses, which Kafka's client cannot be held to: write network = {}"
             )
         named = all("{asset}" in topic for topic in settings.payload.topics)
         self._keys_name_assets = named and not settings.is_visit
@@ -144,7 +144,7 @@ class KafkaSource(MessageSource):
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as a broker is there."""
-        self._collector.open(resume)
+        self._collector.open(resume, self.state_file)
         self._thread.start()
 
     def _run(self) -> None:

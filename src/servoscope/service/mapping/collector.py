@@ -8,6 +8,7 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,17 +17,20 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import MessageError
 from servoscope.core.messages import message, render
 from servoscope.service.assets.reception import AssetTrouble
-from servoscope.service.mapping.rows import MessageMapping, SignalValue
+from servoscope.service.log import log
+from servoscope.service.mapping.guard import MessageGuard
+from servoscope.service.mapping.rows import MessageContent, MessageMapping, SignalValue
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
 from servoscope.service.sources.base import BlockSource, RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 
 POLL_S = 0.02
-QUIET_S = 2.0  # without a message of an asset for so long, what has come of it is made a block, however short
-REMEMBERED = 1000  # messages of an asset by which one that comes again is known
+MAX_QUIET_S = 2.0  # without a message of an asset for so long, what has come of it is made a block, however short
+MAX_KNOWN_MESSAGES = 1000  # messages of an asset by which one that comes again is known
 MAX_VALUES = 100_000  # of a signal, between two looks at what is complete
-SETTLED = 0.75  # of a period: behind a row with all signals nothing of its moment comes
+SETTLED_PERIOD_SHARE = 0.75  # of a period: behind a row with all signals nothing of its moment comes
+MARK = 2**32  # added to the checksum by which a message is known, so that it is never 0
 LAG_S = 2.0  # how far a signal may be behind others, which come in messages of their own, by time stamps
 
 
@@ -81,7 +85,7 @@ class _AssetStream:
         """Return whether a message of this mark was among the last ones; remember it."""
         known = mark in self._seen
         self._seen[mark] = None
-        if len(self._seen) > REMEMBERED:
+        if len(self._seen) > MAX_KNOWN_MESSAGES:
             del self._seen[next(iter(self._seen))]
         return known
 
@@ -110,7 +114,7 @@ class _AssetStream:
         """Make the blocks that are complete, and see which messages are in them."""
         assembler, self.values = self.assembler, 0
         last = max(self._newest)
-        settled = last + SETTLED * assembler.period if self._complete else last
+        settled = last + SETTLED_PERIOD_SHARE * assembler.period if self._complete else last
         if not (self._complete or short):  # others may still come for what one signal has reached
             settled = max(min(self._newest), last - max(LAG_S, self._span_s))
         assembler.collect(-math.inf, settled)
@@ -139,7 +143,9 @@ class _AssetStream:
 
 
 class MessageCollector:
-    """Collects the messages of some assets, from any thread; `limit`: most that the sender has open at a time.
+    """Collects the messages of some assets; `limit`: most that the sender has open at a time.
+
+    `add` is called from one thread, all else from any.
 
     A message is acknowledged when every sample of it is in a block that is stored, or was refused and counted.
     """
@@ -152,14 +158,20 @@ class MessageCollector:
         limit: int,
     ) -> None:
         self._settings, self._assets, self._rejections, self._limit = settings, assets, rejections, limit
-        rates = {name: one.loop.sample_rate for name, one in assets.items()}
-        self.mapping = MessageMapping(settings, rates, rejections.add)
+        self._rates = {name: one.loop.sample_rate for name, one in assets.items()}
+        self.mapping = MessageMapping(settings, self._rates, rejections.add)
+        self._guard: MessageGuard | None = None
         self._lock = threading.RLock()
         self._streams: dict[str, _AssetStream] = {}
         self.waiting = 0  # blocks that are not polled
 
-    def open(self, resume: Mapping[str, ResumePosition]) -> None:
-        """Begin; assets in `resume` continue behind what was counted."""
+    def open(self, resume: Mapping[str, ResumePosition], state_file: Path | None = None) -> None:
+        """Begin; assets in `resume` continue behind what was counted. `state_file`: as in `BlockSource`."""
+        if state_file is not None:
+            try:
+                self._guard = MessageGuard(state_file, self._settings, self._rates)
+            except OSError as error:
+                log("warning", "messages in hand cannot be noted", file=str(state_file), why=error.strerror)
         for name, asset in self._assets.items():
             rate = asset.loop.sample_rate
             at, size = resume.get(name, ResumePosition(-1, math.nan)), max(1, round(self._settings.block * rate))
@@ -170,27 +182,32 @@ class MessageCollector:
 
     def add(self, topic: str, content: bytes, acknowledge: Callable[[], None], *, old: bool = False) -> None:
         """Take a message; `old`: it was sent before we listened."""
+        mark, receipt = MARK | zlib.crc32(content, zlib.crc32(topic.encode())), Receipt(acknowledge)
+        try:
+            if self._guard is not None:
+                self._guard.check(mark, topic, content)  # for some seconds perhaps: nobody waits for the lock meanwhile
+                self._guard.begin(mark)
+            if old and not self._settings.time:
+                raise MessageError("retained", "the broker had kept it, and it does not say when it was sent")
+            found = self.mapping.read(topic, content, time.time())
+            with self._lock:
+                self._add(topic, found, mark, receipt)
+        except MessageError as error:
+            self._rejections.add(self.mapping.find_asset(topic), error.kind, str(error))
+        if self._guard is not None:
+            self._guard.end()
         with self._lock:
-            receipt = Receipt(acknowledge)
-            try:
-                self._add(topic, content, receipt, old)
-            except MessageError as error:
-                self._rejections.add(self.mapping.find_asset(topic), error.kind, str(error))
             receipt.release()
             # no more may come before some of these are acknowledged
             if sum(len(one.open) for one in self._streams.values()) > self._limit // 2:
                 self._flush(math.inf)
 
-    def _add(self, topic: str, content: bytes, receipt: Receipt, old: bool) -> None:
-        if old and not self._settings.time:
-            raise MessageError("retained", "the broker had kept it, and it does not say when it was sent")
-        found = self.mapping.read(topic, content, time.time())
+    def _add(self, topic: str, found: MessageContent, mark: int, receipt: Receipt) -> None:
         for name in found.gone:
             stream = self._streams[name]
             stream.collect(short=True)
             stream.restart()
             stream.trouble = AssetTrouble("silent", render(message("service.trouble.death", topic=topic)))
-        mark = zlib.crc32(content, zlib.crc32(topic.encode()))
         now = time.time()
         for name, values in found.values.items():
             stream, latest = self._streams[name], now + self._assets[name].ahead_s
@@ -229,7 +246,7 @@ class MessageCollector:
     def poll(self, limit: int) -> list[Block]:
         """Return up to so many blocks that are complete."""
         with self._lock:
-            self._flush(time.monotonic() - max(QUIET_S, 2.0 * self._settings.block))
+            self._flush(time.monotonic() - max(MAX_QUIET_S, 2.0 * self._settings.block))
             found = list[Block]()
             for stream in self._streams.values():
                 while stream.ready and len(found) < limit:

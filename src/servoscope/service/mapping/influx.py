@@ -10,6 +10,7 @@ import re
 from typing import Any
 
 from servoscope.core.errors import MessageError
+from servoscope.service.mapping.paths import MAX_ROWS
 
 KEY = r"(?:[^\\,=\s]|\\.)+"
 TEXT = r'"(?:[^"\\]|\\.)*"'
@@ -26,13 +27,16 @@ TRUE, FALSE = {"t", "T", "true", "True", "TRUE"}, {"f", "F", "false", "False", "
 
 
 def parse_lines(message: bytes) -> list[dict[str, Any]]:
-    """Return each line as a table: name, tags, fields, and timestamp where there is one; raises MessageError."""
+    """Return each line as a table: name, tags, fields, and timestamp where there is one; raises MessageError.
+
+    Lines behind `MAX_ROWS` are not read.
+    """
     try:
         text = message.decode()
     except UnicodeDecodeError:
         raise MessageError("not a block", "no text in UTF-8, and so no line protocol") from None
-    rows, at = [], _skip(text, 0)
-    while at < len(text):
+    rows, at = list[dict[str, Any]](), _skip(text, 0)
+    while at < len(text) and len(rows) <= MAX_ROWS:
         found = LINE.match(text, at)
         if found is None:
             raise MessageError("not a block", f"no line protocol: {text[at : at + 60]!r}")

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 NAME = re.compile(r"\{(\w+)\}")  # in a pattern: a part of a text, or a key of a table, that has a name
+MAX_TEXT_CHARS = 500  # of a text that a pattern matches: no name of a plant is longer
+MAX_ROWS = 50_000  # of a message that are read: 1 MiB has 35 000 samples, one each
 ASSET, SIGNAL = "asset", "signal"  # names that mean something; what others hold does not matter
 
 
@@ -18,25 +20,40 @@ MISSING = _Missing()
 
 
 class TextPattern:
-    """A text with names, ``plant/{line}/{asset}``; a name stands for what holds no ``/``."""
+    """A text with names, ``plant/{line}/{asset}``; a name stands for what holds no ``/``, and is not empty.
+
+    Where a level can be read in several ways, ``{asset}.{signal}`` for a.b.c, the text between two names is found as
+    far to the right as possible: asset is a.b. The expression has no name twice in a level, so that nothing of it can
+    be read in two ways, and the levels that have are searched once, from their end: the time is proportional to the
+    length of the text.
+    """
 
     def __init__(self, text: str) -> None:
         self.text, self.names = text, frozenset(NAME.findall(text))
-        parts = NAME.split(text)
-        seen = set[str]()
-        regex = ""
-        for k, part in enumerate(parts):
-            if k % 2 == 0:
-                regex += re.escape(part)
-            else:
-                regex += f"(?P={part})" if part in seen else f"(?P<{part}>[^/]+)"
-                seen.add(part)
-        self._regex = re.compile(regex)
+        seen, levels = set[str](), list[str]()
+        self._shared = dict[int, list[str]]()  # by level with several names: text, name, text, name, ..., text
+        for k, level in enumerate(text.split("/")):
+            parts = NAME.split(level)
+            if len(parts) > 3:
+                self._shared[k] = parts
+                levels.append("[^/]+")
+                continue
+            name = "".join(f"(?P={one})" if one in seen else f"(?P<{one}>[^/]+)" for one in parts[1:2])
+            seen.update(parts[1:2])
+            levels.append(re.escape(parts[0]) + name + re.escape("".join(parts[2:])))
+        self._regex = re.compile("/".join(levels))
 
     def match(self, text: str) -> dict[str, str] | None:
-        """Return what the names stand for; None where the text is another one."""
-        found = self._regex.fullmatch(text)
-        return None if found is None else found.groupdict()
+        """Return what the names stand for; None where the text is another one, or longer than `MAX_TEXT_CHARS`."""
+        found = self._regex.fullmatch(text) if len(text) <= MAX_TEXT_CHARS else None
+        if found is None:
+            return None
+        names = found.groupdict()
+        if self._shared:
+            levels = text.split("/")
+            if not all(_match_level(parts, levels[k], names) for k, parts in self._shared.items()):
+                return None
+        return names
 
     def filters(self, values: Mapping[str, frozenset[str]]) -> set[str]:
         """Return the topics to subscribe to: with the `values` of names that have some, and any level for others."""
@@ -45,6 +62,22 @@ class TextPattern:
             choices = values.get(name, {f"{{{name}}}"})
             found = {text.replace(f"{{{name}}}", value) for text in found for value in choices}
         return {"/".join("+" if NAME.search(level) else level for level in text.split("/")) for text in found}
+
+
+def _match_level(parts: list[str], level: str, found: dict[str, str]) -> bool:
+    """Add what the names of a level stand for; return whether it fits."""
+    first, last = parts[0], parts[-1]
+    start, end = len(first), len(level) - len(last)
+    if not (start < end and level.startswith(first) and level.endswith(last)):
+        return False
+    for k in range(len(parts) - 2, 1, -2):
+        at = level.rfind(parts[k - 1], start + 1, end - 1)
+        if at < 0:
+            return False
+        value, end = level[at + len(parts[k - 1]) : end], at
+        if found.setdefault(parts[k], value) != value:
+            return False
+    return found.setdefault(parts[1], level[start:end]) == level[start:end]
 
 
 def split_path(path: str) -> tuple[str | int, ...]:

@@ -12,6 +12,7 @@ from servoscope.core.errors import ConfigError, MessageError
 from servoscope.service.mapping.influx import parse_lines
 from servoscope.service.mapping.paths import (
     ASSET,
+    MAX_ROWS,
     MISSING,
     SIGNAL,
     RowPath,
@@ -29,7 +30,9 @@ from servoscope.signals.readers.clock import ZoneOffset
 
 PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts
 MAX_STAMP = 10**30  # beyond any time, in any unit
-SHOWN = 8  # names that a message lists
+MAX_NAMES_SHOWN = 8  # names that a message lists
+MAX_BAD_ROWS = 100  # of a message that are refused one by one
+MAX_EXTRA = 1000  # names of a message that are not mapped, of which some are shown
 _ALWAYS = frozenset(range(len(SIGNALS)))  # what each sample has; covariates come when they like
 Reject = Callable[[str, str, str], None]  # counts what cannot be used: of which asset, of which kind, why
 
@@ -83,7 +86,8 @@ class MessageMapping:
         scale, covariates = settings.scale, tuple(settings.fields.covariates)
         self._scale = (scale.r, scale.u, scale.y, *(scale.covariates.get(name, 1.0) for name in covariates))
         self._signals = (*SIGNALS, *covariates)
-        self._sparkplug = SparkplugDecoder() if settings.decoder == "sparkplug" else None
+        self._known_names = ((SIGNAL, self._by_name), (ASSET, self._assets))
+        self._sparkplug = SparkplugDecoder(self._is_mapped) if settings.decoder == "sparkplug" else None
         self._senders: dict[str, dict[str, str]] = {}  # by asset, what its last topic said
         # where nothing but r, u and y is expected: the table of all of them, and what else may stand in it
         parents = {one[:-1] for one in self._fields}
@@ -102,6 +106,16 @@ class MessageMapping:
     def missing_births(self) -> set[tuple[str, str]]:
         """Nodes of Sparkplug that have to send their births again: group and node; whoever asks them removes them."""
         return self._sparkplug.missing_births if self._sparkplug is not None else set()
+
+    def _is_mapped(self, metric: str) -> bool:
+        """Return whether a metric of Sparkplug may be a signal of an asset, by its name."""
+        names: dict[str, str] = {}
+        for path, pattern in self._match:
+            if path == ("name",):
+                if (found := pattern.match(metric)) is None:
+                    return False
+                names |= found
+        return all(name not in names or names[name] in known for name, known in self._known_names)
 
     def find_asset(self, topic: str) -> str:
         """Return the asset that a topic tells, or the only one; empty: it tells none."""
@@ -122,17 +136,21 @@ class MessageMapping:
             raise MessageError("unknown topic", f"{topic[:100]!r} fits none of the topics of this source")
         tree, gone = self._decode(names, message)
         values: dict[str, list[SignalValue]] = {}
-        extra, complete, rows = set[str](), True, 0
+        extra, complete, rows, bad = set[str](), True, 0, 0
         for around, found in self._rows.rows(tree):
             rows += 1
+            if rows > MAX_ROWS or bad > MAX_BAD_ROWS:
+                why = f"{MAX_ROWS} rows" if rows > MAX_ROWS else f"{bad} rows that cannot be used"
+                self._reject(self.find_asset(topic), "rows", f"all that is behind {why} of a message is left out")
+                break
             row_names = self._match_row(around, {**names, **found})
             asset = self._only if row_names is not None else ""
             if row_names is not None and ASSET in row_names:
                 asset = self._assets.get(row_names[ASSET], "")
             if row_names is None or not asset:
-                extra.add(
-                    f"row of {row_names[ASSET]!r}" if row_names and ASSET in row_names else "row that matches nothing"
-                )
+                if len(extra) < MAX_EXTRA:
+                    called = (row_names or {}).get(ASSET)
+                    extra.add("row that matches nothing" if called is None else f"row of {called!r}")
                 continue
             self._senders[asset] = names
             try:
@@ -142,11 +160,12 @@ class MessageMapping:
                     values.setdefault(asset, []).extend(made)
                 complete = complete and len(signals.keys() & _ALWAYS) == len(SIGNALS)
             except MessageError as error:
+                bad += 1
                 self._reject(asset, error.kind, str(error))
         if not rows and not gone and self._sparkplug is None:
             raise MessageError("keys", f"no rows at {self.settings.rows!r}, {describe_keys(tree)}")
         if extra and not self.settings.ignore_extra:
-            text = ", ".join(sorted(extra)[:SHOWN])[:200]
+            text = ", ".join(sorted(extra)[:MAX_NAMES_SHOWN])[:200]
             self._reject(self.find_asset(topic), "extra", f"is not mapped: {text} (ignore_extra = true leaves it out)")
         return MessageContent(values, gone, complete and bool(values))
 
@@ -268,7 +287,7 @@ class MessageMapping:
 def describe_keys(tree: Any) -> str:
     """Return what there is instead, in words."""
     if isinstance(tree, dict):
-        return f"only {', '.join(sorted(map(str, tree))[:SHOWN])[:200] or 'an empty table'}"
+        return f"only {', '.join(sorted(map(str, tree))[:MAX_NAMES_SHOWN])[:200] or 'an empty table'}"
     return f"only a list of {len(tree)}" if isinstance(tree, list) else f"only {type(tree).__name__} {str(tree)[:40]}"
 
 

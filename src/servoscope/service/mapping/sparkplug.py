@@ -7,10 +7,13 @@ are Protocol Buffers; their field numbers stand in `FIELDS`, and protobuf reads 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 from servoscope.core.errors import ConfigError, MessageError
+from servoscope.service.mapping.paths import MAX_ROWS
 
 UINT32, UINT64, FLOAT, DOUBLE, BOOL, TEXT = "UINT32", "UINT64", "FLOAT", "DOUBLE", "BOOL", "STRING"
 FIELDS = {  # by message: name, number and type of the fields that are read (6.4.1); protobuf skips others
@@ -25,7 +28,8 @@ SIGNED_BITS = {1: 8, 2: 16, 3: 32, 4: 64}  # by number of the data type: Int8 to
 NUMBERS = ("int_value", "long_value", "float_value", "double_value")
 SEQUENCE = "bdSeq"  # metric that tells which birth a death belongs to (6.4.22)
 REBIRTH = "Node Control/Rebirth"  # metric that asks a node for its births (6.4.23)
-MAX_NODES, MAX_ALIASES = 1000, 100_000  # that are remembered, whatever comes
+MAX_NODES, MAX_METRICS = 1000, 100_000  # that are remembered, whatever comes; the metrics are those of all nodes
+Sender = tuple[str, ...]  # what a topic names beside the kind of message: group, node, device
 BIRTHS, DEATHS, DATA = ("NBIRTH", "DBIRTH"), ("NDEATH", "DDEATH"), ("NDATA", "DDATA")
 
 
@@ -41,8 +45,8 @@ def payload_class() -> Any:
     kinds = plain.FieldDescriptorProto
     for name, fields in FIELDS.items():
         made = file.message_type.add(name=name)
-        for field, number, kind in fields:
-            one = made.field.add(name=field, number=number, label=kinds.LABEL_OPTIONAL)
+        for key, number, kind in fields:
+            one = made.field.add(name=key, number=number, label=kinds.LABEL_OPTIONAL)
             if kind in FIELDS:
                 one.label, one.type, one.type_name = kinds.LABEL_REPEATED, kinds.TYPE_MESSAGE, f".servoscope.{kind}"
             else:
@@ -52,16 +56,35 @@ def payload_class() -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("servoscope.Payload"))
 
 
+@dataclass
+class _Node:
+    """What the births of a node and of its devices have said."""
+
+    birth: int = -1  # number of the node's own birth
+    metrics: dict[int | str, tuple[str, int]] = field(default_factory=dict)  # by alias and by name: name, data type
+    senders: set[Sender] = field(default_factory=set)  # whose births have come
+
+    @property
+    def size(self) -> int:
+        """How much is remembered of it."""
+        return len(self.metrics) + len(self.senders)
+
+
 class SparkplugDecoder:
     """Turns messages into rows of name, value and timestamp; remembers which metrics aliases are.
 
     `missing_births`: nodes, as (group, node), that have to send their births again before they can be understood.
+
+    Parameters
+    ----------
+    is_mapped
+        Whether a metric of this name may be a signal: the others of a birth are not remembered. Where too much is, the
+        nodes go first that have been silent for longest: they are asked for their births again.
     """
 
-    def __init__(self) -> None:
-        self._payload = payload_class()
-        self._metrics: dict[tuple[str, str], dict[int | str, tuple[str, int]]] = {}  # by alias or name: name, data type
-        self._births: dict[tuple[str, str], int] = {}
+    def __init__(self, is_mapped: Callable[[str], bool] = lambda _: True) -> None:
+        self._payload, self._is_mapped = payload_class(), is_mapped
+        self._nodes: dict[tuple[str, str], _Node] = {}  # the last one heard last
         self.missing_births = set[tuple[str, str]]()
 
     def decode(self, names: Mapping[str, str], message: bytes) -> list[dict[str, Any]]:
@@ -74,16 +97,53 @@ class SparkplugDecoder:
             payload.ParseFromString(message)
         except Exception as error:  # what the library raises depends on its version
             raise MessageError("not a block", f"no Sparkplug B: {' '.join(str(error).split())[:100]}") from None
-        if kind == "NBIRTH":
-            self._births[node] = _birth_number(payload)
-        if kind == "NBIRTH" or (kind == "DBIRTH" and node not in self._metrics):
-            if len(self._metrics) >= MAX_NODES and node not in self._metrics:
-                raise MessageError("overflow", f"more than {MAX_NODES} nodes")
-            self._metrics[node] = {}
-            self.missing_births.discard(node)
         if kind in DEATHS:
             return []
-        return [row for one in payload.metrics if (row := self._row(one, node, kind, payload.timestamp))]
+        sender = tuple(names[key] for key in sorted(names) if key != "message")
+        about = self._nodes.pop(node, None) if kind != "NBIRTH" else None
+        metrics = list(islice(payload.metrics, MAX_ROWS + 1))
+        if kind in BIRTHS:
+            about = self._take_birth(about or _Node(), metrics, sender)
+            self.missing_births.discard(node)
+            if kind == "NBIRTH":
+                about.birth = _birth_number(payload)
+        if about is not None:
+            self._nodes[node] = about
+            if kind in BIRTHS:
+                self._forget()
+        is_born = about is not None and sender in about.senders
+        rows = []
+        for metric in metrics:
+            if not is_born and self._needs_birth(about, metric):
+                if len(self.missing_births) < MAX_NODES:
+                    self.missing_births.add(node)
+                what = repr(metric.name[:40]) if metric.name else f"alias {metric.alias}"
+                raise MessageError("no birth", f"{what}: its birth has not come, it was asked for")
+            if (row := _row(metric, about, payload.timestamp)) is not None:
+                rows.append(row)
+        return rows
+
+    def _take_birth(self, about: _Node, metrics: Iterable[Any], sender: Sender) -> _Node:
+        about.senders.add(sender)
+        for metric in metrics:
+            if self._is_mapped(metric.name):
+                about.metrics[metric.name] = metric.name, metric.datatype
+                if metric.HasField("alias"):
+                    about.metrics[metric.alias] = metric.name, metric.datatype
+        return about
+
+    def _forget(self) -> None:
+        """Forget the nodes that have been silent for longest, where there are too many or their births too large."""
+        size = sum(one.size for one in self._nodes.values())
+        while len(self._nodes) > 1 and (size > MAX_METRICS or len(self._nodes) > MAX_NODES):
+            size -= self._nodes.pop(next(iter(self._nodes))).size
+
+    @staticmethod
+    def _needs_birth(about: _Node | None, metric: Any) -> bool:
+        """Return whether a metric cannot be understood without a birth that has not come."""
+        is_whole = metric.HasField("int_value") or metric.HasField("long_value")
+        is_known = about is not None and (metric.name or metric.alias) in about.metrics
+        return not is_known and (not metric.name or (is_whole and not metric.datatype))
 
     def is_dead(self, names: Mapping[str, str], message: bytes) -> bool:
         """Return whether a message says that its device, or all of its node, is gone."""
@@ -92,37 +152,26 @@ class SparkplugDecoder:
             return kind == "DDEATH"
         payload = self._payload()
         payload.ParseFromString(message)
-        born = self._births.get((names.get("group", ""), names.get("node", "")))
+        about = self._nodes.get((names.get("group", ""), names.get("node", "")))
         # one of an earlier session, which the broker has sent late (6.4.22)
-        return born is None or _birth_number(payload) in (born, -1)
+        return about is None or _birth_number(payload) in (about.birth, -1)
 
-    def _row(self, metric: Any, node: tuple[str, str], kind: str, sent: int) -> dict[str, Any] | None:
-        known = self._metrics.get(node, {})
-        if kind in BIRTHS:
-            if len(known) >= MAX_ALIASES:
-                raise MessageError("overflow", f"more than {MAX_ALIASES} metrics of one node")
-            about = metric.name, metric.datatype
-            known[metric.name] = about
-            if metric.HasField("alias"):
-                known[metric.alias] = about
-        key = metric.name or metric.alias
-        whole = metric.HasField("int_value") or metric.HasField("long_value")
-        if key not in known and (not metric.name or (whole and not metric.datatype)):
-            self.missing_births.add(node)
-            what = repr(metric.name[:40]) if metric.name else f"alias {metric.alias}"
-            raise MessageError("no birth", f"{what}: its birth has not come, it was asked for")
-        name, datatype = known.get(key, (metric.name, metric.datatype))
-        value: float | None = None
-        field = next((one for one in NUMBERS if metric.HasField(one)), None)
-        if field is None and not metric.is_null:
-            return None  # a text, a template: nothing that a loop has
-        if field is not None and not metric.is_null:
-            value = getattr(metric, field)
-            bits = SIGNED_BITS.get(metric.datatype or datatype)
-            if bits is not None:  # they come as what has the same bits without a sign (6.4.17)
-                value = int(value) & (2**bits - 1)
-                value -= 2**bits if value >= 2 ** (bits - 1) else 0
-        return {"name": name, "value": value, "timestamp": metric.timestamp or sent}
+
+def _row(metric: Any, about: _Node | None, sent: int) -> dict[str, Any] | None:
+    """Return a metric as a row; None where it is nothing that a loop has, or of a name that is not mapped."""
+    known = about.metrics.get(metric.name or metric.alias) if about is not None else None
+    name, datatype = known or (metric.name, metric.datatype)
+    value: float | None = None
+    number = next((one for one in NUMBERS if metric.HasField(one)), None)
+    if not name or (number is None and not metric.is_null):
+        return None  # a text, a template; an alias that its birth has given to what is not mapped
+    if number is not None and not metric.is_null:
+        value = getattr(metric, number)
+        bits = SIGNED_BITS.get(metric.datatype or datatype)
+        if bits is not None:  # they come as what has the same bits without a sign (6.4.17)
+            value = int(value) & (2**bits - 1)
+            value -= 2**bits if value >= 2 ** (bits - 1) else 0
+    return {"name": name, "value": value, "timestamp": metric.timestamp or sent}
 
 
 def _birth_number(payload: Any) -> int:

@@ -29,7 +29,7 @@ VERSION, STREAM, SEQUENCE, OLDEST, T0, DT, T = range(7)
 NEEDED = 1 << VERSION | 1 << SEQUENCE | 0b1110 << T
 UNIFORM, STAMPED = 1 << T0 | 1 << DT, 1 << T  # which of the keys tell the times
 SAMPLES, CHECKSUM = VERSION, T0  # in the row of a message's whole numbers; the version is always the same
-WHOLE = 5  # numbers of such a row
+ROW_NUMBERS = 5  # numbers of such a row
 
 COMMA, COLON, QUOTE, OPEN, CLOSE, BEGIN, END = b',:"[]{}'
 SPACE, TAB, NEW_LINE, CARRIAGE_RETURN = b" \t\n\r"
@@ -56,7 +56,7 @@ def parse_regular(messages: Sequence[bytes]) -> Iterator[RegularBlock | None]:
     """Yield the block of each message, None where it is not regular; their signals are parts of one array."""
     text = np.frombuffer(b"\0".join((*messages, CLOSING_BYTES)), np.uint8)
     starts = np.array([0, *accumulate(len(one) + 1 for one in messages)])
-    whole, numbers = np.empty((len(messages), WHOLE), np.int64), np.empty(_count_numbers(messages, text))
+    whole, numbers = np.empty((len(messages), ROW_NUMBERS), np.int64), np.empty(_count_numbers(messages, text))
     parse_messages(text, starts, whole, numbers)
     at = 0
     for n, stream, sequence, oldest, checksum in whole.tolist():

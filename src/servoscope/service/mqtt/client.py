@@ -96,6 +96,10 @@ class BrokerConnection:
             self._reason = render(message("service.trouble.lost", reason=str(reason)))
         self.connected = False
 
+    def leave(self) -> None:
+        """Take that the connection is ended on purpose: its end is no loss."""
+        self.connected = False
+
     def _report(self, trouble: str) -> None:
         if trouble != self._reason:  # the client retries every few seconds; once in the log is enough
             log("error", "broker cannot be reached", broker=self._settings.host, why=trouble)

@@ -22,8 +22,8 @@ Text = npt.NDArray[np.uint8]
 WordArray = npt.NDArray[np.uint64]
 
 ZERO, NINE, MINUS, PLUS, POINT, EXPONENT, LOWER_CASE = 48, 57, 45, 43, 46, 101, 32  # of ASCII
-SMALLEST, LARGEST = -342, 308  # powers of ten: beyond, w times them is zero or infinite
-MOST_DIGITS = 19  # that a word holds
+MIN_EXPONENT10, MAX_EXPONENT10 = -342, 308  # powers of ten: beyond, w times them is zero or infinite
+MAX_DIGITS = 19  # that a word holds
 BYTES = 8  # of a word
 CLOSING_BYTES = bytes(16)  # that follow a text: what is read of them is no number
 
@@ -31,7 +31,7 @@ ONE, FIVE_BITS = Word(1), Word(3)
 ZEROS, NINES, HIGHS = Word(0x3030303030303030), Word(0x7676767676767676), Word(0x8080808080808080)
 TEN, BYTE, TWO_BYTES, FOUR_BYTES = Word(10), Word(8), Word(16), Word(32)
 PAIRS, HUNDREDS, UNITS = Word(0x000000FF000000FF), Word(10**2 + (10**6 << 32)), Word(1 + (10**4 << 32))
-TENS = np.array([10**k for k in range(MOST_DIGITS + 1)], dtype=np.uint64)
+TENS = np.array([10**k for k in range(MAX_DIGITS + 1)], dtype=np.uint64)
 SIGN, TOP, ROUNDING = Word(1 << 63), Word(63), Word(9)
 FRACTION, HIDDEN_BIT, CARRY, EXPONENT_PLACE = Word(2**52 - 1), Word(2**52), Word(2**53), Word(52)
 LOW_BITS, LAST_BITS = Word(2**9 - 1), Word(3)
@@ -40,7 +40,7 @@ LOW_BITS, LAST_BITS = Word(2**9 - 1), Word(3)
 def _powers_of_ten() -> WordArray:
     """Return the first 128 bits of each power, shape (651, 2); those of 10^-27 to 10^-1 are rounded up."""
     rows = []
-    for q in range(SMALLEST, LARGEST + 1):
+    for q in range(MIN_EXPONENT10, MAX_EXPONENT10 + 1):
         five = 5 ** abs(q)
         size = five.bit_length()
         bits = (five << 128) >> size if q >= 0 else (1 << (127 + size)) // five + (q >= -27)
@@ -83,7 +83,7 @@ def read_whole(text: Text, i: int) -> tuple[int, np.uint64]:
         word = load_word(text, i)
         count = count_digits(word)
     i += count
-    if i == begin or i - begin > MOST_DIGITS or (text[begin] == ZERO and i > begin + 1):
+    if i == begin or i - begin > MAX_DIGITS or (text[begin] == ZERO and i > begin + 1):
         return -1, value
     return i, append_digits(value, word, count)
 
@@ -91,7 +91,7 @@ def read_whole(text: Text, i: int) -> tuple[int, np.uint64]:
 @inline
 def read_number(text: Text, i: int) -> tuple[int, np.uint64]:
     """Return where the number ends that begins at `i`, and its bits."""
-    sign, q, most = Word(0), 0, MOST_DIGITS + 1
+    sign, q, most = Word(0), 0, MAX_DIGITS + 1
     if text[i] == MINUS:
         sign, i = SIGN, i + 1
     begin = i
@@ -133,7 +133,7 @@ def read_number(text: Text, i: int) -> tuple[int, np.uint64]:
         return -1, w  # whether -0 has a sign is not ours to say
     if w == Word(0):
         return i, sign
-    if q < SMALLEST or q > LARGEST:
+    if q < MIN_EXPONENT10 or q > MAX_EXPONENT10:
         return -1, w
     bits = round_decimal(w, q)
     return (i if bits != Word(0) else -1), bits | sign
@@ -144,9 +144,9 @@ def round_decimal(w: np.uint64, q: int) -> np.uint64:
     """Return the bits of the number of binary64 that is nearest to w 10^q, w > 0; 0: it is none of the normal ones."""
     shift = leading_zeros(w)
     w <<= shift
-    high, low = multiply_high(w, POWERS[q - SMALLEST, 0]), w * POWERS[q - SMALLEST, 0]
+    high, low = multiply_high(w, POWERS[q - MIN_EXPONENT10, 0]), w * POWERS[q - MIN_EXPONENT10, 0]
     if high & LOW_BITS == LOW_BITS:  # the next 64 bits of the power may change those that are kept
-        more = multiply_high(w, POWERS[q - SMALLEST, 1])
+        more = multiply_high(w, POWERS[q - MIN_EXPONENT10, 1])
         low += more
         if low < more:
             high += ONE

@@ -83,5 +83,6 @@ class MqttPublisher:
 
     def close(self) -> None:
         """Disconnect."""
+        self._broker.leave()
         self._client.disconnect()
         self._client.loop_stop()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections import deque
@@ -18,7 +17,7 @@ from servoscope.core.errors import MessageError
 from servoscope.service.config_types import Seconds
 from servoscope.service.mapping.collector import MessageCollector, MessageSource
 from servoscope.service.mapping.settings import PayloadSettings
-from servoscope.service.mapping.sparkplug import encode_rebirth
+from servoscope.service.mapping.sparkplug import MAX_NODES, encode_rebirth
 from servoscope.service.mqtt import topics
 from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_bulk_client
 from servoscope.service.mqtt.payload import BlockMessage, DecodedBlock, decode_blocks
@@ -273,6 +272,7 @@ class MqttSource(BlockSource):
 
     def close(self) -> None:
         """Disconnect; the broker keeps what comes meanwhile."""
+        self._broker.leave()
         self._client.disconnect()
         self._client.loop_stop()
 
@@ -291,7 +291,7 @@ class PlantSource(MessageSource, MqttSource):
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as the broker is there."""
-        self._collector.open(resume)
+        self._collector.open(resume, self.state_file)
         super().open(resume)
 
     def _topic_filters(self) -> list[str]:
@@ -321,8 +321,8 @@ class PlantSource(MessageSource, MqttSource):
     def _ask_for_births(self) -> None:
         """Ask nodes of Sparkplug for the births that we have not heard."""
         missing, now = self._collector.mapping.missing_births, time.monotonic()
-        for group, node in list(missing):
-            missing.discard((group, node))
-            if now - self._asked.get((group, node), -math.inf) >= REBIRTH_EVERY_S:
-                self._asked[group, node] = now
-                self._client.publish(f"spBv1.0/{group}/NCMD/{node}", encode_rebirth(time.time()))
+        self._asked = {node: at for node, at in self._asked.items() if now - at < REBIRTH_EVERY_S}
+        for group, node in sorted(missing - self._asked.keys())[: MAX_NODES - len(self._asked)]:
+            self._asked[group, node] = now
+            self._client.publish(f"spBv1.0/{group}/NCMD/{node}", encode_rebirth(time.time()))
+        missing.clear()

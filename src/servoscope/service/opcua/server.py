@@ -19,6 +19,8 @@ from servoscope.service.publishers.base import PublisherSettings, StatusByAsset
 
 URI, NAMESPACE = "urn:servoscope", "urn:servoscope:assets"
 START_TIMEOUT_S = 120.0  # thousands of nodes of the standard are created first; a busy machine takes its time
+MAX_CONNECTIONS = 64  # as many as the server of health takes; further ones are closed
+HANDSHAKE_S = 10.0  # until a client must have a session
 EPOCH = datetime.fromtimestamp(0.0, UTC)
 VARIABLES: Mapping[str, Any] = {  # of each asset, with their values before anything is known
     "Verdict": "undetermined", "Summary": "", "Since": EPOCH, "T2": 0.0, "Level": 0.0, "Fault": "", "Parameter": "",
@@ -101,6 +103,7 @@ class OpcuaServer:
 
         server: Any = import_asyncua().Server()
         await server.init()
+        server.iserver.max_connections, server.iserver.max_pending_activation_seconds = MAX_CONNECTIONS, HANDSHAKE_S
         server.set_endpoint(f"opc.tcp://{self.settings.listen}/servoscope")
         server.set_server_name("servoscope")
         await server.set_application_uri(URI)

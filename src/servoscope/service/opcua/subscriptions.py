@@ -19,7 +19,7 @@ from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import MAX_TIME_S, Block, ResumePosition
 from servoscope.service.sources.resample import CLOCK_STEP_S
-from servoscope.service.sources.update_rate import SLOW_PERIODS
+from servoscope.service.sources.update_rate import MAX_PERIODS
 
 CLOCK_MARGIN_S = 10.0  # a server's clock may stand still for a second or more
 OVERFLOW_BITS = 0x480  # info type "data value" and its bit "overflow": the server's queue was too short
@@ -30,7 +30,7 @@ TRANSIENT_STATUSES = {  # status codes, the library's among them, of trouble tha
     "BadSecureChannelClosed", "BadSecureChannelIdInvalid", "BadCommunicationError", "BadServerNotConnected",
     "BadShutdown", "BadServerHalted", "BadDisconnect", "BadNotConnected", "BadTooManyOperations", "BadTcpServerTooBusy",
 }  # fmt: skip
-HELD_S = 60.0  # of samples that wait for the decision whether they come too slowly
+MAX_HELD_S = 60.0  # of samples that wait for the decision whether they come too slowly
 MAX_EXACT_INT = 2.0**53  # beyond, a binary64 cannot count
 
 
@@ -139,7 +139,7 @@ class ScalarSubscription(_Subscription):
         self._assembler.restart_rates()
         needed = math.ceil(publishing_s / self.value_s)
         granted = [grants[node] for node in self.nodes[: len(SIGNALS)]]
-        limit_ms = SLOW_PERIODS * self.sampling_ms
+        limit_ms = MAX_PERIODS * self.sampling_ms
         self._granted_ms = {k: one.sampling_ms for k, one in enumerate(granted) if one.sampling_ms > limit_ms}
         values = {"publishing_ms": 1000.0 * publishing_s, "needed": needed}
         short = [
@@ -211,7 +211,7 @@ class ScalarSubscription(_Subscription):
             self._follow_rates()
         self._assembler.collect(alive_until)
         if self.trouble is not None:  # until it is known what a server's word is worth, a minute of samples waits
-            kept = round(HELD_S / self.value_s) if self._undecided else 0
+            kept = round(MAX_HELD_S / self.value_s) if self._undecided else 0
             self._assembler.discard(kept, self.trouble.state, self.trouble.why)
             return
         for block in self._assembler.take_blocks():

@@ -70,6 +70,8 @@ class BlockSource(ABC):
         1.0  # how fast the clock of the samples runs: 1 where they are measured now; 0 where it waits for polls
     )
 
+    # where it may note what must survive the process, however that ends; set before `open`. None: nowhere
+    state_file: Path | None = None
     connected = True  # whether it is connected to where its blocks come from
 
     def __init__(self) -> None:

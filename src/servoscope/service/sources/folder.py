@@ -110,7 +110,7 @@ class FolderSource(BlockSource):
         self._digests: dict[bytes, str] = {}
         self._first_times: dict[tuple[str, FileVersion], float] = {}
         self._troubles: dict[str, AssetTrouble] = {}
-        self._trouble, self._reached_at = render(message("service.trouble.connecting")), time.monotonic()
+        self._trouble = render(message("service.trouble.connecting"))
         self._asked_at = math.inf  # since when an answer of the share is waited for, by the monotonic clock [s]
         self._files_wait = True  # whether there are files that are complete, or soon will be
         self._ready = queue.Queue[ReadFile](maxsize=1)
@@ -148,10 +148,7 @@ class FolderSource(BlockSource):
 
     @property
     def asset_troubles(self) -> Mapping[str, AssetTrouble]:
-        """Assets whose last file could not be read; all of them where the folder has been away for an interval."""
-        trouble = self.trouble
-        if trouble and time.monotonic() - self._reached_at > self.settings.interval_s:
-            return dict.fromkeys(self._assets, AssetTrouble("silent", trouble))
+        """Assets whose last file could not be read."""
         return dict(self._troubles)
 
     @property
@@ -312,7 +309,7 @@ class FolderSource(BlockSource):
             self._first_names = set(changing)
         first = sorted(complete, key=lambda file: file.name)[:MAX_COMPARED]
         ordered = sorted(first, key=self._order) if len(first) > 1 else first
-        self._changing, self._trouble, self._reached_at = changing, "", now
+        self._changing, self._trouble = changing, ""
         return ordered
 
     def _order(self, file: LogFile) -> tuple[float, str]:

@@ -9,9 +9,9 @@ import numpy as np
 
 STEPS = 60  # updates from which an interval is measured
 FAST_SHARE = 0.1  # of the steps: as short as these a signal's updates may follow each other
-FEW_STEPS = 10  # steps that tell whether a server's word holds
+MIN_STEPS = 10  # steps that tell whether a server's word holds
 FASTER_SHARE = 0.75  # of the interval that a server has stated: steps as short as that are faster
-SLOW_PERIODS = 1.5  # sample times: a longer interval leaves out samples
+MAX_PERIODS = 1.5  # sample times: a longer interval leaves out samples
 ONE_STEP = 1.5  # times the smallest change: a signal that never changes by more is slow itself, and not its updates
 
 
@@ -40,14 +40,14 @@ class UpdateRate:
         Some servers do not look, but are told of each change, and say the time between their messages instead.
         """
         steps = np.diff(self._t)
-        return None if steps.size < FEW_STEPS else bool(np.median(steps) < FASTER_SHARE * interval_s)
+        return None if steps.size < MIN_STEPS else bool(np.median(steps) < FASTER_SHARE * interval_s)
 
     def is_too_slow(self, period: float) -> bool:
         """Whether samples of a signal that changes in between are left out; `period`: the sample time [s].
 
         A coarse signal that creeps is told rarely too; but it changes by one step of its sensor at a time.
         """
-        if not self.interval_s > SLOW_PERIODS * period:
+        if not self.interval_s > MAX_PERIODS * period:
             return False
         changes = np.abs(np.diff(self._values))
         changes = changes[changes > 0.0]

@@ -22,7 +22,8 @@ from servoscope.service.store import tables
 from servoscope.service.store.rows import Row
 
 BUNDLES = 64  # that all assets are shared out among: whoever reads one asset reads the rows of its bundle
-PATIENCE = 80  # commits: two rounds of checkpoints, after which a row that is needed in part is no longer waited for
+# commits: two rounds of checkpoints, after which a row that is needed in part is no longer waited for
+MAX_COMMITS_WAITED = 80
 ROW_BYTES = 2**24  # about, at which another row begins: after an outage a commit may have more than a database takes
 RATE_DIGITS = 2  # of the rate of time stamps [Hz]
 
@@ -78,7 +79,7 @@ class BundleIndex:
                     changes.unneeded.append(key)
                 elif 2 * left[0] <= left[1]:
                     self._sparse.setdefault(key, self._number)
-        while self._sparse and next(iter(self._sparse.values())) <= self._number - PATIENCE:
+        while self._sparse and next(iter(self._sparse.values())) <= self._number - MAX_COMMITS_WAITED:
             key = next(iter(self._sparse))
             del self._sparse[key], counts[key]
             changes.sparse.append(key)

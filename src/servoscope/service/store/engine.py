@@ -20,7 +20,6 @@ from sqlalchemy.engine import URL, make_url
 
 from servoscope.core.addresses import hide_secrets, show_address
 from servoscope.core.errors import StoreError, StoreUnavailableError
-from servoscope.service.network import NetworkSettings
 
 LOCK_TIMEOUT_S = 0.5  # s: for a locked SQLite file; samples keep coming meanwhile
 TRANSIENT_ERRORS = {  # of SQLite, where a retry may help
@@ -40,7 +39,7 @@ LARGE_WRITES = (  # samples come and go by megabytes: together these take less t
     "cache_size = -32768",  # a commit of ten thousand assets fits in
     "secure_delete = OFF",  # Debian's SQLite overwrites with zeros what is deleted
 )
-UNCHANGED = {"mode": "ro", "immutable": "1", "uri": "true"}
+READ_ONLY_OPTIONS = {"mode": "ro", "immutable": "1", "uri": "true"}
 LOCK_RELEASE_S = 2.0  # s: after which a killed process has released its lock
 
 
@@ -80,13 +79,11 @@ def display_url(url: URL) -> str:
     return show_address(url.set(drivername="postgresql").render_as_string())
 
 
-def create_store_engine(
-    url: URL, network: NetworkSettings | None = None, *, lock_timeout_s: float = LOCK_TIMEOUT_S, write: bool = False
-) -> sa.Engine:
+def create_store_engine(url: URL, *, lock_timeout_s: float = LOCK_TIMEOUT_S, write: bool = False) -> sa.Engine:
     """Return an engine that has opened nothing yet; raises StoreError if the driver is missing."""
     if url.get_backend_name() == "sqlite":
         lies_still = not write and _lies_still(Path(str(url.database)))
-        read = url.set(database=f"file:{quote(str(url.database))}", query=UNCHANGED) if lies_still else url
+        read = url.set(database=f"file:{quote(str(url.database))}", query=READ_ONLY_OPTIONS) if lies_still else url
         arguments: dict[str, Any] = {"connect_args": {"timeout": lock_timeout_s}, "json_serializer": encode_document}
         engine = sa.create_engine(read, hide_parameters=True, **arguments)
         if not lies_still:
@@ -103,8 +100,6 @@ def create_store_engine(
     except ModuleNotFoundError:
         where = display_url(url)
         raise StoreError(f"{where}: the driver psycopg is missing, pip install 'servoscope[service]'") from None
-    if network is not None:
-        sa.event.listen(engine, "do_connect", lambda *given: _resolve_host(network, given[-1]))
     return engine
 
 
@@ -124,13 +119,6 @@ def _lies_still(path: Path) -> bool:
     return not os.access(path.parent, os.W_OK, effective_ids=True) and not (log.exists() and log.stat().st_size)
 
 
-def _resolve_host(network: NetworkSettings, arguments: dict[str, Any]) -> None:
-    """Let PostgreSQL's driver connect to the address that was checked; a folder of sockets is on this machine."""
-    host = str(arguments.get("hostaddr") or arguments.get("host") or "")
-    if network.refused and host and not host.startswith("/"):
-        arguments["hostaddr"] = network.resolve(host, int(arguments.get("port") or 5432))
-
-
 def _set_up_sqlite(connection: sqlite3.Connection, _: object) -> None:
     # readers never wait for the writer; FULL, because what has been acknowledged must survive a power cut
     for pragma in (*LARGE_WRITES, "journal_mode = WAL", "synchronous = FULL"):
@@ -147,7 +135,7 @@ def translate_errors(url: URL) -> Iterator[None]:
         text = " ".join(str(error.orig).split()) + HINTS.get(getattr(error.orig, "sqlite_errorcode", 0) & 0xFF, "")
         kind = StoreUnavailableError if _is_transient(error) else StoreError
         raise kind(f"{display_url(url)}: {text}") from error
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         raise StoreError(f"{display_url(url)}: a document in it is torn ({error}), restore it from a copy") from None
     except OSError as error:  # of a host that has no address, or none that may be reached
         raise StoreUnavailableError(f"{display_url(url)}: {error.strerror or error}") from error

@@ -11,7 +11,8 @@ from servoscope.prognosis.series import NORMAL_95
 Row = Mapping[str, Any]  # of any table
 NOTE = "note"  # in the audit: what somebody noted about an asset
 SIZE_EVERY_S = 600.0  # between two stored values of a coefficient
-REFUSED = "refused: "  # how the outcome of a refused command begins in rows of version 0.1, which have no fields for it
+# how the outcome of a refused command begins in rows of version 0.1, which have no fields for it
+REFUSAL_PREFIX = "refused: "
 
 
 class CheckpointRow(TypedDict):
@@ -81,7 +82,7 @@ class CommandOutcome(NamedTuple):
         """Return the outcome that a row of the commands holds."""
         if "accepted" in document:
             return cls(document["accepted"], document.get("refusal", ""))
-        return cls(not outcome.startswith(REFUSED), outcome.removeprefix(REFUSED))
+        return cls(not outcome.startswith(REFUSAL_PREFIX), outcome.removeprefix(REFUSAL_PREFIX))
 
 
 def fault_rows(t: float, kind: str, faults: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:

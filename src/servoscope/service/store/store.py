@@ -16,7 +16,6 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
 
 from servoscope.core.errors import EmptyStoreError, StoreError, StoreUnavailableError
-from servoscope.service.network import NetworkSettings
 from servoscope.service.store import engine, schema, tables
 from servoscope.service.store.bundles import (
     BundleChanges,
@@ -115,19 +114,17 @@ class Store:
         *,
         write: bool = False,
         lock_timeout_s: float = engine.LOCK_TIMEOUT_S,
-        network: NetworkSettings | None = None,
         has_lock: bool = False,
     ) -> Store:
         """Open a store by its URL, or a path for SQLite, relative to `folder` or else the working directory.
 
         With `write` tables may be created and migrated; otherwise the store must exist. A locked SQLite file is
-        waited for `lock_timeout_s`; `network` says which addresses a server may have; `has_lock`: whether the process
-        has inherited the lock of a file. Raises StoreError if it cannot be
-        used.
+        waited for `lock_timeout_s`; `has_lock`: whether the process has inherited the lock of a file. Raises StoreError
+        if it cannot be used.
         """
         try:
             found = engine.parse_store_url(url, folder or Path.cwd())
-            store = cls(found, engine.create_store_engine(found, network, lock_timeout_s=lock_timeout_s, write=write))
+            store = cls(found, engine.create_store_engine(found, lock_timeout_s=lock_timeout_s, write=write))
         except ModuleNotFoundError as error:
             raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
         store._has_lock = has_lock and found.get_backend_name() == "sqlite"

@@ -22,9 +22,9 @@ _T = TypeVar("_T")
 
 GZIP, ZIP = ".gz", ".zip"
 ARCHIVES = (GZIP, ZIP)
-MOST_BYTES = 8_000_000_000  # of one file when it is unpacked
-MOST_RATIO = 200  # times its size in the archive; measured values shrink to a tenth
-LEAST_BYTES = 100_000_000  # that any file may have when it is unpacked
+MAX_UNPACKED_BYTES = 8_000_000_000  # of one file when it is unpacked
+MAX_UNPACKED_RATIO = 200  # times its size in the archive; measured values shrink to a tenth
+MIN_UNPACKED_LIMIT_BYTES = 100_000_000  # that any file may have when it is unpacked
 
 
 def expand_paths(paths: Sequence[Path], suffixes: Collection[str], what: str = "recordings") -> list[Path]:
@@ -131,7 +131,7 @@ def unpack(path: Path, open_plain: Callable[[Path], TableFile]) -> TableFile:
 
 
 def _copy(source: IO[bytes] | gzip.GzipFile, target: Path, path: Path, packed: int) -> None:
-    most = min(MOST_BYTES, max(LEAST_BYTES, MOST_RATIO * packed))
+    most = min(MAX_UNPACKED_BYTES, max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKED_RATIO * packed))
     with target.open("wb") as file:
         while piece := source.read(1 << 20):
             file.write(piece)

@@ -12,7 +12,8 @@ from servoscope.signals.readers.recording_file import ChannelInfo
 # what tells axes apart in names: a number, or a letter that stands alone or ends a word as in AxisX
 MARK = re.compile(r"\d+|(?<![A-Za-z0-9])[XYZABCxyzabc](?![A-Za-z0-9])|(?<=[a-z])[XYZABC](?![A-Za-z])")
 
-STEADY = 2.0  # the largest over the smallest value, below which a positive column is a supply rather than a signal
+# the largest over the smallest value, below which a positive column is a supply rather than a signal
+MAX_SUPPLY_RATIO = 2.0
 
 
 def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
@@ -21,7 +22,7 @@ def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
     All of them where none of the others may be u.
     """
     names = [channel.name for channel in channels]
-    moving = [each.name for each in channels if not 0.0 < each.min <= each.max < STEADY * each.min]
+    moving = [each.name for each in channels if not 0.0 < each.min <= each.max < MAX_SUPPLY_RATIO * each.min]
     lost = {"t", "u", "y"} & guess_columns(names).keys() - guess_columns(moving).keys()
     return names if lost else moving
 

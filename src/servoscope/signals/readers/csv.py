@@ -18,12 +18,13 @@ COMMENTS = ("#", "%", "//")
 DELIMITERS = (";", "\t", ",", "|", " ")
 HEAD_BYTES = 1 << 16  # that tell the layout
 HEAD_LINES = 400
-LONGEST_LINE = 1 << 16
+MIN_HEAD_LINES = 8  # a file of thousands of columns has fewer in so many bytes
+MAX_LINE_BYTES = 1 << 22
 LINE_ENDS = ";%"  # that stand behind each row in files of some programs
 CHUNK_BYTES = 1 << 23  # bytes that are read at a time
 SINGLE_BLOCK_BYTES = 1 << 20  # bytes that Arrow parses as one block anyway
 MAX_BROKEN_SHARE = 0.01  # share of rows that may not fit the columns
-CHINESE = re.compile("[一-鿿]")
+CHINESE_CHARACTER = re.compile("[一-鿿]")
 
 
 @dataclass(frozen=True)
@@ -50,18 +51,21 @@ class CsvLayout:
 def open_csv(path: Path, text: TextLayout | None = None) -> TableFile:
     """Open a text file, once its layout is known; `text`: what the user says of it."""
     with path.open("rb") as file:
-        layout = detect_layout(path, file.read(HEAD_BYTES), text or TextLayout())
+        head = file.read(HEAD_BYTES)
+        while head.count(b"\n") < MIN_HEAD_LINES and len(head) < MAX_LINE_BYTES and (more := file.read(len(head))):
+            head += more
+        layout = detect_layout(path, head, text or TextLayout(), cut=bool(file.read(1)))
     return TableFile(path, layout.columns, lambda *wanted: read_csv(path, layout, *wanted))
 
 
-def detect_layout(path: Path, head: bytes, text: TextLayout) -> CsvLayout:
-    """Find out how a text file is laid out from its first bytes.
+def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) -> CsvLayout:
+    """Find out how a text file is laid out from its first bytes; `cut`: it has more.
 
     Raises RecordingError if it is not a table.
     """
     encoding = _detect_encoding(head)
     lines = head.decode(encoding, errors="replace").splitlines()
-    if len(head) == HEAD_BYTES:
+    if cut:
         lines = lines[:-1] or lines
     lines = lines[:HEAD_LINES]
     comments = (text.comment,) if text.comment else COMMENTS
@@ -255,7 +259,7 @@ def _detect_encoding(head: bytes) -> str:
     except UnicodeDecodeError:
         # two bytes of Chinese are two letters of Latin: words that names of columns have tell
         told = lines.decode("gb18030", errors="replace")
-        words = (word for each in WORDS.values() for word in each if CHINESE.search(word))
+        words = (word for each in WORDS.values() for word in each if CHINESE_CHARACTER.search(word))
         return "gb18030" if any(word in told for word in words) else "latin-1"
     return "utf-8-sig"
 
@@ -276,7 +280,7 @@ def _split_cells(line: str, delimiter: str) -> list[str]:
         cells = line.split()
     else:
         try:
-            cells = next(csv.reader([line[:LONGEST_LINE]], delimiter=delimiter, skipinitialspace=True), [])
+            cells = next(csv.reader([line[:MAX_LINE_BYTES]], delimiter=delimiter, skipinitialspace=True), [])
         except csv.Error:
             cells = line.split(delimiter)
     return [cell.strip().strip("'\"") for cell in cells]

@@ -54,16 +54,19 @@ class Reader(NamedTuple):
         return opened
 
 
-_HERE = "servoscope.signals.readers"
-CSV, PARQUET = Reader("CSV", f"{_HERE}.csv", "open_csv"), Reader("Parquet", f"{_HERE}.parquet", "open_parquet")
-MAT = Reader("MAT", f"{_HERE}.mat", "open_mat")
-HDF5 = Reader("HDF5", f"{_HERE}.mat", "open_hdf5", bounded=True)
-MDF = Reader("MDF", f"{_HERE}.mdf_tdms", "open_mdf", "asammdf", "mdf", bounded=True)
-TDMS = Reader("TDMS", f"{_HERE}.mdf_tdms", "open_tdms", "nptdms", "tdms", bounded=True)
-SHEET = Reader("Excel", f"{_HERE}.programs", "open_sheet", "python_calamine", "formats", bounded=True)
-LVM = Reader("LVM", f"{_HERE}.programs", "open_lvm", "lvm_read", "formats", bounded=True)
-MCAP = Reader("MCAP", f"{_HERE}.topics", "open_mcap", "mcap_ros2", "formats", bounded=True)
-ULOG = Reader("ULog", f"{_HERE}.topics", "open_ulog", "pyulog", "formats", bounded=True)
+_READERS_PACKAGE = "servoscope.signals.readers"
+CSV, PARQUET = (
+    Reader("CSV", f"{_READERS_PACKAGE}.csv", "open_csv"),
+    Reader("Parquet", f"{_READERS_PACKAGE}.parquet", "open_parquet"),
+)
+MAT = Reader("MAT", f"{_READERS_PACKAGE}.mat", "open_mat")
+HDF5 = Reader("HDF5", f"{_READERS_PACKAGE}.mat", "open_hdf5", bounded=True)
+MDF = Reader("MDF", f"{_READERS_PACKAGE}.mdf_tdms", "open_mdf", "asammdf", "mdf", bounded=True)
+TDMS = Reader("TDMS", f"{_READERS_PACKAGE}.mdf_tdms", "open_tdms", "nptdms", "tdms", bounded=True)
+SHEET = Reader("Excel", f"{_READERS_PACKAGE}.programs", "open_sheet", "python_calamine", "formats", bounded=True)
+LVM = Reader("LVM", f"{_READERS_PACKAGE}.programs", "open_lvm", "lvm_read", "formats", bounded=True)
+MCAP = Reader("MCAP", f"{_READERS_PACKAGE}.topics", "open_mcap", "mcap_ros2", "formats", bounded=True)
+ULOG = Reader("ULog", f"{_READERS_PACKAGE}.topics", "open_ulog", "pyulog", "formats", bounded=True)
 BUILT_IN = {
     **{".csv": CSV, ".txt": CSV, ".tsv": CSV, ".dat": CSV, ".asc": CSV, ".log": CSV},
     **{".parquet": PARQUET, ".pq": PARQUET, ".mat": MAT, ".mf4": MDF, ".mdf": MDF, ".tdms": TDMS},
@@ -89,7 +92,12 @@ MAGIC = {
     b"\x89MCAP0\r\n": "MCAP",
     b"ULog\x01": "ULog",
 }
-SAME = {("MAT", "HDF5"), ("Excel", "ZIP archive or Excel workbook"), ("Excel", "Excel workbook"), ("HDF5", "MAT")}
+COMPATIBLE_KINDS = {
+    ("MAT", "HDF5"),
+    ("Excel", "ZIP archive or Excel workbook"),
+    ("Excel", "Excel workbook"),
+    ("HDF5", "MAT"),
+}
 
 
 def readable_suffixes() -> list[str]:
@@ -161,7 +169,7 @@ def _recognise(head: bytes) -> str | None:
 
 def _check_format(path: Path, head: bytes, wanted: str) -> None:
     found = _recognise(head)
-    if found == wanted or (wanted, found) in SAME or (wanted == "CSV" and found in (None, "LVM")):
+    if found == wanted or (wanted, found) in COMPATIBLE_KINDS or (wanted == "CSV" and found in (None, "LVM")):
         return
     suffix = next((suffix for suffix, reader in BUILT_IN.items() if reader.format == found), None)
     advice = {

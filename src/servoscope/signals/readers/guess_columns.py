@@ -84,7 +84,7 @@ SPEED_WORDS = {
     *("speed", "velocity", "rpm", "drehzahl", "istdrehzahl", "geschwindigkeit", "istgeschwindigkeit"),
     *("vitesse", "velocita", "velocidad", "速度", "转速"),
 }
-OF_CONTROLLER = {"control", "controller", "command", "cmd", "drive"}  # whose output is u
+CONTROLLER_WORDS = {"control", "controller", "command", "cmd", "drive"}  # whose output is u
 COMMAND = ("command", "cmd")  # what the controller commands where there is a reference besides, else the reference
 FIELDS = {"t": "time", "r": "reference", "u": "input", "y": "output"}
 TIME_UNITS = {"ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns", "min": "min", "s": "s", "sec": "s"}
@@ -98,6 +98,7 @@ CLOCK_PARTS = (
 def guess_columns(names: Sequence[str]) -> dict[str, str]:
     """Return the likeliest column for t, r, u and y, each column once; without those that no name suggests."""
     parts = {name: _words(name) for name in names}
+    bare = {name: _plain(split_unit(name)[0]) for name in names}
     values = [name for name in names if not parts[name] & ERRORS]
     plain = [name for name in values if not parts[name] & QUANTITIES]
     has_reference = any(parts[name] & set(WORDS["r"]) and not parts[name] & set(COMMAND) for name in plain)
@@ -110,13 +111,13 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
         for letter in [each for each in words if each not in found]:
             among = plain if letter == "r" else values
             if letter == "y":
-                among = [name for name in values if not ("output" in parts[name] and parts[name] & OF_CONTROLLER)]
+                among = [name for name in values if not ("output" in parts[name] and parts[name] & CONTROLLER_WORDS)]
             left = [name for name in among if name not in found.values()]
             matches = (
                 name
                 for word in words[letter]
                 for name in left
-                if (_plain(split_unit(name)[0]) == word if whole else word in parts[name])
+                if (bare[name] == word if whole else word in parts[name])
             )
             if (match := next(matches, None)) is not None:
                 found[letter] = match

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,8 +13,8 @@ from servoscope.signals.readers.guess_columns import guess_columns
 from servoscope.signals.readers.table import NULL_TEXTS, TIME_UNITS, is_number
 from servoscope.signals.readers.units import is_unit
 
-AHEAD = 5  # rows that tell whether a table begins
-BEGUN = 0.6  # share of them that must look like rows of it
+LOOKAHEAD_ROWS = 5  # rows that tell whether a table begins
+TABLE_ROW_SHARE = 0.6  # share of them that must look like rows of it
 PAIR_KEY = "Name"  # before each channel's name in an export of TwinCAT Scope, as the other keys before their values
 SAMPLE_TIME_KEY = re.compile(r"SampleTime\[(\w+)\]")
 
@@ -54,10 +55,10 @@ def find_table(rows: Sequence[Sequence[str]], name: str, header: int | None = No
     width, numeric = _table_shape(rows)
     begun = [_is_row(row, width, numeric) for row in rows]
     for first, here in enumerate(begun):
-        ahead = begun[first : first + AHEAD]
+        ahead = begun[first : first + LOOKAHEAD_ROWS]
         # a first row with text among its numbers is one of a header, unless the next one is a row too
         sure = _is_pure(rows[first], numeric) or all(ahead[:2])
-        if here and sure and sum(ahead) >= BEGUN * len(ahead) and (header is None or first > header):
+        if here and sure and sum(ahead) >= TABLE_ROW_SHARE * len(ahead) and (header is None or first > header):
             break
     else:
         return None
@@ -74,7 +75,7 @@ def find_table(rows: Sequence[Sequence[str]], name: str, header: int | None = No
 
 def check_names(names: Sequence[str], file: str) -> None:
     """Refuse two columns of one name; raises RecordingError."""
-    twice = next((name for name in names if name and names.count(name) > 1), None)
+    twice = next((name for name, count in Counter(names).items() if name and count > 1), None)
     if twice is not None:
         raise RecordingError(f"{file}: two columns are called {twice!r}, rename one of them")
 

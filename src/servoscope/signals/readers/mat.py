@@ -24,6 +24,7 @@ HEADER_BYTES = 128  # bytes of text, version and byte order
 TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 14: 1, 16: 1, 17: 2, 18: 4}  # bytes of one
 MATRIX, COMPRESSED = 14, 15
 MAX_DEPTH = 30  # structures in structures
+IN_OTHER_FILE = "lies in another file, which is not read: save all data in one file"
 
 
 def open_mat(path: Path) -> TableFile:
@@ -34,7 +35,7 @@ def open_mat(path: Path) -> TableFile:
         return any(name == "__function_workspace__" or _is_object(value) for name, value in variables.items())
 
     if h5py.is_hdf5(path):
-        return open_bounded(path, "MAT", __name__, "open_mat_objects", "scipy.io")
+        return open_bounded(path, "MAT", __name__, "open_mat_objects", "matio")
     return _open_variables(path, "MAT", _load_mat5, has_objects)
 
 
@@ -61,13 +62,15 @@ def _open_variables(
         loaded = load(path)
         beyond = is_beyond(loaded)
         variables = {} if beyond else dict(_flatten(loaded))
+    except RecordingError:
+        raise
     # SciPy and h5py raise nearly anything at damaged files, from MatReadError to AttributeError.
     except Exception as error:
         raise RecordingError(
             f"{path}: is a damaged or unknown {kind} file ({shorten_error(error)}), save it again"
         ) from None
     if beyond:
-        return open_bounded(path, kind, __name__, "open_mat_objects", "scipy.io")
+        return open_bounded(path, kind, __name__, "open_mat_objects", "matio")
     lengths = [x.size for x in variables.values() if x.size > 1]
     # The channels are the vectors of the length that most of them, and of those the longest, have.
     rows = max(lengths, key=lambda size: (lengths.count(size), size), default=0)
@@ -141,7 +144,40 @@ def _load_hdf5(path: Path, matlab: bool) -> dict[str, Any]:
         return _frame_columns(inner)
 
     with h5py.File(path, "r") as file:
+        refuse_other_files(path, file)
         return group(file)
+
+
+def refuse_other_files(path: Path, file: Any) -> None:
+    """Refuse an HDF5 file of which a part lies in another file: what is read could be any file of this machine.
+
+    All that links or references lead to is looked at, before any values are read. A link to a name within the file
+    needs no look: what it names has a link of its own, if it is there.
+    """
+    import h5py
+
+    known: set[int] = set()
+    waiting: list[tuple[Any, Any]] = [(file, "/")]
+    while waiting:
+        group, key = waiting.pop()
+        if isinstance(key, str):
+            link = group.get(key, getlink=True) if key != "/" else None
+            if isinstance(link, h5py.SoftLink):
+                continue
+            if isinstance(link, h5py.ExternalLink):
+                raise RecordingError(f"{path}: {key!r} {IN_OTHER_FILE}")
+        node = group[key]
+        if hash(node.id) in known:
+            continue
+        known.add(hash(node.id))
+        references = [node.attrs[name] for name in node.attrs if h5py.check_ref_dtype(node.attrs.get_id(name).dtype)]
+        if isinstance(node, h5py.Group):
+            waiting += ((node, name) for name in node)
+        elif isinstance(node, h5py.Dataset):
+            if node.is_virtual or node.external:
+                raise RecordingError(f"{path}: {node.name or 'a cell'!r} {IN_OTHER_FILE}")
+            references += [node[()]] if h5py.check_ref_dtype(node.dtype) else []
+        waiting += ((file, target) for values in references for target in np.ravel(values) if target)
 
 
 def _frame_columns(node: dict[str, Any]) -> dict[str, Any]:

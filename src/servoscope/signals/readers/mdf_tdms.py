@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -41,6 +42,7 @@ def open_mdf(path: Path) -> TableFile:
         raise RecordingError(f"{path}: MDF files need asammdf, pip install 'servoscope[mdf]'") from None
 
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # broken files raise an error
+    _ignore_external_attachments()
 
     def list_rasters(file: Any) -> list[_Raster]:
         found = []
@@ -111,7 +113,27 @@ def open_tdms(path: Path) -> TableFile:
                 found[name] = begin + step * np.arange(first, first + rows)
         return found
 
-    return _open_measurement(path, "TDMS", lambda: closing(TdmsFile.open(path)), list_rasters, read)
+    @contextmanager
+    def opened() -> Iterator[Any]:
+        # given a path, the library would take the description from a file beside it, where there is one
+        with path.open("rb") as raw, TdmsFile.open(raw) as file:
+            yield file
+
+    return _open_measurement(path, "TDMS", opened, list_rasters, read)
+
+
+@functools.cache
+def _ignore_external_attachments() -> None:
+    """Let asammdf read attachments within a file only: an external one could be any file of this machine."""
+    from asammdf.blocks.mdf_v4 import MDF4, v4c
+
+    extract = MDF4._extract_attachment
+
+    def extract_embedded(self: Any, index: int | None = None, password: str | bytes | None = None) -> Any:
+        embedded = index is not None and self.attachments[index].flags & v4c.FLAG_AT_EMBEDDED
+        return extract(self, index if embedded else None, password)
+
+    MDF4._extract_attachment = extract_embedded
 
 
 def _close_partial(error: Exception) -> None:

@@ -5,85 +5,70 @@ from __future__ import annotations
 import atexit
 import importlib
 import os
-import threading
+import weakref
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from servoscope.core.errors import RecordingError
-from servoscope.core.workers import ProcessLimits, Progress, Worker, WorkerError
+from servoscope.core.sandbox import Sandbox
+from servoscope.core.workers import ProcessLimits, Progress, WorkerError, WorkerGroup
 from servoscope.signals.readers.table import Table, TableFile
 
-START_S = 60.0  # that a process and the libraries may take to start, on a machine that is busy
 BASE_S, BYTES_PER_S = 15.0, 5e5  # that a small file may take, and what is larger, by the clock on the wall
 LIMITS = ProcessLimits(cpu_s=1e6, memory_mb=8000.0, file_mb=1e6)  # a task's time is bound, not the process's
-TASKS = "servoscope.signals.readers.reader_process"
+LIBRARIES = ("pandas", "pyarrow", "h5py")  # what most readers use; Arrow looks for pandas at its first array
 
-_idle: list[Worker] = []  # kept, because starting one and loading its libraries takes a second
-_lock = threading.Lock()
+_workers = WorkerGroup(LIMITS)  # kept, because starting one and loading its libraries takes a second
+atexit.register(_workers.close)
 _opened: dict[tuple[str, int, int], TableFile] = {}  # in a worker: the file that it read last
 
 
 def open_bounded(path: Path, kind: str, module: str, function: str, library: str) -> TableFile:
-    """Open a file in a worker.
+    """Open a file in a worker, which can open no other one.
 
     `kind`: what errors call the file; `module`, `function`: what opens it, with `library`. Raises RecordingError if it
     cannot be read, also where it would take more time or memory than files of its size do.
     """
     timeout_s = BASE_S + path.stat().st_size / BYTES_PER_S
     place = (module, function, str(path.absolute()), str(path))
+    folder = TemporaryDirectory(prefix="servoscope-read-")
+    target = Path(folder.name) / "rows.arrow"
+    sandbox = Sandbox(read=(place[2],), write=(folder.name,))
 
     def run(task: str, *arguments: Any) -> Any:
         try:
-            answer = _run_task(library, task, place, arguments, timeout_s)
+            answer = _workers.run(
+                f"{__name__}:{task}",
+                *place,
+                *arguments,
+                timeout_s=timeout_s,
+                libraries=(__name__, module, library, *LIBRARIES),
+                sandbox=sandbox,
+            )
         except WorkerError as error:
             raise RecordingError(f"{path}: is a damaged {kind} file ({str(error)[:120]}), export it again") from None
         if "error" in answer:  # in the reader's own words
             raise RecordingError(answer["error"])
         return answer
 
-    found = run("describe_file")
-
     def read_chunks(wanted: Sequence[str], texts: Collection[str]) -> Iterator[Table]:
         import pyarrow as pa
 
-        with TemporaryDirectory(prefix="servoscope-read-") as folder:
-            target = Path(folder) / "rows.arrow"
-            run("extract_rows", list(wanted), list(texts), str(target))
-            first = 1
-            with pa.OSFile(str(target)) as source:
-                for batch in pa.ipc.open_stream(source):
-                    columns = {name: pa.chunked_array([batch.column(name)]) for name in batch.schema.names}
-                    yield Table(path.name, columns, first)
-                    first += batch.num_rows
+        run("extract_rows", list(wanted), list(texts), str(target))
+        first = 1
+        with pa.OSFile(str(target)) as source:
+            target.unlink()
+            for batch in pa.ipc.open_stream(source):
+                columns = {name: pa.chunked_array([batch.column(name)]) for name in batch.schema.names}
+                yield Table(path.name, columns, first)
+                first += batch.num_rows
 
+    weakref.finalize(read_chunks, folder.cleanup)
+    found = run("describe_file")
     groups = tuple(tuple(each) for each in found["groups"])
     return TableFile(path, tuple(found["columns"]), read_chunks, found["others"], groups)
-
-
-def _run_task(library: str, task: str, place: tuple[str, ...], arguments: tuple[Any, ...], timeout_s: float) -> Any:
-    with _lock:
-        worker = _idle.pop() if _idle else Worker(LIMITS)
-        if not _idle:
-            atexit.unregister(_stop_workers)
-            atexit.register(_stop_workers)
-    try:
-        worker.run(f"{TASKS}:load_library", library, timeout_s=START_S)
-        return worker.run(f"{TASKS}:{task}", *place, *arguments, timeout_s=timeout_s)
-    finally:  # after a failure, its next task starts its process again
-        with _lock:
-            _idle.append(worker)
-
-
-def _stop_workers() -> None:
-    while _idle:
-        _idle.pop().stop()
-
-
-def load_library(_: Progress, library: str) -> None:
-    """Load what a reader needs, before its time counts; in the worker."""
-    importlib.import_module(library)
 
 
 def describe_file(_: Progress, module: str, function: str, path: str, shown: str) -> dict[str, Any]:

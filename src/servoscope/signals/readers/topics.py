@@ -12,8 +12,8 @@ import numpy.typing as npt
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
 
-MOST_VALUES = 200_000_000  # of all topics together, which are held in memory
-LONGEST_ARRAY = 64  # values of one field, such as the joints of a robot; images and scans have more
+MAX_VALUES = 200_000_000  # of all topics together, which are held in memory
+MAX_ARRAY_LENGTH = 64  # values of one field, such as the joints of a robot; images and scans have more
 
 Topics = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 
@@ -38,8 +38,8 @@ def open_mcap(path: Path) -> TableFile:
                 seconds = stamp[0] + 1e-9 * stamp[1] if any(stamp) else 1e-9 * message.log_time
                 rows.setdefault(channel.topic, []).append({"time": seconds, **fields})
                 count += len(fields)
-                if count > MOST_VALUES:
-                    raise RecordingError(f"{path}: holds more than {MOST_VALUES} values, leave topics out")
+                if count > MAX_VALUES:
+                    raise RecordingError(f"{path}: holds more than {MAX_VALUES} values, leave topics out")
     except RecordingError:
         raise
     # the libraries raise nearly anything at damaged files
@@ -58,7 +58,7 @@ def _message_fields(message: Any, prefix: str = "", depth: int = 0) -> Iterator[
         value = getattr(message, name)
         if isinstance(value, bool | int | float):
             yield f"{prefix}{name}", float(value)
-        elif isinstance(value, list | tuple | np.ndarray) and len(value) <= LONGEST_ARRAY:
+        elif isinstance(value, list | tuple | np.ndarray) and len(value) <= MAX_ARRAY_LENGTH:
             for index, each in enumerate(value):
                 if isinstance(each, bool | int | float | np.number):
                     yield f"{prefix}{name}[{index}]", float(each)

@@ -28,7 +28,7 @@ INPUTS = {
     **{"N·m": 1.0, "mNm": 1e-3, "bar": 1e5, "Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "%": 1.0, "W": 1.0, "kW": 1e3},
 }
 TIMES = ("s", "ms", "us", "µs", "ns", "min", "sec", "seconds", "h")
-OTHERS = (
+OTHER_UNITS = (
     "°C",
     "C",
     "K",
@@ -46,21 +46,21 @@ OTHERS = (
     "V/s",
 )
 FACTORS = {**LENGTHS, **ANGLES, **SPEEDS, **INPUTS}
-BEHIND = re.compile(r"^(.*?)\s*(?:\[\s*([^\[\]]+?)\s*\]|\(\s*([^()]+?)\s*\))\s*$")
-LOOSE = re.compile(r"^(.+?)(?:[_ ]|\s*/\s*)([A-Za-zµμ°%/]{1,5})$")  # a unit without brackets: pos_mm, t/ms
+BRACKETED_UNIT = re.compile(r"^(.*?)\s*(?:\[\s*([^\[\]]+?)\s*\]|\(\s*([^()]+?)\s*\))\s*$")
+BARE_UNIT = re.compile(r"^(.+?)(?:[_ ]|\s*/\s*)([A-Za-zµμ°%/]{1,5})$")  # a unit without brackets: pos_mm, t/ms
 
 
 def is_unit(text: str) -> bool:
     """Tell whether a text is a unit that is known."""
-    return text in FACTORS or text in TIMES or text in OTHERS
+    return text in FACTORS or text in TIMES or text in OTHER_UNITS
 
 
 def split_unit(name: str) -> tuple[str, str]:
     """Return a column's name without its unit, and the unit; empty where it has none that is known."""
-    found = BEHIND.match(name)
+    found = BRACKETED_UNIT.match(name)
     if found is not None and is_unit(unit := found[2] or found[3]):
         return found[1], unit
-    loose = LOOSE.match(name)
+    loose = BARE_UNIT.match(name)
     # a single letter is a name more often than a unit: joint_A, r_m
     if loose is not None and is_unit(loose[2]) and (len(loose[2]) > 1 or loose[2] in "s°%"):
         return loose[1], loose[2]

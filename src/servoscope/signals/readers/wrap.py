@@ -11,11 +11,12 @@ from servoscope.signals.readers.table import Table
 
 # ranges in which counters and angles wrap: bits of a word, degrees, radians, turns, lines of encoders
 RANGES = (*(2.0**bits for bits in (8, 10, 12, 14, 16, 17, 20, 23, 24, 32)), 360.0, 3600.0, 36000.0, 2.0 * math.pi, 1.0)
-NEGATIVE = 0.75  # share of the range from which the first value is one below zero, as a word with a sign is logged
-FILLED = 0.9  # share of the range that the values span
-SMOOTHER = 20.0  # times shorter than the range are all steps of the column unwrapped
-MOST_JUMPS = 0.1  # share of the steps
-ROUNDING = 1e-3  # of the range
+# share of the range from which the first value is one below zero, as a word with a sign is logged
+SIGNED_WORD_SHARE = 0.75
+MIN_RANGE_SHARE = 0.9  # share of the range that the values span
+MIN_STEP_RATIO = 20.0  # times shorter than the range are all steps of the column unwrapped
+MAX_JUMP_SHARE = 0.1  # share of the steps
+ROUNDING_TOLERANCE = 1e-3  # of the range
 
 
 class Unwrapper:
@@ -36,7 +37,7 @@ class Unwrapper:
         if known.size:
             if math.isnan(self._last):
                 self._last = float(x[known[0]])
-                self._offset = -self._period if self._last > NEGATIVE * self._period else 0.0
+                self._offset = -self._period if self._last > SIGNED_WORD_SHARE * self._period else 0.0
             steps = np.diff(x[known], prepend=self._last)
             turns = self._offset - self._period * np.cumsum(np.round(steps / self._period))
             found[known] += turns
@@ -56,12 +57,12 @@ def find_wrap(x: FloatArray) -> float | None:
         return None
     steps, span = np.diff(x), float(np.ptp(x))
     for period in sorted(RANGES):
-        if not FILLED * period < span <= period * (1.0 + ROUNDING):
+        if not MIN_RANGE_SHARE * period < span <= period * (1.0 + ROUNDING_TOLERANCE):
             continue
         turns = np.round(steps / period)
         left = np.abs(steps - period * turns)
         jumps = np.count_nonzero(turns)
         moves = float(left[turns == 0.0].max(initial=0.0)) > 0.0  # a switch does not move between its jumps
-        if 0 < jumps <= MOST_JUMPS * steps.size and moves and SMOOTHER * float(left.max()) < period:
+        if 0 < jumps <= MAX_JUMP_SHARE * steps.size and moves and MIN_STEP_RATIO * float(left.max()) < period:
             return float(period)
     return None

@@ -6,21 +6,23 @@ import asyncio
 import os
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from starlette.exceptions import HTTPException
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import SETTING, current_language, message, render
+from servoscope.core.sandbox import Sandbox
 from servoscope.core.workers import ProcessLimits, Progress, Worker
 from servoscope.web import errors
 from servoscope.web.schemas.responses import JobResponse, JsonObject
 
+TASKS = "servoscope.web.jobs.tasks"
 MAX_FINISHED = 200  # finished jobs that can still be asked for
 MAX_QUEUED = 20  # jobs that may wait
 MAX_RUNNING = 2  # jobs, and short tasks, at the same time
@@ -42,6 +44,8 @@ class Job:
     task: str  # function of `servoscope.web.jobs.tasks`
     arguments: tuple[Any, ...]
     folder: Path  # where it runs: the folder of its input, so that messages name files and not the server's folders
+    reads: Sequence[str]  # what else it reads
+    out: Path | None  # the folder into which it writes
     finish: Callable[[Any], JsonObject]  # turns the task's result into the job's, in a thread
     discard: Callable[[], None] = lambda: None  # removes what a failed job leaves
     id: str = field(default_factory=lambda: secrets.token_hex(8))
@@ -62,8 +66,8 @@ class Job:
 class JobQueue:
     """Runs jobs, a few at the same time, each within the limits."""
 
-    def __init__(self, limits: ProcessLimits) -> None:
-        self._limits = limits
+    def __init__(self, limits: ProcessLimits, user: str | None = None) -> None:
+        self._limits, self._user = limits, user
         self._short_limits = ProcessLimits(min(limits.cpu_s, SHORT_CPU_S), min(limits.memory_mb, SHORT_MEMORY_MB))
         self._jobs: dict[str, Job] = {}
         self._slots = asyncio.Semaphore(MAX_RUNNING)
@@ -101,7 +105,11 @@ class JobQueue:
     async def run_now(self, task: str, folder: Path, *arguments: Any) -> Any:
         """Run a short task at once, within smaller limits, and return its result; raises WorkerError if it failed."""
         async with self._short_slots:
-            return await run_task(task, arguments, folder, self._short_limits)
+            return await run_task(task, arguments, folder, self._short_limits, self._sandbox(folder))
+
+    def _sandbox(self, folder: Path, reads: Sequence[str] = (), out: Path | None = None) -> Sandbox:
+        writes = _cache_folders() if out is None else (*_cache_folders(), str(out))
+        return Sandbox((str(folder), *reads), writes, self._user)
 
     async def _run(self, job: Job) -> None:
         def show(step: str) -> None:
@@ -110,7 +118,8 @@ class JobQueue:
         try:
             async with self._slots:
                 job.state = "running"
-                result = await run_task(job.task, job.arguments, job.folder, self._limits, show)
+                sandbox = self._sandbox(job.folder, job.reads, job.out)
+                result = await run_task(job.task, job.arguments, job.folder, self._limits, sandbox, show)
                 job.result = await asyncio.to_thread(job.finish, result)
             job.state = "done"
         except ServoscopeError as error:
@@ -131,20 +140,37 @@ class JobQueue:
 
 
 async def run_task(
-    task: str, arguments: tuple[Any, ...], folder: Path, limits: ProcessLimits, progress: Progress = lambda _: None
+    task: str,
+    arguments: tuple[Any, ...],
+    folder: Path,
+    limits: ProcessLimits,
+    sandbox: Sandbox,
+    progress: Progress = lambda _: None,
 ) -> Any:
     """Run a function of `servoscope.web.jobs.tasks` in a process of its own and return its result.
 
     Raises WorkerError if it failed, or needed more than its limits.
     """
     worker = Worker(limits, folder=folder, environment=_environment())
-    run = partial(worker.run, progress=progress, timeout_s=START_S + WALL_TIME_FACTOR * limits.cpu_s)
+
+    def run() -> Any:
+        with TemporaryDirectory(prefix="servoscope-job-") as temporary:
+            walls = replace(sandbox, write=(temporary, *sandbox.write))
+            timeout_s = START_S + WALL_TIME_FACTOR * limits.cpu_s
+            return worker.run(f"{TASKS}:{task}", *arguments, progress=progress, timeout_s=timeout_s, sandbox=walls)
+
     try:
-        function = f"servoscope.web.jobs.tasks:{task}"
-        return await asyncio.get_running_loop().run_in_executor(_threads, run, function, *arguments)
+        return await asyncio.get_running_loop().run_in_executor(_threads, run)
     finally:
         # the wait for the process is milliseconds: it is killed
         worker.stop()
+
+
+def _cache_folders() -> tuple[str, ...]:
+    """Return where compiled kernels are kept, and what Matplotlib knows of fonts."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folders = {"NUMBA_CACHE_DIR": caches / "numba", "MPLCONFIGDIR": caches / "matplotlib"}
+    return tuple(os.environ.get(name, str(folder)) for name, folder in folders.items())
 
 
 def _environment() -> dict[str, str]:

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.errors import LoopError, RecordingError
-from servoscope.core.settings import parse_toml
+from servoscope.core.errors import RecordingError
 from servoscope.core.workers import Progress
 from servoscope.design import design_study
 from servoscope.detection.trace import Trace
@@ -218,7 +217,7 @@ def load_loop(ref: requests.LoopRef) -> Loop:
     if ref.example is not None:
         name = f"{ref.example}.toml"
         text = files("servoscope.simulation").joinpath(name).read_text(encoding="utf-8")
-    return Loop.from_dict(parse_toml(text, name, LoopError), name)
+    return Loop.from_text(text, name)
 
 
 def read_recording(file: str, loop: Loop | None, selection: requests.RecordingSelection) -> Recording:

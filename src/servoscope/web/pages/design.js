@@ -1,4 +1,4 @@
-// Before deployment: which faults of a loop can be seen and told apart, from which size on, after how long.
+// Before deployment: which faults of a loop can be seen and told apart, and from which size on.
 import { get, job, mayChange, part, query } from "./api.js";
 import { axis, legend, plot, tooltip } from "./charts.js";
 import { short } from "./curves.js";
@@ -73,7 +73,6 @@ function studied(study, drawn, signal) {
     drawn.push(() => plot(element, label, describe, signal));
     return element;
   };
-  const percent = (value) => (value === null || value === undefined || value >= 10 ? DASH : `${number(100 * value, 3)} %`);
   const sides = faults.flatMap((fault) => [["up", fault.up], ["down", fault.down]].map(([way, side]) => [fault, way, side]));
   const amount = (value, unit) => (value === null ? "never" : unit === "ratio" || unit === "relative" || !unit ? `${number(100 * value, 3)} %` : `${number(value, 3)} ${unit}`);
   const heat = (value) => {
@@ -87,16 +86,11 @@ function studied(study, drawn, signal) {
       "Detected: announced in time with 90 % probability. Named: called by its own name with 99.5 % probability. Linear bound: what sensitivities and the Cramér-Rao bound allow.",
       table(
         "Radii of faults",
-        ["Change", "*Detected from", "*Named from", "*Linear bound", "Else taken for", "*Half announced within"],
-        sides.map(([fault, way, side]) => [h("span", {}, `${capital(plain(fault.name))} ${way} `, h("small", {}, prose(fault.parameter))), change(side.detectable), change(named(side)), change(side.bound), side.nearest || DASH, side.delays.length && side.delays[0].half_s !== null ? `${number(side.delays[0].half_s, 3)} s` : DASH]),
+        ["Change", "*Detected from", "*Named from", "*Linear bound", "Else taken for"],
+        sides.map(([fault, way, side]) => [h("span", {}, `${capital(plain(fault.name))} ${way} `, h("small", {}, prose(fault.parameter))), change(side.detectable), change(named(side)), change(side.bound), side.nearest || DASH]),
       ),
     ),
-    h(
-      "div",
-      { class: "columns" },
-      h("div", { class: "half" }, section("Time to detection", "Half of all changes of a size are announced by then.", picture("Time to detection over size of the change", (c) => delays(c, sides)))),
-      h("div", { class: "half" }, section("How sure a size becomes", "Cramér-Rao bound, with the healthy parameters as well known as they are.", picture("Standard deviation of the size over time", (c) => sizes(c, faults)))),
-    ),
+    section("How sure a size becomes", "Cramér-Rao bound, with the healthy parameters as well known as they are.", picture("Standard deviation of the size over time", (c) => sizes(c, faults))),
     section(
       "When the loop fails",
       "Tracking lost: its bandwidth falls to 0.7 of the healthy one. Stability lost: its distance to instability is halved. Such a size is a limit for the trend of an asset.",
@@ -104,8 +98,6 @@ function studied(study, drawn, signal) {
     ),
     names.length > 1 && section("How alike they look", "Cosine between what small changes do: 1 or −1 cannot be told apart, 0 is as different as can be.", table("Cosines between faults", ["Change", ...names.map((name) => `*${plain(name)}`)], names.map((one) => [plain(one), ...names.map((other) => heat(study.cosines[one][other]))]))),
     study.mimics?.length > 0 && section("What else it could be", "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart.", table("Mimics", ["Change", "Is most like", "*Cosine", "*So much", "*Looks like", "*Told apart from"], study.mimics.map((one) => [h("span", {}, one.words, !/ |^delay$/.test(one.name) && h("small", {}, " ", prose(one.name))), one.imitates, number(one.cosines[one.imitates], 3), amount(one.amount, one.unit), change(one.looks_like), amount(one.told_apart, one.unit)]))),
-    section("Frequencies to monitor", `Standard deviation of each size as one frequency shows it. The best set the faults ${number(study.frequencies.gain, 3)} times as far apart, on average.`, table("Frequencies", ["Frequency", "", ...names.map((name) => `*${plain(name)}`)], [["monitored", study.frequencies.own], ["best", study.frequencies.best]].flatMap(([what, several]) => several.map((one) => [`${general(one.frequency_hz)} Hz`, what, ...names.map((name) => percent(one.apart[name]))])))),
-    study.dither?.length > 0 && section("What a dither would buy", "Sizes from which on each fault is named, of linear sensitivities; amplitude as a share of the reference's rms.", table("Dither", ["Sine on the reference", `*Adds to u (rms)${unit(study.units?.[1])}`, ...names.map((name) => `*${plain(name)} from`)], study.dither.map((one) => [one.share ? `${general(100 * one.share)} % at ${general(one.frequency_hz)} Hz` : "none", number(one.extra_u_rms, 3), ...names.map((name) => change(one.radius[name]))]))),
   ].filter(Boolean);
 }
 
@@ -126,12 +118,7 @@ function several(c, named, x, y) {
   };
 }
 
-function delays(c, sides) {
-  const lines = sides.filter(([, way]) => way === "up").map(([fault, , side]) => [plain(fault.name), side.delays.filter((one) => one.half_s > 0).map((one) => [100 * Math.abs(one.ratio - 1), one.half_s])]);
-  return several(c, lines, "size of the change [%]", "time to detection [s]");
-}
-
 function sizes(c, faults) {
-  const lines = faults.map((fault) => [plain(fault.name), fault.sizes.filter((one) => one.alone_learned > 0).map((one) => [one.seconds, 100 * one.alone_learned])]);
+  const lines = faults.map((fault) => [plain(fault.name), fault.sizes.map((one) => [one.seconds, 100 * (one.std ?? one.alone_learned)]).filter(([, std]) => std > 0)]);
   return several(c, lines, "time after the onset [s]", "standard deviation [%]");
 }

@@ -18,8 +18,9 @@ export function translate(text) {
 }
 
 function composed(text) {
-  let found = text;
-  for (const { shape, text: translated } of PATTERNS) {
+  const small = EXACT.get(text.charAt(0).toLowerCase() + text.slice(1)); // a heading of a fault's words
+  let found = small ? small.charAt(0).toUpperCase() + small.slice(1) : text;
+  for (const { shape, text: translated } of small ? [] : PATTERNS) {
     const values = shape.exec(text);
     if (!values) continue;
     found = translated.replace(VALUE, (_, i, kind) => (kind === "!w" ? translate(values[Number(i) + 1]) : values[Number(i) + 1]));

@@ -155,7 +155,7 @@ def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Quer
     except StoreError as error:
         raise HTTPException(404, str(error)) from None
     found = prognose(series, query.limit)
-    return sizes.Forecast(asset=asset, **found.model_dump(exclude={"headline", "reasons", "effects"}))
+    return sizes.Forecast(asset=asset, **dict(found))
 
 
 @router.get("/assets/{asset}/limits")
@@ -166,8 +166,7 @@ def get_limits(context: ContextDep, asset: str) -> sizes.LimitList:
     if id_ is None:
         return sizes.LimitList(limits=[])
     path = find_baseline(context, id_).path
-    found = _loop_limits(path, load_cached(path).hash)
-    return sizes.LimitList(limits=[sizes.LimitRow(**one._asdict()) for one in found])
+    return sizes.LimitList(limits=list(_loop_limits(path, load_cached(path).hash)))
 
 
 @functools.lru_cache(maxsize=256)  # it takes a second, and every reader of a page asks

@@ -194,7 +194,8 @@ async def start_learning(context: ContextDep, who: Engineer, request: LearningRe
 
     arguments = request, loop, paths, earlier, alike, str(out)
     discard = partial(context.storage.remove, "learnings", id_)
-    return context.jobs.submit(Job("learning", who.user, "learn_baseline", arguments, out, finish, discard))
+    reads = (*loop.files, *paths, *alike, *([earlier] if earlier is not None else []))
+    return context.jobs.submit(Job("learning", who.user, "learn_baseline", arguments, out, reads, out, finish, discard))
 
 
 @router.post("/baselines", status_code=HTTP_201_CREATED)

@@ -54,4 +54,6 @@ async def start_design(context: ContextDep, who: Engineer, request: DesignReques
 
     arguments = request, loop, paths, str(out)
     discard = partial(context.storage.remove, "designs", id_)
-    return context.jobs.submit(Job("design", who.user, "study_design", arguments, out, finish, discard))
+    return context.jobs.submit(
+        Job("design", who.user, "study_design", arguments, out, (*loop.files, *paths), out, finish, discard)
+    )

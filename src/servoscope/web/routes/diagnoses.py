@@ -156,6 +156,9 @@ async def start_diagnosis(context: ContextDep, who: Operator, request: Diagnosis
         context.storage.publish(responses.UploadDiagnosis.model_validate(record))
         return {"diagnosis": f"{UPLOAD_PREFIX}{id_}"}
 
-    arguments = file.name, request, str(baseline.path), baseline.row.name, str(out)
+    path = str(baseline.path)
+    arguments = file.name, request, path, baseline.row.name, str(out)
     discard = partial(context.storage.remove, "diagnoses", id_)
-    return context.jobs.submit(Job("diagnosis", who.user, "diagnose_file", arguments, file.parent, finish, discard))
+    return context.jobs.submit(
+        Job("diagnosis", who.user, "diagnose_file", arguments, file.parent, (path,), out, finish, discard)
+    )

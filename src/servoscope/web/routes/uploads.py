@@ -99,9 +99,9 @@ async def start_inspection(context: ContextDep, who: Operator, request: Inspecti
     """Find out whether an upload is usable, and if not, why; a job."""
     file = await asyncio.to_thread(context.storage.upload, request.upload)
     loop = await asyncio.to_thread(resolve_loop, context, request.loop) if request.loop is not None else None
-    arguments = file.name, request, loop
+    arguments, reads = (file.name, request, loop), loop.files if loop is not None else ()
     return context.jobs.submit(
-        Job("inspection", who.user, "inspect_file", arguments, file.parent, lambda result: result)
+        Job("inspection", who.user, "inspect_file", arguments, file.parent, reads, None, lambda result: result)
     )
 
 
@@ -110,7 +110,7 @@ async def start_proposal(context: ContextDep, who: Operator, request: ProposalRe
     """Propose a loop file for an upload, with the evidence for each line, and inspect the upload with it; a job."""
     file = await asyncio.to_thread(context.storage.upload, request.upload)
     return context.jobs.submit(
-        Job("proposal", who.user, "propose_file", (file.name, request), file.parent, lambda result: result)
+        Job("proposal", who.user, "propose_file", (file.name, request), file.parent, (), None, lambda result: result)
     )
 
 

@@ -10,12 +10,12 @@ from typing import Any, get_args
 
 from pydantic import Field
 
-from servoscope.detection.result import Verdict
+from servoscope.diagnosis.result import Verdict
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
-from servoscope.prognosis.forecast import Outlook as OutlookKind
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
 from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
+from servoscope.service.assets.outlook import Outlook
 from servoscope.service.assets.status import AlarmStatus, AssetStatus, FloodCounts, ServiceStatus
 from servoscope.web.schemas.requests import CommandName
 from servoscope.web.schemas.responses import ApiResponse, DiagnosisRow, NullableFloats, SignalColumns
@@ -106,16 +106,10 @@ class FaultSize(ApiResponse):
     high: float
 
 
-class OutlookRow(ApiResponse):
-    """When a fault reaches its limit: intervals as lower end, median, upper end."""
+class OutlookRow(Outlook, ApiResponse):
+    """When a fault reaches its limit."""
 
-    name: str
-    limit: float
-    outlook: OutlookKind
-    asked: float
-    reach_t: tuple[float | None, ...] | None
-    rate_per_day: tuple[float, ...] | None
-    summary: str
+    t: float = Field(exclude=True)
 
 
 class AssetRow(ApiResponse):

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from servoscope.detection.result import Verdict
+from servoscope.diagnosis.result import Verdict
 
 Text = Annotated[str, Field(max_length=1000)]
 Id = Annotated[str, Field(min_length=1, max_length=150)]
@@ -167,6 +167,11 @@ class LoopRef(ApiRequest):
         if sum(value is not None for value in (self.toml, self.baseline, self.example)) != 1:
             raise ValueError("give exactly one of toml, baseline, example")
         return self
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """What a job reads for it."""
+        return (self.baseline,) if self.baseline is not None else ()
 
 
 class RecordingSelection(ApiRequest):

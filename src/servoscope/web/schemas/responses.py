@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from servoscope.detection.result import Verdict
+from servoscope.diagnosis.result import Verdict
 from servoscope.service.access import Role
 
 JsonObject = dict[str, Any]  # a document of another package, passed on as it is

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-from servoscope.prognosis.forecast import Outlook
+from pydantic import Field
+
+from servoscope.core.messages import MessageField
+from servoscope.design.operating_limits import OperatingLimit
+from servoscope.prognosis.forecast import Prognosis
 from servoscope.web.schemas.responses import ApiResponse
 
 
@@ -42,35 +46,17 @@ class NoteList(ApiResponse):
     notes: list[Note]
 
 
-class Forecast(ApiResponse):
-    """How a size grows, and when it reaches a limit: intervals as lower end, median, upper end."""
+class Forecast(Prognosis, ApiResponse):
+    """A prognosis of an asset, with its sentences as text."""
 
     asset: str
-    name: str
-    limit: float
-    coverage: float
-    points: int
-    from_t: float
-    to_t: float
-    outlook: Outlook
-    value: tuple[float, ...] | None
-    rate_per_day: tuple[float, ...] | None
-    remaining_s: tuple[float | None, ...] | None
-    odds: float | None
-    summary: str
-    explanation: tuple[str, ...]
-
-
-class LimitRow(ApiResponse):
-    """The ratio to healthy, above 1 and below 1, at which the loop loses tracking or its margin of stability."""
-
-    fault: str
-    kind: Literal["tracking", "stability"]
-    up: float | None
-    down: float | None
+    # headline, reasons, effects: in the sentences
+    headline: MessageField = Field(exclude=True)
+    reasons: tuple[MessageField, ...] = Field((), exclude=True)
+    effects: dict[str, tuple[float, float, float]] = Field({}, exclude=True)
 
 
 class LimitList(ApiResponse):
     """Limits by fault."""
 
-    limits: list[LimitRow]
+    limits: list[OperatingLimit]

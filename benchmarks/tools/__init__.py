@@ -1,0 +1,1 @@
+"""What several cases of `speed.py` use: limits of the machine, other libraries, slow doubles, senders."""

@@ -1,0 +1,299 @@
+"""The result of a diagnosis as data: verdict, intervals with faults and candidates, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import computed_field, model_validator
+
+from servoscope.core.messages import Message, MessageField, MessageText, message, read_messages, render, text_message
+from servoscope.core.short_repr import ShortRepr
+from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
+from servoscope.signals import Defect
+
+Verdict = Literal["healthy", "fault", "undetermined"]
+VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
+
+
+class Mimic(ResultModel):
+    """A cause outside the list of faults that explains the recording as well, or better where the answer is unknown."""
+
+    name: str
+    description: MessageField
+    value: float  # a ratio to the healthy value, or a size in `unit`
+    unit: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, written: Any) -> Any:
+        return read_messages(written, description="words")
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def words(self) -> str:
+        """The description as text."""
+        return render(self.description)
+
+    @property
+    def size(self) -> Message:
+        """Its value with its unit, a ratio as a factor."""
+        if self.unit == "ratio":
+            return message("diagnosis.mimic_ratio", value=self.value)
+        unit = {"in units of y": message("diagnosis.units_of_y"), "in units of u": message("diagnosis.units_of_u")}
+        return message("diagnosis.mimic_size", value=self.value, unit=unit.get(self.unit, self.unit))
+
+
+class RefitSummary(ResultModel):
+    """The refit of the seconds around the onset, from which onset and candidates of a diagnosis come."""
+
+    from_s: float  # from_s, to_s: the seconds that were fitted
+    to_s: float
+    over_s: float  # how long the change grew; 0 where it may have been a step, growing for less than the onset interval
+    noise: float  # standard deviation of the innovations, as a multiple of the baseline's
+    misfit: float  # what the best candidate leaves unexplained
+    limit: float  # of the misfit; a true candidate exceeds it in one of a thousand cases
+    recursive: tuple[Candidate, ...]  # what the recursion alone, with its memory, finds at its last evaluation
+    mimics: tuple[Mimic, ...]
+
+    @property
+    def drifting(self) -> bool:
+        """Whether the change grew, by an explanation that fits."""
+        return self.over_s > 0.0 and self.misfit <= self.limit
+
+
+class FinalCoefficient(ResultModel):
+    """A coefficient at the end of the recording: value, standard deviation, and what a healthy loop would show."""
+
+    value: float
+    std: float
+    nominal: float
+
+
+class ResponsePoint(ResultModel):
+    """The iFRF at one monitored frequency at the end of the recording."""
+
+    frequency_hz: float
+    real: float
+    imag: float
+    real_std: float
+    imag_std: float
+    nominal_real: float
+    nominal_imag: float
+
+
+class DiagnosisWarning(ResultModel):
+    """Something about the recording that the reader should know."""
+
+    kind: str
+    from_s: float
+    to_s: float
+    count: int
+    description: MessageField
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, written: Any) -> Any:
+        return read_messages(written, description="message")
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def message(self) -> str:
+        """The description as text."""
+        return render(self.description)
+
+    @classmethod
+    def of(cls, defect: Defect) -> DiagnosisWarning:
+        """Turn a recording's defect into a warning."""
+        return cls(
+            kind=defect.kind,
+            from_s=defect.from_s,
+            to_s=defect.to_s,
+            count=defect.count,
+            description=text_message(defect.message),
+        )
+
+
+class FaultInterval(ResultModel):
+    """A time during which the actuator differed from healthy, and what explains that."""
+
+    detected_at_s: float | None = None  # first evaluation above a threshold
+    onset_s: tuple[float, float, float] | None = None  # lower end, most likely, upper end of the 95 % interval
+    end_s: float | None = None  # when it was over, or the alarm gone; None while it lasts
+    end_interval_s: tuple[float, float, float] | None = None  # the same with its 95 % interval, where a refit dates it
+    from_start: bool = False  # the change may be older than the recording
+    probability: float | None = None  # of the first candidate
+    faults: tuple[FaultEstimate, ...] = ()  # those that are named; none where no candidate reaches probability 0.95
+    candidates: tuple[Candidate, ...] = ()  # most probable first
+    refit: RefitSummary | None = None  # what the candidates rest on; None where the recursion alone found them
+
+
+class Provenance(ResultModel):
+    """What a diagnosis was made with: versions, and hashes of the baseline and of the recording's samples."""
+
+    servoscope: str
+    python: str
+    numpy: str
+    baseline: str
+    recording: str
+
+
+WRITTEN_INTERVAL = frozenset(FaultInterval.model_fields) - {
+    "end_s",
+    "end_interval_s",
+    "from_start",
+}  # fields that a Diagnosis repeats
+
+
+class Diagnosis(ShortRepr, ResultModel):
+    """The verdict on one recording.
+
+    Parameters
+    ----------
+    recording, samples, duration_s
+        What was examined.
+    verdict
+        ``undetermined`` when the recording excites too little or is too short to show a change of the size that the
+        baseline promises.
+    headline
+        The verdict in one sentence; as text: `summary`.
+    reasons
+        Why, sentence by sentence: what moved, what was rejected; as text: `explanation`.
+    checks
+        What to check on the machine, by what the loop file says of the faults, or else by what is known of them.
+    intervals
+        When the actuator differed from healthy, in order; `onset_s`, `detected_at_s`, `probability`, `faults`,
+        `candidates` and `refit` are those of the last one, None or empty where there is none.
+    parameters, ifrf
+        At the end of the recording.
+    warnings
+        Defects of the recording, and doubts about the result.
+    point
+        Operating point whose baseline was used; None where the baseline has none.
+    provenance
+        Versions and hashes by which `servoscope verify` repeats it; None where nobody asked for them.
+    """
+
+    recording: str
+    samples: int
+    duration_s: float
+    verdict: Verdict
+    headline: MessageField
+    reasons: tuple[MessageField, ...] = ()
+    checks: tuple[MessageText, ...] = ()
+    intervals: tuple[FaultInterval, ...] = ()
+    parameters: dict[str, FinalCoefficient]
+    ifrf: tuple[ResponsePoint, ...]
+    warnings: tuple[DiagnosisWarning, ...] = ()
+    point: str | None = None
+    provenance: Provenance | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, written: Any) -> Any:
+        """Read what was written, by version 0.1.0 too: it had text for messages, and no list of intervals."""
+        if not isinstance(written, Mapping):
+            return written
+        fields = read_messages(written, headline="summary", reasons="explanation")
+        last = {name: fields.pop(name) for name in WRITTEN_INTERVAL if name in fields}
+        if "intervals" not in fields and any(value not in (None, (), []) for value in last.values()):
+            fields["intervals"] = (last,)
+        return fields
+
+    @property
+    def current(self) -> FaultInterval:
+        """The last interval; an empty one where there is none."""
+        return self.intervals[-1] if self.intervals else FaultInterval()
+
+    def _shown_facts(self) -> dict[str, object]:
+        return {"recording": self.recording, "verdict": self.verdict, "summary": self.summary}
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def summary(self) -> str:
+        """The verdict in one sentence."""
+        return render(self.headline)
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def explanation(self) -> tuple[str, ...]:
+        """Why, sentence by sentence."""
+        return tuple(render(reason) for reason in self.reasons)
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def detected_at_s(self) -> float | None:
+        """First evaluation above a threshold."""
+        return self.current.detected_at_s
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def onset_s(self) -> tuple[float, float, float] | None:
+        """Lower end, most likely, upper end of the 95 % interval of the onset."""
+        return self.current.onset_s
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def probability(self) -> float | None:
+        """Of the first candidate; None when nothing was detected."""
+        return self.current.probability
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def faults(self) -> tuple[FaultEstimate, ...]:
+        """Named faults; empty when healthy and when no candidate reaches probability 0.95."""
+        return self.current.faults
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Explanations, the most probable first."""
+        return self.current.candidates
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def refit(self) -> RefitSummary | None:
+        """What the candidates rest on; None where the recursion alone found them."""
+        return self.current.refit
+
+    def dated_headline(self, began: float, onset: float | None = None) -> Message:
+        """Return the headline with a date instead of seconds since the recording began, at `began` [UTC s].
+
+        `onset`: of a change that is older than the recording, where it is known [UTC s].
+        """
+        if self.headline.key == "diagnosis.timeline":
+            return _dated_timeline(self.headline, began)
+        since = self.headline.values.get("since")
+        if self.current.onset_s is None or not isinstance(since, Message):
+            return self.headline
+        if self.current.from_start and onset is None:
+            since = message("diagnosis.since_start_date", t=began)
+        else:
+            at = began + self.current.onset_s[1] if onset is None else onset
+            since = message("diagnosis.since_date", t=at, growth=since.values.get("growth"))
+        return self.headline.model_copy(update={"values": {**self.headline.values, "since": since}})
+
+
+DATED = {  # parts of the headline of a timeline: in seconds, and as dates
+    "diagnosis.healed": "diagnosis.healed_date",
+    "diagnosis.stretch_when": "diagnosis.stretch_when_date",
+    "diagnosis.stretch_since": "diagnosis.stretch_since_date",
+    "diagnosis.stretch_until": "diagnosis.stretch_until_date",
+    "diagnosis.stretch_start": "diagnosis.stretch_start_date",
+}
+
+
+def _dated_timeline(headline: Message, began: float) -> Message:
+    """Return the headline of a timeline with dates instead of seconds since `began` [UTC s]."""
+
+    def dated(given: Message) -> Message:
+        times = {name: began + given.values[name] for name in ("t", "from_s", "to_s") if given.values.get(name)}
+        return message(DATED[given.key], began=began, **times)
+
+    stretches = tuple(
+        one.model_copy(update={"values": {**one.values, "when": dated(one.values["when"])}})
+        for one in headline.values["stretches"]
+    )
+    now = headline.values["now"]
+    values = {**headline.values, "stretches": stretches, "now": None if now is None else dated(now)}
+    return headline.model_copy(update={"values": values})
