@@ -121,10 +121,10 @@ def test_a_webhook_is_tried_until_it_is_taken_with_the_same_key_and_a_good_signa
             tries.append(deliver(row, settings, now))
             row = tries[-1].retry_entry
             now = row.due if row else now
-    assert [(one.attempt, one.delivered, one.is_final_failure) for one in tries] == [
+    assert [(one.attempt, one.delivered, one.retry_entry is None) for one in tries] == [
         (1, False, False),
         (2, False, False),
-        (3, True, False),
+        (3, True, True),
     ]
     assert tries[0].detail == f"{receiver.url.removesuffix('/hook')}: answered 500"
     first, second = (one.retry_entry for one in tries[:2])

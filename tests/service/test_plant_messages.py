@@ -230,7 +230,7 @@ def test_what_is_behind_ahead_or_sent_twice_is_counted_apart_and_not_used() -> N
 
 
 def test_a_signal_that_does_not_come_is_missing_and_a_pause_is_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collecting, "QUIET_S", 0.0)
+    monkeypatch.setattr(collecting, "MAX_QUIET_S", 0.0)
     t0 = time.time() - 5.0
     for hold_s, missing, samples in ((0.0, [3], 8), (1.0, [], 12)):
         line = Line(hold_s=hold_s, block=0.05)

@@ -311,7 +311,8 @@ class Loop(ShortRepr, Settings):
         """Return the loop that the text of a loop file describes; error messages call it `source`."""
         settings = parse_toml(text, source, LoopError)
         monitor = settings.get("monitor")
-        if isinstance(monitor, Mapping) and "sequential_step" in monitor:
+        # `to_dict` writes the value that is left, so files that hold it are as good as those without it
+        if isinstance(monitor, Mapping) and monitor.get("sequential_step", "evaluation") != "evaluation":
             warnings.warn(
                 f"{source}: [monitor] sequential_step: is no setting any more, leave it out: the sequential test "
                 "decides once per evaluation, and a higher evaluation_rate makes its alarms faster",
