@@ -20,7 +20,7 @@ import pytest
 import typer.main
 from commands import prepared
 from documents import CodeBlock, code_blocks, command_lines, run_page
-from test_architecture import load
+from sources import load
 
 import servoscope as ss
 from servoscope.cli import app

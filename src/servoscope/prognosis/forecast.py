@@ -62,9 +62,9 @@ class Prognosis(BaseModel):
     from_t: float
     to_t: float
     outlook: Outlook
-    value: tuple[float, float, float] | None = None
-    rate_per_day: tuple[float, float, float] | None = None
-    remaining_s: tuple[float | None, float | None, float | None] | None = None
+    value: tuple[float, ...] | None = None
+    rate_per_day: tuple[float, ...] | None = None
+    remaining_s: tuple[float | None, ...] | None = None
     odds: float | None = None
     effects: dict[str, tuple[float, float, float]] = {}
     headline: MessageField

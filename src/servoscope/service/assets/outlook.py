@@ -46,8 +46,8 @@ class Outlook(BaseModel):
     outlook: Literal["forecast", "reached", "none"]
     t: float  # of the newest size
     asked: float  # when it was made, by the asset's clock
-    reach_t: tuple[float | None, float | None, float | None] | None = None  # None: later than can be said
-    rate_per_day: tuple[float, float, float] | None = None
+    reach_t: tuple[float | None, ...] | None = None  # None: later than can be said
+    rate_per_day: tuple[float, ...] | None = None
     summary: str
 
     @classmethod
