@@ -2,7 +2,7 @@
 
     python benchmarks/public/xl330.py [--data DIR] [--json]
 
-The loop file is what `init` and `explore` write. In four of the files the motor is switched off after 2 s, and the
+The loop file is what `init` writes. In four of the files the motor is switched off after 2 s, and the
 pendulum swings freely. Changed recordings have `GAIN` times the u from `CHANGED_S` on: a motor that has become weaker
 under a controller that has become as much stronger.
 """
@@ -20,11 +20,9 @@ import servoscope as ss
 from public.servoscope_detector import OURS, with_gain
 from public.simple_detectors import detectors, judge
 from servoscope.learning.axis_fit import fit_axis
-from servoscope.learning.axis_structures import explore_structures
 from servoscope.learning.proposal import propose, propose_columns
 from servoscope.signals.readers import list_channels
 
-FIRST = "sin_sin_kp100.parquet"  # the file that the loop is proposed from
 AUTHORS = 71.7  # gravity over inertia with the authors' rotor [1/s^2] (Rhoban, BAM)
 GAIN = 2.0
 CHANGED_S = 1.0
@@ -32,16 +30,15 @@ WINDOW_S = 2.0
 RATES = 185.9, 200.0  # Hz, beside the proposed one: what is learned must not hang on it
 
 
-def proposed_loop(folder: Path) -> ss.Loop:
+def proposed_loop(files: list[Path]) -> ss.Loop:
     """Return the loop that `init` proposes with --resample, for the files are logged at two rates."""
-    path = folder / FIRST
-    columns = propose_columns(path, list_channels(path), None).model_copy(update={"resample": True})
-    return propose(path, columns)[0].loop
+    columns = propose_columns(files[0], list_channels(files[0]), None).model_copy(update={"resample": True})
+    return propose(files, columns)[0].loop
 
 
 def with_axis(loop: ss.Loop, terms: tuple[str, ...], rate: float) -> ss.Loop:
     """Return the loop as an axis with these terms, at another rate."""
-    settings = loop.to_dict() | {"plant": {"kind": "axis", "terms": [*terms, "offset"]}, "sample_rate": rate}
+    settings = loop.to_dict() | {"plant": {"kind": "axis", "terms": list(terms)}, "sample_rate": rate}
     return ss.Loop.from_dict(settings)
 
 
@@ -50,16 +47,16 @@ def main() -> None:
     given = parse_with_data(parser(__doc__), "real/xl330")
     folder = given.data / "real" / "xl330"
     files = sorted(folder.glob("*.parquet"))
-    proposed = proposed_loop(folder)
-    found = explore_structures(proposed, [ss.read(path, proposed) for path in files])[0].plant
-    loop = with_axis(proposed, found.terms, proposed.sample_rate)
+    loop = proposed_loop(files)
+    proposed = loop.plant.terms
     runs = [ss.read(path, loop) for path in files]
-    values = {"terms": ", ".join(found.terms)}
+    values = {"terms": ", ".join(term for term in proposed if term != "offset")}
 
     rows = []
-    for terms in dict.fromkeys([found.terms, ("viscous", "coulomb", "gravity"), ("viscous", "gravity")]):
+    others = ("viscous", "coulomb", "gravity", "offset"), ("viscous", "gravity", "offset")
+    for terms in dict.fromkeys([proposed, *others]):
         for rate in (loop.sample_rate, *RATES):
-            other = with_axis(proposed, terms, rate)
+            other = with_axis(loop, terms, rate)
             each = [ss.read(path, other) for path in files]
             whole, span = _gravity_over_inertia(other, each), ""
             if rate == loop.sample_rate:

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 import servoscope as ss
-from servoscope.cli.explore import plant_table
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
 from servoscope.core.messages import render
 from servoscope.estimation.pipeline import Pipeline
-from servoscope.learning.axis_structures import explore_structures
+from servoscope.learning.plant_choice import choose_plant
 from servoscope.learning.proposal import propose
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.simulation import FaultEvent, simulate
@@ -122,10 +121,8 @@ class TestSpeed:
 
     def test_structures_are_those_of_a_speed(self) -> None:
         recordings = [turned(seed) for seed in range(3)]
-        found = explore_structures(spindle(), recordings)
-        assert found[0].plant.terms == ("viscous", "coulomb")
-        assert found[0].inertia == pytest.approx(0.02, rel=0.02)
-        assert 'y = "speed"' in plant_table(found[0])
+        supported = choose_plant(recordings, 10.0, True, 0.1)[0]
+        assert supported.settings == {"kind": "axis", "y": "speed", "terms": ["viscous", "coulomb", "offset"]}
 
     def test_a_log_of_a_drive_is_proposed_as_one(self, tmp_path: Path) -> None:
         one = turned(0)

@@ -9,7 +9,7 @@ from commands import one_line, run
 from logs import GERMAN_RATE, german_axis
 
 from servoscope.models.loop import Loop
-from servoscope.models.plants.polynomial import PolynomialPlant
+from servoscope.models.plants.axis import AxisPlant
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +22,9 @@ def test_the_proposal_is_the_machine_and_says_why(log: Path, tmp_path: Path) -> 
     told = run("init", log, "-o", target)
     assert told.code == 0 and "Usable" in told.out
     loop = Loop.load(target)
-    assert isinstance(loop.plant, PolynomialPlant)
-    assert (loop.plant.order, loop.plant.friction, loop.plant.stiffness) == (2, "coulomb", False)
+    assert isinstance(loop.plant, AxisPlant)
+    assert loop.plant.terms == ("viscous", "coulomb", "offset")
+    assert "axis: viscous, coulomb, offset" in told.out and "plants compared" in told.out
     assert loop.sample_rate == pytest.approx(GERMAN_RATE)
     assert loop.columns.output == "0.001 * `Istposition [mm]`" and loop.columns.time_unit == "ms"
     assert 0.2 < (loop.monitor.cutoff or 0.0) <= GERMAN_RATE / 10.0 and 5.0 <= loop.monitor.memory <= 10.0
@@ -42,6 +43,42 @@ def test_a_log_whose_names_say_nothing_needs_columns(log: Path, tmp_path: Path) 
     mapping = "t=c0[ms], r=1e-3*c1, u=c2, y=1e-3*c3"
     assert run("init", path, "-o", tmp_path / "a.toml", "--columns", mapping).code == 0
     assert Loop.load(tmp_path / "a.toml").columns.output == "1e-3*c3"
+
+
+def test_several_logs_and_folders_are_one_machine(log: Path, tmp_path: Path) -> None:
+    folder, target = tmp_path / "logs", tmp_path / "loop.toml"
+    folder.mkdir()
+    text = log.read_text(encoding="utf-8")
+    for name in ("monday", "tuesday"):
+        (folder / f"{name}.csv").write_text(text, encoding="utf-8")
+    (folder / "wednesday.csv").write_text("Zeit;Drehmoment\n1;2\n", encoding="utf-8")
+    told = run("init", folder, "-o", target)
+    assert told.code == 0 and "left out" in told.out and "wednesday.csv" in told.out
+    assert told.out.count("Usable") == 2
+    assert "monday.csv" in told.out and "tuesday.csv -o baseline.json" in " ".join(told.out.split())
+    assert Loop.load(target).plant.kind == "axis"
+
+
+def test_what_may_be_a_covariate_is_mentioned(log: Path, tmp_path: Path) -> None:
+    lines = log.read_text(encoding="utf-8").splitlines()
+    added = ["Öltemperatur", "°C", *(f"{20.0 + 1e-3 * k:.3f}".replace(".", ",") for k in range(len(lines)))]
+    rows = [lines[0], *(f"{line};{cell}" for line, cell in zip(lines[1:], added, strict=False))]
+    path = tmp_path / "warm.csv"
+    path.write_text("\n".join(rows), encoding="utf-8")
+    told = run("init", path, "-o", tmp_path / "loop.toml")
+    assert told.code == 0 and "if Öltemperatur" in told.out and "covariates" in told.out
+
+
+def test_rest_that_the_plant_does_not_explain_is_left_out(shared_data: Path, tmp_path: Path) -> None:
+    target = tmp_path / "loop.toml"
+    told = run("init", shared_data / "real" / "xl330" / "sin_sin_kp100.parquet", "-o", target)
+    assert told.code == 0 and "if input_volts, temp moves what is healthy" in " ".join(told.out.split())
+    monitor = Loop.load(target).monitor
+    assert monitor.update_when == "moving" and 0.0 < monitor.rest_speed < 0.1
+
+
+def test_explore_says_what_took_its_place(tmp_path: Path) -> None:
+    one_line(run("explore", "loop.toml", "a.csv", "-o", tmp_path / "axis.toml"), "servoscope init", "part of")
 
 
 def test_control_characters_in_names_leave_valid_toml(log: Path, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from servoscope.cli import (  # their commands add themselves to the application
     alarms,
     bench,
-    explore,
     export,
     fleet,
     init,
@@ -27,7 +26,6 @@ __all__ = [
     "alarms",
     "app",
     "bench",
-    "explore",
     "export",
     "fleet",
     "init",

@@ -21,7 +21,7 @@ GARBAGE = 200_000  # new objects before cycles are looked for: loading code make
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 GROUPS = {
-    "Begin": ("demo", "tutorial", "init", "inspect", "explore", "docs", "help"),
+    "Begin": ("demo", "tutorial", "init", "inspect", "docs", "help"),
     "Judge recordings": ("learn", "diagnose", "verify"),
     "Follow machines for months": (
         "run",

@@ -26,6 +26,14 @@ EXIT_INPUT, EXIT_FAULT, EXIT_INTERRUPTED = 1, 3, 130  # exit codes; 2 is the com
 class CommandGroup(typer.core.TyperGroup):
     """Commands whose users' errors are one line and an exit code; other errors keep their traceback."""
 
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command by its name; of one that is gone, say what took its place."""
+        if cmd_name == "explore":  # until the next version
+            from servoscope.report.page import say
+
+            raise ServoscopeError(say("init.explore"))
+        return super().get_command(ctx, cmd_name)
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
         try:

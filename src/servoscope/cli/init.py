@@ -1,4 +1,4 @@
-"""The command that begins: a loop file from one log."""
+"""The command that begins: a loop file from logs."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ if TYPE_CHECKING:
 
     from servoscope.models.loop import Columns
 
+MAX_LISTED_PLANTS = 6
+
 
 @app.command()
 @with_reading_options("where", "by", "from_s", "to_s")
 def init(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log of the healthy machine at work.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Logs of the healthy machine at work.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="LOOP", help="Loop file to write.")] = Path(
         "loop.toml"
     ),
@@ -32,8 +34,9 @@ def init(
     reading: ReadingOptions,
     yes: Annotated[bool, typer.Option("--yes", help="Take what is proposed; ask nothing.")] = False,
 ) -> None:
-    """Look at a log, propose a loop file with the evidence for each line, write it, and inspect the log with it."""
-    check_output(output, "-o", (".toml",), [log])
+    """Look at logs, compare plants, propose a loop file with the evidence for each line, write it, inspect the logs."""
+    logs = arguments.expand_files(logs)
+    check_output(output, "-o", (".toml",), logs)
 
     from servoscope.cli.render import results
     from servoscope.core.errors import OutputError, ServoscopeError
@@ -42,7 +45,7 @@ def init(
     from servoscope.signals import readers
     from servoscope.signals.readers.axes import find_axes
 
-    asks = not yes and sys.stdin.isatty() and sys.stdout.isatty()
+    log, asks = logs[0], not yes and sys.stdin.isatty() and sys.stdout.isatty()
     reader = arguments.RecordingReader.from_options(None, reading)
     out = results.create_console()
     mapping = reader.columns
@@ -73,7 +76,7 @@ def init(
                     chosen = arguments.parse_mapping(typer.prompt(say("init.ask_columns")), chosen)
             assert chosen is not None, "it was proposed, or asked for"
             changes = {"text": reader.text or chosen.text, "resample": reading.resample or chosen.resample}
-            _propose(out, log, chosen.model_copy(update=changes), target, asks)
+            _propose(out, logs, chosen.model_copy(update=changes), target, asks)
     failures.exit_if_any()
 
 
@@ -82,9 +85,10 @@ def _axis_file(output: Path, axis: str | None) -> Path:
     return output.with_name(f"{output.stem}-{axis}{output.suffix}")
 
 
-def _propose(out: Console, log: Path, columns: Columns, output: Path, asks: bool) -> None:
-    """Print the proposal for a log with its evidence, write it, and inspect the log with it."""
+def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, asks: bool) -> None:
+    """Print the proposal for logs with its evidence, write it, and inspect the logs with it."""
     from servoscope.cli.render import results
+    from servoscope.core.errors import ServoscopeError
     from servoscope.core.files import atomic_write
     from servoscope.core.messages import render
     from servoscope.learning import inspection
@@ -92,25 +96,34 @@ def _propose(out: Console, log: Path, columns: Columns, output: Path, asks: bool
     from servoscope.report.page import say
     from servoscope.signals import readers
 
-    proposal = propose_loop(log, columns)
+    proposal = propose_loop(logs, columns)
     lines = [
         (f"{line.section}.{line.key}".lstrip("."), line.value + " ?" * line.doubtful, render(line.why))
         for line in proposal.lines
     ]
     results.print_table(out, ("setting", "proposed", "why"), lines, words=3)
+    compared = [(plant.words, f"{100.0 * plant.explained:.2f} %") for plant in proposal.candidates[:MAX_LISTED_PLANTS]]
+    results.print_table(out, ("plant", "explained of u"), compared)
+    notes = [say("init.compared", count=len(proposal.candidates)), *map(render, proposal.notes)]
     if any(line.doubtful for line in proposal.lines):
-        results.print_notes(out, [say("init.doubtful")])
-        if asks:
-            typer.confirm(say("init.confirm"), default=True, abort=True)
-    atomic_write(output, proposal.to_toml(log.name).encode())
+        notes.append(say("init.doubtful"))
+    results.print_notes(out, notes)
+    if asks and any(line.doubtful for line in proposal.lines):
+        typer.confirm(say("init.confirm"), default=True, abort=True)
+    atomic_write(output, proposal.to_toml(logs[0].name).encode())
     results.print_written_path(out, output)
-    found = inspection.inspect(readers.read(log, proposal.loop), proposal.loop)
-    results.print_inspection(out, found)
-    if found.verdict == "not usable":
-        results.print_notes(out, [say("init.not_usable", loop=str(output))])
-    else:
+    usable = []
+    for log in logs:
+        try:
+            found = inspection.inspect(readers.read(log, proposal.loop), proposal.loop)
+        except ServoscopeError:  # the notes say why
+            continue
+        results.print_inspection(out, found)
+        usable += [log] * (found.verdict != "not usable")
+    if usable:
+        learned = " ".join(shlex.quote(str(log)) for log in usable)
         results.print_command(
-            out,
-            say("init.next"),
-            f"servoscope learn {shlex.quote(str(output))} {shlex.quote(str(log))} -o baseline.json",
+            out, say("init.next"), f"servoscope learn {shlex.quote(str(output))} {learned} -o baseline.json"
         )
+    else:
+        results.print_notes(out, [say("init.not_usable", loop=str(output))])

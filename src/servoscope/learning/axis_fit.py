@@ -32,7 +32,7 @@ MAX_SCATTER_ROUNDS = 30  # steps in which coefficients and their scatter agree
 FALSE_ALARMS = 1.0 / 200.0  # share of healthy recordings that change within themselves beyond a learned limit
 MIN_LOG_LIKELIHOOD_GAIN = 1.0  # of a likelihood ratio whose logarithm counts
 MIN_SAMPLES_PER_COLUMN = 10  # samples in motion
-STEPS = 250  # of the search for the noise
+STEPS, FIRST_STEP = 250, 0.7  # of the search for the noise: steps, and the logarithm of the first ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +118,14 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
         # a filter that forgets a reversal sooner counts more innovations, which makes it no likelier
         return total * first / max(count, 1)
 
+    # a simplex of its own size: SciPy's is a share of the logarithms, and so depends on the unit of y
+    simplex = np.vstack([start, start + FIRST_STEP * np.eye(len(start))])
     found = minimize(
-        cost, start, method="Nelder-Mead", bounds=bounds, options={"maxiter": STEPS, "xatol": 0.02, "fatol": 0.5}
+        cost,
+        start,
+        method="Nelder-Mead",
+        bounds=bounds,
+        options={"maxiter": STEPS, "xatol": 0.02, "fatol": 0.5, "initial_simplex": simplex},
     )
     return AxisNoise(*np.exp(found.x).tolist())
 

@@ -1,11 +1,11 @@
-"""A loop file proposed from one log: columns, units, sample rate, plant, cutoff and memory, each with its evidence."""
+"""A loop file proposed from logs: columns, units, sample rate, plant, cutoff and memory, each with its evidence."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +13,14 @@ import numpy as np
 
 from servoscope.core import number_format
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import IrregularTimeError, RecordingError, ServoscopeError
+from servoscope.core.errors import IrregularTimeError, NotEnoughError, RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.learning.inspection import Inspection, inspect
-from servoscope.learning.inspection.model_order import MIN_FRICTION_GAIN, ModelOrderFit
+from servoscope.learning.inspection.rules import advised_rest_speed
+from servoscope.learning.plant_choice import PlantCandidate, choose_plant
 from servoscope.models.loop import Columns, Loop, MonitorSettings
 from servoscope.signals import Recording
-from servoscope.signals.readers import ChannelInfo, read
+from servoscope.signals.readers import ChannelInfo, list_channels, read
 from servoscope.signals.readers.axes import find_axes, signal_names
 from servoscope.signals.readers.columns import LinearCombination, parse_combination
 from servoscope.signals.readers.formats import open_file
@@ -30,9 +31,23 @@ from servoscope.signals.readers.wrap import find_wrap
 
 MEMORIES = 10.0  # that a recording to learn from should have at least
 MAX_MEMORY_S, MIN_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
-MIN_TERM_GAIN = 0.005  # share of u that a higher order or a stiffness has to explain
 JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
 SPEED_AXIS = {"kind": "axis", "y": "speed", "terms": ["viscous", "coulomb", "offset"]}
+# what moves the healthy coefficients, by what its name contains
+COVARIATE_STEMS = (
+    "temp",
+    "°c",
+    "degc",
+    "volt",
+    "supply",
+    "pressure",
+    "druck",
+    "pression",
+    "load",
+    "carga",
+    "humid",
+    "温度",
+)
 MIN_CLEAR_SHARE = 0.9  # share of u that a plant explains; below it, the choice is in doubt
 
 
@@ -49,10 +64,12 @@ class ProposalLine:
 
 @dataclass(frozen=True)
 class LoopProposal:
-    """A loop with the lines of its file."""
+    """A loop with the lines of its file, the plants that were compared, the proposed one first, and what to know."""
 
     loop: Loop
     lines: tuple[ProposalLine, ...]
+    candidates: tuple[PlantCandidate, ...]
+    notes: tuple[Message, ...]
 
     def to_toml(self, origin: str) -> str:
         """Return the loop file with comments; `origin`: the log that it was made from."""
@@ -92,11 +109,13 @@ def propose_columns(path: Path, channels: Sequence[ChannelInfo], axis: str | Non
     return Columns.model_validate({**fields, "segment": ()})
 
 
-def propose_loop(path: Path, columns: Columns) -> LoopProposal:
-    """Return a loop for a log whose columns are known, as `inspect` measures it.
+def propose_loop(paths: Sequence[Path], columns: Columns) -> LoopProposal:
+    """Return a loop for logs whose columns are known, as `inspect` measures the first of them.
 
-    Raises RecordingError if the log cannot be read, or nothing moves in it.
+    Logs that cannot be used with the first are left out, with a note. Raises RecordingError if the first log cannot be
+    read, or nothing moves in it.
     """
+    path, others = paths[0], paths[1:]
     columns, wraps = _unwrapped_columns(path, columns)
     is_speed = names_speed(columns.outputs[0])
     try:
@@ -109,8 +128,7 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
         columns = columns.model_copy(update={"resample": True})
         recording = read(path, columns=columns)
         found = _inspect(recording, is_speed)
-    best = found.best_order
-    if best is None or found.suggested_cutoff_hz is None:
+    if found.best_order is None or found.suggested_cutoff_hz is None:
         raise RecordingError(f"{path}: {found.summary}")
     rate = float(f"{recording.sample_rate:.6g}")
     # the largest of two digits that the recommendation allows
@@ -121,33 +139,44 @@ def propose_loop(path: Path, columns: Columns) -> LoopProposal:
     memory = max(MIN_PERIODS / cutoff, min(MAX_MEMORY_S, recording.duration_s / MEMORIES))
     memory = number_format.round_down(memory)
     frequencies = [f for f in MonitorSettings().frequencies if f <= cutoff] or [float(f"{cutoff / 2.0:.2g}")]
-    settings = {
-        "sample_rate": rate,
-        "columns": columns.model_dump(exclude_none=True) | {"time": columns.time},
-        "monitor": {"cutoff": cutoff, "memory": memory, "frequencies": frequencies},
-    }
+    monitor: dict[str, object] = {"cutoff": cutoff, "memory": memory, "frequencies": frequencies}
+    settings = {"sample_rate": rate, "columns": columns.model_dump(exclude_none=True) | {"time": columns.time}}
 
     def loop_of(plant: Mapping[str, object]) -> Loop:
-        return Loop.from_dict({**settings, "plant": plant}, source=str(path))
+        return Loop.from_dict({**settings, "plant": plant, "monitor": monitor}, source=str(path))
 
-    def explained_by(plant: Mapping[str, object]) -> float:
-        fit = inspect(recording, loop_of(plant)).fit
-        return 0.0 if fit is None else fit.explained
-
-    # friction that changes its sign with y itself; what no rigid axis explains is a polynomial in s of its y
-    plant, plant_lines = _propose_speed_axis(explained_by) if is_speed else ({}, ())
-    if not plant:
-        plant, plant_lines = _propose_polynomial(best, explained_by)
-    loop = loop_of(plant)
+    recordings, notes = [recording], []
+    for other in others:
+        try:
+            recordings.append(read(other, loop_of({"kind": "polynomial", "order": 2})))
+        except ServoscopeError as error:
+            notes.append(message("init.left_out", reason=str(error)))
+    assert found.rest is not None, "what has an order has moved"
+    try:
+        candidates = choose_plant(recordings, cutoff, is_speed, found.rest.speed)
+    except NotEnoughError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    chosen = candidates[0]
+    loop = loop_of(chosen.settings)
+    held = []
+    if (speed := advised_rest_speed(inspect(recording, loop), loop)) is not None:
+        speed = float(f"{speed:.2g}")
+        monitor |= {"update_when": "moving", "rest_speed": speed}
+        loop = loop_of(chosen.settings)
+        held = [
+            ProposalLine("monitor", "update_when", '"moving"', message("init.update_when")),
+            ProposalLine("monitor", "rest_speed", repr(speed), message("init.rest_speed")),
+        ]
     lines = (
         ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
         *_column_lines(columns, wraps, recording),
-        *plant_lines,
+        *_plant_lines(chosen),
         ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff")),
         ProposalLine("monitor", "memory", repr(memory), message("init.memory", length=recording.duration_s)),
         ProposalLine("monitor", "frequencies", repr(frequencies), message("init.frequencies")),
+        *held,
     )
-    return LoopProposal(loop, lines)
+    return LoopProposal(loop, lines, candidates, (*notes, *_covariate_notes(path, columns)))
 
 
 def _inspect(recording: Recording, is_speed: bool) -> Inspection:
@@ -157,67 +186,46 @@ def _inspect(recording: Recording, is_speed: bool) -> Inspection:
     return inspect(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
 
 
-def _propose_speed_axis(
-    explained_by: Callable[[Mapping[str, object]], float],
-) -> tuple[Mapping[str, object], tuple[ProposalLine, ...]]:
-    """Return a motor axis whose y is a speed with its lines, nothing where it does not explain u."""
-    plain = SPEED_AXIS | {"terms": ["viscous", "offset"]}
-    shares = [explained_by(plant) for plant in (SPEED_AXIS, plain)]
-    rubs = 1.0 - shares[0] < (1.0 - MIN_FRICTION_GAIN) * (1.0 - shares[1])
-    plant, share = (SPEED_AXIS, shares[0]) if rubs else (plain, shares[1])
-    if share < MIN_CLEAR_SHARE:
-        return {}, ()
-    explained = message("init.axis", share=100.0 * share)
-    return plant, (
-        ProposalLine("plant", "kind", '"axis"', explained),
-        ProposalLine("plant", "y", '"speed"', message("init.speed")),
-        ProposalLine("plant", "terms", json.dumps(plant["terms"]), _friction_reason("coulomb" if rubs else "none")),
-    )
-
-
-def _propose_polynomial(
-    best: ModelOrderFit, explained_by: Callable[[Mapping[str, object]], float]
-) -> tuple[Mapping[str, object], tuple[ProposalLine, ...]]:
-    """Return a polynomial in s with its lines."""
-
-    def plant_of(order: int, stiffness: bool) -> dict[str, object]:
-        known = {"kind": "polynomial", "order": order, "friction": best.friction}
-        return {**known, "stiffness": stiffness, "offset": True}
-
-    order, stiffness, share = best.order, best.stiffness, best.explained
-    # beside friction, a higher order and a stiffness may explain what friction leaves over: the simpler plant is taken
-    for simpler in ((order, False), (order - 1, False)):
-        if simpler[0] and (found := explained_by(plant_of(*simpler))) > share - MIN_TERM_GAIN:
-            order, stiffness, share = *simpler, found
+def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
+    """Return the section on the plant; constant forces are part of each."""
+    share = chosen.explained
     explained = message("init.explained", share=100.0 * share)
-    return plant_of(order, stiffness), (
-        ProposalLine("plant", "kind", '"polynomial"', message("init.kind")),
-        ProposalLine("plant", "order", str(order), explained, share < MIN_CLEAR_SHARE),
-        ProposalLine("plant", "friction", json.dumps(best.friction), _friction_reason(best.friction)),
-        ProposalLine(
-            "plant", "stiffness", json.dumps(stiffness), message("init.stiffness" if stiffness else "init.free")
-        ),
-        ProposalLine("plant", "offset", "true", message("init.offset")),
-    )
+    lines = []
+    for key, value in chosen.settings.items():
+        known = f"init.of_{key}"
+        why = explained if key == "kind" else message(known)
+        lines.append(ProposalLine("plant", key, json.dumps(value), why, key == "kind" and share < MIN_CLEAR_SHARE))
+    return lines
 
 
-def propose(path: str | Path, columns: Columns | None = None) -> tuple[LoopProposal, Inspection]:
-    """Return a loop for a log, and what `inspect` says of the log with this loop.
+def _covariate_notes(path: Path, columns: Columns) -> list[Message]:
+    """Return which other columns may move what is healthy, by their names."""
+    mapped = " ".join([columns.reference, columns.input, *columns.outputs, columns.time or ""])
+    names = [
+        channel.name
+        for channel in list_channels(path, columns.text)
+        if any(stem in channel.name.casefold() for stem in COVARIATE_STEMS)
+        and channel.name not in mapped
+        and channel.min < channel.max
+    ]
+    return [message("init.covariates", names=names)] if names else []
+
+
+def propose(path: str | Path | Sequence[str | Path], columns: Columns | None = None) -> tuple[LoopProposal, Inspection]:
+    """Return a loop for logs, and what `inspect` says of the first one with this loop.
 
     Parameters
     ----------
     path
-        The log.
+        The log, or several of one machine.
     columns
         Where the signals stand; None: as the names of the columns suggest.
 
     Raises RecordingError if the log cannot be read, nothing moves in it, or no name suggests u or y.
     """
-    from servoscope.signals.readers import list_channels
-
-    path = Path(path)
-    proposal = propose_loop(path, columns or propose_columns(path, list_channels(path)))
-    return proposal, inspect(read(path, proposal.loop), proposal.loop)
+    paths = [Path(path)] if isinstance(path, str | Path) else [Path(log) for log in path]
+    proposal = propose_loop(paths, columns or propose_columns(paths[0], list_channels(paths[0])))
+    return proposal, inspect(read(paths[0], proposal.loop), proposal.loop)
 
 
 def _unwrapped_columns(path: Path, columns: Columns) -> tuple[Columns, dict[str, float]]:
@@ -272,7 +280,3 @@ def _column_lines(columns: Columns, wraps: Mapping[str, float], recording: Recor
 
 def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
-
-
-def _friction_reason(friction: str) -> Message:
-    return message("init.no_friction") if friction == "none" else message("init.friction")

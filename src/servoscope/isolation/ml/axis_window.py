@@ -44,6 +44,7 @@ class AxisWindow(ChangeWindow):
     rate: float
 
     systematic = 2e-2  # the terms are simpler than friction is
+    size_error = 2e-2
     follows = True  # healthy recordings differ by more than small changes do
 
     @classmethod

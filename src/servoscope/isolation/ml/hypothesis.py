@@ -181,11 +181,14 @@ class HypothesisEvidence:
     log: float  # logarithm of the integral of likelihood times prior
     intervals: tuple[tuple[float, float], ...]  # 95 % intervals of the logarithms of the ratios, one per fault
 
-    def widen(self, fitted: HypothesisFit, spread: Mapping[str, float]) -> HypothesisEvidence:
-        """Return the same with intervals that hold what is not known of the onset, `spread` by parameter, too."""
+    def widen(self, fitted: HypothesisFit, spread: Mapping[str, float], model_error: float = 0.0) -> HypothesisEvidence:
+        """Return the same with intervals that hold what is not known of the onset, `spread` by parameter, too.
+
+        `model_error`: share of a size, as a logarithm, that a plant simpler than the machine brings.
+        """
         intervals = []
         for name, x, (low, high) in zip(fitted.names, fitted.x, self.intervals, strict=True):
-            more = 1.96 * spread.get(name, 0.0)
+            more = 1.96 * float(np.hypot(spread.get(name, 0.0), model_error * x))
             intervals.append((float(x - np.hypot(x - low, more)), float(x + np.hypot(high - x, more))))
         return replace(self, intervals=tuple(intervals))
 

@@ -350,7 +350,7 @@ class _HypothesisSearch:
         logs = np.append(logs, np.logaddexp.reduce([nothing, *rivals]))
         probability = np.exp(logs - logs.max())
         probability /= probability.sum()
-        told = [e.widen(f, found.size_std) for e, f in zip(told, fitted, strict=True)]
+        told = [e.widen(f, found.size_std, self.window.size_error) for e, f in zip(told, fitted, strict=True)]
         # by their logarithms: under a change that is unknown all probabilities may vanish
         order = np.argsort(-logs[:-1], kind="stable")
         hypotheses = tuple(Hypothesis(fitted[i], told[i], float(probability[i])) for i in order)

@@ -65,6 +65,9 @@ class ChangeWindow(abc.ABC):
 
     stride = 1  # samples of the recording from one of the window to the next
     systematic = 2e-3  # share of a change that nominal parameters may be off by
+    size_error = (
+        0.0  # share of a size, as a logarithm, by which it is off because the plant is simpler than the machine
+    )
     follows = False  # whether the healthy parameters are this recording's own from the first fit on
     coloured = 0  # samples over which what a true hypothesis leaves may hang together; 0: it is white
 

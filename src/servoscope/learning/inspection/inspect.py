@@ -171,7 +171,7 @@ def _measure_with_model(
     g = model_order.form_regressors(recording, generic)
     v = g.phi[:, 1 if loop is None else 1 - loop.plant.derivative]
     at_rest, rest = signals.detect_rest(recording, v, noise * math.sqrt(own_rate**3 / (32.0 * rate)))
-    moving = _motion_mask(g, at_rest)
+    moving = motion_mask(g, at_rest)
     block = settling_samples(cutoff, 4, 1.0 / rate)
     orders, best = model_order.select_order(g, g.ok & moving, block)
     m = m.model_copy(
@@ -242,7 +242,7 @@ def _suggested_cutoff(spectra: Spectra | None, coherent: float | None, noise: fl
     return float(f"{min(max(edge, 4.0 * float(spectra.f[0])), rate / 10.0):.3g}")
 
 
-def _motion_mask(g: Regressors, at_rest: BoolArray) -> BoolArray:
+def motion_mask(g: Regressors, at_rest: BoolArray) -> BoolArray:
     """Return where neither the output rests nor the filters remember a rest, if enough is left then."""
     last = np.where(at_rest, np.arange(at_rest.size), -g.bank.wait - 1)
     moving = np.arange(at_rest.size) - np.maximum.accumulate(last) > g.bank.wait

@@ -115,13 +115,9 @@ def _recommendations(m: InspectionMeasurements, loop: Loop | None) -> Iterator[M
             yield _inspection("set_delay", delay_s=d.seconds)
         elif d.samples is not None and d.samples < -DELAY_TOLERANCE:
             yield _inspection("log_u_earlier")
-    excess = (1.0 - m.fit.explained_ungated) / max(1.0 - m.fit.explained, 1e-12)
-    gated = loop is not None and loop.monitor.update_when == "moving"
-    sticks = m.dead_zone is not None or (excess > 1.3 and m.fit.explained_ungated < 0.99)
-    if m.rest is not None and not gated and sticks:
+    if (speed := advised_rest_speed(m, loop)) is not None:
         simulated = loop is not None and loop.plant.has_physics and loop.controller is not None
-        short_rests = None if simulated else _inspection("short_rests")
-        yield _inspection("set_update_when", speed=m.rest.speed, short_rests=short_rests)
+        yield _inspection("set_update_when", speed=speed, short_rests=None if simulated else _inspection("short_rests"))
     if m.dead_zone is not None and (loop is None or loop.input_deadzone is None):
         yield _inspection("set_dead_zone", low=m.dead_zone.low, high=m.dead_zone.high)
     if m.saturation is not None and m.saturation.source == "seen":
@@ -139,6 +135,15 @@ def _recommendations(m: InspectionMeasurements, loop: Loop | None) -> Iterator[M
         yield _inspection("log_finer", signals=coarse)
     if m.residual is not None and m.residual.period_s is None:
         yield _inspection("record_repeating")
+
+
+def advised_rest_speed(m: InspectionMeasurements, loop: Loop | None) -> float | None:
+    """Return the speed below which the estimator should hold, None where rest does no harm or is left out already."""
+    if m.rest is None or m.fit is None or (loop is not None and loop.monitor.update_when == "moving"):
+        return None
+    excess = (1.0 - m.fit.explained_ungated) / max(1.0 - m.fit.explained, 1e-12)
+    sticks = m.dead_zone is not None or (excess > 1.3 and m.fit.explained_ungated < 0.99)
+    return m.rest.speed if sticks else None
 
 
 def _memory_s(loop: Loop | None) -> float:

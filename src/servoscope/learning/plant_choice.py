@@ -1,0 +1,260 @@
+"""Which plant explains u: polynomials in s and motor axes, judged by rows that they were not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.errors import NotEnoughError
+from servoscope.learning.inspection import model_order, signals
+from servoscope.learning.inspection.inspect import motion_mask
+from servoscope.models.loop import Loop, MonitorSettings
+from servoscope.models.plants.axis import TERMS, AxisPlant
+from servoscope.signals import Recording
+
+MIN_FOLDS = 6  # of which each is left out once: a recording, or a piece of one
+MIN_ROWS_PER_COLUMN = 10  # in motion, of all recordings
+ROWS_PER_PERIOD = 40.0  # of the cutoff, beyond which neighbouring rows repeat each other
+BLOCK_S = 1.0  # of which the squared residuals are counted as one
+MIN_GAIN = 0.03  # share of what is left of u that one more coefficient has to take away
+MIN_SHARE = 2e-5  # and of u
+# share of u that each of these has to explain: they imitate what a sign that comes late leaves of friction
+IMITATORS = {"stiffness": 0.005, "stribeck": 0.005, "order 3": 0.005}
+MIN_SINE_RANGE_RAD = 0.5  # half of the range of y [rad], from which a sine differs from a straight line
+STRIBECK_SHARE = 0.2  # of the rms speed, at which Stribeck friction may have fallen to a half
+MIN_ANGLE_RAD = 0.02  # off 0, from which it is said where a weight hangs
+MIN_ANGLE_STDS = 3.0
+AXIS_POWERS = "stiffness", "viscous_friction", "inertia"
+AXIS_TERMS = "stiffness", "viscous_by_direction", "coulomb", "stribeck", "offset"
+SWING_TERMS = "gravity", "load_friction", "cogging"  # a cogging of period 2 pi tells where the weight hangs
+
+
+@dataclass(frozen=True, eq=False)
+class PlantCandidate:
+    """A plant, and what it explains of u on rows that it was not fitted to."""
+
+    settings: Mapping[str, object]  # the table ``[plant]``
+    explained: float  # share of the variance of u, constant forces aside
+    squares: FloatArray  # of the residual over the variance of u, by block
+    coefficients: int
+    plausible: bool  # whether inertia and frictions are positive, as far as the plant has them
+
+    @property
+    def worth(self) -> float:
+        """What it explains, less what its terms may explain by imitating friction."""
+        return self.explained - sum(share for word, share in IMITATORS.items() if word in self.words)
+
+    @property
+    def words(self) -> str:
+        """Return the terms of an axis, or what the polynomial is made of."""
+        s = self.settings
+        if s["kind"] == "axis":
+            terms = s["terms"]
+            assert isinstance(terms, list)
+            return f"axis: {', '.join(terms)}"
+        parts = [f"order {s['order']}", *["stiffness"] * bool(s["stiffness"]), *["coulomb"] * (s["friction"] != "none")]
+        return f"polynomial: {', '.join(parts)}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Fold:
+    """Rows of one recording, the mean of each column taken off: a constant force is its own."""
+
+    eta: FloatArray  # (N,)
+    columns: Mapping[str, FloatArray]
+    blocks: npt.NDArray[np.int_]  # first row of each block
+
+    def matrix(self, names: Sequence[str]) -> FloatArray:
+        return np.column_stack([self.columns[name] for name in names])
+
+
+def choose_plant(
+    recordings: Sequence[Recording], cutoff: float, is_speed: bool, rest_speed: float
+) -> tuple[PlantCandidate, ...]:
+    """Return plants, the supported one first, the others by what they explain of u.
+
+    Each is fitted by least squares to all folds but one and judged by that one (Stone, 1974). Of those that are worse
+    than the best by no more than a standard error (Breiman, Friedman, Olshen and Stone, 1984), or by no more than what
+    their missing coefficients have to be worth, that of fewest coefficients is supported.
+
+    Raises NotEnoughError where the recordings hardly move.
+    """
+    half = 0.5 * max(float(np.ptp(recording.y)) for recording in recordings)
+    swings = half > MIN_SINE_RANGE_RAD and not is_speed
+    rate = recordings[0].sample_rate
+    speed = max(_rms_speed(recording, is_speed) for recording in recordings)
+    stribeck = float(f"{STRIBECK_SHARE * speed:.2g}")
+    used = [_rows_in_motion(recording, cutoff, is_speed, rest_speed) for recording in recordings]
+
+    def folds(loop: Loop) -> list[_Fold]:
+        return [
+            fold
+            for recording, rows in zip(recordings, used, strict=True)
+            for fold in _cut(model_order.form_regressors(recording, loop), rows, cutoff, len(recordings))
+        ]
+
+    axis = {"kind": "axis", "y": "speed" if is_speed else "position", "stribeck_speed": stribeck}
+    hanging_at = 0.0
+    of_axis = folds(_loop(rate, cutoff, _rich_axis(axis, swings, hanging_at)))
+    if swings:
+        hanging_at = _hanging_angle(of_axis)
+        if hanging_at:
+            of_axis = folds(_loop(rate, cutoff, _rich_axis(axis, swings, hanging_at)))
+    generic = model_order.generic_loop(rate, cutoff)
+    powers = generic.plant.names[: len(generic.plant.powers)]
+    # what an axis can have is compared in the filters of an axis, so that equal plants are equal to the last bit
+    plants = [(*plant, of_axis) for plant in _axes(axis, swings, hanging_at)]
+    plants += [(*plant, of_axis) for plant in _polynomials(AXIS_POWERS[is_speed:])]
+    of_generic = folds(generic)
+    of_higher_order = [plant for plant in _polynomials(powers) if plant[0]["order"] > 2 - is_speed]
+    plants += [(*plant, of_generic) for plant in of_higher_order]
+    candidates = [candidate for plant in plants if (candidate := _judge(*plant)) is not None]
+    plausible = [candidate for candidate in candidates if candidate.plausible]
+    if not plausible:
+        raise NotEnoughError("it moves too little to compare plants: record a livelier or longer motion")
+    best = max(plausible, key=lambda candidate: candidate.worth)
+    supported = min(
+        (candidate for candidate in plausible if _is_as_good(candidate, best)),
+        key=lambda candidate: (*_simplicity(candidate, swings), -candidate.worth),
+    )
+    others = sorted(candidates, key=lambda candidate: -candidate.explained)
+    return supported, *(candidate for candidate in others if candidate is not supported)
+
+
+def _is_as_good(candidate: PlantCandidate, best: PlantCandidate) -> bool:
+    more = 0.0
+    if len(candidate.squares) == len(best.squares):
+        difference = candidate.squares - best.squares
+        more = float(np.sqrt(len(difference)) * difference.std())
+    excess = best.worth - candidate.worth
+    saved = best.coefficients - candidate.coefficients
+    return excess <= max(more, ((1.0 + MIN_GAIN) ** saved - 1.0) * (1.0 - best.explained), MIN_SHARE * saved)
+
+
+def _simplicity(candidate: PlantCandidate, swings: bool) -> tuple[int, bool, bool]:
+    """Return what is compared of plants that explain alike: what swings hangs on a weight more often than on a spring.
+
+    Faults of an axis have names and its refit; what a spring holds without friction is a linear system of order 2.
+    """
+    settings = candidate.settings
+    terms, polynomial = settings.get("terms", []), settings["kind"] == "polynomial"
+    assert isinstance(terms, list)
+    spring = "stiffness" in terms or settings.get("stiffness") is True
+    rubs = "coulomb" in terms or settings.get("friction") == "coulomb"
+    return candidate.coefficients, swings and spring, polynomial == (rubs or not spring)
+
+
+def _rich_axis(axis: Mapping[str, object], swings: bool, hanging_at: float) -> dict[str, object]:
+    terms = [term for term in AXIS_TERMS if term != "stiffness" or axis["y"] == "position"]
+    swing = {"period": 2.0 * np.pi, "hanging_at": hanging_at} if swings else {}
+    return {**axis, **swing, "terms": [*terms, *(SWING_TERMS if swings else ())]}
+
+
+def _loop(rate: float, cutoff: float, plant: Mapping[str, object]) -> Loop:
+    sign = {"sign_cutoff": min(model_order.FAST_SIGN, rate / 4.0)}
+    monitor = MonitorSettings(cutoff=cutoff, evaluation_rate=min(10.0, rate), frequencies=(rate / 10.0,))
+    return Loop(name="axis", sample_rate=rate, plant=AxisPlant.model_validate({**plant, **sign}), monitor=monitor)
+
+
+def _axes(
+    axis: Mapping[str, object], swings: bool, hanging_at: float
+) -> Iterator[tuple[dict[str, Any], tuple[str, ...]]]:
+    """Yield axes with the names of their columns."""
+    viscous: tuple[tuple[str, ...], ...] = ("viscous",), ("viscous_by_direction",)
+    dry: tuple[tuple[str, ...], ...] = (), ("coulomb",), ("coulomb", "stribeck")
+    swing = (("gravity",), ("gravity", "load_friction")) if swings else ()
+    position: tuple[tuple[str, ...], ...] = ((),) if axis["y"] == "speed" else ((), ("stiffness",), *swing)
+    for terms in product(viscous, dry, position):
+        chosen = [term for group in terms for term in group]
+        settings: dict[str, Any] = {"kind": "axis"} | ({"y": "speed"} if axis["y"] == "speed" else {})
+        settings["terms"] = [*chosen, "offset"]
+        if "stribeck" in chosen:
+            settings["stribeck_speed"] = axis["stribeck_speed"]
+        if "gravity" in chosen and hanging_at:
+            settings["hanging_at"] = hanging_at
+        names = [column.coefficient for term in chosen for column in TERMS[term]]
+        yield settings, ("inertia", *names)
+
+
+def _polynomials(names: Sequence[str]) -> Iterator[tuple[dict[str, Any], tuple[str, ...]]]:
+    """Yield polynomials in s with the names of their columns; `names`: those of the powers."""
+    for order, stiffness, friction in product(range(1, len(names)), (False, True), ("none", "coulomb")):
+        settings = {"kind": "polynomial", "order": order, "friction": friction, "stiffness": stiffness, "offset": True}
+        rub = ["coulomb_friction"] * (friction == "coulomb")
+        yield settings, (*names[0 if stiffness else 1 : order + 1], *rub)
+
+
+def _judge(settings: dict[str, object], names: tuple[str, ...], folds: Sequence[_Fold]) -> PlantCandidate | None:
+    """Fit a plant to all folds but one, predict that one; None where there are too few rows."""
+    axis = settings["kind"] == "axis"
+    made = [fold.matrix(names) for fold in folds]
+    if sum(map(len, made)) < MIN_ROWS_PER_COLUMN * len(names):
+        return None
+    products = [(X.T @ X, X.T @ fold.eta) for X, fold in zip(made, folds, strict=True)]
+    A, c = (np.sum(parts, axis=0) for parts in zip(*products, strict=True))
+    size = np.sqrt(np.diag(A))
+    if not size.all():
+        return None
+
+    def solve(A: FloatArray, c: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.lstsq(A / np.outer(size, size), c / size, rcond=1e-12)[0] / size)
+
+    whole = sum(float(fold.eta @ fold.eta) for fold in folds)
+    squares = []
+    for X, fold, (a, b) in zip(made, folds, products, strict=True):
+        left = fold.eta - X @ solve(A - a, c - b)
+        squares.append(np.add.reduceat(left**2, fold.blocks) / whole)
+    together = np.concatenate(squares)
+    theta = dict(zip(names, solve(A, c), strict=True))
+    signed = {column.coefficient for columns in TERMS.values() for column in columns if column.signed}
+    plausible = not axis or all(value > 0.0 for name, value in theta.items() if name not in signed)
+    return PlantCandidate(settings, 1.0 - float(together.sum()), together, len(names), plausible)
+
+
+def _cut(g: model_order.Regressors, used: BoolArray, cutoff: float, recordings: int) -> Iterator[_Fold]:
+    """Yield the folds of a recording: itself where there are many, else pieces of it."""
+    every = max(1, int(g.loop.sample_rate / (ROWS_PER_PERIOD * cutoff)))
+    rows = np.flatnonzero(g.ok & used)[::every]
+    pieces = 1 if recordings >= MIN_FOLDS else -(-MIN_FOLDS // recordings)
+    block = round(BLOCK_S * g.loop.sample_rate / every)
+    for part in np.array_split(rows, pieces):
+        columns = dict(zip(g.bank.names, (g.phi[part] - g.phi[part].mean(axis=0)).T, strict=True))
+        if "viscous_friction_forward" in columns:  # one coefficient for both directions
+            columns["viscous_friction"] = columns["viscous_friction_forward"] + columns["viscous_friction_backward"]
+        yield _Fold(g.eta[part] - g.eta[part].mean(), columns, np.arange(0, len(part), max(1, min(block, len(part)))))
+
+
+def _hanging_angle(folds: Sequence[_Fold]) -> float:
+    """Return where a weight hangs [rad], 0 where that is as likely."""
+    names = "inertia", "viscous_friction", "coulomb_friction", "cogging_cos", "gravity"
+
+    def angle(some: Sequence[_Fold]) -> float:
+        X, e = np.vstack([fold.matrix(names) for fold in some]), np.concatenate([fold.eta for fold in some])
+        cosine, sine = np.linalg.lstsq(X, e, rcond=None)[0][-2:]
+        return float(np.arctan2(-cosine, sine))
+
+    whole = angle(folds)
+    without = [angle([*folds[:k], *folds[k + 1 :]]) for k in range(len(folds))]
+    off = (np.array(without) - whole + np.pi) % (2.0 * np.pi) - np.pi
+    std = float(np.sqrt((len(folds) - 1) * np.mean(off**2)))  # the jackknife's (Tukey, 1958)
+    return round(whole, 3) if abs(whole) > max(MIN_ANGLE_RAD, MIN_ANGLE_STDS * std) else 0.0
+
+
+def _rms_speed(recording: Recording, is_speed: bool) -> float:
+    if is_speed:
+        return float(np.sqrt(np.mean(recording.y**2)))
+    steps = np.diff(recording.y)[~recording.restart[1:]] * recording.sample_rate
+    return float(np.sqrt(np.mean(steps**2)))
+
+
+def _rows_in_motion(recording: Recording, cutoff: float, is_speed: bool, rest_speed: float) -> BoolArray:
+    """Return where the output neither rests nor the filters remember a rest, shape (N,)."""
+    g = model_order.form_regressors(recording, model_order.generic_loop(recording.sample_rate, cutoff))
+    at_rest, _ = signals.detect_rest(recording, g.phi[:, 1 - is_speed], rest_speed / 3.0)
+    return g.ok & motion_mask(g, at_rest)
