@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import chaos
 import pytest
-from reliability import chaos
 from reliability.plc import SCRIPT
 from reliability.servers import mosquitto
 

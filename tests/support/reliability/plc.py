@@ -1,6 +1,6 @@
 """OPC UA servers whose assets write blocks as a PLC would: processes of their own, to be killed.
 
-    python benchmarks/reliability/plc.py SETTINGS
+    python tests/support/reliability/plc.py SETTINGS
 
 One is asyncua's (this file), one node-opcua's (`tests/support/opcua_server/blocks.js`), both with the same settings,
 a JSON file. Which block is written depends on the clock alone, so that those of the time while it is dead are never
@@ -20,9 +20,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
+SUPPORT = Path(__file__).resolve().parent.parent
 if __name__ == "__main__":
-    sys.path[0] = str(BENCHMARKS)
+    sys.path[0] = str(SUPPORT)
 
 from reliability.fleet import LOOP, Fleet  # noqa: E402
 from servoscope.models.loop import Loop  # noqa: E402
@@ -33,7 +33,7 @@ __all__ = ["STACKS", "Plc", "tape"]
 
 REMEMBERED = 60  # blocks of each asset in the server's history, which dies with it
 STACKS = {"asyncua": 2, "node": 1}  # and the namespace of its nodes
-SCRIPT = BENCHMARKS.parent / "tests" / "support" / "opcua_server" / "blocks.js"
+SCRIPT = SUPPORT / "opcua_server" / "blocks.js"
 
 
 def tape(fleet: Fleet) -> ReplayStream:
