@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from servoscope.core.workers import Progress, WorkerError, WorkerGroup
+from servoscope.core.workers import Progress, WorkerError, Workers
 from servoscope.fleet.tasks import ExamineTask, LearnTask
 
 Task = LearnTask | ExamineTask
@@ -20,7 +20,7 @@ def local(jobs: int) -> Engine:
         if jobs == 1:
             yield from ((task, task.run()) for task in tasks)
             return
-        for task, result in WorkerGroup().map(f"{__name__}:run_task", tasks, jobs):
+        for task, result in Workers().map(f"{__name__}:run_task", tasks, jobs):
             yield task, crash_result(task) if isinstance(result, WorkerError) else result
 
     return run

@@ -6,12 +6,12 @@ import mmap
 import os
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 from servoscope.core.errors import MessageError, OutputError
 from servoscope.core.files import atomic_write
-from servoscope.core.workers import ProcessLimits, Worker, WorkerError
+from servoscope.core.workers import ProcessLimits, WorkerError, Workers
 from servoscope.service.log import log
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
@@ -79,17 +79,16 @@ class MessageGuard:
 
     def _try(self, topic: str, content: bytes) -> str:
         """Return why a message cannot be decoded within the limits; empty: it can, whatever comes of it."""
-        worker = Worker(TRIAL_LIMITS)
-        try:
-            worker.run(TASK, *self._mapping, "", b"")  # imports what it needs, which may take its time
+        with closing(Workers(TRIAL_LIMITS)) as workers:
             try:
-                worker.run(TASK, *self._mapping, topic, content, timeout_s=TRIAL_S)
+                workers.run(TASK, *self._mapping, "", b"")  # imports what it needs, which may take its time
+            except WorkerError as error:
+                log("error", "no process to try a message in", why=str(error))
+                return ""
+            try:
+                workers.run(TASK, *self._mapping, topic, content, timeout_s=TRIAL_S)
             except WorkerError as error:
                 return str(error)
-        except WorkerError as error:
-            log("error", "no process to try a message in", why=str(error))
-        finally:
-            worker.stop()
         return ""
 
     def _set_aside(self, mark: int, topic: str, content: bytes, why: str) -> MessageError:
