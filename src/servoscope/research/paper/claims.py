@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.resources import files
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ class Claim:
     place: str  # where it stands in the paper
     claim: str  # what the paper says
     measured: str  # the numbers, medians over the seeds with quartiles in brackets
-    verdict: Literal["holds", "holds partly", "does not hold"]  # follows from the numbers by the rule in `RULES`
+    verdict: str  # holds, holds partly, does not hold: follows from the numbers by the rule in `RULES`
     why: str  # what is behind it
     numbers: dict[str, tuple[float, float, float]]  # name -> lower quartile, median, upper quartile
 
