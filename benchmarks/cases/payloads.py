@@ -23,7 +23,7 @@ from servoscope.service.mqtt.payload import decode_block, encode_json
 from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import Message, Transport
+from servoscope.service.sources.message import InboxMessage, Transport
 
 SAMPLES, RATE, ROUNDS = 10_000, 100.0, 3
 FORMS: dict[str, dict[str, Any]] = {
@@ -50,7 +50,7 @@ class Given(Transport):
 
     def __init__(self, messages: list[tuple[str, bytes]]) -> None:
         super().__init__()
-        self.waiting.extend(Message(topic, content, 0.0) for topic, content in messages)
+        self.waiting.extend(InboxMessage(topic, content, 0.0) for topic, content in messages)
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Receive nothing more."""

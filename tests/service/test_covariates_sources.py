@@ -35,9 +35,10 @@ from servoscope.models.loop import Columns
 from servoscope.service.kafka.source import KafkaSourceSettings
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.opcua.settings import OpcuaNodes
-from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
-from servoscope.service.sources.base import BlockSource, RejectionCounter, SourceAsset
+from servoscope.service.opcua.source import OpcuaSourceSettings
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block
+from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.resample import Resampler
 from servoscope.signals import clean, writers
 
@@ -145,7 +146,7 @@ def test_a_thermometer_whose_clock_is_set_back_is_believed() -> None:
         assert made.values[:, -1].tolist() == [value, value]
 
 
-def collect(source: BlockSource, blocks: int) -> list[Block]:
+def collect(source: Inbox, blocks: int) -> list[Block]:
     found: list[Block] = []
     until(lambda: (found.extend(source.poll(100)), len(found) >= blocks)[1], 60.0)
     source.close()
@@ -172,7 +173,7 @@ def test_kafka_carries_them(tmp_path: Path) -> None:
 
 def received(settings: OpcuaSourceSettings, nodes: OpcuaNodes, count: int) -> list[Block]:
     """Return the first blocks of an asset whose loop names one covariate, oil."""
-    source = OpcuaSource(settings, source_assets(nodes, RATE, ("oil",)), Path())
+    source = settings.create("hall.line", source_assets(nodes, RATE, ("oil",)), Path())
     source.open({})
     return collect(source, count)
 

@@ -27,10 +27,9 @@ from servoscope.core.workers import WorkerError
 from servoscope.service.mapping import sparkplug
 from servoscope.service.mapping.influx import parse_lines
 from servoscope.service.mapping.paths import MAX_ROWS, MAX_TEXT_CHARS, NAME, TextPattern
-from servoscope.service.mapping.rows import MAX_BAD_ROWS, MessageMapping
+from servoscope.service.mapping.rows import MAX_BAD_ROWS, TASK, MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder, payload_class
-from servoscope.service.mapping.rows import TASK
 from servoscope.service.sources import guard as guarding
 from servoscope.service.sources.guard import MessageGuard
 

@@ -27,8 +27,8 @@ from servoscope.service.mapping.paths import RowPath, TextPattern, find
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder, encode_rebirth, payload_class
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources import inbox as inbox_module
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
 from servoscope.signals.readers import read
 

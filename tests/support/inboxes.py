@@ -13,7 +13,7 @@ from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import Message, Transport
+from servoscope.service.sources.message import InboxMessage, Transport
 
 STUB = SourceAsset(SimpleNamespace(columns=SimpleNamespace(covariates={}), sample_rate=100.0), None)  # type: ignore[arg-type]
 
@@ -51,5 +51,5 @@ class HandInbox(Inbox):
 
     def add(self, address: str, content: bytes, release: Callable[[], Any], *, old: bool = False) -> None:
         """Take a message, and all that it leads to."""
-        self.transport.waiting.append(Message(address, content, time.monotonic(), release, old))
+        self.transport.waiting.append(InboxMessage(address, content, time.monotonic(), release, old))
         self.poll(0)

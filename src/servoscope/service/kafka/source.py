@@ -19,10 +19,11 @@ from servoscope.service.log import log
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.network import TlsSettings
-from servoscope.service.sources.base import RejectionCounter, SourceAsset, SourceSettings
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import Message, Transport
+from servoscope.service.sources.message import InboxMessage, Transport
+from servoscope.service.sources.settings import SourceSettings
 
 FETCH_S = 0.2  # how long one call of the client waits for messages
 SESSION_MS = 6000  # after a kill so long, the brokers give our partitions away, to our next process as well
@@ -190,7 +191,7 @@ class KafkaTransport(Transport):
             self._settle(offsets, offset)
         else:
             release = partial(self._settle, offsets, offset)
-            self.waiting.append(Message(address, content, time.monotonic(), release))
+            self.waiting.append(InboxMessage(address, content, time.monotonic(), release))
 
     def _settle(self, offsets: _PartitionOffsets, offset: int) -> None:
         with self._lock:

@@ -29,7 +29,7 @@ from servoscope.service.mqtt.payload import parse_json
 from servoscope.service.sources.assembly import SIGNALS
 from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import MAX_TIME_S
-from servoscope.service.sources.message import Content, Decoder, Message, SignalValue
+from servoscope.service.sources.message import Content, Decoder, InboxMessage, SignalValue
 from servoscope.signals.readers.clock import ZoneOffset
 
 PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts
@@ -124,7 +124,7 @@ class MessageMapping(Decoder):
         """Return what the names of the first pattern that fits stand for."""
         return next((found for one in self._topics if (found := one.match(topic)) is not None), None)
 
-    def decode(self, message: Message) -> Content:
+    def decode(self, message: InboxMessage) -> Content:
         """Return the values of a message; what has no time stamp was measured when it came."""
         return self.read(message.address, message.content, time.time() - (time.monotonic() - message.at))
 

@@ -33,7 +33,7 @@ from servoscope.core.errors import MessageError
 from servoscope.service.mqtt.topics import data_topic, parse_asset
 from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import MAX_COUNT, MAX_TIME_S, Block
-from servoscope.service.sources.message import Content, Decoder, Message
+from servoscope.service.sources.message import Content, Decoder, InboxMessage
 
 MAGIC, VERSION = b"SVSB", 1
 HEADER = struct.Struct("<4sBBHII")
@@ -262,14 +262,14 @@ class BlockMessages(Decoder):
         asset = parse_asset(address)
         return asset if asset in self._covariates else ""
 
-    def decode(self, message: Message) -> Content:
+    def decode(self, message: InboxMessage) -> Content:
         """Return the block of one message; `decode_all` takes less time for each of many."""
         asset = parse_asset(message.address)
         if asset not in self._covariates:
             raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
         return Content(blocks=(decode_block(asset, message.content, message.at, self._covariates[asset]),))
 
-    def decode_all(self, messages: Sequence[Message]) -> Iterator[Content | MessageError]:
+    def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
         """Yield the block of each message, or why it is none."""
         assets = [parse_asset(one.address) for one in messages]
         if not self._covariates.keys() >= set(assets):

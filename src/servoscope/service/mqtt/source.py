@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -17,10 +17,11 @@ from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mqtt import topics
 from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_bulk_client
 from servoscope.service.mqtt.payload import BlockMessages
-from servoscope.service.sources.base import RejectionCounter, SourceAsset, SourceSettings
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import Decoder, Message, Transport
+from servoscope.service.sources.message import Decoder, InboxMessage, Transport
+from servoscope.service.sources.settings import SourceSettings
 
 if TYPE_CHECKING:
     from servoscope.service.mqtt.paho_clients import ReceivedMessage
@@ -150,9 +151,9 @@ class MqttTransport(Transport):
                     return
         # of blocks the latency counts from when the socket was last seen empty: it came after that
         at = self._client.empty_at if self.settings.payload is None else time.monotonic()
-        self.waiting.append(Message(topic, content, at, delivery, retain))
+        self.waiting.append(InboxMessage(topic, content, at, delivery, retain))
 
-    def receive(self, most: int) -> list[Message]:
+    def receive(self, most: int) -> Sequence[InboxMessage]:
         """Return messages in the order in which they came."""
         with self._lock:
             messages = super().receive(most)

@@ -8,6 +8,7 @@ import time
 import zlib
 from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from servoscope.core.errors import MessageError
@@ -16,10 +17,10 @@ from servoscope.core.messages import render
 from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.log import log
 from servoscope.service.sources.assembly import AssetStream, Receipt
-from servoscope.service.sources.base import BlockSource, RejectionCounter, SourceAsset
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.guard import MessageGuard
-from servoscope.service.sources.message import Content, Decoder, Message, SignalValue, Transport
+from servoscope.service.sources.message import Content, Decoder, InboxMessage, SignalValue, Transport
 
 MAX_QUIET_S = 2.0  # without a message of an asset for so long, what has come of it is made a block, however short
 MAX_TURN_S = 0.25  # that messages are decoded at once: then it is the turn of other sources
@@ -34,8 +35,11 @@ class _UnstoredBlock(NamedTuple):
     receipts: list[Receipt]
 
 
-class Inbox(BlockSource):
+class Inbox:
     """Makes blocks of the messages of some assets; one thread calls it.
+
+    The service polls: one that cannot keep up, or cannot store, stops polling. Blocks that it has polled and not
+    acknowledged are returned again after a restart.
 
     A message is released when every sample of it is in a block that is stored, or was refused and counted.
 
@@ -59,11 +63,12 @@ class Inbox(BlockSource):
         rejections: RejectionCounter | None = None,
         in_flight: int = 10**9,
     ) -> None:
-        super().__init__()
-        self.rejections = rejections or self.rejections
+        self.rejections = rejections or RejectionCounter()  # what came and could not be used
         self.transport, self.decoder, self._assets = transport, decoder, assets
         self._in_flight, self.clock_rate = in_flight, transport.clock_rate
         transport.bind(decoder, self.rejections)
+        # where messages in hand are noted, so that they survive the process; set before `open`. None: nowhere
+        self.state_file: Path | None = None
         self._guard: MessageGuard | None = None
         self._resume: Mapping[str, ResumePosition] = {}
         self._streams: dict[str, AssetStream] = {}  # of the assets that single values have come of
@@ -88,7 +93,7 @@ class Inbox(BlockSource):
         self.transport.open(resume)
 
     @property
-    def connected(self) -> bool:  # type: ignore[override]  # others set it
+    def connected(self) -> bool:
         """Whether the transport is connected."""
         return self.transport.connected
 
@@ -111,19 +116,10 @@ class Inbox(BlockSource):
         return {**own, **self.transport.update_intervals_s}
 
     @property
-    def layer_seconds(self) -> Mapping[str, float]:
-        """Processor time of the transport's thread so far, by layer [s]."""
-        return self.transport.layer_seconds
-
-    @property
     def pause_s(self) -> float:
         """How long an asset may pause without being silent [s]; infinite while something may be on its way."""
         is_due = self.transport.pause_s > 0.0 and self.next_block_s == 0.0
         return math.inf if is_due else self.transport.pause_s
-
-    def preview(self) -> Sequence[str]:
-        """Return what the transport would do, line by line."""
-        return self.transport.preview()
 
     @property
     def next_block_s(self) -> float:
@@ -162,7 +158,7 @@ class Inbox(BlockSource):
             quiet_s = max(MAX_QUIET_S, 2.0 * self.decoder.block_s)
             self._flush(math.inf if is_full else time.monotonic() - quiet_s)
 
-    def _take(self, messages: Sequence[Message]) -> Iterator[bool]:
+    def _take(self, messages: Sequence[InboxMessage]) -> Iterator[bool]:
         """Take messages one by one, and block by block; yield whether to go on now."""
         decode = self._decode_guarded if self._guard is not None else self.decoder.decode_all
         found = decode(messages)
@@ -187,7 +183,7 @@ class Inbox(BlockSource):
             receipt.release()
             yield True
 
-    def _decode_guarded(self, messages: Sequence[Message]) -> Iterator[Content | MessageError | None]:
+    def _decode_guarded(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError | None]:
         """Yield what each message holds, or why it is refused; None while one is tried in another process."""
         assert self._guard is not None
         for message in messages:
@@ -230,7 +226,7 @@ class Inbox(BlockSource):
             self._streams[asset] = stream
         return stream
 
-    def _take_values(self, message: Message, content: Content, receipt: Receipt) -> None:
+    def _take_values(self, message: InboxMessage, content: Content, receipt: Receipt) -> None:
         """Take single values, and that assets are gone."""
         if message.is_old and not self.decoder.is_dated:
             why = "the broker had kept it, and it does not say when it was sent"
@@ -298,6 +294,6 @@ class Inbox(BlockSource):
         self.transport.close()
 
 
-def _mark(message: Message) -> int:
+def _mark(message: InboxMessage) -> int:
     """Return the number by which a message is known."""
     return MARK | zlib.crc32(message.content, zlib.crc32(message.address.encode()))

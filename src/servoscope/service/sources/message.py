@@ -14,14 +14,14 @@ from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
 
 POLL_S = 0.02  # between two looks at a transport whose messages come from a thread of its own
-NOTHING: Mapping[str, Any] = MappingProxyType({})
+NOTHING: Mapping[Any, Any] = MappingProxyType({})
 
 
 def _forget() -> None:
     """Release nothing: the transport keeps no messages."""
 
 
-class Message(NamedTuple):
+class InboxMessage(NamedTuple):
     """What a transport has received; `address`: from where."""
 
     address: str
@@ -71,10 +71,10 @@ class Decoder(ABC):
         return ""
 
     @abstractmethod
-    def decode(self, message: Message) -> Content:
+    def decode(self, message: InboxMessage) -> Content:
         """Return what a message holds; raises MessageError if nothing of it can be used."""
 
-    def decode_all(self, messages: Sequence[Message]) -> Iterator[Content | MessageError]:
+    def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
         """Yield what each message holds, or why nothing of it can be used."""
         for message in messages:
             try:
@@ -100,7 +100,7 @@ class Transport(ABC):
     pause_s = 0.0  # how long an asset may pause without being silent [s]
 
     def __init__(self) -> None:
-        self.waiting = deque[Message]()
+        self.waiting = deque[InboxMessage]()
 
     def bind(self, decoder: Decoder, rejections: RejectionCounter) -> None:
         """Take who decodes its messages, and who counts those that it does not keep; before `open`."""
@@ -118,7 +118,7 @@ class Transport(ABC):
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Begin to receive, now or as soon as there is a connection."""
 
-    def receive(self, most: int) -> Sequence[Message]:
+    def receive(self, most: int) -> Sequence[InboxMessage]:
         """Return up to so many messages in the order in which they came; at once."""
         return [self.waiting.popleft() for _ in range(min(most, len(self.waiting)))]
 
@@ -144,6 +144,6 @@ class Transport(ABC):
 class BlockDecoder(Decoder):
     """For transports whose messages are blocks already."""
 
-    def decode(self, message: Message) -> Content:
+    def decode(self, message: InboxMessage) -> Content:
         """Return the block."""
         return Content(blocks=(message.content,))
