@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from tables import Table, parser, show
 
-from servoscope.service.mapping.collector import MessageCollector
+from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import payload_class
 from servoscope.service.mqtt.payload import decode_block, encode_json
 from servoscope.service.sources.base import RejectionCounter, SourceAsset
-from servoscope.service.sources.block import Block
+from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import InboxMessage, Transport
 
 SAMPLES, RATE, ROUNDS = 10_000, 100.0, 3
 FORMS: dict[str, dict[str, Any]] = {
@@ -41,6 +43,20 @@ WORDS = {
     "sparkplug": "a row in a message, Sparkplug B with aliases",
     "blocks": "a block of our own, 100 samples, JSON",
 }
+
+
+class Given(Transport):
+    """Has received some messages, topics and contents, already."""
+
+    def __init__(self, messages: list[tuple[str, bytes]]) -> None:
+        super().__init__()
+        self.waiting.extend(InboxMessage(topic, content, 0.0) for topic, content in messages)
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Receive nothing more."""
+
+    def close(self) -> None:
+        """Stop."""
 
 
 def write(form: str, rows: np.ndarray) -> list[tuple[str, bytes]]:
@@ -94,19 +110,20 @@ def main() -> None:
 
         def run(messages: list[tuple[str, bytes]] = messages, settings: PayloadSettings = settings) -> int:
             asset = SourceAsset(SimpleNamespace(sample_rate=RATE), None, 60.0)  # type: ignore[arg-type]
-            collector = MessageCollector(settings, {"press": asset}, RejectionCounter(), 10**9)
-            collector.open({})
-            for topic, content in messages:
-                collector.add(topic, content, lambda: None)
-            blocks = collector.poll(10**6)
-            collector.acknowledge("press", len(blocks))
+            rejections, transport = RejectionCounter(), Given(messages)
+            decoder = MessageMapping.of_assets(settings, {"press": asset}, rejections)
+            inbox, blocks = Inbox(transport, decoder, {"press": asset}, rejections), []
+            inbox.open({})
+            while len(transport.waiting) or inbox.next_block_s == 0.0:
+                blocks += inbox.poll(10**6)
+            inbox.acknowledge("press", len(blocks))
             samples = sum(block.t.size for block in blocks)
             assert samples > 0.9 * SAMPLES
             return samples
 
         found[form] = measure(run)
     blocks = [encode_json(Block("press", k, *rows[:, 100 * k : 100 * k + 100])) for k in range(SAMPLES // 100)]
-    found["blocks"] = measure(lambda: sum(decode_block("press", one).block.t.size for one in blocks))
+    found["blocks"] = measure(lambda: sum(decode_block("press", one).t.size for one in blocks))
     table = Table(
         "Plant messages",
         "Processor time from a message's bytes to the block.",

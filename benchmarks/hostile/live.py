@@ -1,4 +1,4 @@
-"""The slowest answer of /health/live of a real service while it is sent messages that are made to cost much.
+"""Slowest answer of /health/live, and memory, of a real service while it is sent messages that are made to cost much.
 
     python benchmarks/hostile/live.py [--fuzzed 300]
 
@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import random
+import resource
 import subprocess
 import sys
 import tempfile
@@ -19,14 +20,16 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
+from http.client import HTTPException
 from pathlib import Path
 
 BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `hostile` and `reliability` are packages, and `tables` lies
+sys.path[0] = str(BENCHMARKS)  # where `hostile` is a package, and `tables` lies
+sys.path.insert(1, str(BENCHMARKS.parent / "tests" / "support"))  # where `reliability` is one
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from reliability.run import free_port  # noqa: E402
 from reliability.servers import Mosquitto, mosquitto  # noqa: E402
+from reliability.workplace import free_port  # noqa: E402
 from tables import machine  # noqa: E402
 
 from hostile.damage import damaged  # noqa: E402
@@ -111,7 +114,7 @@ class Health:
         try:
             with urllib.request.urlopen(self._url, timeout=60.0) as answer:
                 answer.read()
-        except OSError:
+        except (OSError, HTTPException):
             return None
         return time.monotonic() - begin
 
@@ -128,8 +131,14 @@ class Health:
             time.sleep(ASK_EVERY_S)
 
 
-def trial(fuzzed: int) -> dict[str, float]:
-    """Return the slowest answer while each kind of message was taken [s]."""
+def resident_mb(pid: int) -> float:
+    """Return the resident memory of a process [MB]."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+def trial(fuzzed: int) -> dict[str, tuple[float, float]]:
+    """Return the slowest answer while each kind of message was taken [s], and by how much memory has grown [MB]."""
     program = mosquitto()
     assert program is not None, "mosquitto is missing: scripts/install-test-servers installs it"
     found = {}
@@ -146,13 +155,15 @@ def trial(fuzzed: int) -> dict[str, float]:
             client.loop_start()
             time.sleep(2.0)  # it is subscribed by then
             health.take()
+            memory = resident_mb(service.pid)
             for kind, messages in (*costly_messages(), ("fuzzed", fuzzed_messages(fuzzed))):
                 for number, (topic, content) in enumerate(messages):
                     client.publish(topic, content, qos=1).wait_for_publish(60.0)
                     if number % 10 == 9:
                         time.sleep(0.5)  # the broker hands on faster than the service reads
                 time.sleep(3.0)
-                found[kind] = round(health.take(), 3)
+                before, memory = memory, resident_mb(service.pid)
+                found[kind] = round(health.take(), 3), round(memory - before)
             assert service.poll() is None, "the service has ended"
         finally:
             client.disconnect()
@@ -168,10 +179,10 @@ def main() -> None:
     command = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     command.add_argument("--fuzzed", type=int, default=300, help="fuzzed messages")
     found = trial(command.parse_args().fuzzed)
-    for kind, seconds in found.items():
-        print(f"{kind}: slowest answer {seconds:.3f} s")
+    for kind, (seconds, grown) in found.items():
+        print(f"{kind}: slowest answer {seconds:.3f} s, memory {grown:+.0f} MB")
     print(machine())
-    if slow := [kind for kind, seconds in found.items() if seconds >= MAX_ANSWER_S]:
+    if slow := [kind for kind, (seconds, _) in found.items() if seconds >= MAX_ANSWER_S]:
         sys.exit(f"a second or longer: {', '.join(slow)}")
 
 

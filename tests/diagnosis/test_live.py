@@ -33,7 +33,7 @@ from servoscope.service.assets.residual_history import HistoryState, update_hist
 from servoscope.service.build import check_service_file
 from servoscope.service.config import DiagnosisSettings, ServiceFile
 from servoscope.service.sources.block import Block, ResumePosition
-from servoscope.service.sources.replay import ReplaySettings, ReplaySource, ReplayStream
+from servoscope.service.sources.replay import ReplaySettings, ReplayStream, ReplayTransport
 from servoscope.service.store.queries import format_time
 from servoscope.signals import Recording
 from servoscope.signals.quality import QualitySettings
@@ -83,21 +83,21 @@ class TestReplay:
         halls.files(tmp_path)
         loop = halls.baseline().loop
         settings = ReplaySettings(kind="replay", speed=0.0, block=1.0)
-        source = ReplaySource(settings, {name: ((tmp_path / "healthy.csv",), loop) for name in ("a", "b")})
+        source = ReplayTransport(settings, {name: ((tmp_path / "healthy.csv",), loop) for name in ("a", "b")})
         source.open({"a": ResumePosition(9, BEGAN), "b": ResumePosition(11, BEGAN)})
-        order = [(block.asset, block.sequence) for block in source.poll(5)]
+        order = [(one.content.asset, one.content.sequence) for one in source.receive(5)]
         assert order == [("a", 10), ("a", 11), ("a", 12), ("b", 12), ("a", 13)]
-        while source.poll(50):
+        while source.receive(50):
             pass
-        assert math.isinf(source.next_block_s)
+        assert math.isinf(source.next_message_s)
 
     def test_it_keeps_time(self, tmp_path: Path) -> None:
         halls.files(tmp_path)
         settings = ReplaySettings(kind="replay", speed=2.0, block=30.0)
-        source = ReplaySource(settings, {"a": ((tmp_path / "healthy.csv",), halls.baseline().loop)})
+        source = ReplayTransport(settings, {"a": ((tmp_path / "healthy.csv",), halls.baseline().loop)})
         source.open({})
-        assert source.poll(1) == []
-        assert 14.0 < source.next_block_s < 15.0  # a block of 30 s, twice as fast as it was recorded
+        assert source.receive(1) == []
+        assert 14.0 < source.next_message_s < 15.0  # a block of 30 s, twice as fast as it was recorded
 
 
 @pytest.mark.parametrize(

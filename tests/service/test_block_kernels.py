@@ -82,8 +82,7 @@ def outcome(found: object) -> object:
     """Return what a decoder has found, so that it can be compared to the last bit."""
     if isinstance(found, MessageError):
         return found.kind, str(found)
-    block, oldest = found
-    return block.asset, block.stream, block.sequence, block.retained, oldest, block.signals.tobytes()
+    return found.asset, found.stream, found.sequence, found.oldest, found.signals.tobytes()
 
 
 def one_by_one(message: bytes) -> object:
@@ -234,7 +233,7 @@ def test_covariates_that_an_asset_needs_are_asked_for(monkeypatch: pytest.Monkey
     plain = encode_json(Block("press", 3, np.array([1.0]), *np.ones((3, 1))))
     messages = [BlockMessage("press", plain, 1.5), BlockMessage("press", plain, covariates=("oil",))]
     found, refused = decode_blocks(messages)
-    assert not isinstance(found, MessageError) and found.block.completed_at == 1.5
+    assert not isinstance(found, MessageError) and found.completed_at == 1.5
     assert isinstance(refused, MessageError) and refused.kind == "covariates"
     assert not list(decode_blocks([]))
 

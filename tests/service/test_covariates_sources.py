@@ -18,6 +18,7 @@ from brokers import BEGAN, kafka_brokers, kafka_cluster, until
 from halls import asked, service_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from inboxes import HandInbox
 from opcua_plant import NODES
 from test_covariates_live import LOOP, WEAR, carry, hall
 from test_opcua import RATE, Plant, source_assets
@@ -32,12 +33,12 @@ from servoscope.fleet.rows import Rows
 from servoscope.fleet.tasks import ExamineTask
 from servoscope.models.loop import Columns
 from servoscope.service.kafka.source import KafkaSourceSettings
-from servoscope.service.mapping.collector import MessageCollector
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.opcua.settings import OpcuaNodes
-from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
-from servoscope.service.sources.base import BlockSource, RejectionCounter, SourceAsset
+from servoscope.service.opcua.source import OpcuaSourceSettings
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block
+from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.resample import Resampler
 from servoscope.signals import clean, writers
 
@@ -64,73 +65,73 @@ def test_covariates_make_no_samples_and_each_sample_has_the_newest(told: list[An
         np.testing.assert_equal(found, expected)
 
 
-def line(**keys: Any) -> tuple[MessageCollector, RejectionCounter]:
-    """Return a collector of presses at 100 Hz, of which only press wants the temperature of its oil."""
+def line(**keys: Any) -> tuple[HandInbox, RejectionCounter]:
+    """Return an inbox of presses at 100 Hz, of which only press wants the temperature of its oil."""
     rejections = RejectionCounter()
     loop: Any = SimpleNamespace(sample_rate=100.0)
     assets = {"press": SourceAsset(loop, None, covariates=("oil",)), "lift": SourceAsset(loop, None)}
     table = PayloadSettings.model_validate({"topics": ["plant/{asset}"], "time": {"t": "s"}, "block": 0.1, **keys})
-    collector = MessageCollector(table, assets, rejections, 1000)
-    collector.open({})
-    return collector, rejections
+    inbox = HandInbox(table, assets, rejections, 1000)
+    inbox.begin()
+    return inbox, rejections
 
 
 FIELDS = {"fields": {"covariates": {"load": "F", "oil": "T"}}, "scale": {"covariates": {"oil": 0.1}}}
 
 
-def send(collector: MessageCollector, plain: Any, topic: str = "plant/press") -> list[int]:
+def send(inbox: HandInbox, plain: Any, topic: str = "plant/press") -> list[int]:
     acknowledged: list[int] = []
-    collector.add(topic, json.dumps(plain).encode(), lambda: acknowledged.append(1))
+    inbox.add(topic, json.dumps(plain).encode(), lambda: acknowledged.append(1))
     return acknowledged
 
 
 def test_a_row_may_bring_a_covariate_now_and_then() -> None:
-    collector, rejections = line(**FIELDS)
+    inbox, rejections = line(**FIELDS)
     for k in range(20):
         for asset in ("press", "lift"):
             also = {"T": 400 + k, "F": 1.0} if k % 5 == 0 else {}
-            send(collector, {"t": BEGAN + 0.01 * k, "r": k, "u": -k, "y": 2 * k, **also}, f"plant/{asset}")
-    found = {block.asset: block for block in collector.poll(10)[::-1]}
+            send(inbox, {"t": BEGAN + 0.01 * k, "r": k, "u": -k, "y": 2 * k, **also}, f"plant/{asset}")
+    found = {block.asset: block for block in inbox.poll(10)[::-1]}
     assert not rejections.take()
     np.testing.assert_array_equal(found["press"].covariates, [[40.0, *[math.nan] * 4, 40.5, *[math.nan] * 4]])
     assert len(found["lift"].covariates) == 0 and found["lift"].y.tolist() == (2.0 * np.arange(10)).tolist()
 
 
 def test_lists_of_samples_may_have_one_temperature_or_one_each() -> None:
-    collector, rejections = line(**FIELDS)
+    inbox, rejections = line(**FIELDS)
     samples = {"r": [1] * 10, "u": [2] * 10, "y": list(range(10))}
-    send(collector, {"t": BEGAN, **samples, "T": 400})
-    send(collector, {"t": BEGAN + 0.1, **samples, "T": [410 + k for k in range(10)]})
-    first, second = collector.poll(10)
+    send(inbox, {"t": BEGAN, **samples, "T": 400})
+    send(inbox, {"t": BEGAN + 0.1, **samples, "T": [410 + k for k in range(10)]})
+    first, second = inbox.poll(10)
     assert first.covariates[0, 0] == 40.0 and np.isnan(first.covariates[0, 2:]).all()
     np.testing.assert_allclose(second.covariates[0], 41.0 + 0.1 * np.arange(10))
-    send(collector, {"t": BEGAN + 0.2, **samples, "T": [1, 2]})  # neither one nor one each
+    send(inbox, {"t": BEGAN + 0.2, **samples, "T": [1, 2]})  # neither one nor one each
     assert [one.kind for one in rejections.take()] == ["lengths"]
 
 
 def test_a_covariate_in_messages_of_its_own_belongs_to_the_next_sample() -> None:
     topics = {"topics": ["{asset}/{signal}"], "value": "v", "fields": {"covariates": {"oil": "T_oil"}}}
-    collector, rejections = line(**topics)
+    inbox, rejections = line(**topics)
     for k in range(40):
         if k in (3, 13):
-            assert send(collector, {"t": BEGAN + 0.01 * k - 0.004, "v": 40 + k}, "press/T_oil") == []
+            assert send(inbox, {"t": BEGAN + 0.01 * k - 0.004, "v": 40 + k}, "press/T_oil") == []
         for signal in "ruy":
-            send(collector, {"t": BEGAN + 0.01 * k, "v": k}, f"press/{signal}")
-    first, second, *_ = [*collector.poll(10)]
+            send(inbox, {"t": BEGAN + 0.01 * k, "v": k}, f"press/{signal}")
+    first, second, *_ = [*inbox.poll(10)]
     assert np.flatnonzero(~np.isnan(first.covariates[0])).tolist() == [3] and first.covariates[0, 3] == 43.0
     assert second.covariates[0, 3] == 53.0 and not rejections.take()
 
 
 def test_a_thermometer_beside_a_machine_that_is_off_keeps_no_messages_open() -> None:
     """A broker sends no more than `in_flight` before it hears of the first: nor would it, once the machine runs."""
-    collector, rejections = line(**FIELDS)
+    inbox, rejections = line(**FIELDS)
     told: list[int] = []
     for k in range(1000):
-        told += [send(collector, {"t": BEGAN + k, "T": k})]  # lists, into which the acknowledgements come
+        told += [send(inbox, {"t": BEGAN + k, "T": k})]  # lists, into which the acknowledgements come
     assert sum(not one for one in told) <= 500
     for k in range(30):
-        send(collector, {"t": BEGAN + 1000.0 + 0.01 * k, "r": k, "u": -k, "y": 2 * k})
-    first, *_ = collector.poll(10)
+        send(inbox, {"t": BEGAN + 1000.0 + 0.01 * k, "r": k, "u": -k, "y": 2 * k})
+    first, *_ = inbox.poll(10)
     np.testing.assert_array_equal(first.covariates, [[99.9, *[math.nan] * 9]])
     assert not rejections.take()
 
@@ -145,7 +146,7 @@ def test_a_thermometer_whose_clock_is_set_back_is_believed() -> None:
         assert made.values[:, -1].tolist() == [value, value]
 
 
-def collect(source: BlockSource, blocks: int) -> list[Block]:
+def collect(source: Inbox, blocks: int) -> list[Block]:
     found: list[Block] = []
     until(lambda: (found.extend(source.poll(100)), len(found) >= blocks)[1], 60.0)
     source.close()
@@ -172,7 +173,7 @@ def test_kafka_carries_them(tmp_path: Path) -> None:
 
 def received(settings: OpcuaSourceSettings, nodes: OpcuaNodes, count: int) -> list[Block]:
     """Return the first blocks of an asset whose loop names one covariate, oil."""
-    source = OpcuaSource(settings, source_assets(nodes, RATE, ("oil",)), Path())
+    source = settings.create("hall.line", source_assets(nodes, RATE, ("oil",)), Path())
     source.open({})
     return collect(source, count)
 

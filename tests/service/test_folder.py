@@ -283,7 +283,7 @@ def test_a_share_that_does_not_answer_is_told(share: Callable[..., Share], monke
     press = share()
     source = press.open()
     press.settle()
-    source._asked_at = time.monotonic() - 31.0
+    source.transport._asked_at = time.monotonic() - 31.0
     assert os.strerror(errno.ETIMEDOUT) in source.trouble
 
 

@@ -19,20 +19,19 @@ from brokers import Sender, started_broker, until
 from halls import asked
 from hypothesis import given
 from hypothesis import strategies as st
+from inboxes import STUB, HandInbox
 from reliability.servers import Mosquitto
 
 from servoscope.core.errors import MessageError
 from servoscope.core.workers import WorkerError
-from servoscope.service.mapping import guard as guarding
 from servoscope.service.mapping import sparkplug
-from servoscope.service.mapping.guard import MessageGuard
 from servoscope.service.mapping.influx import parse_lines
 from servoscope.service.mapping.paths import MAX_ROWS, MAX_TEXT_CHARS, NAME, TextPattern
-from servoscope.service.mapping.rows import MAX_BAD_ROWS, MessageMapping
+from servoscope.service.mapping.rows import MAX_BAD_ROWS, TASK, MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder, payload_class
-from servoscope.service.mqtt.source import MqttSourceSettings, PlantSource
-from servoscope.service.sources.base import SourceAsset
+from servoscope.service.sources import guard as guarding
+from servoscope.service.sources.guard import MessageGuard
 
 
 def first_reading(parts: list[str], text: str) -> dict[str, str] | None:
@@ -157,25 +156,20 @@ def test_one_limit_holds_over_all_nodes_and_those_that_are_heard_stay(monkeypatc
     assert len(decoder.missing_births) == 20
 
 
-def test_what_was_asked_for_births_is_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = MqttSourceSettings.model_validate(
-        {"kind": "mqtt", "host": "127.0.0.1", "payload": {"form": "sparkplug"}}
-    )
-    source, now, asked_for = PlantSource(settings, {"press": ASSET}, tmp_path, "hall.plant"), [0.0], list[str]()
-    monkeypatch.setattr("servoscope.service.mqtt.source.time.monotonic", lambda: now[0])
-    monkeypatch.setattr(source._client, "publish", lambda topic, _content: asked_for.append(topic))
-    missing = source._collector.mapping.missing_births
+def test_what_was_asked_for_births_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    decoder, now, asked_for = SparkplugDecoder(), [0.0], list[str]()
+    monkeypatch.setattr("servoscope.service.mapping.sparkplug.time.monotonic", lambda: now[0])
     for k in range(3000):
-        missing.add(("g", f"n{k % 2000}"))
-        source._ask_for_births()
-    assert len(asked_for) == len(set(asked_for)) == len(source._asked) == sparkplug.MAX_NODES and not missing
+        decoder.missing_births.add(("g", f"n{k % 2000}"))
+        asked_for += [topic for topic, _ in decoder.rebirth_requests()]
+    assert len(asked_for) == len(set(asked_for)) == len(decoder._asked_at) == sparkplug.MAX_NODES
+    assert not decoder.missing_births
     now[0] = 100.0
-    missing.add(("g", "n0"))
-    source._ask_for_births()
-    assert set(source._asked) == {("g", "n0")} and asked_for[-1] == "spBv1.0/g/NCMD/n0"
+    decoder.missing_births.add(("g", "n0"))
+    assert [topic for topic, _ in decoder.rebirth_requests()] == ["spBv1.0/g/NCMD/n0"]
+    assert set(decoder._asked_at) == {("g", "n0")}
 
 
-ASSET = SourceAsset(type("AxisLoop", (), {"sample_rate": 100.0})(), None)
 SETTINGS = PayloadSettings.model_validate({"topics": ["line/{asset}"]})
 
 
@@ -190,12 +184,12 @@ def test_only_a_message_that_was_in_hand_is_tried_and_only_one_that_fails_is_set
         if b"poison" in content:
             raise WorkerError("it took more than 10 s")
 
-    monkeypatch.setattr(guarding.Worker, "run", run)
+    monkeypatch.setattr(guarding.Workers, "run", run)
     path = tmp_path / "hall.in-hand"
 
     def killed_with(mark: int) -> MessageGuard:
-        MessageGuard(path, SETTINGS, {"press": 100.0}).begin(mark)
-        return MessageGuard(path, SETTINGS, {"press": 100.0})
+        MessageGuard(path, TASK, SETTINGS, {"press": 100.0}).begin(mark)
+        return MessageGuard(path, TASK, SETTINGS, {"press": 100.0})
 
     guard = killed_with(11)
     guard.check(12, "line/press", b"another")
@@ -203,7 +197,7 @@ def test_only_a_message_that_was_in_hand_is_tried_and_only_one_that_fails_is_set
     guard.check(11, "line/press", b"sound")
     assert tried == [b"sound"]
     killed_with(21)
-    guard = MessageGuard(path, SETTINGS, {"press": 100.0})  # and killed once more before it came again
+    guard = MessageGuard(path, TASK, SETTINGS, {"press": 100.0})  # and killed once more before it came again
     for _ in range(2):
         with pytest.raises(MessageError, match=r"8 bytes .* and once more: it took more") as refused:
             guard.check(21, "line/press", b"poison 1")
@@ -216,11 +210,10 @@ def test_only_a_message_that_was_in_hand_is_tried_and_only_one_that_fails_is_set
 
 def test_a_service_goes_on_where_no_mark_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
-    settings = MqttSourceSettings.model_validate({"kind": "mqtt", "host": "127.0.0.1", "payload": SETTINGS})
-    source = PlantSource(settings, {"press": ASSET}, tmp_path, "hall.plant")
-    source._collector.open({}, tmp_path / "folder")
+    source = HandInbox(SETTINGS, {"press": STUB})
+    source.begin({}, tmp_path / "folder")
     done = list[bool]()
-    source._collector.add("line/press", b"[]", lambda: done.append(True))
+    source.add("line/press", b"[]", lambda: done.append(True))
     assert done == [True]
 
 

@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 from brokers import BEGAN, Running, Sender, Taker, block, publisher, started_broker, until
 from halls import RESULTS, asked
+from inboxes import STUB
 from reliability.servers import Mosquitto, mosquitto
 
 from servoscope.core.errors import ConfigError, SourceError
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
 from servoscope.service.mqtt import payload
-from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
+from servoscope.service.mqtt.source import MqttSourceSettings
 from servoscope.service.service import Service
+from servoscope.service.sources.inbox import Inbox
 from servoscope.signals import clean, writers
 
 MISSING = "Mosquitto is not on this machine: scripts/install-test-servers installs it"
@@ -157,12 +159,12 @@ def test_tls_and_password(tmp_path: Path) -> None:
     (tmp_path / "password").write_text("secret\n")
     server.start()
 
-    def source(**keys: object) -> MqttSource:
+    def source(**keys: object) -> Inbox:
         given = {"tls": True, "ca_file": "ca.pem", "user": "hall", "password_file": "password", **keys}
         settings = MqttSourceSettings.model_validate(
             {"kind": "mqtt", "host": "127.0.0.1", "port": server.port, **given}
         )
-        return MqttSource(settings, frozenset({"press"}), tmp_path, "hall")
+        return settings.create("hall", {"press": STUB}, tmp_path)
 
     try:
         for keys, trouble in (({}, ""), ({"user": "guest"}, "Not authorized"), ({"ca_file": None}, "self-signed")):

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from brokers import until
+from inboxes import STUB
 
 from servoscope.service.mqtt.client import BrokerSettings, create_bulk_client
 from servoscope.service.mqtt.paho_clients import GATHER_S, ReceivedMessage
 from servoscope.service.mqtt.payload import encode_binary
-from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
+from servoscope.service.mqtt.source import MqttSourceSettings
 from servoscope.service.sources.block import Block
 
 CONNACK = bytes([0x20, 3, 0, 0, 0])
@@ -78,7 +79,7 @@ def test_topics_that_are_none_do_not_make_a_source_deaf(topic: bytes, qos: int) 
         broker = threading.Thread(target=serve, args=(server, [strange, good], bytearray()), daemon=True)
         broker.start()
         settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=server.getsockname()[1])
-        source = MqttSource(settings, frozenset(["press"]), Path(), "reader")
+        source = settings.create("reader", {"press": STUB}, Path())
         source.open({})
         (found,) = until(lambda: source.poll(10), 20.0)
         source.close()
@@ -128,17 +129,17 @@ def test_what_is_sent_again_takes_the_place_of_its_earlier_copy() -> None:
     connections = [((1, 0), (2, 1)), ((11, 0), (12, 1), (13, 2))]  # in each: numbers of messages, and which they are
 
     def send(server: socket.socket) -> None:
-        for sent, ends in zip(connections, (lambda: len(source._waiting) == 2, None), strict=True):
+        for sent, ends in zip(connections, (lambda: len(source.transport.waiting) == 2, None), strict=True):
             packets = [publish(ReceivedMessage(topic, payloads[k], 1, mid, False)) for mid, k in sent]
             serve(server, packets, received, ends)
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=server.getsockname()[1])
-        source = MqttSource(settings, frozenset(["press"]), Path(), "reader")
+        source = settings.create("reader", {"press": STUB}, Path())
         broker = threading.Thread(target=send, args=(server,))
         broker.start()
         source.open({})
-        until(lambda: len(source._waiting) == 3, 60.0)
+        until(lambda: len(source.transport.waiting) == 3, 60.0)
         assert [one.sequence for one in source.poll(10)] == [0, 1, 2]
         source.acknowledge("press", 3)
         source.close()
@@ -149,10 +150,10 @@ def test_what_is_sent_again_takes_the_place_of_its_earlier_copy() -> None:
 def test_what_is_too_large_does_not_wait_in_memory() -> None:
     """It would until its turn: while the store is away as many as may be in flight, each four times the largest."""
     settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", largest=1024)
-    source = MqttSource(settings, frozenset(["press"]), Path(), "reader")
+    source = settings.create("reader", {"press": STUB}, Path())
     for qos in (0, 1):
-        source._on_message(ReceivedMessage("servoscope/v1/data/press", bytes(1025), qos, 1, False))
-    assert not source._waiting
+        source.transport._on_message(ReceivedMessage("servoscope/v1/data/press", bytes(1025), qos, 1, False))
+    assert not source.transport.waiting
     assert [(one.asset, one.kind, one.count) for one in source.rejections.take()] == [("press", "oversized", 2)]
 
 

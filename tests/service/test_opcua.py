@@ -27,10 +27,11 @@ from servoscope.service.opcua import server as opcua_server
 from servoscope.service.opcua.monitored_items import _AnswerRecorder
 from servoscope.service.opcua.server import OpcuaServer, OpcuaServerSettings
 from servoscope.service.opcua.settings import OpcuaNodes
-from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
+from servoscope.service.opcua.source import OpcuaSourceSettings
 from servoscope.service.opcua.subscriptions import parse_block, parse_value, read_history
 from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.resample import Resampler
 
 RATE = 20.0
@@ -162,7 +163,7 @@ class Following:
 
     def __init__(self, plant: Plant, nodes: OpcuaNodes, resume: dict[str, ResumePosition] | None = None) -> None:
         given_ = {"kind": "opcua", "url": f"opc.tcp://127.0.0.1:{plant.port}/plant", "block": 0.25, "heartbeat_s": 3.0}
-        self.source = OpcuaSource(OpcuaSourceSettings.model_validate(given_), source_assets(nodes, RATE), Path())
+        self.source = OpcuaSourceSettings.model_validate(given_).create("hall.line", source_assets(nodes, RATE), Path())
         self.source.open(resume or {})
         self.began, self.blocks = plant.began, list[Block]()
         self.refused: dict[str, int] = {}
@@ -291,14 +292,14 @@ def test_verdicts_are_offered_signed_and_encrypted(tmp_path: Path) -> None:
     url = f"opc.tcp://127.0.0.1:{port}/servoscope"
     nodes = OpcuaNodes(r="ns=2;s=press.T2", u="ns=2;s=press.Level", y="ns=2;s=press.Ratio")
 
-    def source(**keys: str) -> OpcuaSource:
+    def source(**keys: str) -> Inbox:
         made = OpcuaSourceSettings.model_validate({"kind": "opcua", "url": url, **keys})
-        return OpcuaSource(made, source_assets(nodes, 1.0), tmp_path)
+        return made.create("hall.line", source_assets(nodes, 1.0), tmp_path)
 
     async def read() -> dict[str, Any]:
         from servoscope.service.opcua.source import create_opcua_client
 
-        async with await create_opcua_client(source(**client).settings, None, tmp_path) as one:
+        async with await create_opcua_client(source(**client).transport.settings, None, tmp_path) as one:
             names = ("Verdict", "Fault", "Ratio", "T2", "NE107", "Since")
             return {name: await one.get_node(f"ns=2;s=press.{name}").read_value() for name in names}
 
@@ -309,7 +310,7 @@ def test_verdicts_are_offered_signed_and_encrypted(tmp_path: Path) -> None:
         secure, open_ = source(**client), source()
         for one in (secure, open_):
             one.open({})
-        until(lambda: secure.connected and open_._trouble)  # who does not encrypt is not let in
+        until(lambda: secure.connected and open_.trouble)  # who does not encrypt is not let in
         assert not open_.connected
         for one in (secure, open_):
             one.close()

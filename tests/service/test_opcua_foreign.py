@@ -18,10 +18,11 @@ from test_opcua import certificate, free_port, source_assets
 from servoscope.core.errors import ConfigError
 from servoscope.service.opcua.monitored_items import ItemGrant
 from servoscope.service.opcua.settings import OpcuaNodes, describe_expiry
-from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
+from servoscope.service.opcua.source import OpcuaSourceSettings
 from servoscope.service.opcua.subscriptions import ScalarSubscription
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.resample import Resampler
 from servoscope.service.sources.update_rate import STEPS, UpdateRate
 
@@ -52,12 +53,12 @@ class ForeignPlant:
         self._process.kill()
         self._process.wait()
 
-    def source(self, **assets: tuple[OpcuaNodes, float]) -> OpcuaSource:
+    def source(self, **assets: tuple[OpcuaNodes, float]) -> Inbox:
         settings = OpcuaSourceSettings.model_validate(
             {"kind": "opcua", "url": f"opc.tcp://127.0.0.1:{self.port}/plant", "block": 0.5}
         )
         told = {name: source_assets(*one)["press"] for name, one in assets.items()}
-        return OpcuaSource(settings, told, Path())
+        return settings.create("hall.line", told, Path())
 
 
 @pytest.fixture(scope="module")
@@ -165,4 +166,4 @@ def test_a_certificate_that_has_expired_is_told_while_samples_go_on(tmp_path: Pa
 def test_a_node_that_cannot_be_one_is_refused_before_anything_starts() -> None:
     settings = OpcuaSourceSettings.model_validate({"kind": "opcua", "url": "opc.tcp://plc"})
     with pytest.raises(ConfigError, match=r"'press\.y' is no node id, write for example ns=2;s=press.y"):
-        OpcuaSource(settings, source_assets(OpcuaNodes(block="press.y"), RATE), Path())
+        settings.create("hall.line", source_assets(OpcuaNodes(block="press.y"), RATE), Path())

@@ -33,25 +33,25 @@ def blocks(draw: st.DrawFn) -> Block:
 
 @given(blocks(), st.none() | st.integers(0, payload.MAX_COUNT))
 def test_a_block_comes_back_bit_by_bit(block: Block, oldest: int | None) -> None:
-    found, kept = payload.decode_block("press", payload.encode_binary(block, oldest))
+    found = payload.decode_block("press", payload.encode_binary(block, oldest))
     assert np.array_equal(found.signals.view(np.int64), block.signals.view(np.int64))
-    assert (found.stream, found.sequence, found.retained, kept) == (
+    assert (found.stream, found.sequence, found.retained, found.oldest) == (
         block.stream,
         block.sequence,
         oldest is not None,
         oldest,
     )
-    text, kept = payload.decode_block(
+    text = payload.decode_block(
         "press", payload.encode_json(block, oldest)
     )  # JSON has no infinity: it is missing as well
     expected = np.where(np.isfinite(block.signals), block.signals, np.nan)
-    assert np.array_equal(text.signals, expected, equal_nan=True) and kept == oldest
+    assert np.array_equal(text.signals, expected, equal_nan=True) and text.oldest == oldest
 
 
 def taken(message: bytes) -> None:
     """Decode: a block whose times and numbers can be used, or the project's own error with a line that says why."""
     try:
-        block = payload.decode_block("press", message).block
+        block = payload.decode_block("press", message)
     except MessageError as error:
         assert error.kind and str(error) and "\n" not in str(error)
         return
@@ -126,8 +126,8 @@ def test_the_binary_form_is_the_documented_one() -> None:
     """Written by hand, as somebody with another language would."""
     body = struct.pack("<QQQdd", 5, 7, 6, T0, 0.5) + struct.pack("<6f", 1, 2, 3, 4, 5, float("nan"))
     message = b"SVSB" + bytes([1, 1 | 4, 0, 0]) + struct.pack("<II", 2, zlib.crc32(body)) + body
-    block, oldest = payload.decode_block("press", message, 3.0)
-    assert (block.stream, block.sequence, oldest, block.completed_at) == (5, 7, 6, 3.0)
+    block = payload.decode_block("press", message, 3.0)
+    assert (block.stream, block.sequence, block.oldest, block.completed_at) == (5, 7, 6, 3.0)
     assert block.t.tolist() == [T0, T0 + 0.5] and block.r.tolist() == [1.0, 2.0] and block.u.tolist() == [3.0, 4.0]
     assert block.y[0] == 5.0 and np.isnan(block.y[1])
 

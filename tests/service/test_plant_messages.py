@@ -17,17 +17,17 @@ import plant_writers as plants
 import pytest
 from commands import one_line, run
 from halls import files
+from inboxes import HandInbox
 from pydantic import ValidationError
 
 from servoscope.core.errors import ConfigError, MessageError
 from servoscope.models.loop import Columns
-from servoscope.service.mapping import collector as collecting
-from servoscope.service.mapping.collector import MessageCollector
 from servoscope.service.mapping.influx import parse_lines
 from servoscope.service.mapping.paths import RowPath, TextPattern, find
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder, encode_rebirth, payload_class
+from servoscope.service.sources import inbox as inbox_module
 from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
 from servoscope.signals.readers import read
@@ -41,20 +41,21 @@ def settings(**keys: Any) -> PayloadSettings:
 
 
 class Line:
-    """A collector of the asset press at 100 Hz, and which messages it has acknowledged."""
+    """An inbox of the asset press at 100 Hz, and which messages it has acknowledged."""
 
     def __init__(self, *, limit: int = 1000, last: ResumePosition | None = None, **keys: Any) -> None:
         self.rejections, self.acknowledged = RejectionCounter(), list[int]()
         asset = SourceAsset(SimpleNamespace(sample_rate=100.0), None, AHEAD_S)  # type: ignore[arg-type]
         table = settings(**{"time": {"t": "s"}, "block": 0.1, **keys})
-        self.collector = MessageCollector(table, {"press": asset}, self.rejections, limit)
-        self.collector.open({} if last is None else {"press": last})
-        self.sent = 0
+        self.inbox = HandInbox(table, {"press": asset}, self.rejections, limit)
+        self.inbox.begin({} if last is None else {"press": last})
+        self.sent, self.requested = 0, list[tuple[str, bytes]]()
+        self.inbox.transport.send = lambda *request: self.requested.append(request)  # type: ignore[method-assign]
 
     def send(self, plain: Any, topic: str = "plant/press", **how: bool) -> None:
         number, content = self.sent, plain if isinstance(plain, bytes) else json.dumps(plain).encode()
         self.sent += 1
-        self.collector.add(topic, content, lambda: self.acknowledged.append(number), **how)
+        self.inbox.add(topic, content, lambda: self.acknowledged.append(number), **how)
 
     def rows(self, start: float, count: int, first: int = 0) -> None:
         for k in range(first, first + count):
@@ -76,7 +77,7 @@ def test_the_examples_of_the_page_are_read_as_they_stand(name: str) -> None:
     )
     topic = next(
         one
-        for one in mapping.topic_filters()
+        for one in mapping.addresses()
         if "press" in one or not found.names_assets or "+" in one or "/" not in one or "press" in example
     )
     topic = topic.replace("press/r", "press/y").replace("+", "north")
@@ -198,20 +199,20 @@ def test_what_is_not_mapped_is_told_unless_it_is_to_be_ignored() -> None:
 def test_a_message_is_acknowledged_when_all_its_samples_are_stored_and_not_before() -> None:
     line, start = Line(), time.time() - 5.0
     line.rows(start, 25)
-    blocks = line.collector.poll(100)
+    blocks = line.inbox.poll(100)
     assert [block.sequence for block in blocks] == [0, 1] and not line.acknowledged
     np.testing.assert_array_equal(np.concatenate([block.y for block in blocks]), 2.0 * np.arange(20))
-    line.collector.acknowledge("press", 1)
+    line.inbox.acknowledge("press", 1)
     assert line.acknowledged == list(range(10))
-    line.collector.acknowledge("press", 1)
+    line.inbox.acknowledge("press", 1)
     assert line.acknowledged == list(range(20))
     # a service that was killed behind the first block gets the others again, and begins behind what it has stored
     again = Line(last=ResumePosition(0, start, 0, float(blocks[0].t[-1])))
     again.rows(start, 20, first=5)
-    (block,) = again.collector.poll(100)
+    (block,) = again.inbox.poll(100)
     assert block.sequence == 1 and block.signals.tobytes() == blocks[1].signals.tobytes()
     assert again.acknowledged == list(range(5))  # they are in what was stored
-    again.collector.acknowledge("press", 1)
+    again.inbox.acknowledge("press", 1)
     assert again.acknowledged == list(range(15))
 
 
@@ -222,22 +223,22 @@ def test_what_is_behind_ahead_or_sent_twice_is_counted_apart_and_not_used() -> N
     line.send({"t": now - 3600.0, "r": 0, "u": 9, "y": 0})
     line.send({"t": now + 7200.0, "r": 0, "u": 9, "y": 0})
     line.rows(now - 10.0, 18, first=12)
-    blocks = line.collector.poll(100)
+    blocks = line.inbox.poll(100)
     assert line.refused() == {"repeated": 1, "late": 3, "future": 1 * 3}
     np.testing.assert_array_equal(np.concatenate([block.y for block in blocks]), 2.0 * np.arange(10 * len(blocks)))
-    line.collector.acknowledge("press", len(blocks))
+    line.inbox.acknowledge("press", len(blocks))
     assert set(range(15)) <= set(line.acknowledged)  # what is refused is not sent again
 
 
 def test_a_signal_that_does_not_come_is_missing_and_a_pause_is_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collecting, "MAX_QUIET_S", 0.0)
+    monkeypatch.setattr(inbox_module, "MAX_QUIET_S", 0.0)
     t0 = time.time() - 5.0
     for hold_s, missing, samples in ((0.0, [3], 8), (1.0, [], 12)):
         line = Line(hold_s=hold_s, block=0.05)
         for k in (0, 1, 2, 3, 4, 9, 10, 11):
             line.send({"t": t0 + 0.01 * k, "r": 0.0, "u": k, **({} if k == 3 else {"y": k})})
         time.sleep(0.2)
-        blocks = line.collector.poll(100)
+        blocks = line.inbox.poll(100)
         y = np.concatenate([block.y for block in blocks])
         assert y.size == samples and np.flatnonzero(np.isnan(y)).tolist() == missing
         assert line.refused() == ({"gap": 4} if hold_s == 0.0 else {})
@@ -246,14 +247,14 @@ def test_a_signal_that_does_not_come_is_missing_and_a_pause_is_a_gap(monkeypatch
 def test_fewer_messages_than_a_block_needs_do_not_stop_a_broker_that_waits_for_acknowledgements() -> None:
     line = Line(limit=8, block=10.0)
     line.rows(time.time(), 5)
-    assert [block.t.size for block in line.collector.poll(10)] == [5]
+    assert [block.t.size for block in line.inbox.poll(10)] == [5]
 
 
 def test_a_signal_that_is_too_slow_makes_no_samples_that_would_look_like_a_fault() -> None:
     line, t0, noise = Line(), time.time() - 30.0, np.random.default_rng(1).normal(size=300)
     for k in range(150):
         line.send({"t": t0 + 0.1 * k, "r": noise[k], "u": noise[k], "y": noise[k]})
-    assert line.collector.troubles["press"].why.startswith("r comes every 100 ms, the loop needs 10")
+    assert line.inbox.asset_troubles["press"].why.startswith("r comes every 100 ms, the loop needs 10")
     assert line.refused()["slow"] > 50
 
 
@@ -263,7 +264,7 @@ def test_signals_in_messages_of_their_own_may_come_one_after_the_other() -> None
         for name in "ruy":
             for k in range(start, start + 10):
                 line.send({"t": t0 + 0.01 * k, "v": k}, f"plant/press/{name}")
-    blocks = line.collector.poll(100)
+    blocks = line.inbox.poll(100)
     assert np.concatenate([block.u for block in blocks]).tolist() == list(range(10 * len(blocks))) and len(blocks) >= 4
 
 
@@ -299,33 +300,33 @@ def test_an_alias_needs_its_birth_and_after_a_death_nothing_holds() -> None:
         ),
         round(time.time()) - 10.0,
     )
-    assert "spBv1.0/+/+/+/press" in line.collector.mapping.topic_filters()
+    assert "spBv1.0/+/+/+/press" in line.inbox.mapping.addresses()
 
     def data(k: int) -> bytes:
         return metrics(*({"alias": a, "double_value": float(k)} for a in (1, 2, 3)), t=t0 + 0.01 * k)
 
     line.send(data(0), "spBv1.0/g/DDATA/n/press")
-    assert line.collector.mapping.missing_births == {("g", "n")} and line.refused() == {"no birth": 1}
+    assert [topic for topic, _ in line.requested] == ["spBv1.0/g/NCMD/n"] and line.refused() == {"no birth": 1}
     line.send(metrics({"name": "bdSeq", "datatype": 8, "long_value": 4}), "spBv1.0/g/NBIRTH/n")
     birth = metrics(
         *({"name": x, "alias": a, "datatype": 10, "double_value": 0.0} for a, x in enumerate("ruy", 1)), t=t0
     )
     line.send(birth, "spBv1.0/g/DBIRTH/n/press")
-    assert not line.collector.mapping.missing_births
+    assert len(line.requested) == 1
     for k in range(1, 15):
         line.send(data(k), "spBv1.0/g/DDATA/n/press")
     line.send(metrics({"name": "bdSeq", "datatype": 8, "long_value": 3}), "spBv1.0/g/NDEATH/n")  # of an earlier session
-    assert not line.collector.troubles
+    assert not line.inbox.asset_troubles
     line.send(metrics({"name": "bdSeq", "datatype": 8, "long_value": 4}), "spBv1.0/g/NDEATH/n")
-    assert line.collector.troubles["press"].state == "silent" and "NDEATH" in line.collector.troubles["press"].why
+    assert line.inbox.asset_troubles["press"].state == "silent" and "NDEATH" in line.inbox.asset_troubles["press"].why
     birth = metrics(
         *({"name": x, "alias": a, "datatype": 10, "double_value": 9.0} for a, x in enumerate("ruy", 1)), t=t0 + 2.0
     )
     line.send(birth, "spBv1.0/g/DBIRTH/n/press")
     for k in range(201, 215):
         line.send(data(k), "spBv1.0/g/DDATA/n/press")
-    assert not line.collector.troubles
-    blocks = line.collector.poll(100)
+    assert not line.inbox.asset_troubles
+    blocks = line.inbox.poll(100)
     t = np.concatenate([block.t for block in blocks])
     assert not ((t > t0 + 0.145) & (t < t0 + 1.99)).any()  # nothing was held over the time in which it was gone
     rebirth = payload_class().FromString(encode_rebirth(NEW_YEAR)).metrics[0]

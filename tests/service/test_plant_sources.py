@@ -20,8 +20,8 @@ from reliability.servers import Mosquitto
 from servoscope.service.build import build_components
 from servoscope.service.commissioning import listen
 from servoscope.service.config import ServiceFile
-from servoscope.service.mapping import collector
 from servoscope.service.service import Service
+from servoscope.service.sources import inbox
 from servoscope.service.sources.block import Block
 
 RATE = 100.0
@@ -82,7 +82,7 @@ def send(sender: Sender, messages: Iterator[plants.Message] | list[plants.Messag
 def test_what_a_plant_sends_is_in_the_store_and_what_is_broken_costs_itself(
     name: str, folder: Path, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(collector, "MAX_QUIET_S", 0.5)
+    monkeypatch.setattr(inbox, "MAX_QUIET_S", 0.5)
     path = service_file(folder, f"hall{list(plants.WRITERS).index(name)}", broker.port, plants.form(name)[0])
     running, sender = start(path), Sender(broker.port)
     begin = round(time.time()) - 60.0
@@ -111,7 +111,7 @@ def test_what_a_plant_sends_is_in_the_store_and_what_is_broken_costs_itself(
 def test_two_services_at_one_broker_each_receive_their_own_assets_only(
     folder: Path, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(collector, "MAX_QUIET_S", 0.5)
+    monkeypatch.setattr(inbox, "MAX_QUIET_S", 0.5)
     table, begin = plants.form("Insights Hub")[0], round(time.time()) - 60.0
     paths = {one: service_file(folder, f"only-{one}", broker.port, table, (one,)) for one in ("press", "lift")}
     running, sender = {one: start(path) for one, path in paths.items()}, Sender(broker.port)

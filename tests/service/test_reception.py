@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from brokers import Running, Sender, started_broker, until
 from halls import asked
+from inboxes import STUB
 from reliability.servers import Mosquitto
 from typer.testing import CliRunner
 
@@ -33,7 +34,7 @@ from servoscope.service.build import build_components
 from servoscope.service.config import DiagnosisSettings, ServiceFile
 from servoscope.service.health import serve_health
 from servoscope.service.mqtt import client
-from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
+from servoscope.service.mqtt.source import MqttSourceSettings
 from servoscope.service.notifications import Notifier
 from servoscope.service.service import Service
 from servoscope.service.sources.block import Block
@@ -166,7 +167,7 @@ def test_two_clients_of_one_name_are_refused_before_anything_starts() -> None:
 
 def test_a_client_that_is_thrown_out_by_one_of_its_name_says_so(tmp_path: Path, broker: Mosquitto) -> None:
     settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=broker.port)
-    ours, theirs = (MqttSource(settings, frozenset({"press"}), tmp_path, "hall.plant") for _ in range(2))
+    ours, theirs = (settings.create("hall.plant", {"press": STUB}, tmp_path) for _ in range(2))
     ours.open({})
     until(lambda: ours.connected, 30.0)
     assert not ours.trouble
@@ -182,7 +183,7 @@ def test_to_leave_a_broker_is_no_loss(tmp_path: Path, broker: Mosquitto, monkeyp
     events = list[str]()
     monkeypatch.setattr(client, "log", lambda _level, event, **_: events.append(event))
     settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=broker.port)
-    for visitor in (MqttSource(settings.for_visit(), frozenset({"press"}), tmp_path, f"hall.{k}") for k in range(2)):
+    for visitor in (settings.for_visit().create(f"hall.{k}", {"press": STUB}, tmp_path) for k in range(2)):
         visitor.open({})
         until(lambda one=visitor: one.connected, 30.0)
         visitor.close()

@@ -21,7 +21,7 @@ from servoscope.core.errors import StoreError
 from servoscope.core.settings_errors import describe_error
 from servoscope.service.actions import ActionSettings, OutboxEntry, deliver
 from servoscope.service.log import log, set_up_logging
-from servoscope.service.opcua.source import OpcuaSource, OpcuaSourceSettings
+from servoscope.service.opcua.source import OpcuaSourceSettings, OpcuaTransport
 from servoscope.service.store import Store
 from servoscope.service.store.engine import display_url, parse_store_url
 
@@ -137,7 +137,7 @@ def test_the_log_hides_what_addresses_hold_wherever_they_stand() -> None:
     try:
         set_up_logging("debug", stream)
         source = OpcuaSourceSettings(kind="opcua", url=planted("opc.tcp", "127.0.0.1:1"))
-        OpcuaSource(source, {}, Path())._log_trouble("the server is away")
+        OpcuaTransport(source, {}, Path())._log_trouble("the server is away")
         log("info", f"went to {planted('http', 'host')}", why=f"{planted('mqtt', 'broker')}: refused")
         log("info", "nested", document={"urls": [planted("https", "host")]})
         logging.getLogger("asyncua").warning("lost %s", planted("opc.tcp", "host"))

@@ -15,39 +15,37 @@ from servoscope.service.assets.reception import MAX_TURN_S
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
-from servoscope.service.sources.base import BlockSource
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import BlockDecoder, InboxMessage, Transport
 
 BLOCK_S = 0.5
 UNHEARD_S, SILENT_S = 30.0, 20.0  # until it is announced, by the settings that hold without others
 TOLERANCE_S = 2.0
 
 
-class Sensor(BlockSource):
+class Sensor(Transport):
     """Blocks of the asset press, each when it is complete, until the sensor falls silent; others never come."""
 
     def __init__(self, simulation: Simulation, silent_from: float) -> None:
         super().__init__()
-        self._simulation, self._silent_from, self._blocks = simulation, silent_from, 0
+        self._simulation, self.silent_from, self._blocks = simulation, silent_from, 0
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         pass
 
-    def poll(self, limit: int) -> list[Block]:
-        end = min(self._simulation.elapsed_s, self._silent_from)
-        found = list[Block]()
-        while (self._blocks + 1) * BLOCK_S <= end and len(found) < limit:
+    def receive(self, most: int) -> list[InboxMessage]:
+        end = min(self._simulation.elapsed_s, self.silent_from)
+        found = list[InboxMessage]()
+        while (self._blocks + 1) * BLOCK_S <= end and len(found) < most:
             k, recording = self._blocks, halls.recorded(1)
             n = round(BLOCK_S * 100.0)
             rows = slice(n * k % 5000, n * k % 5000 + n)
             t = self._simulation.began + (n * k + np.arange(n)) / 100.0
-            found.append(Block("press", k, t, recording.r[rows], recording.u[rows], recording.y[rows]))
+            block = Block("press", k, t, recording.r[rows], recording.u[rows], recording.y[rows])
+            found.append(InboxMessage("press", block, 0.0))
             self._blocks += 1
         return found
-
-    @property
-    def next_block_s(self) -> float:
-        return 0.02
 
     def close(self) -> None:
         pass
@@ -61,7 +59,7 @@ class Simulation:
         self.elapsed_s = 0.0
         config = ServiceFile.load(halls.hall(folder, "hall"))
         components = build_components(config)
-        components.sources["line"] = Sensor(self, silent_from)
+        components.sources["line"] = Inbox(Sensor(self, silent_from), BlockDecoder(), {})
         self.began = time.time()  # lift waits from about then
         self.service = Service(config, components, lambda: self.elapsed_s)
 
@@ -100,10 +98,10 @@ def test_silence_is_announced_and_dated_in_time_however_long_a_turn_takes(tmp_pa
 def test_what_was_not_listened_to_is_no_silence(tmp_path: Path) -> None:
     simulation = Simulation(tmp_path, silent_from=1000.0)
     simulation.run(5.0, 0.25)
-    source = simulation.service.sources["line"]
-    assert isinstance(source, Sensor)
+    sensor = simulation.service.sources["line"].transport
+    assert isinstance(sensor, Sensor)
     simulation.elapsed_s += 600.0  # the process was suspended, and its connections have nothing yet
-    source._silent_from = simulation.elapsed_s - 600.0
+    sensor.silent_from = simulation.elapsed_s - 600.0
     simulation.run(simulation.elapsed_s + 4.0, 0.25)
     assert simulation.service.assets["press"].reception.state == "followed"
     assert simulation.announced("press", "data_quality") is None and simulation.announced("lift", "reception") is None

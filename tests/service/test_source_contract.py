@@ -23,8 +23,9 @@ from test_opcua import NODES, RATE, STATUS, Plant, free_port
 from servoscope.models.loop import Loop
 from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
 from servoscope.service.opcua.settings import OpcuaNodes
-from servoscope.service.sources.base import CHECKS, BlockSource, SourceAsset
+from servoscope.service.sources.base import CHECKS, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
 from servoscope.signals import clean, writers
 
 # asyncua leaves sockets of connections that were cut to the garbage collector
@@ -40,12 +41,12 @@ class Harness:
         self.settings = find_kinds(SOURCES)[kind].load().model_validate({"kind": kind, **settings})
         self.asset, self.folder = asset, folder
 
-    def create(self) -> BlockSource:
+    def create(self) -> Inbox:
         source = self.settings.create("hall.contract", {"press": self.asset}, self.folder)
-        assert isinstance(source, BlockSource)
+        assert isinstance(source, Inbox)
         return source
 
-    def open(self, last: Block | None = None) -> BlockSource:
+    def open(self, last: Block | None = None) -> Inbox:
         """Return an open source that continues behind a block."""
         source = self.create()
         start = ResumePosition(last.sequence, self.start, last.stream, float(last.t[-1])) if last is not None else None
@@ -55,7 +56,7 @@ class Harness:
     start = 0.0
 
 
-def collect(source: BlockSource, blocks: int, limit: int = 100) -> list[Block]:
+def collect(source: Inbox, blocks: int, limit: int = 100) -> list[Block]:
     """Poll until there are so many blocks; return these."""
     found: list[Block] = []
 

@@ -12,16 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from inboxes import STUB
 from reliability.servers import Mosquitto, mosquitto
 
 from servoscope.service.assets.checkpoint import StreamPosition
 from servoscope.service.mqtt import payload
 from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
 from servoscope.service.mqtt.replay_client import ReplayClient, ReplayClientSettings
-from servoscope.service.mqtt.source import MqttSource, MqttSourceSettings
+from servoscope.service.mqtt.source import MqttSourceSettings
 from servoscope.service.service import Service
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.continuity import check_continuity
+from servoscope.service.sources.inbox import Inbox
 
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
 LOOP = Path(__file__).parents[2] / "src/servoscope/simulation/reference-rig.toml"
@@ -62,9 +64,9 @@ class Taker:
         default_factory=dict
     )  # what a store would hold
 
-    def start(self) -> MqttSource:
+    def start(self) -> Inbox:
         settings = MqttSourceSettings(kind="mqtt", host="127.0.0.1", port=self.port, client="hall")
-        self.source = MqttSource(settings, self.assets, Path(), "hall")
+        self.source = settings.create("hall", dict.fromkeys(self.assets, STUB), Path())
         self.source.open(
             {asset: ResumePosition(one.sequence, BEGAN, one.stream) for asset, (one, _) in self.kept.items()}
         )

@@ -15,7 +15,8 @@ from brokers import until
 from servoscope.models.loop import Loop
 from servoscope.service.sources.base import Rejection, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
-from servoscope.service.sources.folder import FolderSettings, FolderSource
+from servoscope.service.sources.folder import FolderSettings
+from servoscope.service.sources.inbox import Inbox
 
 LOOP = Loop.load(halls.LOOP)  # at 100 Hz
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
@@ -42,7 +43,7 @@ class Share:
         self.counted: dict[str, list[np.ndarray]] = {name: [] for name in self.assets}
         self.rejections = Counter[str]()
         self.reasons: list[Rejection] = []
-        self.source: FolderSource | None = None
+        self.source: Inbox | None = None
 
     def put(self, name: str, content: str | bytes, *, modified: float | None = None) -> Path:
         path = self.folder / name
@@ -52,7 +53,7 @@ class Share:
             os.utime(path, (modified, modified))
         return path
 
-    def open(self) -> FolderSource:
+    def open(self) -> Inbox:
         assets = {name: SourceAsset(self.loop, None) for name in self.assets}
         self.source = self.settings.create("hall.share", assets, self.folder.parent)
         self.source.open(self.kept)

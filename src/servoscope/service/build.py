@@ -28,8 +28,9 @@ from servoscope.service.assets.reception import UNHEARD_RECEPTION
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
 from servoscope.service.publishers.base import StatusPublisher
-from servoscope.service.sources.base import BlockSource, SourceAsset
+from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
 from servoscope.service.store import CheckpointRow, Store
 from servoscope.service.store.engine import parse_store_url
 
@@ -41,7 +42,7 @@ class ServiceComponents:
     assets: dict[str, Asset]
     groups: AssetGroups
     notifier: Notifier
-    sources: dict[str, BlockSource]
+    sources: dict[str, Inbox]
     publishers: dict[str, StatusPublisher]
     store: Store
     restarted: tuple[str, ...] = ()  # those that begin with a new state
@@ -123,7 +124,7 @@ def resume_assets(
         assets[name].count_rows(number)
 
 
-def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, BlockSource]]:
+def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, Inbox]]:
     """Return the assets and sources of a service file, these as visitors: a service that runs loses nothing to them."""
     sources = {name: settings.for_visit() for name, settings in config.sources.items()}
     visit = config.model_copy(update={"name": f"{config.name}.check", "sources": sources})
@@ -140,10 +141,10 @@ def check_service_file(config: ServiceFile) -> list[str]:
     check_actions(config, assets)
     sources = _build_sources(config, assets)
     _build_publishers(config)
-    return [f"[sources] {name}: {line}" for name, source in sources.items() for line in source.preview()]
+    return [f"[sources] {name}: {line}" for name, source in sources.items() for line in source.transport.preview()]
 
 
-def open_source(config: ServiceFile, name: str, source: BlockSource, assets: Mapping[str, Asset]) -> None:
+def open_source(config: ServiceFile, name: str, source: Inbox, assets: Mapping[str, Asset]) -> None:
     """Open a source of a service that runs; beside a store in a file it may note what must survive the process."""
     url, client = parse_store_url(config.store.url, config.folder), config.client_names()["sources", name]
     prefix = f"{url.database}." if url.get_backend_name() == "sqlite" else ""  # else: in the folder where it runs
@@ -263,13 +264,13 @@ def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str)
     return found
 
 
-def build_source(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> BlockSource:
+def build_source(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> Inbox:
     """Return a source, not yet open; raises ServoscopeError if something that it names cannot be used."""
     client = config.client_names()["sources", name]
     return config.sources[name].create(client, source_assets(config, assets, name), config.folder)
 
 
-def _build_sources(config: ServiceFile, assets: Mapping[str, Asset]) -> dict[str, BlockSource]:
+def _build_sources(config: ServiceFile, assets: Mapping[str, Asset]) -> dict[str, Inbox]:
     return {name: build_source(config, assets, name) for name in config.sources}
 
 

@@ -20,7 +20,7 @@ from servoscope.service.kinds import PUBLISHERS, SOURCES, parse_tables
 from servoscope.service.network import NetworkSettings, apply_network
 from servoscope.service.opcua.settings import OpcuaNodes
 from servoscope.service.publishers.base import PublisherSettings
-from servoscope.service.sources.base import SourceSettings
+from servoscope.service.sources.settings import SourceSettings
 from servoscope.signals.quality import QualitySettings
 
 Paths = Annotated[tuple[NonEmptyStr, ...], Field(min_length=1)]

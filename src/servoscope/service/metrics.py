@@ -15,7 +15,8 @@ from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.metrics import write_asset_series
 from servoscope.service.health import alarm_gauge
 from servoscope.service.layer_times import LayerTimes
-from servoscope.service.sources.base import BlockSource, Rejection
+from servoscope.service.sources.base import Rejection
+from servoscope.service.sources.inbox import Inbox
 from servoscope.service.writer import StoreWriter
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class MetricsContext(Protocol):
     """What the metrics read of a service."""
 
     assets: dict[str, Asset]
-    sources: dict[str, BlockSource]
+    sources: dict[str, Inbox]
     writer: StoreWriter
     layers: LayerTimes
     last_turn: float  # when it last polled its sources, by the monotonic clock [s]
@@ -105,7 +106,7 @@ class ServiceMetrics:
         layers = CounterMetricFamily("servoscope_processor_seconds", "Processor time by layer", labels=["layer"])
         shares = TotalCounter({**service.layers.seconds, "metrics": self._render_s})
         for source in service.sources.values():
-            shares.update(source.layer_seconds)
+            shares.update(source.transport.layer_seconds)
         for layer, seconds in shares.items():
             layers.add_metric([layer], seconds)
         up = GaugeMetricFamily("servoscope_source_up", "Whether a source is connected", labels=["source"])

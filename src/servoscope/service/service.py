@@ -30,8 +30,8 @@ from servoscope.service.log import log, set_level
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.publishers.base import publisher_trouble
 from servoscope.service.reload import reload_components
-from servoscope.service.sources.base import BlockSource
 from servoscope.service.sources.block import Block
+from servoscope.service.sources.inbox import Inbox
 from servoscope.service.systemd import notify_systemd
 from servoscope.service.writer import StoreWriter
 
@@ -192,7 +192,7 @@ class Service:
             self._next_commit = now + self.config.service.commit_every_s
             self._commit()
 
-    def _process_blocks(self, source: BlockSource, blocks: Sequence[Block]) -> None:
+    def _process_blocks(self, source: Inbox, blocks: Sequence[Block]) -> None:
         # recordings are dated as they like
         latest = self.clock.latest() + self.config.service.ahead_s if source.clock_rate == 1.0 else math.inf
         for found in self._groups.process(blocks, latest):

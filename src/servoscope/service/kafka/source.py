@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -15,11 +16,14 @@ from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
 from servoscope.service.config_types import read_password
 from servoscope.service.log import log
-from servoscope.service.mapping.collector import MessageCollector, MessageSource
+from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.network import TlsSettings
-from servoscope.service.sources.base import SourceAsset, SourceSettings
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
+from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import InboxMessage, Transport
+from servoscope.service.sources.settings import SourceSettings
 
 FETCH_S = 0.2  # how long one call of the client waits for messages
 SESSION_MS = 6000  # after a kill so long, the brokers give our partitions away, to our next process as well
@@ -62,9 +66,11 @@ class KafkaSourceSettings(TlsSettings, SourceSettings):
         """Messages have what the payload names."""
         return self.payload.carries(covariate)
 
-    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> KafkaSource:
+    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> Inbox:
         """Return the source."""
-        return KafkaSource(self, assets, folder, name)
+        rejections = RejectionCounter()
+        decoder = MessageMapping.of_assets(self.payload, assets, rejections)
+        return Inbox(KafkaTransport(self, folder, name), decoder, assets, rejections, self.in_flight)
 
     def client_settings(self, name: str, folder: Path) -> dict[str, Any]:
         """Return what the client library calls these settings."""
@@ -103,12 +109,10 @@ class _PartitionOffsets:
         return next(iter(self.open), self.next)
 
 
-class KafkaSource(MessageSource):
-    """Follows the messages of some assets; `client` names its group, unless the settings do."""
+class KafkaTransport(Transport):
+    """Receives the messages of some topics; `client` names our group, unless the settings do."""
 
-    def __init__(
-        self, settings: KafkaSourceSettings, assets: Mapping[str, SourceAsset], folder: Path, client: str
-    ) -> None:
+    def __init__(self, settings: KafkaSourceSettings, folder: Path, client: str) -> None:
         super().__init__()
         try:
             import confluent_kafka
@@ -124,27 +128,15 @@ class KafkaSource(MessageSource):
             )
         named = all("{asset}" in topic for topic in settings.payload.topics)
         self._keys_name_assets = named and not settings.is_visit
-        self._collector = MessageCollector(settings.payload, assets, self.rejections, settings.in_flight)
         self._client_settings = settings.client_settings(client, folder)
         self._lock = threading.Lock()
         self._offsets: dict[tuple[str, int], _PartitionOffsets] = {}
         self._stop_event = threading.Event()
         self._thread = threading.Thread(target=self._run, name="kafka", daemon=True)
-        self._trouble, self._connected = render(message("service.trouble.connecting")), False
-
-    @property
-    def connected(self) -> bool:  # type: ignore[override]  # others set it
-        """Whether a broker has given us partitions."""
-        return self._connected
-
-    @property
-    def trouble(self) -> str:
-        """What is wrong with the connection, in words; empty: nothing."""
-        return self._trouble
+        self.trouble, self.connected = render(message("service.trouble.connecting")), False
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as a broker is there."""
-        self._collector.open(resume, self.state_file)
         self._thread.start()
 
     def _run(self) -> None:
@@ -167,13 +159,13 @@ class KafkaSource(MessageSource):
 
     def _note_error(self, error: Any) -> None:
         trouble = render(message("service.trouble.unreachable", reason=str(error.str())[:200]))
-        if trouble != self._trouble:
+        if trouble != self.trouble:
             log("error", "Kafka cannot be followed", brokers=", ".join(self.settings.brokers), why=trouble)
-        if error.code() == self._kafka.KafkaError._ALL_BROKERS_DOWN or not self._connected:
-            self._trouble, self._connected = trouble, False
+        if error.code() == self._kafka.KafkaError._ALL_BROKERS_DOWN or not self.connected:
+            self.trouble, self.connected = trouble, False
 
     def _begin_partitions(self, _consumer: Any, _partitions: Any) -> None:
-        self._trouble, self._connected = "", True
+        self.trouble, self.connected = "", True
         log("info", "Kafka followed", topics=", ".join(self._topics))
 
     def _end_partitions(self, _consumer: Any, partitions: Any) -> None:
@@ -185,22 +177,21 @@ class KafkaSource(MessageSource):
         if one.error() is not None:
             self._note_error(one.error())
             return
-        self._trouble, self._connected = "", True
+        self.trouble, self.connected = "", True
         topic, partition, offset = one.topic(), one.partition(), one.offset()
         key, content = one.key(), one.value() or b""
         address = f"{topic}/{key.decode(errors='replace')}" if key else topic
         with self._lock:
             offsets = self._offsets.setdefault((topic, partition), _PartitionOffsets())
             offsets.open[offset], offsets.next = None, offset + 1
-        acknowledge = partial(self._settle, offsets, offset)
-        if self._keys_name_assets and not self._collector.mapping.find_asset(address):
-            acknowledge()  # another service's: a topic comes as a whole
+        if self._keys_name_assets and not self.decoder.find_asset(address):
+            self._settle(offsets, offset)  # another service's: a topic comes as a whole
         elif len(content) > self.settings.largest:
-            reason = f"{len(content)} bytes, largest = {self.settings.largest}"
-            self.rejections.add(self._collector.mapping.find_asset(address), "oversized", reason)
-            acknowledge()
+            self.refuse(address, "oversized", f"{len(content)} bytes, largest = {self.settings.largest}")
+            self._settle(offsets, offset)
         else:
-            self._collector.add(address, content, acknowledge)
+            release = partial(self._settle, offsets, offset)
+            self.waiting.append(InboxMessage(address, content, time.monotonic(), release))
 
     def _settle(self, offsets: _PartitionOffsets, offset: int) -> None:
         with self._lock:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,35 +27,22 @@ from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder
 from servoscope.service.mqtt.payload import parse_json
 from servoscope.service.sources.assembly import SIGNALS
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import MAX_TIME_S
+from servoscope.service.sources.message import Content, Decoder, InboxMessage, SignalValue
 from servoscope.signals.readers.clock import ZoneOffset
 
 PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts
 MAX_STAMP = 10**30  # beyond any time, in any unit
 MAX_NAMES_SHOWN = 8  # names that a message lists
 MAX_BAD_ROWS = 100  # of a message that are refused one by one
+TASK = "servoscope.service.mapping.rows:try_decoding"
 MAX_EXTRA = 1000  # names of a message that are not mapped, of which some are shown
 _ALWAYS = frozenset(range(len(SIGNALS)))  # what each sample has; covariates come when they like
 Reject = Callable[[str, str, str], None]  # counts what cannot be used: of which asset, of which kind, why
 
 
-class SignalValue(NamedTuple):
-    """A value of one signal."""
-
-    signal: int  # place among r, u, y and the covariates, in the order of the settings
-    t: float  # [UTC s]
-    value: float  # NaN: it is known to be bad
-
-
-class MessageContent(NamedTuple):
-    """What a message holds: values by asset; assets whose sender is gone; whether each row has r, u and y."""
-
-    values: dict[str, list[SignalValue]]
-    gone: frozenset[str] = frozenset()
-    complete: bool = False
-
-
-class MessageMapping:
+class MessageMapping(Decoder):
     """Reads the messages of some assets, given with their sample rates [Hz].
 
     Raises ConfigError if the settings do not say of which asset a message is, or name one that there is not.
@@ -61,6 +50,9 @@ class MessageMapping:
 
     def __init__(self, settings: PayloadSettings, rates: Mapping[str, float], reject: Reject) -> None:
         self.settings, self._rates, self._reject = settings, rates, reject
+        self.covariates = tuple(settings.fields.covariates)
+        self.block_s, self.hold_s, self.is_dated = settings.block, settings.hold_s, bool(settings.time)
+        self.trial = TASK, settings, dict(rates)
         if strange := set(settings.called) - set(rates):
             raise ConfigError(f"payload.called: there is no asset {min(strange)!r} of this source")
         if not settings.names_assets and len(rates) > 1:
@@ -83,9 +75,9 @@ class MessageMapping:
         self._fields = [split_path(one) for one in settings.fields.all]
         self._by_name = {name: k for k, name in enumerate(settings.fields.all)} if settings.has_signal_names else {}
         self._value = split_path(settings.value)
-        scale, covariates = settings.scale, tuple(settings.fields.covariates)
-        self._scale = (scale.r, scale.u, scale.y, *(scale.covariates.get(name, 1.0) for name in covariates))
-        self._signals = (*SIGNALS, *covariates)
+        scale = settings.scale
+        self._scale = (scale.r, scale.u, scale.y, *(scale.covariates.get(name, 1.0) for name in self.covariates))
+        self._signals = (*SIGNALS, *self.covariates)
         self._known_names = ((SIGNAL, self._by_name), (ASSET, self._assets))
         self._sparkplug = SparkplugDecoder(self._is_mapped) if settings.decoder == "sparkplug" else None
         self._senders: dict[str, dict[str, str]] = {}  # by asset, what its last topic said
@@ -95,17 +87,23 @@ class MessageMapping:
         beside = (*self._time, *self._match, *self._good)
         self._expected = {str(one[-1]) for one in self._fields} | {str(path[0]) for path, _ in beside}
 
-    def topic_filters(self, *, everyone: bool = False) -> list[str]:
+    @classmethod
+    def of_assets(
+        cls, settings: PayloadSettings, assets: Mapping[str, SourceAsset], rejections: RejectionCounter
+    ) -> MessageMapping:
+        """Return the mapping for the assets of a source."""
+        return cls(settings, {name: one.loop.sample_rate for name, one in assets.items()}, rejections.add)
+
+    def addresses(self, *, everyone: bool = False) -> list[str]:
         """Return what to subscribe to: the topics of these assets, as far as topics tell them, or of `everyone`."""
         values = {} if everyone else {ASSET: frozenset(self._assets)}
         if self._by_name:
             values[SIGNAL] = frozenset(self._by_name)
         return sorted(set().union(*(one.filters(values) for one in self._topics)))
 
-    @property
-    def missing_births(self) -> set[tuple[str, str]]:
-        """Nodes of Sparkplug that have to send their births again: group and node; whoever asks them removes them."""
-        return self._sparkplug.missing_births if self._sparkplug is not None else set()
+    def requests(self) -> list[tuple[str, bytes]]:
+        """Return the messages that ask nodes of Sparkplug for their births."""
+        return self._sparkplug.rebirth_requests() if self._sparkplug is not None else []
 
     def _is_mapped(self, metric: str) -> bool:
         """Return whether a metric of Sparkplug may be a signal of an asset, by its name."""
@@ -126,7 +124,11 @@ class MessageMapping:
         """Return what the names of the first pattern that fits stand for."""
         return next((found for one in self._topics if (found := one.match(topic)) is not None), None)
 
-    def read(self, topic: str, message: bytes, received_at: float) -> MessageContent:
+    def decode(self, message: InboxMessage) -> Content:
+        """Return the values of a message; what has no time stamp was measured when it came."""
+        return self.read(message.address, message.content, time.time() - (time.monotonic() - message.at))
+
+    def read(self, topic: str, message: bytes, received_at: float) -> Content:
         """Return what a message holds that came at `received_at` [UTC s].
 
         A row that cannot be used is counted and left out; raises MessageError if nothing of the message can be read.
@@ -167,7 +169,7 @@ class MessageMapping:
         if extra and not self.settings.ignore_extra:
             text = ", ".join(sorted(extra)[:MAX_NAMES_SHOWN])[:200]
             self._reject(self.find_asset(topic), "extra", f"is not mapped: {text} (ignore_extra = true leaves it out)")
-        return MessageContent(values, gone, complete and bool(values))
+        return Content(values, gone, complete and bool(values))
 
     def _decode(self, names: dict[str, str], message: bytes) -> tuple[Any, frozenset[str]]:
         if self._sparkplug is not None:
@@ -299,3 +301,11 @@ def _parse_number(value: Any, what: str) -> float:
         return float(value)
     except (ValueError, OverflowError):
         raise MessageError("wrong type", f"{what}: {str(value)[:40]!r} is no number that a computer can hold") from None
+
+
+def try_decoding(
+    _: Callable[[str], None], settings: PayloadSettings, rates: Mapping[str, float], topic: str, content: bytes
+) -> None:
+    """Decode a message in a worker's process: it matters only that this comes to an end."""
+    with suppress(MessageError):
+        MessageMapping(settings, rates, lambda *_: None).read(topic, content, time.time())

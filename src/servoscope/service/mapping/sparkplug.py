@@ -7,6 +7,7 @@ are Protocol Buffers; their field numbers stand in `FIELDS`, and protobuf reads 
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
@@ -28,6 +29,7 @@ SIGNED_BITS = {1: 8, 2: 16, 3: 32, 4: 64}  # by number of the data type: Int8 to
 NUMBERS = ("int_value", "long_value", "float_value", "double_value")
 SEQUENCE = "bdSeq"  # metric that tells which birth a death belongs to (6.4.22)
 REBIRTH = "Node Control/Rebirth"  # metric that asks a node for its births (6.4.23)
+REBIRTH_EVERY_S = 10.0  # how often a node is asked for its births
 MAX_NODES, MAX_METRICS = 1000, 100_000  # that are remembered, whatever comes; the metrics are those of all nodes
 Sender = tuple[str, ...]  # what a topic names beside the kind of message: group, node, device
 BIRTHS, DEATHS, DATA = ("NBIRTH", "DBIRTH"), ("NDEATH", "DDEATH"), ("NDATA", "DDATA")
@@ -86,6 +88,7 @@ class SparkplugDecoder:
         self._payload, self._is_mapped = payload_class(), is_mapped
         self._nodes: dict[tuple[str, str], _Node] = {}  # the last one heard last
         self.missing_births = set[tuple[str, str]]()
+        self._asked_at: dict[tuple[str, str], float] = {}  # by node, monotonic [s]
 
     def decode(self, names: Mapping[str, str], message: bytes) -> list[dict[str, Any]]:
         """Return the metrics of a message as rows; a death has none. Raises MessageError if it is no message."""
@@ -122,6 +125,17 @@ class SparkplugDecoder:
             if (row := _row(metric, about, payload.timestamp)) is not None:
                 rows.append(row)
         return rows
+
+    def rebirth_requests(self) -> list[tuple[str, bytes]]:
+        """Return the messages, with their topics, that ask nodes for missing births; each node now and then only."""
+        missing, now = self.missing_births, time.monotonic()
+        if not missing:
+            return []
+        self._asked_at = {node: at for node, at in self._asked_at.items() if now - at < REBIRTH_EVERY_S}
+        asked = sorted(missing - self._asked_at.keys())[: MAX_NODES - len(self._asked_at)]
+        self._asked_at |= dict.fromkeys(asked, now)
+        missing.clear()
+        return [(f"spBv1.0/{group}/NCMD/{node}", encode_rebirth(time.time())) for group, node in asked]
 
     def _take_birth(self, about: _Node, metrics: Iterable[Any], sender: Sender) -> _Node:
         about.senders.add(sender)

@@ -23,15 +23,17 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
-from functools import cache, lru_cache
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import MessageError
+from servoscope.service.mqtt.topics import data_topic, parse_asset
+from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import MAX_COUNT, MAX_TIME_S, Block
+from servoscope.service.sources.message import Content, Decoder, InboxMessage
 
 MAGIC, VERSION = b"SVSB", 1
 HEADER = struct.Struct("<4sBBHII")
@@ -49,13 +51,6 @@ class BlockMessage(NamedTuple):
     content: bytes
     received_at: float = 0.0
     covariates: Sequence[str] = ()
-
-
-class DecodedBlock(NamedTuple):
-    """A block, and the number of the oldest one that its sender retains; None: it retains none."""
-
-    block: Block
-    oldest: int | None
 
 
 def encode_binary(block: Block, oldest: int | None = None) -> bytes:
@@ -86,7 +81,7 @@ def _plain_column(values: FloatArray) -> list[float | None]:
     return [x if math.isfinite(x) else None for x in values.tolist()]
 
 
-def decode_blocks(messages: Sequence[BlockMessage]) -> Iterator[DecodedBlock | MessageError]:
+def decode_blocks(messages: Sequence[BlockMessage]) -> Iterator[Block | MessageError]:
     """Yield the block of each message, or why it is none: what `decode_block` returns or raises, in less time."""
     from servoscope.service.mqtt.block_kernels import parse_regular  # late: it imports Numba
 
@@ -103,18 +98,16 @@ def decode_blocks(messages: Sequence[BlockMessage]) -> Iterator[DecodedBlock | M
                 except MessageError as error:
                     yield error
                 continue
-            retained = found.oldest is not None
-            block = Block.from_signals(
-                one.asset, found.sequence, found.signals, one.received_at, found.stream, retained
+            yield Block.from_signals(
+                one.asset, found.sequence, found.signals, one.received_at, found.stream, found.oldest
             )
-            yield DecodedBlock(block, found.oldest)
 
 
 def _is_whole(message: bytes, checksum: int | None) -> bool:
     return checksum is None or zlib.crc32(memoryview(message)[HEADER.size :]) == checksum
 
 
-def decode_block(asset: str, message: bytes, received_at: float = 0.0, covariates: Sequence[str] = ()) -> DecodedBlock:
+def decode_block(asset: str, message: bytes, received_at: float = 0.0, covariates: Sequence[str] = ()) -> Block:
     """Return the block of a message, binary or JSON, that came at `received_at` by the monotonic clock [s].
 
     `covariates`: names of the further columns that it must have; without them, further columns are left out. Memory is
@@ -127,7 +120,7 @@ def decode_block(asset: str, message: bytes, received_at: float = 0.0, covariate
     raise MessageError("not a block", f"begins with {message[:8]!r}: neither a binary block nor a JSON object")
 
 
-def _decode_binary(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> DecodedBlock:
+def _decode_binary(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> Block:
     if len(message) < HEADER.size + BODY_HEADER.size:
         shortest = HEADER.size + BODY_HEADER.size
         raise MessageError("truncated", f"{len(message)} bytes, a binary block has at least {shortest}")
@@ -155,45 +148,7 @@ def _decode_binary(asset: str, message: bytes, received_at: float, covariates: S
     return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, signals, received_at)
 
 
-@cache
-def _json_decoder() -> Any:
-    """Return what reads a JSON message of the usual keys in a third of the time that `parse_json` and checks take."""
-    import msgspec
-
-    numbers, number = list[float | None], float | None
-    given: list[tuple[str, Any]] = [("version", int), ("sequence", int), *((name, numbers) for name in "ruy")]
-    others: list[tuple[str, Any]] = [("t", numbers | None), ("t0", number), ("dt", number), ("oldest", int | None)]
-    fields: list[Any] = [*given, *((name, kind, None) for name, kind in others), ("stream", int, 0)]
-    return msgspec.json.Decoder(msgspec.defstruct("JsonBlock", fields, forbid_unknown_fields=True))
-
-
-@lru_cache(maxsize=16)
-def _packer(numbers: int) -> struct.Struct:
-    return struct.Struct(f"={numbers}d")
-
-
-def _decode_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> DecodedBlock:
-    import msgspec
-
-    if covariates:
-        return _decode_loose_json(asset, message, received_at, covariates)
-    try:
-        found = _json_decoder().decode(message)
-        columns = [found.t, found.r, found.u, found.y]
-        lengths = {len(column) for column in columns if column is not None}
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        return _decode_loose_json(asset, message, received_at, ())  # which takes more, or says what is wrong
-    if found.version != VERSION or found.t is None or len(lengths) > 1:
-        return _decode_loose_json(asset, message, received_at, ())
-    signals = np.empty((4, len(found.t)))
-    try:  # in half of the time that np.array takes
-        _packer(signals.size).pack_into(signals.data, 0, *found.t, *found.r, *found.u, *found.y)
-    except (struct.error, OverflowError):
-        signals = np.array(columns, dtype=np.float64)  # None becomes NaN
-    return _build_block(asset, found.stream, found.sequence, found.oldest, signals, received_at)
-
-
-def _decode_loose_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> DecodedBlock:
+def _decode_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> Block:
     try:
         plain = parse_json(message)
     except (ValueError, RecursionError) as error:
@@ -278,7 +233,7 @@ def _join_columns(t: FloatArray, numbers: FloatArray) -> FloatArray:
 
 def _build_block(
     asset: str, stream: int, sequence: int, oldest: int | None, signals: FloatArray, received_at: float
-) -> DecodedBlock:
+) -> Block:
     t = signals[0]
     if not t.size:
         raise MessageError("empty", "no samples")
@@ -288,5 +243,39 @@ def _build_block(
         raise MessageError("out of range", f"{name}: must lie between 0 and 2^63 - 1")
     if not (t.min() >= 0.0 and t.max() < MAX_TIME_S):  # NaN is neither
         raise MessageError("times", "a time stamp is missing, or outside of the years 1970 to 9999")
-    block = Block.from_signals(asset, sequence, signals, received_at, stream, oldest is not None)
-    return DecodedBlock(block, oldest)
+    return Block.from_signals(asset, sequence, signals, received_at, stream, oldest)
+
+
+class BlockMessages(Decoder):
+    """Decodes the blocks of some assets under the topics that begin with a prefix."""
+
+    def __init__(self, prefix: str, assets: Mapping[str, SourceAsset]) -> None:
+        self._prefix, self._covariates = prefix, {name: one.covariates for name, one in assets.items()}
+        list(decode_blocks([BlockMessage("", b"")]))  # compiles it, so that the first block does not wait for it
+
+    def addresses(self, *, everyone: bool = False) -> list[str]:
+        """Return the topics of these assets: another service at this broker may follow others."""
+        return [data_topic(self._prefix, asset) for asset in sorted(self._covariates)]
+
+    def find_asset(self, address: str) -> str:
+        """Return the asset of a topic; empty: none of ours."""
+        asset = parse_asset(address)
+        return asset if asset in self._covariates else ""
+
+    def decode(self, message: InboxMessage) -> Content:
+        """Return the block of one message; `decode_all` takes less time for each of many."""
+        asset = parse_asset(message.address)
+        if asset not in self._covariates:
+            raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
+        return Content(blocks=(decode_block(asset, message.content, message.at, self._covariates[asset]),))
+
+    def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
+        """Yield the block of each message, or why it is none."""
+        assets = [parse_asset(one.address) for one in messages]
+        if not self._covariates.keys() >= set(assets):
+            yield from super().decode_all(messages)
+            return
+        named = zip(assets, messages, strict=True)
+        blocks = decode_blocks([BlockMessage(k, one.content, one.at, self._covariates[k]) for k, one in named])
+        for block in blocks:
+            yield block if isinstance(block, MessageError) else Content(blocks=(block,))

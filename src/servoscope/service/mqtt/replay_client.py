@@ -20,7 +20,7 @@ from servoscope.service.log import log
 from servoscope.service.mqtt import payload, topics
 from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerSettings, create_mqtt_client
 from servoscope.service.sources.block import Block, ResumePosition
-from servoscope.service.sources.replay import ReplaySettings, ReplaySource
+from servoscope.service.sources.replay import ReplaySettings, ReplayTransport
 
 if TYPE_CHECKING:
     from paho.mqtt.client import MQTTMessage, MQTTMessageInfo
@@ -90,7 +90,7 @@ class ReplayClient:
             for name, one in settings.assets.items()
         }
         covariates = {name: tuple(loop.columns.covariates) for name, (_, loop) in files.items()}
-        self._replay = ReplaySource(settings.replay.model_copy(update={"start": start}), files, covariates)
+        self._replay = ReplayTransport(settings.replay.model_copy(update={"start": start}), files, covariates)
         self._client = create_mqtt_client(settings.broker, settings.folder, "")
         self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
         self._client.on_message = self._on_message
@@ -127,7 +127,7 @@ class ReplayClient:
 
     @property
     def _done(self) -> bool:
-        return math.isinf(self._replay.next_block_s) and not any(queue.blocks for queue in self._queues.values())
+        return math.isinf(self._replay.next_message_s) and not any(queue.blocks for queue in self._queues.values())
 
     def _begin(self) -> None:
         """Continue behind what the service has."""
@@ -163,8 +163,8 @@ class ReplayClient:
         if not self._connected:
             return
         free = self.settings.ahead * len(self._queues) - sum(len(queue.blocks) for queue in self._queues.values())
-        for block in self._replay.poll(free):
-            self._enqueue(replace(block, stream=self._stream))
+        for message in self._replay.receive(free):
+            self._enqueue(replace(message.content, stream=self._stream))
         reconnected, self._reconnected = self._reconnected, False
         for asset, queue in self._queues.items():
             if reconnected:

@@ -39,14 +39,15 @@ from servoscope.service.opcua.settings import (
     import_asyncua,
 )
 from servoscope.service.opcua.subscriptions import QUEUE_MARGIN, ArraySubscription, ScalarSubscription, timestamp
-from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
+from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import BlockDecoder, InboxMessage, Transport
+from servoscope.service.sources.settings import SourceSettings
 
-POLL_S = 0.02
 SETTLING_S = 2.0  # behind the server's clock: a change that has not been reported by then has not happened
 RETRY_NODES_S = 30.0  # between two attempts to subscribe to nodes that the server has refused
 RECONNECT_S = 1.0  # between two attempts to connect
-MAX_BUFFERED = 10_000  # blocks that wait to be polled; then the oldest are dropped, and counted as rejected
 SERVER_TIME = "i=2258"  # Server_ServerStatus_CurrentTime, which every server has
 
 
@@ -75,9 +76,9 @@ class OpcuaSourceSettings(ConnectionSettings, CertificateSettings, SourceSetting
     heartbeat: NonEmptyStr = SERVER_TIME
     heartbeat_s: Seconds = 5.0  # without a heartbeat for so long, the connection is made anew [s]
 
-    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> OpcuaSource:
+    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> Inbox:
         """Return the source of these nodes."""
-        return OpcuaSource(self, assets, folder)
+        return Inbox(OpcuaTransport(self, assets, folder), BlockDecoder(), assets)
 
     def carries(self, covariate: str, address: OpcuaNodes) -> bool:
         """Arrays have what the loop's columns name; single values, what the nodes name."""
@@ -122,11 +123,13 @@ class _SubscriptionHandler:
         self.end_status = str(status.Status)
 
 
-class OpcuaSource(BlockSource):
-    """Subscribes to the nodes of several assets.
+class OpcuaTransport(Transport):
+    """Subscribes to the nodes of several assets, and makes blocks of their values.
 
     A server waits for no acknowledgement: what was not stored is read from its history after a restart.
     """
+
+    keeps = False
 
     def __init__(self, settings: OpcuaSourceSettings, assets: Mapping[str, SourceAsset], folder: Path) -> None:
         super().__init__()
@@ -136,31 +139,20 @@ class OpcuaSource(BlockSource):
         check_files(folder, settings.cert_file, settings.key_file, settings.server_cert_file)
         self._assets = dict(assets)
         check_nodes(settings.heartbeat, *(node for one in self._assets.values() for node in one.address.given))
-        self._waiting: deque[Block] = deque()
         self._handles = 1  # of the next item that is monitored
         self._stop_event = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="opcua", daemon=True)
         self._subscriptions: list[ArraySubscription | ScalarSubscription] = []
         self._last_heartbeat = self._server_time = math.nan
-        self._trouble, self._connected = render(message("service.trouble.connecting")), False
+        self.trouble, self.connected = render(message("service.trouble.connecting")), False
 
     @property
-    def connected(self) -> bool:  # type: ignore[override]  # others set it
-        """Whether the server is followed."""
-        return self._connected
-
-    @property
-    def trouble(self) -> str:
-        """Why the server cannot be followed, or not for long, in words; empty: nothing is wrong."""
-        return self._trouble
-
-    @property
-    def asset_troubles(self) -> dict[str, AssetTrouble]:
+    def asset_troubles(self) -> dict[str, AssetTrouble]:  # type: ignore[override]
         """Assets whose nodes are refused, or come too slowly."""
         return {one.asset: one.trouble for one in self._subscriptions if one.trouble is not None}
 
     @property
-    def update_intervals_s(self) -> dict[tuple[str, str], float]:
+    def update_intervals_s(self) -> dict[tuple[str, str], float]:  # type: ignore[override]
         """Time between two updates, as measured, by asset and signal [s]."""
         return {(one.asset, name): value for one in self._subscriptions for name, value in one.intervals_s.items()}
 
@@ -178,10 +170,7 @@ class OpcuaSource(BlockSource):
         self._thread.start()
 
     def _enqueue(self, block: Block) -> None:
-        if len(self._waiting) >= MAX_BUFFERED:
-            lost = self._waiting.popleft()
-            self.rejections.add(lost.asset, "overflow", "blocks wait longer than there is room for them")
-        self._waiting.append(block)
+        self.waiting.append(InboxMessage(block.asset, block, block.completed_at))
 
     async def _run(self) -> None:
         """Follow the server through its restarts, in a thread of its own."""
@@ -195,13 +184,13 @@ class OpcuaSource(BlockSource):
                     self._log_trouble(
                         render(message("service.trouble.unreachable", reason=words or type(error).__name__))
                     )
-            self._connected = False
+            self.connected = False
             await asyncio.sleep(RECONNECT_S if not self._stop_event.is_set() else 0.0)
 
     def _log_trouble(self, trouble: str) -> None:
-        if trouble != self._trouble:
+        if trouble != self.trouble:
             log("error", "OPC UA server cannot be followed", url=show_address(self.settings.url), why=trouble)
-        self._trouble = trouble
+        self.trouble = trouble
 
     async def _run_subscription(self, client: Any) -> None:
         """Subscribe, read what was missed, and continue until the server is silent."""
@@ -220,8 +209,8 @@ class OpcuaSource(BlockSource):
         now = _parse_heartbeat(await client.get_node(heartbeat).read_data_value())
         for one in self._subscriptions:
             await one.read_missed(client, now)
-        self._connected, self._last_heartbeat = True, time.monotonic()
-        self._trouble = describe_expiry(client, self._folder, self.settings, datetime.now(UTC))
+        self.connected, self._last_heartbeat = True, time.monotonic()
+        self.trouble = describe_expiry(client, self._folder, self.settings, datetime.now(UTC))
         retry_at = time.monotonic() + RETRY_NODES_S
         log("info", "OPC UA server followed", url=show_address(self.settings.url))
         while not self._stop_event.is_set():
@@ -267,15 +256,6 @@ class OpcuaSource(BlockSource):
         for one in changed:
             one.check_grants(grants, period)
         return period
-
-    def poll(self, limit: int) -> list[Block]:
-        """Return blocks in the order in which they came."""
-        return [self._waiting.popleft() for _ in range(min(limit, len(self._waiting)))]
-
-    @property
-    def next_block_s(self) -> float:
-        """How long until the next block may be due [s]."""
-        return 0.0 if self._waiting else POLL_S
 
     def close(self) -> None:
         """Disconnect."""

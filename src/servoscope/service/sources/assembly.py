@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import message, render
+from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.message import SignalValue
 from servoscope.service.sources.resample import Resampler, SampleGap
 from servoscope.service.sources.update_rate import UpdateRate
 
 SIGNALS = ("r", "u", "y")  # what single values are of, in this order
+MAX_KNOWN_MESSAGES = 1000  # messages of an asset by which one that comes again is known
+MAX_VALUES = 100_000  # of a signal, between two looks at what is complete
+SETTLED_PERIOD_SHARE = 0.75  # of a period: behind a row with all signals nothing of its moment comes
+LAG_S = 2.0  # how far a signal may be behind others, which come in messages of their own, by time stamps
 
 
 class BlockAssembler:
@@ -111,3 +120,128 @@ def describe_gap(gap: SampleGap) -> str:
     """Return when a gap was."""
     start, end = (datetime.fromtimestamp(t, UTC).isoformat(timespec="milliseconds") for t in gap[:2])
     return f"{gap.samples} samples between {start} and {end} are missing"
+
+
+class Receipt:
+    """A message that came: `release` calls `acknowledge` when all that hold it have released it."""
+
+    __slots__ = ("_acknowledge", "holders")
+
+    def __init__(self, acknowledge: Callable[[], None]) -> None:
+        self._acknowledge, self.holders = acknowledge, 1
+
+    def release(self) -> None:
+        """Release it for one of its holders, or for whom it was made by."""
+        self.holders -= 1
+        if not self.holders:
+            self._acknowledge()
+
+
+class _OpenMessage(NamedTuple):
+    """The times of an asset's values in a message [UTC s]: until none of them waits, some are in no block."""
+
+    first: float
+    last: float
+    receipt: Receipt
+
+    def waits(self, times: FloatArray) -> bool:
+        at = int(np.searchsorted(times, self.first))
+        return at < times.size and times[at] <= self.last
+
+
+class AssetStream(BlockAssembler):
+    """What has come of one asset in messages, and is in no block; `known`: covariates of the messages, in order.
+
+    `block_s`: length of a block [s]; the asset wants some of the covariates, in its own order.
+    """
+
+    def __init__(
+        self,
+        asset: str,
+        resume: ResumePosition,
+        rejections: RejectionCounter,
+        rate: float,
+        block_s: float,
+        hold_s: float,
+        known: Sequence[str],
+        covariates: tuple[str, ...],
+    ) -> None:
+        size = max(1, round(block_s * rate))
+        super().__init__(asset, resume, rejections, rate, size, hold_s, covariates)
+        self._span_s = (size - 0.5) / rate
+        self._places = [self.signals.index(one) if one in self.signals else -1 for one in (*SIGNALS, *known)]
+        self.open = deque[_OpenMessage]()
+        self._seen: dict[int, None] = {}
+        self.trouble: AssetTrouble | None = None
+        # heard_at: when r, u or y came last, by the monotonic clock [s]
+        self.heard_at, self._values_taken, self._from = time.monotonic(), 0, math.nan
+        self._complete, self.is_flushed = False, True
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew: what signals were before is unknown."""
+        self.resampler.restart(math.nan)
+        self._newest = [-math.inf] * len(SIGNALS)
+
+    def knows(self, mark: int) -> bool:
+        """Return whether a message of this mark was among the last ones; remember it."""
+        known = mark in self._seen
+        self._seen[mark] = None
+        if len(self._seen) > MAX_KNOWN_MESSAGES:
+            del self._seen[next(iter(self._seen))]
+        return known
+
+    def hold(self, values: Sequence[SignalValue], receipt: Receipt) -> None:
+        """Hold a message until its values are in a block."""
+        times = [one.t for one in values]
+        receipt.holders += 1
+        self.open.append(_OpenMessage(min(times), max(times), receipt))
+
+    def take(self, values: Sequence[SignalValue], complete: bool) -> bool:
+        """Take values, of which each moment has all signals if they are `complete`; return whether a block may be."""
+        newest, sampled = self._newest, False
+        for signal, t, value in values:
+            place = self._places[signal]
+            if place < 0:
+                continue
+            self.add(place, t, value)
+            self.rates[place].add(t, value)
+            if place < len(SIGNALS):
+                newest[place], sampled = max(newest[place], t), True
+        self._values_taken, self.is_flushed = self._values_taken + len(values), False
+        if sampled:
+            self._complete, self.heard_at = complete, time.monotonic()
+            if self.trouble is not None and self.trouble.state == "silent":
+                self.trouble = None
+        if math.isnan(self._from):
+            self._from = values[0].t
+        return abs(values[-1].t - self._from) >= self._span_s or self._values_taken >= len(SIGNALS) * MAX_VALUES
+
+    def collect_blocks(self, *, short: bool) -> list[Block]:
+        """Return the blocks that are complete; with what is left of samples if they may be `short`."""
+        self._values_taken, last = 0, max(self._newest)
+        settled = last + SETTLED_PERIOD_SHARE * self.period if self._complete else last
+        if not (self._complete or short):  # others may still come for what one signal has reached
+            settled = max(min(self._newest), last - max(LAG_S, self._span_s))
+        self.collect(-math.inf, settled)
+        if short:  # a machine that is off makes no samples, while its thermometer goes on: no message waits for them
+            self.resampler.take_covariates()
+        if self.trouble is None or self.trouble.state == "slow":
+            words = [self.describe_slow(k, interval_ms) for k, interval_ms in self.slow_ms.items()]
+            self.trouble = AssetTrouble("slow", ", ".join(words)) if words else None
+        if self.trouble is not None:
+            self.discard(0, self.trouble.state, self.trouble.why)
+        blocks = self.take_blocks(short=short)
+        self._from = last - self.buffered * self.period if math.isfinite(last) else math.nan
+        return blocks
+
+    def take_closed(self) -> list[Receipt]:
+        """Return the messages of which no value waits any more."""
+        times, closed, waiting = self.waiting_times, list[Receipt](), deque[_OpenMessage]()
+        for one in self.open:
+            if one.waits(times):
+                waiting.append(one)
+            else:
+                closed.append(one.receipt)
+        self.open = waiting
+        return closed

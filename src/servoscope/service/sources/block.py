@@ -54,9 +54,15 @@ class Block:
     y: FloatArray
     completed_at: float = 0.0  # when its last sample was taken, by `time.monotonic` [s]: latency counts from there
     stream: int = 0  # name of the asset's stream, greater for a later one; 0: it has none, and there is only one
-    retained: bool = False  # whether its sender retains it, and sends it again, until it is acknowledged
+    # number of the oldest block that its sender keeps, and sends again, until it is acknowledged; None: it keeps none
+    oldest: int | None = None
     # columns of what the healthy coefficients depend on, as the loop file names them, shape (k, N)
     covariates: FloatArray = field(default_factory=lambda: NO_COVARIATES)
+
+    @property
+    def retained(self) -> bool:
+        """Whether its sender keeps it until it is acknowledged."""
+        return self.oldest is not None
 
     def start_time(self) -> float:
         """Return the time of its first sample that has one.
@@ -94,7 +100,7 @@ class Block:
         signals: FloatArray,
         completed_at: float = 0.0,
         stream: int = 0,
-        retained: bool = False,
+        oldest: int | None = None,
     ) -> Block:
         """Return the block of t, r, u, y and the covariates as rows, shape (4 + k, N), which it keeps."""
         block = object.__new__(cls)  # checks nothing, in a third of the time
@@ -107,7 +113,7 @@ class Block:
             y=signals[3],
             completed_at=completed_at,
             stream=stream,
-            retained=retained,
+            oldest=oldest,
             covariates=signals[4:] if len(signals) > 4 else NO_COVARIATES,
             signals=signals,
         )

@@ -11,7 +11,9 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -19,13 +21,15 @@ import numpy as np
 from pydantic import AwareDatetime
 
 from servoscope.core.errors import EmptyRecordingError, OutputError
-from servoscope.core.messages import message, render
+from servoscope.core.messages import message as text
+from servoscope.core.messages import render
 from servoscope.core.settings import NonEmptyStr
 from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.config_types import Seconds
 from servoscope.service.log import log
-from servoscope.service.sources.base import BlockSource, SourceAsset
+from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.log_files import (
     FileNames,
     FileRows,
@@ -38,6 +42,7 @@ from servoscope.service.sources.log_files import (
     find_first_time,
     parse_file,
 )
+from servoscope.service.sources.message import POLL_S, Content, Decoder, InboxMessage, Transport
 
 DONE, FAILED = "done", "failed"  # subfolders that files are moved to
 MAX_CLOCK_DIFFERENCE_S = 3600.0  # between the file server and whoever writes the time stamps
@@ -82,118 +87,47 @@ class FolderSettings(FolderNames):
         """Files have what the loop's columns name."""
         return True
 
-    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> FolderSource:
+    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> Inbox:
         """Return the source; raises ConfigError where nothing says of which asset a file is."""
-        return FolderSource(self, assets, folder / self.path)
+        rejections = RejectionCounter()
+        decoder = LogDecoder(self, assets, rejections)
+        return Inbox(FolderTransport(self, assets, folder / self.path), decoder, assets, rejections)
+
+    def begin_times(self, assets: Iterable[str], resume: Mapping[str, ResumePosition]) -> dict[str, float]:
+        """Return up to when the rows of each asset were counted, or are to be left out [UTC s]."""
+        begin = time.time() if self.start == "now" else -math.inf
+        if isinstance(self.start, datetime):
+            begin = self.start.timestamp()
+        return {name: resume[name].last_t if name in resume else begin for name in assets}
 
 
-class FolderSource(BlockSource):
-    """Follows the files of some assets in a folder; a thread looks into it and reads, one file ahead.
+class LogDecoder(Decoder):
+    """Cuts the rows of files into blocks, those that were not counted before, whichever file they are in."""
 
-    What was counted of an asset is known by the time of its last sample alone: a restart reads what may hold later
-    rows, and leaves out the others. So does any file that repeats rows of another one.
-    """
-
-    def __init__(self, settings: FolderSettings, assets: Mapping[str, SourceAsset], folder: Path) -> None:
-        super().__init__()
-        self.settings, self._assets, self._folder = settings, assets, folder
-        self._loops = {name: asset.loop for name, asset in assets.items()}
-        self._names = FileNames(settings, list(assets))
+    def __init__(
+        self, settings: FolderSettings, assets: Mapping[str, SourceAsset], rejections: RejectionCounter
+    ) -> None:
+        self.settings, self._assets, self._rejections = settings, assets, rejections
         self._counted: dict[str, float] = {}  # by asset, up to when its rows are in blocks [UTC s]
-        self._resumed: dict[str, float] = {}  # the same when it was opened
-        self._sequences = dict.fromkeys(assets, -1)
-        # of the thread: files that may still change, those that were dealt with, and those that lay there at first;
-        # contents by their digest; first time stamps [UTC s]
-        self._changing: dict[str, IncompleteFile] = {}
-        self._settled: dict[str, FileVersion] = {}
-        self._first_names: set[str] | None = None
-        self._digests: dict[bytes, str] = {}
-        self._first_times: dict[tuple[str, FileVersion], float] = {}
-        self._troubles: dict[str, AssetTrouble] = {}
-        self._trouble = render(message("service.trouble.connecting"))
-        self._asked_at = math.inf  # since when an answer of the share is waited for, by the monotonic clock [s]
-        self._files_wait = True  # whether there are files that are complete, or soon will be
-        self._ready = queue.Queue[ReadFile](maxsize=1)
-        self._stored = queue.SimpleQueue[ReadFile]()
-        self._current: ReadFile | None = None
-        self._polled: dict[str, deque[ReadFile]] = {name: deque() for name in assets}
-        self._stop_event = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="folder", daemon=True)
+        self._sequences: dict[str, int] = {}
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
-        """Start; assets in `resume` continue behind the last row that was counted."""
-        start = self.settings.start
-        begin = -math.inf if start == "beginning" else time.time() if start == "now" else start.timestamp()
-        for name in self._assets:
-            position = resume.get(name)
-            self._resumed[name] = begin if position is None else position.last_t
-            self._sequences[name] = -1 if position is None else position.sequence
-        self._counted = dict(self._resumed)
-        self._thread.start()
+        """Begin; assets in `resume` continue behind the last row that was counted."""
+        self._counted = self.settings.begin_times(self._assets, resume)
+        self._sequences = {name: resume[name].sequence if name in resume else -1 for name in self._assets}
 
-    @property
-    def connected(self) -> bool:  # type: ignore[override]  # others set it
-        """Whether the folder can be reached."""
-        return not self.trouble
-
-    @property
-    def trouble(self) -> str:
-        """Why the folder cannot be reached, in words; empty: nothing."""
-        if time.monotonic() - self._asked_at > MAX_ANSWER_S:
-            return self._describe_trouble(os.strerror(errno.ETIMEDOUT))
-        return self._trouble
-
-    def _describe_trouble(self, reason: str) -> str:
-        return render(message("service.trouble.unreachable", reason=f"{self._folder}: {reason}"))
-
-    @property
-    def asset_troubles(self) -> Mapping[str, AssetTrouble]:
-        """Assets whose last file could not be read."""
-        return dict(self._troubles)
-
-    @property
-    def pause_s(self) -> float:
-        """How long an asset may pause [s]: without bound while files wait, or the folder cannot be reached."""
-        waits = self._files_wait or self.next_block_s == 0.0 or self.trouble
-        return math.inf if waits else self.settings.interval_s
-
-    @property
-    def next_block_s(self) -> float:
-        """How long until the next block may be due [s]."""
-        return 0.0 if self._current is not None or not self._ready.empty() else IDLE_S
-
-    def poll(self, limit: int) -> list[Block]:
-        """Return blocks of what has been read, file by file."""
-        blocks = list[Block]()
-        while len(blocks) < limit:
-            if self._current is None:
-                try:
-                    self._current = self._ready.get_nowait()
-                except queue.Empty:
-                    break
-            if self._current.blocks is None:
-                self._current.blocks = self._cut(self._current)
-            block = next(self._current.blocks, None)
-            if block is None:
-                self._release(self._current)
-                self._current = None
-                continue
-            self._current.unstored += 1
-            self._polled[block.asset].append(self._current)
-            blocks.append(block)
-        return blocks
-
-    def _cut(self, read: ReadFile) -> Iterator[Block]:
+    def decode(self, message: InboxMessage) -> Content:
         """Return the blocks of the rows of a file that were not counted before, in the order of time."""
+        read: ReadFile = message.content
         firsts = {name: self._first_new(name, rows) for name, rows in read.rows.items()}
         total = sum(rows.samples.t.size for rows in read.rows.values())
         new = total - sum(firsts.values())
         log("info", "file read", file=read.file.name, rows=total, new=new)
         if total and not new and read.is_new:
-            why = render(message("service.folder.late", file=read.file.name))
-            self.rejections.add(read.file.asset, "late", why)
+            why = render(text("service.folder.late", file=read.file.name))
+            self._rejections.add(read.file.asset, "late", why)
         streams = (self._cut_asset(name, read.rows[name], first) for name, first in firsts.items())
-        return heapq.merge(*streams, key=lambda block: float(block.t[-1]))
+        return Content(blocks=heapq.merge(*streams, key=lambda block: float(block.t[-1])))
 
     def _first_new(self, name: str, rows: FileRows) -> int:
         half_s = 0.5 / self._assets[name].loop.sample_rate
@@ -211,15 +145,58 @@ class FolderSource(BlockSource):
             self._counted[name] = float(signals[0, -1])
             yield Block.from_signals(name, self._sequences[name], signals, time.monotonic())
 
-    def acknowledge(self, asset: str, blocks: int) -> None:
-        """Register that so many more blocks of an asset are stored."""
-        for _ in range(blocks):
-            self._release(self._polled[asset].popleft())
 
-    def _release(self, read: ReadFile) -> None:
-        read.unstored -= 1
-        if not read.unstored:
-            self._stored.put(read)
+class FolderTransport(Transport):
+    """Follows the files of some assets in a folder; a thread looks into it and reads, one file ahead.
+
+    What was counted of an asset is known by the time of its last sample alone: a restart reads what may hold later
+    rows, and leaves out the others. So does any file that repeats rows of another one.
+    """
+
+    def __init__(self, settings: FolderSettings, assets: Mapping[str, SourceAsset], folder: Path) -> None:
+        super().__init__()
+        self.settings, self._assets, self._folder = settings, assets, folder
+        self._loops = {name: asset.loop for name, asset in assets.items()}
+        self._names = FileNames(settings, list(assets))
+        self._resumed: dict[str, float] = {}  # by asset, up to when its rows had been counted [UTC s]
+        # of the thread: files that may still change, those that were dealt with, and those that lay there at first;
+        # contents by their digest; first time stamps [UTC s]
+        self._changing: dict[str, IncompleteFile] = {}
+        self._settled: dict[str, FileVersion] = {}
+        self._first_names: set[str] | None = None
+        self._digests: dict[bytes, str] = {}
+        self._first_times: dict[tuple[str, FileVersion], float] = {}
+        self._trouble = render(text("service.trouble.connecting"))
+        self._asked_at = math.inf  # since when an answer of the share is waited for, by the monotonic clock [s]
+        self._files_wait = True  # whether there are files that are complete, or soon will be
+        self._stored = queue.SimpleQueue[ReadFile]()
+        self._stop_event = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="folder", daemon=True)
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Look into the folder from now on."""
+        self._resumed = self.settings.begin_times(self._assets, resume)
+        self._thread.start()
+
+    @property
+    def connected(self) -> bool:  # type: ignore[override]
+        """Whether the folder can be reached."""
+        return not self.trouble
+
+    @property
+    def trouble(self) -> str:  # type: ignore[override]
+        """Why the folder cannot be reached, in words; empty: nothing."""
+        if time.monotonic() - self._asked_at > MAX_ANSWER_S:
+            return self._describe_trouble(os.strerror(errno.ETIMEDOUT))
+        return self._trouble
+
+    def _describe_trouble(self, reason: str) -> str:
+        return render(text("service.trouble.unreachable", reason=f"{self._folder}: {reason}"))
+
+    @property
+    def pause_s(self) -> float:  # type: ignore[override]
+        """How long an asset may pause [s]: without bound while files wait, or the folder cannot be reached."""
+        return math.inf if self._files_wait or self.trouble else self.settings.interval_s
 
     def close(self) -> None:
         """Stop."""
@@ -331,12 +308,12 @@ class FolderSource(BlockSource):
             return
         except PermissionError as error:  # it may be open elsewhere: it is tried again
             refused = AssetTrouble("refused", f"{path}: cannot be read ({error.strerror})")
-            if self._troubles.get(assets[0]) != refused:
+            if self.asset_troubles.get(assets[0]) != refused:
                 self.rejections.add(file.asset, "unreadable", refused.why)
-            self._troubles = self._troubles | dict.fromkeys(assets, refused)
+            self.asset_troubles = {**self.asset_troubles, **dict.fromkeys(assets, refused)}
             return
         if digest in self._digests:
-            why = render(message("service.folder.repeated", file=file.name, other=self._digests[digest]))
+            why = render(text("service.folder.repeated", file=file.name, other=self._digests[digest]))
             self.rejections.add(file.asset, "repeated", why)
         else:
             self._asked_at = math.inf  # how long it takes depends on its size
@@ -357,15 +334,13 @@ class FolderSource(BlockSource):
             del self._digests[next(iter(self._digests))]
         for why in dict.fromkeys(failures.values()):
             self.rejections.add(file.asset, "unreadable", why)
-        kept = {name: one for name, one in self._troubles.items() if name not in assets or not rows}
-        self._troubles = kept | {name: AssetTrouble("refused", why) for name, why in failures.items()}
+        kept = {name: one for name, one in self.asset_troubles.items() if name not in assets or not rows}
+        self.asset_troubles = kept | {name: AssetTrouble("refused", why) for name, why in failures.items()}
         is_new = file.name not in (self._first_names or ())
         read = ReadFile(file, rows, is_new, FAILED if failures else DONE)
-        while not self._stop_event.is_set():
-            try:
-                return self._ready.put(read, timeout=IDLE_S)
-            except queue.Full:
-                continue
+        while self.waiting and not self._stop_event.wait(POLL_S):
+            pass
+        self.waiting.append(InboxMessage(file.name, read, time.monotonic(), partial(self._stored.put, read)))
 
     def _digest(self, file: LogFile) -> bytes:
         """Return what tells a file from others: its content, and what its name says; logs of machines at rest agree."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import fnmatch
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -17,8 +16,7 @@ from pydantic import Field
 from servoscope.core.errors import ConfigError, RecordingError, ServoscopeError
 from servoscope.core.settings import NonEmptyStr
 from servoscope.models.loop import Loop
-from servoscope.service.sources.base import SourceSettings
-from servoscope.service.sources.block import Block
+from servoscope.service.sources.settings import SourceSettings
 from servoscope.signals.readers.recording_file import first_time, read_log
 from servoscope.signals.samples import Samples
 
@@ -76,16 +74,13 @@ class FileRows(NamedTuple):
     offset: float  # what makes seconds since 1970 of their time stamps [s]
 
 
-@dataclass(eq=False)
-class ReadFile:
-    """A file that was read, until its blocks are stored."""
+class ReadFile(NamedTuple):
+    """A file that was read."""
 
     file: LogFile
-    rows: dict[str, FileRows]
+    rows: dict[str, FileRows]  # by asset
     is_new: bool  # whether it came while we looked
-    subfolder: str  # where it belongs when they are stored
-    unstored: int = 1  # blocks that were polled and are not stored; one more until all have been polled
-    blocks: Iterator[Block] | None = None  # None: none has been polled
+    subfolder: str  # where it belongs when its blocks are stored
 
 
 class FileNames:

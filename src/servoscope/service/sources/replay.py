@@ -16,8 +16,11 @@ from pydantic import AwareDatetime
 from servoscope.core.settings import NonNegative
 from servoscope.models.loop import Loop
 from servoscope.service.config_types import Seconds
-from servoscope.service.sources.base import BlockSource, SourceAsset, SourceSettings
+from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import BlockDecoder, InboxMessage, Transport
+from servoscope.service.sources.settings import SourceSettings
 from servoscope.signals import Recording
 from servoscope.signals.readers import is_address, read
 
@@ -41,13 +44,14 @@ class ReplaySettings(SourceSettings):
         """Files have what the loop's columns name."""
         return True
 
-    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> ReplaySource:
+    def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> Inbox:
         """Return the source of these recordings."""
         files = {
             each: (tuple(Path(file) if is_address(file) else folder / file for file in one.address), one.loop)
             for each, one in assets.items()
         }
-        return ReplaySource(self, files, {each: one.covariates for each, one in assets.items()})
+        covariates = {each: one.covariates for each, one in assets.items()}
+        return Inbox(ReplayTransport(self, files, covariates), BlockDecoder(), assets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +94,8 @@ class ReplayStream:
         return replace(block, covariates=np.stack([recording.channels[name][rows] for name in self.covariates]))
 
 
-class ReplaySource(BlockSource):
-    """Replays recordings for several assets, in the order of time; a file has to be acknowledged nothing."""
+class ReplayTransport(Transport):
+    """Replays recordings for several assets, in the order of time; it has nothing to release."""
 
     def __init__(
         self,
@@ -139,17 +143,17 @@ class ReplaySource(BlockSource):
         began, first = self._clock_origin
         return began + (t - first) / self.settings.speed if self.settings.speed else now
 
-    def poll(self, limit: int) -> list[Block]:
+    def receive(self, most: int) -> list[InboxMessage]:
         """Return the blocks that are due."""
-        now, found = time.monotonic(), list[Block]()
-        while self._queue and len(found) < limit and (due := self._due(self._queue[0][0], now)) <= now:
+        now, messages = time.monotonic(), list[InboxMessage]()
+        while self._queue and len(messages) < most and (due := self._due(self._queue[0][0], now)) <= now:
             _, order, block = heapq.heappop(self._queue)
-            found.append(replace(block, completed_at=due))
+            messages.append(InboxMessage(block.asset, replace(block, completed_at=due), due))
             self._schedule(order, block.asset, block.sequence + 1)
-        return found
+        return messages
 
     @property
-    def next_block_s(self) -> float:
+    def next_message_s(self) -> float:
         """How long until the next block is due [s]."""
         now = time.monotonic()
         return max(0.0, self._due(self._queue[0][0], now) - now) if self._queue else math.inf

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import mmap
 import os
-import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 from servoscope.core.errors import MessageError, OutputError
 from servoscope.core.files import atomic_write
-from servoscope.core.workers import ProcessLimits, Worker, WorkerError
+from servoscope.core.workers import ProcessLimits, WorkerError, Workers
 from servoscope.service.log import log
-from servoscope.service.mapping.rows import MessageMapping
-from servoscope.service.mapping.settings import PayloadSettings
 
 TRIAL_S = 10.0  # for one message in a process of its own; the largest that is accepted takes a second
 TRIAL_LIMITS = ProcessLimits(cpu_s=60.0, memory_mb=4000.0)
 MAX_SUSPECTS = 63  # that are remembered; the oldest gives way
 MARK_BYTES = 8
-TASK = "servoscope.service.mapping.guard:try_decoding"
 
 
 class MessageGuard:
@@ -34,12 +30,12 @@ class MessageGuard:
     ----------
     path
         The file. Raises OSError if it cannot be written.
-    settings, rates
-        As `MessageMapping` takes them.
+    task, arguments
+        What a worker runs to decode a message: the task takes these arguments, the message's address and its content.
     """
 
-    def __init__(self, path: Path, settings: PayloadSettings, rates: Mapping[str, float]) -> None:
-        self._path, self._mapping = path, (settings, dict(rates))
+    def __init__(self, path: Path, task: str, *arguments: Any) -> None:
+        self._path, self._task = path, (task, *arguments)
         size = (1 + MAX_SUSPECTS) * MARK_BYTES
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -54,16 +50,24 @@ class MessageGuard:
         self._write_suspects()
         self._marks[0] = 0
 
-    def check(self, mark: int, topic: str, content: bytes) -> None:
+    def is_suspect(self, mark: int) -> bool:
+        """Return whether a message has to be tried."""
+        return mark in self._suspects and mark not in self._refusals
+
+    def try_message(self, mark: int, address: str, content: bytes) -> None:
+        """Decode a message in a process of its own, for seconds perhaps; what it comes to is known to `check`."""
+        if why := self._try(address, content):
+            self._refusals[mark] = self._set_aside(mark, address, content, why)
+        else:
+            del self._suspects[mark]
+            self._write_suspects()
+
+    def check(self, mark: int, address: str, content: bytes) -> None:
         """Try a message if it is a suspect; raises MessageError if it is set aside."""
-        if mark not in self._suspects:
-            return
-        if mark not in self._refusals and (why := self._try(topic, content)):
-            self._refusals[mark] = self._set_aside(mark, topic, content, why)
+        if self.is_suspect(mark):
+            self.try_message(mark, address, content)
         if mark in self._refusals:  # it remains a suspect: until it is acknowledged it may come again
             raise self._refusals[mark]
-        del self._suspects[mark]
-        self._write_suspects()
 
     def begin(self, mark: int) -> None:
         """Note that a message is in hand."""
@@ -77,34 +81,25 @@ class MessageGuard:
         for k, mark in enumerate([*self._suspects, *[0] * (MAX_SUSPECTS - len(self._suspects))], 1):
             self._marks[k] = mark
 
-    def _try(self, topic: str, content: bytes) -> str:
+    def _try(self, address: str, content: bytes) -> str:
         """Return why a message cannot be decoded within the limits; empty: it can, whatever comes of it."""
-        worker = Worker(TRIAL_LIMITS)
-        try:
-            worker.run(TASK, *self._mapping, "", b"")  # imports what it needs, which may take its time
+        with closing(Workers(TRIAL_LIMITS)) as workers:
             try:
-                worker.run(TASK, *self._mapping, topic, content, timeout_s=TRIAL_S)
+                workers.run(*self._task, "", b"")  # imports what it needs, which may take its time
+            except WorkerError as error:
+                log("error", "no process to try a message in", why=str(error))
+                return ""
+            try:
+                workers.run(*self._task, address, content, timeout_s=TRIAL_S)
             except WorkerError as error:
                 return str(error)
-        except WorkerError as error:
-            log("error", "no process to try a message in", why=str(error))
-        finally:
-            worker.stop()
         return ""
 
-    def _set_aside(self, mark: int, topic: str, content: bytes, why: str) -> MessageError:
+    def _set_aside(self, mark: int, address: str, content: bytes, why: str) -> MessageError:
         path = self._path.with_name(f"{self._path.name}.{mark:x}")
         try:
             atomic_write(path, content)
         except OutputError as error:
             log("error", "message cannot be kept", why=str(error))
-        reason = f"{len(content)} bytes from {topic[:100]!r} ended the service, and once more: {why}; kept as {path}"
+        reason = f"{len(content)} bytes from {address[:100]!r} ended the service, and once more: {why}; kept as {path}"
         return MessageError("set aside", reason)
-
-
-def try_decoding(
-    _: Callable[[str], None], settings: PayloadSettings, rates: Mapping[str, float], topic: str, content: bytes
-) -> None:
-    """Decode a message in a worker's process: it matters only that this comes to an end."""
-    with suppress(MessageError):
-        MessageMapping(settings, rates, lambda *_: None).read(topic, content, time.time())

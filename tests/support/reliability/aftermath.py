@@ -32,7 +32,7 @@ def looked_at(
     plain
         Numbers of the blocks that the sender has sent that keeps nothing, and of those by a clock that was wrong.
     written
-        Numbers of the blocks that each OPC UA server has written, by asset.
+        Numbers of the blocks that each sender of another library has written, by asset.
     """
     store = opened(config)
     rows = store.checkpoints([*fleet.names, "plain", *(name for one in written.values() for name in one)])

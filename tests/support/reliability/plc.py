@@ -1,10 +1,10 @@
-"""OPC UA servers whose assets write blocks as a PLC would: processes of their own, to be killed.
+"""Senders of other libraries whose assets write blocks as a PLC would: processes of their own, to be killed.
 
-    python benchmarks/reliability/plc.py SETTINGS
+    python tests/support/reliability/plc.py SETTINGS
 
-One is asyncua's (this file), one node-opcua's (`tests/support/opcua_server/blocks.js`), both with the same settings,
-a JSON file. Which block is written depends on the clock alone, so that those of the time while it is dead are never
-written.
+Two are OPC UA servers, asyncua's (this file) and node-opcua's (`tests/support/opcua_server/blocks.js`), one sends over
+MQTT by mqtt.js (`tests/support/mqtt_sender/sender.js`), all with the same settings, a JSON file. Which block is written
+depends on the clock alone, so that those of the time while it is dead are never written.
 What was written is noted in the file `written` of the settings, line by line: asset and number.
 """
 
@@ -20,20 +20,22 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
+SUPPORT = Path(__file__).resolve().parent.parent
 if __name__ == "__main__":
-    sys.path[0] = str(BENCHMARKS)
+    sys.path[0] = str(SUPPORT)
 
 from reliability.fleet import LOOP, Fleet  # noqa: E402
 from servoscope.models.loop import Loop  # noqa: E402
+from servoscope.service.mqtt import topics  # noqa: E402
 from servoscope.service.sources.replay import SEPARATION_SAMPLES, ReplayStream  # noqa: E402
 from servoscope.signals.readers import read  # noqa: E402
 
-__all__ = ["STACKS", "Plc", "tape"]
+__all__ = ["SENDER", "STACKS", "Plc", "tape"]
 
 REMEMBERED = 60  # blocks of each asset in the server's history, which dies with it
-STACKS = {"asyncua": 2, "node": 1}  # and the namespace of its nodes
-SCRIPT = BENCHMARKS.parent / "tests" / "support" / "opcua_server" / "blocks.js"
+STACKS = {"asyncua": 2, "node": 1}  # OPC UA servers, and the namespace of their nodes
+SENDER = "mqttjs"
+SCRIPTS = {"node": SUPPORT / "opcua_server" / "blocks.js", SENDER: SUPPORT / "mqtt_sender" / "sender.js"}
 
 
 def tape(fleet: Fleet) -> ReplayStream:
@@ -48,9 +50,9 @@ class Plc:
     Parameters
     ----------
     stack
-        One of `STACKS`.
+        One of `STACKS`, or `SENDER`.
     port
-        Where it listens.
+        Where the server listens; of the sender, where it finds its broker.
     fleet
         Whose recordings it plays.
     assets
@@ -62,8 +64,8 @@ class Plc:
         self._settings, self._log = fleet.folder / f"{stack}.json", fleet.folder / f"{stack}.log"
         self._settings.write_text(json.dumps(self._told(stack, fleet)), encoding="utf-8")
         node = shutil.which("node")
-        assert node or stack != "node", "Node.js is missing: scripts/install-test-servers installs it"
-        program = [sys.executable, __file__] if stack == "asyncua" else [str(node), str(SCRIPT)]
+        assert node or stack not in SCRIPTS, "Node.js is missing: scripts/install-test-servers installs it"
+        program = [str(node), str(SCRIPTS[stack])] if stack in SCRIPTS else [sys.executable, __file__]
         self._command, self._stack = [*program, str(self._settings)], stack
 
     def _told(self, stack: str, fleet: Fleet) -> dict[str, Any]:
@@ -84,8 +86,9 @@ class Plc:
         }
 
     def node(self, name: str, stack: str = "") -> str:
-        """Return where an asset's blocks are written."""
-        return f"ns={STACKS[stack or self._stack]};s={name}.block"
+        """Return where an asset's blocks are written: a node, or a topic."""
+        stack = stack or self._stack
+        return topics.data_topic("servoscope", name) if stack == SENDER else f"ns={STACKS[stack]};s={name}.block"
 
     def start(self) -> None:
         """Start it, and wait until it is there."""

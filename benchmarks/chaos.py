@@ -1,11 +1,11 @@
 """Publisher, broker, OPC UA servers, database and service, killed at random, cables pulled, a clock that jumps.
 
-    python benchmarks/reliability/chaos.py [sqlite|postgresql] [--hours 1] [--assets 200] [--speed 1] [--block 1]
-    python benchmarks/reliability/chaos.py --render
+    python benchmarks/chaos.py [sqlite|postgresql] [--hours 1] [--assets 200] [--speed 1] [--block 1]
+    python benchmarks/chaos.py --render
 
 The assets are sent by `servoscope publish`. One more, `plain`, has a sender that keeps nothing and whose clock jumps,
-and some are nodes of OPC UA servers, one of asyncua's and one of node-opcua's, whose history dies with them: what these
-lose has to be named, block by block.
+some are sent as JSON by mqtt.js, and some are nodes of OPC UA servers, one of asyncua's and one of node-opcua's, whose
+history dies with them: what these lose has to be named, block by block.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `reliability` is a package, and `tables` lies
+BENCHMARKS = Path(__file__).resolve().parent
+sys.path.insert(1, str(BENCHMARKS.parent / "tests" / "support"))  # where `reliability` is a package
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-from tables import machine  # noqa: E402
 
 from reliability.aftermath import looked_at  # noqa: E402
 from reliability.fleet import BEGAN, LOOP, Fleet  # noqa: E402
 from reliability.plain import Plain  # noqa: E402
-from reliability.plc import STACKS, Plc  # noqa: E402
-from reliability.run import PAGE, RESULTS, TRIALS, free_port  # noqa: E402
+from reliability.plc import SENDER, STACKS, Plc  # noqa: E402
 from reliability.servers import Cable, Mosquitto, Postgres, mosquitto, programs  # noqa: E402
 from reliability.trial import CALM_S, Latencies, quantile  # noqa: E402
+from reliability.workplace import free_port  # noqa: E402
+from soak import PAGE, RESULTS, TRIALS  # noqa: E402
+from tables import machine  # noqa: E402
+
 from servoscope.core.files import atomic_write  # noqa: E402
 
 LONGEST_S = 900.0  # until results are stored again
@@ -48,14 +49,16 @@ AHEAD = 4  # blocks that the publisher keeps per asset
 PULLED_S = 3.0
 OUT_S = 2.0  # for which the database is gone
 JUMPED = 5  # blocks by a clock that is ahead
-CABLES = ("cable of the publisher", "cable of the service", *(f"cable of {stack}" for stack in STACKS))
-PLC = 4  # assets of each OPC UA server
+OTHERS = (*STACKS, SENDER)
+CABLES = ("cable of the publisher", "cable of the service", *(f"cable of {other}" for other in OTHERS))
+PLC = 4  # assets of each sender of another library
 LOOK_S = 1.0  # how often the metrics are looked at
 COUNTED = re.compile(r'servoscope_blocks_total\{asset="(\w+)[^"]*"\} (\S+)')
 SENDERS = {
     "plain": "sent by who keeps nothing",
     "asyncua": "written by asyncua's OPC UA server",
     "node": "written by node-opcua's",
+    SENDER: "sent by mqtt.js",
 }
 EVENTS = {  # and the words of their rows
     "service": "kill -9 of the service",
@@ -63,6 +66,7 @@ EVENTS = {  # and the words of their rows
     "publisher": "kill -9 of the publisher",
     "asyncua": "kill -9 of asyncua's OPC UA server",
     "node": "kill -9 of node-opcua's",
+    SENDER: "kill -9 of mqtt.js",
     "database": "crash of the database",
     "clock": f"clock of a sender two hours ahead for {JUMPED} blocks",
     "cable": f"cable pulled for {PULLED_S:g} s",
@@ -89,10 +93,11 @@ class Chaos:
         assert program is not None, "mosquitto is missing: scripts/install-test-servers installs it"
         self._fleet, self._every, self._chance = fleet, every_s, random.Random(seed)
         self._broker, self._database = Mosquitto(fleet.folder, program), database
-        self._plcs = {stack: Plc(stack, free_port(), fleet, PLC) for stack in STACKS}
-        ports = {"publisher": self._broker.port, "service": self._broker.port}
-        ports |= {stack: plc.port for stack, plc in self._plcs.items()}
+        listen = {stack: free_port() for stack in STACKS}
+        ports = {"publisher": self._broker.port, "service": self._broker.port, SENDER: self._broker.port, **listen}
         self._cables = {name: Cable(port) for name, port in ports.items()}
+        listen[SENDER] = self._cables[SENDER].port  # where it finds the broker
+        self._plcs = {other: Plc(other, port, fleet, PLC) for other, port in listen.items()}
         self._port, self._log = free_port(), (fleet.folder / "chaos.log").open("ab")
         self.config, self._publish = self._files()
         self.happened: dict[str, list[float]] = {}
@@ -100,7 +105,7 @@ class Chaos:
 
     @property
     def written(self) -> dict[str, dict[str, set[int]]]:
-        """Numbers of the blocks that each OPC UA server has written, by asset."""
+        """Numbers of the blocks that each sender of another library has written, by asset."""
         return {stack: plc.blocks() for stack, plc in self._plcs.items()}
 
     def _files(self) -> tuple[Path, Path]:
@@ -111,10 +116,11 @@ class Chaos:
             f'[sources.line]\nkind = "mqtt"\nhost = "127.0.0.1"\nport = {self._cables["service"].port}',
             *(
                 f'[assets.{name}]\nbaseline = "baseline.json"\nsource = "line"'
-                for name in [*self._fleet.names, "plain"]
+                for name in [*self._fleet.names, "plain", *self._plcs[SENDER].names]
             ),
         ]
-        for stack, plc in self._plcs.items():
+        for stack in STACKS:
+            plc = self._plcs[stack]
             at = f"opc.tcp://127.0.0.1:{self._cables[stack].port}/plc"
             service += [f'[sources.{stack}]\nkind = "opcua"\nurl = "{at}"']
             service += [
@@ -156,7 +162,7 @@ class Chaos:
             self._log.close()
 
     def _run(self) -> tuple[set[int], set[int]]:
-        self._until_more(dict.fromkeys(("press", *STACKS), 0.0))  # the service has subscribed by then
+        self._until_more(dict.fromkeys(("press", *OTHERS), 0.0))  # the service has subscribed by then
         self._plain = Plain(self._fleet, self._cables["publisher"].port)
         left_out = set() if self._database else {"database"}
         events = [event for event in (*EVENTS, *CABLES) if event not in {"cable", *left_out}]
@@ -192,7 +198,7 @@ class Chaos:
         if what == "broker":
             self._broker.stop(signal.SIGKILL)
             self._broker.start()
-        elif what in STACKS:
+        elif what in OTHERS:
             self._plcs[what].kill()
             self._plcs[what].start()
             return (what,)
@@ -201,7 +207,7 @@ class Chaos:
             self._cables[name].pulled.set()
             time.sleep(PULLED_S)
             self._cables[name].pulled.clear()
-            return (name,) if name in STACKS else ("press",)
+            return (name,) if name in OTHERS else ("press",)
         elif what == "clock":
             self._plain.jump(JUMPED)
             return ("plain",)
@@ -210,13 +216,13 @@ class Chaos:
             self._database.stop("immediate")
             time.sleep(OUT_S)
             self._database.start()
-            return ("press", *STACKS)
+            return ("press", *OTHERS)
         elif what == "service":
             self._service.kill()
             self._service.wait()
             self._service = self._start("run", self.config)
             self.latencies.restart()
-            return ("press", *STACKS)
+            return ("press", *OTHERS)
         else:
             self._publisher.kill()
             self._publisher.wait()

@@ -1,0 +1,149 @@
+"""What an inbox is made of: transports, which receive messages, and decoders, which say what a message holds."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from servoscope.core.errors import MessageError
+from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.sources.base import RejectionCounter
+from servoscope.service.sources.block import Block, ResumePosition
+
+POLL_S = 0.02  # between two looks at a transport whose messages come from a thread of its own
+NOTHING: Mapping[Any, Any] = MappingProxyType({})
+
+
+def _forget() -> None:
+    """Release nothing: the transport keeps no messages."""
+
+
+class InboxMessage(NamedTuple):
+    """What a transport has received; `address`: from where."""
+
+    address: str
+    content: Any  # bytes, or what the transport's library makes of them
+    at: float  # when it came, by the monotonic clock [s]
+    release: Callable[[], None] = _forget  # called once all of it is stored or refused: it need not come again
+    is_old: bool = False  # whether it was sent before anybody listened
+
+
+class SignalValue(NamedTuple):
+    """A value of one signal."""
+
+    signal: int  # place among r, u, y and the decoder's covariates
+    t: float  # [UTC s]
+    value: float  # NaN: it is known to be bad
+
+
+class Content(NamedTuple):
+    """What a message holds: single values, or blocks as their sender has numbered them."""
+
+    values: Mapping[str, list[SignalValue]] = NOTHING  # by asset
+    gone: frozenset[str] = frozenset()  # assets whose sender says that it ends
+    complete: bool = False  # whether each moment of the values has r, u and y
+    blocks: Iterable[Block] = ()  # taken one by one, when there is room for them
+
+
+class Decoder(ABC):
+    """Says what messages hold; one thread calls it."""
+
+    covariates: Sequence[str] = ()  # signals of its values behind r, u and y
+    block_s = 1.0  # length of the blocks that are made of its values [s]
+    hold_s = 0.0  # how long a value holds where only changes are sent [s]
+    is_dated = True  # whether messages say when they were measured, so that the same bytes are the same message
+    # a task for `core.workers`, and its first arguments, that decodes a message in a process with limits; None: there
+    # is none, and no message can hang it
+    trial: tuple[Any, ...] | None = None
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:  # noqa: B027 - most keep nothing of an asset
+        """Begin; assets in `resume` continue behind that position."""
+
+    def addresses(self, *, everyone: bool = False) -> Sequence[str]:
+        """Return what its messages come from, for the transport; `everyone`: those of other assets, too."""
+        return ()
+
+    def find_asset(self, address: str) -> str:
+        """Return which asset an address names; empty: none of ours."""
+        return ""
+
+    @abstractmethod
+    def decode(self, message: InboxMessage) -> Content:
+        """Return what a message holds; raises MessageError if nothing of it can be used."""
+
+    def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
+        """Yield what each message holds, or why nothing of it can be used."""
+        for message in messages:
+            try:
+                yield self.decode(message)
+            except MessageError as error:
+                yield error
+
+    def requests(self) -> Iterable[tuple[str, bytes]]:
+        """Return messages, with their addresses, that ask senders for what it lacks."""
+        return ()
+
+
+class Transport(ABC):
+    """Receives messages. What its own thread appends to `waiting` is handed over; or it overrides `receive`."""
+
+    clock_rate = 1.0  # how fast the clock of its samples runs, as in `BlockSource`
+    keeps = True  # whether what was not released comes again, so that messages may wait; else blocks are dropped
+    connected = True
+    trouble = ""  # why nothing can be received, in words; empty: nothing is wrong
+    asset_troubles: Mapping[str, AssetTrouble] = NOTHING
+    update_intervals_s: Mapping[tuple[str, str], float] = NOTHING
+    layer_seconds: Mapping[str, float] = NOTHING
+    pause_s = 0.0  # how long an asset may pause without being silent [s]
+
+    def __init__(self) -> None:
+        self.waiting = deque[InboxMessage]()
+
+    def bind(self, decoder: Decoder, rejections: RejectionCounter) -> None:
+        """Take who decodes its messages, and who counts those that it does not keep; before `open`."""
+        self.decoder, self.rejections = decoder, rejections
+
+    def refuse(self, address: str, kind: str, why: str) -> None:
+        """Count a message that is not handed over."""
+        self.rejections.add(self.decoder.find_asset(address), kind, why)
+
+    def preview(self) -> Sequence[str]:
+        """Return what it would do, line by line; it need not be open."""
+        return ()
+
+    @abstractmethod
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Begin to receive, now or as soon as there is a connection."""
+
+    def receive(self, most: int) -> Sequence[InboxMessage]:
+        """Return up to so many messages in the order in which they came; at once."""
+        return [self.waiting.popleft() for _ in range(min(most, len(self.waiting)))]
+
+    @property
+    def next_message_s(self) -> float:
+        """How long until the next message may be there [s]; infinite: none will come."""
+        return 0.0 if self.waiting else POLL_S
+
+    def confirm(self, asset: str, stream: int, sequence: int) -> None:  # noqa: B027 - only some have a way back
+        """Tell the sender that its blocks are stored up to this one."""
+
+    def send(self, address: str, content: bytes) -> None:  # noqa: B027
+        """Send a request of the decoder."""
+
+    def leave(self, address: str) -> None:  # noqa: B027
+        """Receive nothing more from an address that is of no asset of ours."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop; it may be called twice."""
+
+
+class BlockDecoder(Decoder):
+    """For transports whose messages are blocks already."""
+
+    def decode(self, message: InboxMessage) -> Content:
+        """Return the block."""
+        return Content(blocks=(message.content,))
