@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.core.arrays import FloatArray
-from servoscope.estimation.axis_filter import AxisNoise
+from servoscope.estimation.axis_filter import NO_LAG, AxisNoise, DriveLag
 from servoscope.models.plants import Fault
 from servoscope.models.plants.axis import BY_DIRECTION, AxisPlant
 
@@ -22,6 +23,8 @@ class AxisModel(BaseModel):
     parameters: tuple[str, ...]  # those of which the logarithm is known with `covariance` (m, m), between recordings
     covariance: tuple[tuple[float, ...], ...]
     noise: AxisNoise
+    # how late the force follows u, beyond the delay of the loop file
+    drive: Annotated[DriveLag, Field(exclude_if=lambda drive: not any(drive))] = NO_LAG
     stride: int  # samples of a recording from one of the filter to the next
     rest_speed: float  # below, the axis counts as resting [output per s]
     offset_std: float  # how far the constant force of a recording may be from that of the others

@@ -54,8 +54,11 @@ class HealthyPlant:
 
 
 def saturated_share(loop: Loop, recording: Recording) -> float:
-    """Return the share of samples with u at or beyond a limit of the loop."""
-    if loop.input_limits is None:
+    """Return the share of samples with u at or beyond a limit, where a linear closed loop is no model of the loop.
+
+    A plant that is not simulated with its controller takes u as it acted, at a limit as elsewhere.
+    """
+    if loop.input_limits is None or not can_simulate(loop):
         return 0.0
     low, high = loop.input_limits
     count = 0

@@ -22,6 +22,7 @@ TARGET_RATE = 200.0  # Hz; what an axis does faster than that is not its rigid b
 SPEED_SAMPLES = 5  # over which a parabola gives the speed
 MAX_REMAINING_SHARE = 1e-2  # share of its state that the filter may still hold
 RELATIVE_FLOOR = 1e-12  # of y's noise, relative to what the force does to y within a sample
+MIN_LAG_SAMPLES = 1e-2  # below which a lag is none
 DOUBLINGS = 30  # of the samples that the steady state is computed over
 
 
@@ -31,6 +32,39 @@ class AxisNoise(NamedTuple):
     acceleration_std: float  # of the force over the inertia [output per s^2]
     correlation_s: float  # time in which the force forgets itself [s]
     y_std: float
+
+
+class DriveLag(NamedTuple):
+    """How late the force of a drive follows u: a dead time, and the time constant of a first-order lag."""
+
+    delay_s: float = 0.0
+    lag_s: float = 0.0
+
+    def of_input(self, u: FloatArray, restart: BoolArray, sample_rate: float) -> FloatArray:
+        """Return the force's mean from each sample to the next, shape (N,), of u that is held; each run begins settled.
+
+        A delay between two samples is the mean of both, which is exact for a u that is held.
+        """
+        if not any(self):
+            return u
+        from scipy.signal import lfilter
+
+        k = np.arange(len(u))
+        begin = np.maximum.accumulate(np.where(restart, k, 0))
+        whole, part = divmod(self.delay_s * sample_rate, 1.0)
+        sooner, later = (u[np.maximum(k - int(whole) - more, begin)] for more in (0, 1))
+        u = (1.0 - part) * sooner + part * later
+        if self.lag_s * sample_rate < MIN_LAG_SAMPLES:
+            return np.asarray(u)
+        kept = float(np.exp(-1.0 / (self.lag_s * sample_rate)))
+        late = np.empty_like(u)
+        first = np.flatnonzero(restart)
+        for a, b in zip(first, [*first[1:], len(u)], strict=True):
+            late[a:b] = lfilter([0.0, 1.0 - kept], [1.0, -kept], u[a:b], zi=[u[a]])[0]
+        return np.asarray(u + (late - u) * self.lag_s * sample_rate * (1.0 - kept))
+
+
+NO_LAG = DriveLag()
 
 
 def axis_stride(sample_rate: float) -> int:

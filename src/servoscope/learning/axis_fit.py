@@ -12,7 +12,7 @@ from servoscope.baseline.feature_model import score_limit
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message
-from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals, axis_stride
+from servoscope.estimation.axis_filter import NO_LAG, AxisFilter, AxisNoise, AxisSignals, DriveLag, axis_stride
 from servoscope.estimation.tuning import sum_covariance
 from servoscope.isolation.ml.axis_scan import HEALTHY_MARGIN, largest_changes, scan_limit
 from servoscope.isolation.ml.axis_vibration import BANDS
@@ -32,6 +32,10 @@ MAX_SCATTER_ROUNDS = 30  # steps in which coefficients and their scatter agree
 FALSE_ALARMS = 1.0 / 200.0  # share of healthy recordings that change within themselves beyond a learned limit
 MIN_LOG_LIKELIHOOD_GAIN = 1.0  # of a likelihood ratio whose logarithm counts
 MIN_SAMPLES_PER_COLUMN = 10  # samples in motion
+DELAYS_S, LAGS_S = np.arange(0.0, 0.1, 0.01), (0.0, 0.01, 0.02, 0.04, 0.08)  # that are tried first
+MIN_DRIVE_GAIN = 50.0  # of twice the log-likelihood, for a delay and a lag
+MIN_DRIVE_S = 5e-3  # of both together: less is what the sampling or a compliant coupling does
+MAX_DRIVE_ROUNDS = 3  # of delay and lag, and noise, in turns
 STEPS, FIRST_STEP = 250, 0.7  # of the search for the noise: steps, and the logarithm of the first ones
 
 
@@ -130,6 +134,69 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
     return AxisNoise(*np.exp(found.x).tolist())
 
 
+def _fit_drive_and_noise(
+    loop: Loop, recordings: Sequence[Recording], stride: int, slow: float
+) -> tuple[DriveLag, AxisNoise, list[AxisRegression]]:
+    """Return how late the force is, the noise, and the regressions with both; a lag that explains little is none."""
+    plant, drive = loop.plant, NO_LAG
+    assert isinstance(plant, AxisPlant)
+
+    def regressions(drive: DriveLag) -> list[AxisRegression]:
+        return [AxisRegression.of(plant, axis_signals(loop, one, stride, drive)) for one in recordings]
+
+    noise = fit_axis_noise(regressions(drive), slow)
+    for _ in range(MAX_DRIVE_ROUNDS):
+        later = fit_drive(loop, recordings, regressions(drive), noise, slow, drive)
+        if later == drive:
+            break
+        drive = later
+        noise = fit_axis_noise(regressions(drive), slow)
+    return drive, noise, regressions(drive)
+
+
+def fit_drive(
+    loop: Loop,
+    recordings: Sequence[Recording],
+    problems: Sequence[AxisRegression],
+    noise: AxisNoise,
+    slow: float,
+    known: DriveLag,
+) -> DriveLag:
+    """Return the delay and lag of the force behind u that make the innovations smallest, `known` where none matters.
+
+    Each recording has coefficients of its own. All columns but that of u stay, so that their directions are taken off
+    once; a grid comes before the search, for the sum of squares has several minima.
+    """
+    from scipy.optimize import minimize
+
+    rate, stride = loop.sample_rate, round(loop.sample_rate / problems[0].signals.sample_rate)
+    fixed = []
+    for recording, problem in zip(recordings, problems, strict=True):
+        X, e, filter = problem.regress(noise, slow)
+        Q = np.linalg.qr(X[:, 1:])[0]
+        where = problem.signals.moving(slow, filter.settling)
+        fixed.append((recording, Q, e - Q @ (Q.T @ e), filter, where, problem.signals.runs))
+
+    def cost(x: FloatArray) -> float:
+        drive, total, count = DriveLag(*np.abs(x).tolist()), 0.0, 0
+        for recording, Q, e, filter, where, runs in fixed:
+            u = axis_signals(loop, recording, stride, drive).u
+            column = filter.of_acceleration(u, runs)[where]
+            column = column - Q @ (Q.T @ column)
+            size = float(column @ column)
+            total += float(e @ e) - (float(column @ e) ** 2 / size if size > 0.0 else 0.0)
+            count += len(e)
+        return count * float(np.log(max(total, np.finfo(np.float64).tiny)))
+
+    grid = [np.array([delay, lag]) for delay in DELAYS_S for lag in LAGS_S]
+    start = min([np.array(known), *grid], key=cost)
+    simplex = start + 0.5 * max(np.diff(DELAYS_S)) * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.02 / rate, "initial_simplex": simplex})
+    late = DriveLag(*np.abs(found.x).tolist())
+    matters = cost(np.array(known)) - float(found.fun) > MIN_DRIVE_GAIN and sum(late) > max(MIN_DRIVE_S, 1.0 / rate)
+    return late if matters else known
+
+
 def fit_recording(problem: AxisRegression, noise: AxisNoise, slow: float) -> AxisFit:
     """Return the coefficients of one recording by least squares on its innovations."""
     X, e, _ = problem.regress(noise, slow)
@@ -154,8 +221,7 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     signals = [axis_signals(loop, one, stride) for one in recordings]
     slow = rest_speed(signals)
     check_motion(recordings, signals, slow, 1 + len(plant.columns))
-    problems = [AxisRegression.of(plant, one) for one in signals]
-    noise = fit_axis_noise(problems, slow)
+    drive, noise, problems = _fit_drive_and_noise(loop, recordings, stride, slow)
     fits = [fit_recording(one, noise, slow) for one in problems]
     names = ("inertia", *(column.coefficient for column in plant.columns))
     center, of_center = combine_fits(fits, len(names))
@@ -186,6 +252,7 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
         parameters=tuple(names[i] for i in known),
         covariance=tuple(tuple(row) for row in covariance.tolist()),
         noise=noise,
+        drive=drive,
         stride=stride,
         rest_speed=slow,
         offset_std=FORCE_OFFSET_SHARE * force,

@@ -13,7 +13,7 @@ from servoscope.baseline.axis_model import AxisModel
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel
-from servoscope.estimation.axis_filter import AxisFilter, AxisSignals
+from servoscope.estimation.axis_filter import NO_LAG, AxisFilter, AxisSignals, DriveLag
 from servoscope.estimation.noise_model import sample_autocovariance
 from servoscope.isolation.ml.kernels import Array
 from servoscope.isolation.ml.window import (
@@ -58,7 +58,7 @@ class AxisWindow(ChangeWindow):
     def of_healthy(cls, loop: Loop, model: AxisModel, recording: Recording, first: int = 0) -> AxisWindow:
         """Return all of a recording of a healthy axis; it begins at sample `first` of a longer one."""
         assert isinstance(loop.plant, AxisPlant)
-        signals = axis_signals(loop, recording, model.stride)
+        signals = axis_signals(loop, recording, model.stride, model.drive)
         each = [np.linalg.inv(np.linalg.cholesky(np.array(model.covariance)))] if model.parameters else []
         m = len(model.parameters)
         prior = np.zeros((m + 2, m + 2))
@@ -246,11 +246,12 @@ class AxisWindow(ChangeWindow):
         return replace(super().cut(first, end))  # what was computed of the whole is left behind
 
 
-def axis_signals(loop: Loop, recording: Recording, stride: int) -> AxisSignals:
-    """Return a recording as the filter of an axis takes it."""
+def axis_signals(loop: Loop, recording: Recording, stride: int, drive: DriveLag = NO_LAG) -> AxisSignals:
+    """Return a recording as the filter of an axis takes it; `drive`: how late the force is beyond the loop's delay."""
     restart = recording.restart.copy()
     restart[0] = True
     u = delay_input(plant_input(loop, recording.u), restart, round(loop.delay * loop.sample_rate))
+    u = drive.of_input(u, restart, loop.sample_rate)
     return AxisSignals.thinned(u, recording.y, restart, loop.sample_rate, stride, loop.plant.derivative)
 
 

@@ -133,6 +133,8 @@ class AxisPlant(CoefficientPlant):
     hanging_at: Finite = 0.0
     # distance of a payload from the joint [m], with input_gain u in N m; 1 on a linear axis, with input_gain u in N
     payload_arm: Annotated[Positive | None, NOT_DUMPED] = None
+    # mass of the payload in the healthy recordings [kg], where u is in no unit of force: it tells the scale of u
+    payload_mass: Annotated[Positive | None, NOT_DUMPED] = None
     # what the output is: a position, or a speed, as drives log it; then no term can depend on the position
     y: Annotated[Literal["position", "speed"], NOT_DUMPED] = "position"
     # speed [output per s] below which sign(y') is not trusted and set to 0
@@ -158,6 +160,8 @@ class AxisPlant(CoefficientPlant):
             raise ValueError(f'terms: {placed[0]} acts by the position, which y = "speed" does not tell, remove it')
         if "load_friction" in self.terms and "gravity" not in self.terms:
             raise ValueError("terms: load_friction grows with the load of gravity, add gravity")
+        if self.payload_mass is not None and not self._lifts:
+            raise ValueError("payload_mass: needs payload_arm and the term gravity, which tells what it weighs")
         if self.coefficients is not None:
             unknown = sorted(set(self.coefficients) ^ set(self.names))
             if unknown:
@@ -255,7 +259,8 @@ class AxisPlant(CoefficientPlant):
         """
         if self.payload_arm is None or parameter != ("moved_mass" if self._lifts else "inertia"):
             return None
-        return (ratio - 1.0) * self._nominal()["inertia"] / self.payload_arm**2
+        own = self._nominal()["inertia"] / self.payload_arm**2 if self.payload_mass is None else self.payload_mass
+        return (ratio - 1.0) * own
 
     def scaled(self, factors: Mapping[str, Any]) -> Self:
         """Return the same axis with coefficients multiplied; ``input_gain`` multiplies all of them."""
@@ -266,8 +271,14 @@ class AxisPlant(CoefficientPlant):
         mass = factors.pop("moved_mass", None)
         scaled = {name: value * common * factors.get(name, 1.0) for name, value in self._nominal().items()}
         if mass is not None:
-            self._load(scaled, (mass - 1.0) * self._nominal()["inertia"] * common)
+            self._load(scaled, (mass - 1.0) * self._unit_inertia() * common)
         return self.model_copy(update={"coefficients": scaled})
+
+    def _unit_inertia(self) -> float:
+        """Return the inertia that a ratio of 1 more stands for: the axis's own, or that of the mass that it carries."""
+        if self.payload_mass is None or self.payload_arm is None:
+            return self._nominal()["inertia"]
+        return abs(self._nominal()["gravity"]) * self.payload_arm / GRAVITY_ACCELERATION
 
     def _load(self, coefficients: dict[str, Any], inertia: Any) -> None:
         """Add the inertia m l^2 of a payload, its weight m g l on the side of the arm's own, and its share of friction.
