@@ -141,7 +141,8 @@ class Inbox:
         while len(self._ready) < limit:
             can_go_on = next(self._steps, None)
             if can_go_on is None:
-                messages = self.transport.receive(limit - len(self._ready))
+                room = limit - len(self._ready)
+                messages = self.transport.receive(room) if room > 0 else ()
                 if not messages:
                     break
                 self._steps = self._take(messages)
@@ -163,6 +164,7 @@ class Inbox:
         decode = self._decode_guarded if self._guard is not None else self.decoder.decode_all
         found = decode(messages)
         for message in messages:
+            yield True
             while (content := next(found)) is None:
                 yield False
             for address, request in self.decoder.requests():
@@ -172,16 +174,14 @@ class Inbox:
                     self.transport.leave(message.address)
                 self.rejections.add(self.decoder.find_asset(message.address), content.kind, str(content))
                 message.release()
-                yield True
                 continue
             receipt = Receipt(message.release)
             if content.values or content.gone:
                 self._take_values(message, content, receipt)
             for block in content.blocks:
+                yield True  # before it is taken: behind the last one the message is released without another poll
                 self._take_block(block, receipt)
-                yield True
             receipt.release()
-            yield True
 
     def _decode_guarded(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError | None]:
         """Yield what each message holds, or why it is refused; None while one is tried in another process."""
@@ -196,10 +196,11 @@ class Inbox:
                     yield None
             try:
                 self._guard.check(*tried)
-                self._guard.begin(mark)
-                yield self.decoder.decode(message)
             except MessageError as error:
                 yield error
+            else:
+                self._guard.begin(mark)
+                yield self.decoder.try_decode(message)
 
     def _take_block(self, block: Block, receipt: Receipt) -> None:
         """Take a block that its sender has numbered, unless it sends again one that comes before."""

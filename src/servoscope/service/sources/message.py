@@ -74,13 +74,18 @@ class Decoder(ABC):
     def decode(self, message: InboxMessage) -> Content:
         """Return what a message holds; raises MessageError if nothing of it can be used."""
 
+    def try_decode(self, message: InboxMessage) -> Content | MessageError:
+        """Return what a message holds, or why nothing of it can be used: no message ends the service."""
+        try:
+            return self.decode(message)
+        except MessageError as error:
+            return error
+        except Exception as error:  # decoders of other packages raise what they like
+            return MessageError("not a block", f"{type(error).__name__}: {' '.join(str(error).split())[:100]}")
+
     def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
-        """Yield what each message holds, or why nothing of it can be used."""
-        for message in messages:
-            try:
-                yield self.decode(message)
-            except MessageError as error:
-                yield error
+        """Yield what `try_decode` returns of each message."""
+        return map(self.try_decode, messages)
 
     def requests(self) -> Iterable[tuple[str, bytes]]:
         """Return messages, with their addresses, that ask senders for what it lacks."""
