@@ -118,8 +118,8 @@ class Inbox:
     @property
     def pause_s(self) -> float:
         """How long an asset may pause without being silent [s]; infinite while something may be on its way."""
-        is_due = self.transport.pause_s > 0.0 and self.next_block_s == 0.0
-        return math.inf if is_due else self.transport.pause_s
+        pause_s = self.transport.pause_s  # first: what its thread hands over meanwhile is seen behind it
+        return math.inf if pause_s > 0.0 and self.next_block_s == 0.0 else pause_s
 
     @property
     def next_block_s(self) -> float:
