@@ -10,6 +10,7 @@ import importlib
 import sys
 from pathlib import Path
 
+sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "tests" / "support"))  # where `reliability` is a package
 CASES = sorted(path.stem for path in (Path(__file__).parent / "cases").glob("[a-z]*.py"))
 
 

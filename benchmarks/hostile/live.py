@@ -24,11 +24,12 @@ from http.client import HTTPException
 from pathlib import Path
 
 BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `hostile` and `reliability` are packages, and `tables` lies
+sys.path[0] = str(BENCHMARKS)  # where `hostile` is a package, and `tables` lies
+sys.path.insert(1, str(BENCHMARKS.parent / "tests" / "support"))  # where `reliability` is one
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from reliability.run import free_port  # noqa: E402
 from reliability.servers import Mosquitto, mosquitto  # noqa: E402
+from reliability.workplace import free_port  # noqa: E402
 from tables import machine  # noqa: E402
 
 from hostile.damage import damaged  # noqa: E402

@@ -17,7 +17,7 @@ from hostile.other_files import plant
 from servoscope.core import sandbox
 from servoscope.core.errors import ConfigError, RecordingError
 from servoscope.core.sandbox import Sandbox
-from servoscope.core.workers import Worker, WorkerGroup
+from servoscope.core.workers import Workers
 from servoscope.signals.readers import reader_process
 
 
@@ -44,7 +44,7 @@ def test_a_reader_that_is_taken_over_opens_its_own_file_only(tmp_path: Path, mon
     )
     own = tmp_path / "own.bin"
     own.write_bytes(b"12345")
-    monkeypatch.setattr(reader_process, "_workers", WorkerGroup(reader_process.LIMITS))
+    monkeypatch.setattr(reader_process, "_workers", Workers(reader_process.LIMITS))
     paths = [str(tmp_path / "module"), *filter(None, [os.environ.get("PYTHONPATH")])]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
     with pytest.raises(RecordingError) as told:
@@ -59,10 +59,10 @@ def process_number(_: object) -> int:
 
 
 def test_the_walls_are_around_each_thread_of_the_process() -> None:
-    worker = Worker(environment={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    worker = Workers(environment={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
     number = worker.run(f"{__name__}:process_number", sandbox=Sandbox())
     threads = [path.read_text() for path in Path(f"/proc/{number}/task").glob("*/status")]
-    worker.stop()
+    worker.close()
     assert len(threads) > 1 and all("NoNewPrivs:\t1" in text for text in threads)
 
 

@@ -76,8 +76,8 @@ def test_a_worker_whose_parent_has_gone_says_nothing(tmp_path: Path) -> None:
     """It is in the middle of a task, whose steps nobody reads any more."""
     (tmp_path / "steps.py").write_text("def tell(progress):\n    while True:\n        progress('on')\n")
     code = (
-        "from servoscope.core.workers import Worker; import os, threading, time\n"
-        "threading.Thread(target=Worker().run, args=('steps:tell',), daemon=True).start()\n"
+        "from servoscope.core.workers import Workers; import os, threading, time\n"
+        "threading.Thread(target=Workers().run, args=('steps:tell',), daemon=True).start()\n"
         "time.sleep(1.5)\nos._exit(9)\n"
     )
     environment = os.environ | {"PYTHONPATH": f"{SOURCE}:{tmp_path}"}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from servoscope.core.workers import ProcessLimits, Progress, Worker, WorkerError
+from servoscope.core.workers import ProcessLimits, Progress, WorkerError, Workers
 
 TESTS = Path(__file__).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(str(path) for path in (TESTS, TESTS.parents[1] / "src"))}
@@ -38,6 +38,10 @@ def hang(_: Progress, file: str = "") -> None:
     time.sleep(600.0)
 
 
+def hang_for(_: Progress, seconds: float) -> None:
+    time.sleep(seconds)
+
+
 def fill_memory(_: Progress) -> int:
     return len(bytearray(10**10))
 
@@ -46,12 +50,12 @@ def fail(_: Progress) -> None:
     raise ZeroDivisionError("by nothing")
 
 
-def run(worker: Worker, name: str, *arguments: object, **more: object) -> object:
+def run(worker: Workers, name: str, *arguments: object, **more: object) -> object:
     return worker.run(f"test_workers:{name}", *arguments, **more)  # type: ignore[arg-type]
 
 
 def test_a_worker_answers_and_lasts_until_it_fails() -> None:
-    worker, steps = Worker(environment=ENVIRONMENT), list[str]()
+    worker, steps = Workers(environment=ENVIRONMENT), list[str]()
     try:
         assert run(worker, "double", 0.1, progress=steps.append) == 0.2 and steps == ["doubling"]
         first = run(worker, "process_number")
@@ -61,28 +65,39 @@ def test_a_worker_answers_and_lasts_until_it_fails() -> None:
                 run(worker, task, *arguments)
         assert run(worker, "process_number") != first
     finally:
-        worker.stop()
+        worker.close()
     with pytest.raises(WorkerError, match="stopped"):
         run(worker, "double", 1.0)
 
 
 def test_a_worker_that_hangs_or_needs_too_much_is_ended() -> None:
-    worker = Worker(ProcessLimits(10.0, 1000.0), environment=ENVIRONMENT)
+    worker = Workers(ProcessLimits(10.0, 1000.0), environment=ENVIRONMENT)
     try:
         with pytest.raises(WorkerError, match="more than 1000 MB"):
             run(worker, "fill_memory")
         with pytest.raises(WorkerError, match=r"more than 0\.5 s"):
             run(worker, "hang", timeout_s=0.5)
-        threading.Timer(0.5, worker.stop).start()
+        threading.Timer(0.5, worker.close).start()
         with pytest.raises(WorkerError):
             run(worker, "hang")
     finally:
-        worker.stop()
+        worker.close()
+
+
+def test_a_map_that_is_left_ends_what_still_runs() -> None:
+    workers = Workers(environment=ENVIRONMENT)
+    results = workers.map("test_workers:hang_for", [0.0, 600.0], 2)
+    assert next(results) == (0.0, None)
+    begin = time.monotonic()
+    results.close()  # type: ignore[attr-defined]  # a generator
+    assert time.monotonic() - begin < 60.0
+    with pytest.raises(WorkerError, match="stopped"):
+        run(workers, "double", 1.0)
 
 
 def test_a_busy_worker_ends_with_its_parent(tmp_path: Path) -> None:
     file = tmp_path / "pid"
-    code = f"from servoscope.core.workers import Worker; Worker().run('test_workers:hang', {str(file)!r})"
+    code = f"from servoscope.core.workers import Workers; Workers().run('test_workers:hang', {str(file)!r})"
     with subprocess.Popen([sys.executable, "-c", code], env=ENVIRONMENT) as parent:
         deadline = time.monotonic() + 30.0
         while not (file.exists() and file.read_text()) and time.monotonic() < deadline:

@@ -6,7 +6,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.fleet.common_cause import Evidence
-from servoscope.fleet.discoveries import RATE, discover
+from servoscope.fleet.summary import RATE, discover
 
 J = np.array([[900.0, 300.0], [300.0, 400.0]])  # what a recording tells of two parameters: 3.3 and 5 %
 ROOT = np.linalg.cholesky(J)

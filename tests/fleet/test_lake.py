@@ -26,9 +26,8 @@ from servoscope.diagnosis.diagnose import diagnose
 from servoscope.fleet import Plan, day_monitor, read
 from servoscope.fleet.day_monitor import DayMonitor, DayState, RowHistory
 from servoscope.fleet.lake import Lake
-from servoscope.fleet.local_engine import local
 from servoscope.fleet.rows import Rows
-from servoscope.fleet.tasks import ExamineTask
+from servoscope.fleet.tasks import ExamineTask, local
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Columns
 from servoscope.signals import Recording

@@ -30,8 +30,7 @@ from servoscope.fleet import Plan, sinks, streaming
 from servoscope.fleet import spark as engines
 from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.lake import Lake
-from servoscope.fleet.local_engine import local
-from servoscope.fleet.tasks import ExamineTask
+from servoscope.fleet.tasks import ExamineTask, local
 from servoscope.service.store import Store
 from servoscope.service.store.tables import diagnoses
 

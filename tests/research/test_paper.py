@@ -225,7 +225,7 @@ def test_claims_have_numbers_and_verdicts() -> None:
 
 def test_numbers_in_words() -> None:
     numbers = MetricQuartiles({"x": [0.1, 0.2, 0.3, 0.4, 0.5], "same": [2.0, 2.0], "never": [np.nan]})
-    assert numbers.text("x") == "0.3 [0.2, 0.4]" and numbers.percent("x") == "30 % [20, 40]"
+    assert numbers.text("x") == "0.3 [0.2, 0.4]" and numbers.fill("{x:%} of {0}", (2,)) == "30 % [20, 40] of 2"
     assert numbers.text("same") == "2" and numbers.text("never") == numbers.text("unknown") == "never"
 
 

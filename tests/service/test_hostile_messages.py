@@ -184,7 +184,7 @@ def test_only_a_message_that_was_in_hand_is_tried_and_only_one_that_fails_is_set
         if b"poison" in content:
             raise WorkerError("it took more than 10 s")
 
-    monkeypatch.setattr(guarding.Worker, "run", run)
+    monkeypatch.setattr(guarding.Workers, "run", run)
     path = tmp_path / "hall.in-hand"
 
     def killed_with(mark: int) -> MessageGuard:

@@ -20,7 +20,7 @@ from reliability.servers import Postgres
 
 from golden.results import FOLDER
 from servoscope.service.config import StoreSettings
-from servoscope.service.retention import DAY_S, delete_old_rows
+from servoscope.service.housekeeping import DAY_S, delete_old_rows
 from servoscope.service.store import Batch, Store, schema, tables
 from servoscope.service.store import copy as copying
 from servoscope.service.store.copy import copy_store

@@ -12,7 +12,7 @@ from commands import one_line, run
 from logs import as_expected, lines, written
 
 from servoscope.core.errors import RecordingError
-from servoscope.core.workers import WorkerGroup
+from servoscope.core.workers import Workers
 from servoscope.signals.readers import archives, read, readable_suffixes, reader_process
 from servoscope.signals.readers.archives import expand_paths
 
@@ -72,7 +72,7 @@ def test_a_reader_that_hangs_is_stopped_and_the_next_file_is_read(
     (tmp_path / "hanging.py").write_text("def open_it(path):\n    while True:\n        pass\n")
     path = written(tmp_path, lines(), "x.bin")
     monkeypatch.setattr(
-        reader_process, "_workers", WorkerGroup(reader_process.LIMITS)
+        reader_process, "_workers", Workers(reader_process.LIMITS)
     )  # a worker finds what is on the path when it starts
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]))
     monkeypatch.setattr(reader_process, "BASE_S", 0.5)

@@ -13,8 +13,7 @@ from servoscope.service.store import Store
 from servoscope.web.dependencies import Context
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
-from servoscope.web.storage import FileStorage
-from servoscope.web.upload_storage import UploadStorage
+from servoscope.web.storage import FileStorage, UploadStorage
 
 
 @contextmanager

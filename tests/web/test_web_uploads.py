@@ -24,8 +24,7 @@ from servoscope.web.app import create_app
 from servoscope.web.dependencies import Context
 from servoscope.web.jobs.queue import JobQueue
 from servoscope.web.jobs.tasks import MAX_COLUMNS, preview_file
-from servoscope.web.storage import FileStorage
-from servoscope.web.upload_storage import PREVIEW_BYTES, UploadStorage
+from servoscope.web.storage import PREVIEW_BYTES, FileStorage, UploadStorage
 
 PREVIEW = {"rows": 1, "columns": [], "preview": {"columns": ["t"], "rows": [[0.0]]}, "mapping": {}}
 FILE_TYPE = {"Content-Type": "application/octet-stream"}

@@ -86,7 +86,7 @@ def fleet(
         from servoscope.cli.progress import show_count
         from servoscope.core.workers import available_cores
         from servoscope.fleet import Lake, Plan, run
-        from servoscope.fleet.local_engine import local
+        from servoscope.fleet.tasks import local
         from servoscope.models.loop import Loop
 
         settings = Loop.load(loop) if loop is not None else None

@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -96,10 +97,9 @@ def run(
         return
     log.set_up_logging(settings.service.log)
     from servoscope.service.health import serve_health
-    from servoscope.service.process_supervisor import call_at_end_of_stdin
+    from servoscope.service.process_supervisor import ProcessSupervisor, call_at_end_of_stdin
     from servoscope.service.service import Service
     from servoscope.service.workers import WorkerPool
-    from servoscope.web.supervisor import supervise_pages
 
     service: Service | WorkerPool
     settings = settings.shard(worker)
@@ -115,7 +115,10 @@ def run(
         call_at_end_of_stdin(service.stop)
     if worker is not None or not sys.stderr.isatty():  # a terminal that is closed ends what runs in it
         signal.signal(signal.SIGHUP, lambda *_: service.reload(config))
-    pages = supervise_pages(config) if settings.web is not None else None
+    pages = None
+    if settings.web is not None:  # in a process of their own, so that they hold up no samples
+        check_web_extra()
+        pages = ProcessSupervisor("pages", lambda: ["serve", str(config), "--with-parent"])
     try:
         if pages is not None:
             pages.start()
@@ -223,6 +226,13 @@ def prefix_file_name(config: Path) -> Iterator[None]:
         yield
     except ConfigError as error:
         raise ConfigError(f"{config}: {error}") from None
+
+
+def check_web_extra() -> None:
+    """Raise ConfigError if something is missing of what the pages need."""
+    for module in ("fastapi", "uvicorn", "argon2"):
+        if find_spec(module) is None:
+            raise ConfigError(f"[web]: {module} is missing, pip install 'servoscope[web]'")
 
 
 def parse_store_address(text: str) -> tuple[str, Path | None]:

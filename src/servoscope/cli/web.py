@@ -10,6 +10,7 @@ import typer
 
 from servoscope.cli.app import app
 from servoscope.cli.exit import print_json
+from servoscope.cli.service import check_web_extra
 from servoscope.service.access import ROLES, Role
 
 if TYPE_CHECKING:
@@ -47,13 +48,7 @@ def serve(
     """Serve pages and HTTP interface over a store; on loopback, without login, unless told otherwise."""
     if (config is None) == (store is None):
         raise typer.BadParameter("give a service file or --store, and not both")
-    try:
-        import fastapi  # noqa: F401  # the first of what the extra brings
-        import uvicorn  # noqa: F401
-    except ModuleNotFoundError as error:
-        from servoscope.core.errors import ConfigError
-
-        raise ConfigError(f"{error.name} is missing, pip install 'servoscope[web]'") from None
+    check_web_extra()
     from servoscope.service.config import ServiceFile
     from servoscope.service.store import Store
     from servoscope.web.server import STORE_TIMEOUT_S, run_server

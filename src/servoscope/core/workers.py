@@ -1,4 +1,4 @@
-"""Work in other processes: a worker with limits, for what may fail or comes from strangers, and pools of equal ones.
+"""Work in other processes, with limits, for what may fail or comes from strangers, or needs several cores.
 
 A worker is told what to do in pickles and answers in JSON, so that a file that takes over the worker that reads it has
 no way into the process that asked.
@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -74,17 +75,17 @@ class ProcessLimits:
             resource.setrlimit(kind, (limit, limit + grace))
 
 
-class Worker:
-    """A process that runs one task after the other; it is started by the first one, and again after a failure.
+class Workers:
+    """Processes that run tasks, as many as there are tasks at a time; each keeps what it has loaded for its next one.
 
-    It ends with the process that started it, however that ends.
+    They end with the process that started them, however that ends.
 
     Parameters
     ----------
     limits
-        None: as much as it takes.
+        Of each; None: as much as it takes.
     folder, environment
-        Where it runs, and its environment variables; None: those of this process.
+        Where they run, and their environment variables; None: those of this process.
     """
 
     def __init__(
@@ -94,11 +95,9 @@ class Worker:
         folder: Path | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self._limits, self._folder, self._environment = limits, folder, environment
+        self._start = partial(_Worker, limits, folder, environment)
         self._lock = threading.Lock()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._fork: tuple[Sequence[str], Sandbox | None] | None = None  # libraries and sandbox of the tasks' process
-        self._connection: Connection
+        self._idle, self._busy = list[_Worker](), set[_Worker]()
         self._stopped = False
 
     def run(
@@ -110,7 +109,7 @@ class Worker:
         libraries: Sequence[str] = (),
         sandbox: Sandbox | None = None,
     ) -> Any:
-        """Run a function and return its result.
+        """Run a function and return its result; from any thread.
 
         Parameters
         ----------
@@ -127,54 +126,88 @@ class Worker:
         Raises
         ------
         WorkerError
-            If it failed, or needed more than its limits; the worker has ended then.
+            If it failed, or needed more than its limits; its process has ended then.
         """
-        process = self._start()
-        if self._fork != (libraries, sandbox):
-            if self._fork is not None:
-                self._exchange(process, None)
-            self._exchange(process, (libraries, self._limits, sandbox), timeout_s=START_S)
-            self._fork = libraries, sandbox
-        return self._exchange(process, (function, arguments), progress, timeout_s)
-
-    def stop(self) -> None:
-        """Stop for good, from any thread; a task that is running fails."""
-        with self._lock:
-            self._stopped = True
-            process = self._process
-        if process is not None:
-            self._end(process)
-
-    def _start(self) -> subprocess.Popen[bytes]:
         with self._lock:
             if self._stopped:
                 raise WorkerError("it was stopped")
-            if self._process is None:
-                # not pipes: whoever holds one end of a pipe can open the other one through /proc
-                ours, theirs = socket.socketpair()
-                with theirs:
-                    self._process = subprocess.Popen(
-                        [sys.executable, "-c", WORKER_CODE],
-                        stdin=theirs.fileno(),
-                        cwd=self._folder,
-                        env=self._environment,
-                        start_new_session=True,  # Ctrl-C in a terminal is for the parent, which then ends it
-                    )
-                self._connection, self._fork = Connection(ours.detach()), None
-            return self._process
+            worker = self._idle.pop() if self._idle else self._start()
+            self._busy.add(worker)
+        try:
+            worker.enter(libraries, sandbox)
+            return worker.exchange((function, arguments), progress, timeout_s)
+        finally:
+            with self._lock:
+                self._busy.remove(worker)
+                if worker.process.poll() is None:
+                    self._idle.append(worker)
 
-    def _exchange(
-        self,
-        process: subprocess.Popen[bytes],
-        question: Any,
-        progress: Progress = lambda _: None,
-        timeout_s: float | None = None,
-    ) -> Any:
+    def map(self, function: str, tasks: Iterable[Task], processes: int) -> Iterator[tuple[Task, Any]]:
+        """Yield tasks with what a function makes of each, as they end; of a task that failed, its WorkerError.
+
+        A task that kills its process costs itself only. Few wait at a time, so that memory is bounded. Stops at the
+        end, as `stop` does.
+        """
+
+        def attempt(task: Task) -> tuple[Task, Any]:
+            try:
+                return task, self.run(function, task)
+            except WorkerError as error:
+                return task, error
+
+        waiting, running = iter(tasks), set[Future[tuple[Task, Any]]]()
+        with ThreadPoolExecutor(processes, "workers") as threads, closing(self):
+            while True:
+                some = islice(waiting, TASKS_PER_PROCESS * processes - len(running))
+                running |= {threads.submit(attempt, task) for task in some}
+                if not running:
+                    return
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                yield from (future.result() for future in done)
+
+    def close(self) -> None:
+        """Stop for good, from any thread; tasks that are running fail."""
+        with self._lock:
+            self._stopped = True
+            for worker in (*self._idle, *self._busy):
+                worker.end()
+
+
+class _Worker:
+    """A process that runs one task after the other, until one fails."""
+
+    def __init__(
+        self, limits: ProcessLimits | None, folder: Path | None, environment: Mapping[str, str] | None
+    ) -> None:
+        self._limits = limits
+        self._entered: tuple[Sequence[str], Sandbox | None] | None = None  # libraries and sandbox of its tasks
+        # not pipes: whoever holds one end of a pipe can open the other one through /proc
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", WORKER_CODE],
+                stdin=theirs.fileno(),
+                cwd=folder,
+                env=environment,
+                start_new_session=True,  # Ctrl-C in a terminal is for the parent, which then ends it
+            )
+        self._connection = Connection(ours.detach())
+
+    def enter(self, libraries: Sequence[str], sandbox: Sandbox | None) -> None:
+        """Load libraries, and let the next tasks run within a sandbox."""
+        if self._entered != (libraries, sandbox):
+            if self._entered is not None:
+                self.exchange(None)
+            self.exchange((libraries, self._limits, sandbox), timeout_s=START_S)
+            self._entered = libraries, sandbox
+
+    def exchange(self, question: Any, progress: Progress = lambda _: None, timeout_s: float | None = None) -> Any:
+        """Send a question and return the answer; raises WorkerError, see `Workers.run`."""
         late = threading.Event()
 
         def expire() -> None:
             late.set()
-            _kill(process)
+            self._kill()
 
         timer = threading.Timer(threading.TIMEOUT_MAX if timeout_s is None else timeout_s, expire)
         timer.daemon = True
@@ -190,16 +223,10 @@ class Worker:
                 if kind == "error":
                     raise WorkerError(content)
                 progress(content)
-        except (
-            EOFError,
-            OSError,
-            TypeError,
-            ValueError,
-            RecursionError,
-        ):  # it has ended, perhaps in the middle of an answer
-            code = self._end(process)
+        except (EOFError, OSError, TypeError, ValueError, RecursionError):
+            code = self.end()  # it has ended, perhaps in the middle of an answer
         except BaseException:
-            self._end(process)
+            self.end()
             raise
         finally:
             timer.cancel()
@@ -207,14 +234,15 @@ class Worker:
             raise WorkerError(f"it took more than {timeout_s:g} s, and was stopped")
         raise WorkerError(self._cause_of_death(code if code <= SIGNAL_CODE else SIGNAL_CODE - code))
 
-    def _end(self, process: subprocess.Popen[bytes]) -> int:
-        """End a process and return its exit code: its own one, if it had ended already."""
-        _kill(process)
-        code = process.wait()
-        with self._lock:
-            if self._process is process:
-                self._process = None
-        return code
+    def _kill(self) -> None:
+        with suppress(ProcessLookupError):
+            if self.process.returncode is None:  # otherwise its number may be another's by now
+                os.killpg(self.process.pid, signal.SIGKILL)  # whatever it has started too
+
+    def end(self) -> int:
+        """End the process and return its exit code: its own one, if it had ended already."""
+        self._kill()
+        return self.process.wait()
 
     def _cause_of_death(self, code: int) -> str:
         limits = self._limits
@@ -222,12 +250,6 @@ class Worker:
             return f"it takes more than {limits.cpu_s:g} s of processor time, and was stopped"
         need = f"; it may need more than {limits.memory_mb:g} MB of memory" if limits is not None else ""
         return f"it took its process down ({code}){need}"
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    with suppress(ProcessLookupError):
-        if process.returncode is None:  # otherwise its number may be another's by now
-            os.killpg(process.pid, signal.SIGKILL)  # whatever it has started too
 
 
 def worker_main() -> None:
@@ -309,55 +331,6 @@ def _read_tasks(parent: Connection, waiting: SimpleQueue[tuple[str, tuple[Any, .
         traceback.print_exc()
         os._exit(1)
     os._exit(0)
-
-
-class WorkerGroup:
-    """Workers side by side, as many as there are tasks at a time; each keeps what it has loaded for its next one.
-
-    Parameters are those of `Worker`.
-    """
-
-    def __init__(self, limits: ProcessLimits | None = None, environment: Mapping[str, str] | None = None) -> None:
-        self._limits, self._environment = limits, environment
-        self._idle: list[Worker] = []
-
-    def run(self, function: str, *arguments: Any, **how: Any) -> Any:
-        """Run a function as `Worker.run` does, from any thread."""
-        try:
-            worker = self._idle.pop()
-        except IndexError:
-            worker = Worker(self._limits, environment=self._environment)
-        try:
-            return worker.run(function, *arguments, **how)
-        finally:  # after a failure, its next task starts its process again
-            self._idle.append(worker)
-
-    def map(self, function: str, tasks: Iterable[Task], processes: int) -> Iterator[tuple[Task, Any]]:
-        """Yield tasks with what a function makes of each, as they end; of a task that failed, its WorkerError.
-
-        A task that kills its process costs itself only. Few wait at a time, so that memory is bounded.
-        """
-
-        def attempt(task: Task) -> tuple[Task, Any]:
-            try:
-                return task, self.run(function, task)
-            except WorkerError as error:
-                return task, error
-
-        waiting, running = iter(tasks), set[Future[tuple[Task, Any]]]()
-        with closing(self), ThreadPoolExecutor(processes, "workers") as threads:
-            while True:
-                some = islice(waiting, TASKS_PER_PROCESS * processes - len(running))
-                running |= {threads.submit(attempt, task) for task in some}
-                if not running:
-                    return
-                done, running = wait(running, return_when=FIRST_COMPLETED)
-                yield from (future.result() for future in done)
-
-    def close(self) -> None:
-        """Stop the workers that have nothing to do."""
-        while self._idle:
-            self._idle.pop().stop()
 
 
 def available_cores() -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -42,7 +41,6 @@ class HypothesisDistances:
 
     others: tuple[Fault, ...]  # the other faults, q of them
     squared: FloatArray  # squared distances, shape (q,)
-    squared_if_certain: FloatArray  # the same if the healthy parameters were known exactly, shape (q,)
     sizes: FloatArray  # logarithms of the ratios at which each is closest, shape (q,)
     residuals: FloatArray  # what each leaves then, in standard deviations, shape (q, N + m)
 
@@ -68,43 +66,27 @@ def hypothesis_distances(scene: Scenario, fault: Fault, x: float) -> HypothesisD
         j = scene.names.index(other.parameter)
         guess = x * float(F[i, j] / max(F[j, j], 1e-300))
         found.append(_closest_hypothesis(scene, window, other, own, guess))
-    left = np.array([each.residual for each in found]).reshape(len(others), len(own))
-    return HypothesisDistances(
-        others,
-        (left**2).sum(axis=1),
-        np.array([each.certain for each in found]),
-        np.array([each.size for each in found]),
-        left,
-    )
+    left = np.array([residual for _, residual in found]).reshape(len(others), len(own))
+    return HypothesisDistances(others, (left**2).sum(axis=1), np.array([size for size, _ in found]), left)
 
 
 Span = tuple[float, float]
 
 
-class AmbiguousSizes(NamedTuple):
-    """Sizes at which a fault is not named rightly, as spans of logarithms (positive) in rising order.
-
-    The first begins at 0; the last ends at infinity if the end of the range is among them. Those beyond the first are
-    sizes at which the fault looks like another once more: a resonance above half the sample rate comes back, for
-    example. `spans` are with the healthy parameters as well known as they are, `certain` if they were known exactly:
-    less nobody can reach, for it is the likelihood ratio that decides (Neyman and Pearson, 1933).
-    """
-
-    spans: tuple[Span, ...]
-    spans_if_certain: tuple[Span, ...]
-
-
 def ambiguous_sizes(
     scene: Scenario, fault: Fault, up: bool, progress: Callable[[], None] = lambda: None
-) -> AmbiguousSizes:
+) -> tuple[Span, ...]:
     """Return at which sizes another single fault is more likely with a probability above `MISNAMED`.
 
-    Sizes with which the loop is unstable do not count: nobody could have recorded them.
+    The spans of logarithms (positive) are in rising order. The first begins at 0; the last ends at infinity if the end
+    of the range is among them. Those beyond the first are sizes at which the fault looks like another once more: a
+    resonance above half the sample rate comes back, for example. Sizes with which the loop is unstable do not count:
+    nobody could have recorded them.
     """
     (low,), (high,) = log_ratio_bounds([fault])
     sign, end = (1.0, float(high)) if up else (-1.0, float(-low))
     if len(scene.names) == 1:
-        return AmbiguousSizes((), ())
+        return ()
     known: dict[float, HypothesisDistances | None] = {}
 
     def at(log_x: float) -> HypothesisDistances | None:
@@ -116,29 +98,20 @@ def ambiguous_sizes(
                 known[log_x] = None
         return known[log_x]
 
-    def excess(of: str) -> Callable[[float], float]:
-        def ratio(log_x: float) -> float:
-            """Return the logarithm of the distance relative to what is needed."""
-            found = at(log_x)
-            if found is None:
-                return UNLIMITED_DISTANCE
-            return float(
-                np.log(
-                    max(equivalent_distance(misnaming_probability(getattr(found, of))), 1e-6)
-                    / equivalent_distance(MISNAMED)
-                )
-            )
-
-        return ratio
+    def excess(log_x: float) -> float:
+        """Return the logarithm of the distance relative to what is needed."""
+        found = at(log_x)
+        if found is None:
+            return UNLIMITED_DISTANCE
+        distance = equivalent_distance(misnaming_probability(found.squared))
+        return float(np.log(max(distance, 1e-6) / equivalent_distance(MISNAMED)))
 
     promised = min(
         linear_isolability_radius(fisher_matrix(scene, exact=False), scene.names.index(fault.parameter)), 0.9 * end
     )
-    learned = excess("squared")
-    points = [(x, learned(x)) for x in np.log(np.geomspace(0.9 * promised, end, GRID)).tolist()]
-    _refine_minima(learned, points)
-    sizes = sorted(known)
-    return AmbiguousSizes(*(_negative_spans(excess(of), sizes) for of in ("squared", "squared_if_certain")))
+    points = [(x, excess(x)) for x in np.log(np.geomspace(0.9 * promised, end, GRID)).tolist()]
+    _refine_minima(excess, points)
+    return _negative_spans(excess, sorted(known))
 
 
 def _negative_spans(excess: Callable[[float], float], log_sizes: list[float]) -> tuple[Span, ...]:
@@ -174,18 +147,13 @@ def _refine_minima(excess: Callable[[float], float], points: list[tuple[float, f
             minimize_scalar(excess, bounds=(low, high), method="bounded", options={"maxiter": LOOKS})
 
 
-class _ClosestHypothesis(NamedTuple):
-    size: float
-    residual: FloatArray
-    certain: float
-
-
 def _closest_hypothesis(
     scene: Scenario, window: RefitWindow, other: Fault, own: FloatArray, guess: float
-) -> _ClosestHypothesis:
-    """Return where another fault comes closest to the truth, whose innovations are `own` (N + m,).
+) -> tuple[float, FloatArray]:
+    """Return the size at which another fault comes closest to the truth, and what it leaves, shape (N + m,).
 
-    First with the healthy parameters held, by search; then with all free.
+    `own` (N + m,) are the innovations of the truth. First with the healthy parameters held, by search; then with all
+    free.
     """
     m, grid = window.nuisance_count, scene.size_grids[other.parameter]
     (low,), (high,) = log_ratio_bounds([other])
@@ -197,10 +165,9 @@ def _closest_hypothesis(
     starts = [np.append(np.zeros(m), x) for x in (min(grid, key=off), float(np.clip(guess, low, high)))]
     z = min(starts, key=lambda z: float(((window.residual(z, (other.parameter,), scene.profile) - own) ** 2).sum()))
     z, left = minimise_distance(scene, window, [other], own, z, held=True)
-    certain = float(left @ left)
     if m:
         z, left = minimise_distance(scene, window, [other], own, z, held=False)
-    return _ClosestHypothesis(float(z[m]), left, certain)
+    return float(z[m]), left
 
 
 def minimise_distance(

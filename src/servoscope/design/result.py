@@ -25,8 +25,6 @@ class DirectionStudy(_StudyModel):
     unclear
         Spans of ratios at which it is not named rightly with 99.5 % probability, from the smallest change on; an open
         end is None.
-    certain
-        The same if the healthy parameters were known exactly: no diagnosis can do better.
     bound
         End of the first span as linear sensitivities and the Cramer-Rao bound have it.
     nearest
@@ -38,7 +36,6 @@ class DirectionStudy(_StudyModel):
 
     detectable: float | None
     unclear: Spans
-    certain: Spans
     bound: float | None
     nearest: str
     tracking: float | None = None

@@ -17,7 +17,7 @@ from servoscope.design.fisher_information import (
     fisher_matrix,
     linear_isolability_radius,
 )
-from servoscope.design.isolability import Span, ambiguous_sizes, hypothesis_distances
+from servoscope.design.isolability import ambiguous_sizes, hypothesis_distances
 from servoscope.design.operating_limits import LIMIT_KINDS, LimitKind, OperatingLimit, operating_limits
 from servoscope.design.result import (
     BaselineStudy,
@@ -27,7 +27,6 @@ from servoscope.design.result import (
     FaultStudy,
     MimicStudy,
     SizePrecision,
-    Spans,
 )
 from servoscope.design.scenario import Scenario, require_exact_predictor, require_study
 from servoscope.detection.statistic import required_noncentrality
@@ -206,13 +205,12 @@ def _side(scene: Scenario, alarms: AlarmPower, fault: Fault, up: bool) -> Direct
     sign = 1.0 if up else -1.0
     seen = detectable_size(alarms, fault, up)
     end = abs(float(np.log(fault.ratio_range[1 if up else 0])))
-    found = ambiguous_sizes(scene, fault, up)
-    first = next((high for _, high in found.spans), 0.0)
+    spans = ambiguous_sizes(scene, fault, up)
+    first = next((high for _, high in spans), 0.0)
     at = min(first, end) or min(seen, end)
     return DirectionStudy(
         detectable=_ratio(sign * seen),
-        unclear=_spans(found.spans, sign),
-        certain=_spans(found.spans_if_certain, sign),
+        unclear=tuple((float(np.exp(sign * low)), _ratio(sign * high)) for low, high in spans),
         bound=_ratio(sign * linear_isolability_radius(fisher_matrix(scene), scene.names.index(fault.parameter))),
         nearest=_nearest_fault(scene, fault, sign * at),
     )
@@ -238,10 +236,6 @@ def _mimic(scene: Scenario, cause: mimics.MimicCause) -> MimicStudy:
         looks_like=float(np.exp(amount * found.size)),
         told_apart=_finite(found.distinguishable_from),
     )
-
-
-def _spans(spans: Sequence[Span], sign: float) -> Spans:
-    return tuple((float(np.exp(sign * low)), _ratio(sign * high)) for low, high in spans)
 
 
 def _ratio(x: float) -> float | None:

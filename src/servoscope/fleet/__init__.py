@@ -6,11 +6,11 @@ from servoscope.fleet import sinks as sinks
 from servoscope.fleet import spark as spark
 from servoscope.fleet.common_cause import Cause, Evidence, Prior, causes
 from servoscope.fleet.lake import Lake
-from servoscope.fleet.local_engine import local
 from servoscope.fleet.run import Plan, run
 from servoscope.fleet.spark import diagnose
 from servoscope.fleet.streaming import follow
 from servoscope.fleet.summary import Fleet
+from servoscope.fleet.tasks import local
 
 __all__ = [
     "Cause",

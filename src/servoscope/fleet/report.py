@@ -8,9 +8,8 @@ from pathlib import Path
 
 from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.messages import count_words
-from servoscope.fleet.discoveries import RATE
 from servoscope.fleet.rows import MICRO
-from servoscope.fleet.summary import COMMON, FAILED, Fleet
+from servoscope.fleet.summary import COMMON, FAILED, RATE, Fleet
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_size
 from servoscope.report.page import render_page, write_page
 

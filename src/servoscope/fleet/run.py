@@ -16,9 +16,8 @@ from servoscope.fleet.common_cause import PRIOR, Prior
 from servoscope.fleet.day_monitor import WINDOW
 from servoscope.fleet.journal import open_journal
 from servoscope.fleet.lake import AssetDay, Lake
-from servoscope.fleet.local_engine import Engine
 from servoscope.fleet.summary import Fleet, summarise_fleet
-from servoscope.fleet.tasks import ExamineTask, LearnTask, result_table
+from servoscope.fleet.tasks import Engine, ExamineTask, LearnTask, result_table
 from servoscope.models.loop import Columns, Loop
 from servoscope.signals.writers import write_table
 

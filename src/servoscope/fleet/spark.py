@@ -14,10 +14,9 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import ServoscopeError
 from servoscope.fleet.baselines import Baselines
 from servoscope.fleet.day_monitor import WINDOW
-from servoscope.fleet.local_engine import Engine, Task, TaskResult, crash_result
 from servoscope.fleet.partition import examine_days
 from servoscope.fleet.rows import required_columns
-from servoscope.fleet.tasks import RESULT_COLUMNS, result_table
+from servoscope.fleet.tasks import RESULT_COLUMNS, Engine, Task, TaskResult, crash_result, result_table
 from servoscope.models.loop import Columns
 
 if TYPE_CHECKING:

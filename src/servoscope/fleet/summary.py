@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from servoscope.fleet.common_cause import (
     ACCEPTANCE_PROBABILITY,
     PRIOR,
@@ -14,12 +16,13 @@ from servoscope.fleet.common_cause import (
     Prior,
     causes,
     fault_probability,
+    log_fault_evidence,
 )
-from servoscope.fleet.discoveries import discover
 from servoscope.fleet.rows import MICRO
 
 Entry = Mapping[str, Any]
 COMMON, FAILED = "common cause", "failed"
+RATE = 0.05  # share of the named assets that is named in error, on average
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,21 @@ def summarise_fleet(
     since = tuple(_first_accepted_day(cause, causes_by_day) for cause in now)
     found = discover({e["asset"]: _parse_evidence(e) for e in last if "evidence" in e}, prior)
     return Fleet(tuple(assets), tuple(now), since, states, tuple(failed), dict(unlearned), dict(late or {}), found)
+
+
+def discover(evidence: Mapping[str, Evidence], prior: Prior = PRIOR, rate: float = RATE) -> tuple[str, ...]:
+    """Return the assets that have changed at a false discovery rate, the surest first.
+
+    The Bayes factor of a fault against none is an e-value: of a healthy asset it is 1 on average. With e-values of N
+    assets those k are named whose smallest is at least N/(k rate), for the largest such k. That holds whatever the
+    assets have in common: warm days, or one baseline (Wang and Ramdas, 2022, Journal of the Royal Statistical Society
+    B, 84(3), proposition 2).
+    """
+    logs = {asset: log_fault_evidence(one, prior) for asset, one in evidence.items()}
+    order = sorted(logs, key=lambda asset: (-logs[asset], asset))
+    N = len(order)
+    enough = [k for k, asset in enumerate(order, 1) if logs[asset] >= np.log(N / (k * rate))]
+    return tuple(order[: max(enough, default=0)])
 
 
 def _last_known_day(states: Mapping[str, str]) -> str:

@@ -1,10 +1,10 @@
-"""The tasks of a fleet, which any engine can run, and their results as rows with the same columns everywhere."""
+"""The tasks of a fleet, which any engine can run, the engine of one machine, and results as rows of equal columns."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from servoscope.core.errors import NotEnoughError, ServoscopeError
 from servoscope.core.files import atomic_write, make_folder
+from servoscope.core.workers import Progress, WorkerError, Workers
 from servoscope.fleet.baselines import load_day_monitor
 from servoscope.fleet.day_monitor import DayMonitor, DayState, EvaluationBlock, RowHistory
 from servoscope.fleet.lake import AssetDay
@@ -135,6 +136,38 @@ class ExamineTask:
         except Exception as error:  # garbage in one item must not cost another
             result = failed_result(error)
         return {"asset": self.item.asset, "day": self.item.day, "stamp": self.item.stamp, **result}
+
+
+Task = LearnTask | ExamineTask
+TaskResult = tuple[Task, dict[str, Any]]
+Engine = Callable[[Sequence[Task]], Iterator[TaskResult]]  # results come as tasks finish, in any order
+
+
+def local(jobs: int) -> Engine:
+    """Return the engine that runs tasks in so many processes; with one, in this one."""
+
+    def run(tasks: Sequence[Task]) -> Iterator[TaskResult]:
+        if jobs == 1:
+            yield from ((task, task.run()) for task in tasks)
+            return
+        for task, result in Workers().map(f"{__name__}:run_task", tasks, jobs):
+            yield task, crash_result(task) if isinstance(result, WorkerError) else result
+
+    return run
+
+
+def run_task(_: Progress, task: Task) -> dict[str, Any]:
+    """Run a task in a worker."""
+    return task.run()
+
+
+def crash_result(task: Task) -> dict[str, Any]:
+    """Return the result of a task that killed its process."""
+    error = "its process died, perhaps for want of memory"
+    if isinstance(task, LearnTask):
+        return {"name": task.name, "error": error, "unused": {}}
+    item = task.item
+    return {"asset": item.asset, "day": item.day, "stamp": item.stamp, "status": "failed", "error": error}
 
 
 def examine_day(monitor: DayMonitor, blocks: Iterable[Rows]) -> tuple[dict[str, Any], list[EvaluationBlock]]:

@@ -52,10 +52,8 @@ def plot_radii(study: DesignStudy) -> Figure:
                 ax.plot(abs(math.log(value)), y, marker, color=colour, markersize=7, label=label if not y else "")
     ax.set_yticks(range(len(rows)), [f"{f.name} {d}" for f, d, _ in rows])
     ax.invert_yaxis()
-    ax.set_xscale("log")
-    ax.set_xlim(low, high)
+    ax.set(xscale="log", xlim=(low, high), xlabel="size of the change")
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: format_log_ratio(x)))
-    ax.set_xlabel("size of the change")
     _add_grid_and_legend(figure, ax)
     return figure
 
@@ -70,12 +68,9 @@ def plot_size_precision(study: DesignStudy) -> Figure:
         known = [(each.seconds, each.std) for each in fault.sizes if each.std is not None]
         if known:
             ax.plot(*zip(*known, strict=True), color=tone, marker=".", label=fault.name)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
+    ax.set(xscale="log", yscale="log", xlabel="time after the onset [s]", ylabel="standard deviation")
     ax.xaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{100.0 * x:g} %"))
-    ax.set_xlabel("time after the onset [s]")
-    ax.set_ylabel("standard deviation")
     ax.set_ylim(top=min(ax.get_ylim()[1], MAX_STD_SHOWN))
     _add_grid_and_legend(figure, ax, columns=4)
     return figure

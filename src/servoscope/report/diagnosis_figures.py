@@ -76,8 +76,7 @@ def plot_statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     ax = figure.subplots()
     usable = trace.ready & np.isfinite(trace.statistic) & (trace.statistic > 0.0)
     unit, factor = time_axis_unit(float(np.ptp(trace.t)) if len(trace.t) else 0.0)
-    ax.set_xlabel(f"time [{unit}]")
-    ax.set_ylabel("statistic T²")
+    ax.set(xlabel=f"time [{unit}]", ylabel="statistic T²")
     if not usable.any():
         _empty(ax, "no evaluation: the estimator never had enough data")
         return figure
@@ -85,8 +84,6 @@ def plot_statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     t = trace.t / factor
     value = np.where(usable, trace.statistic, np.nan)
     lowest = min(float(np.nanpercentile(value, 1.0)), limit) / 2.0
-    ax.set_yscale("log")
-    ax.yaxis.set_major_formatter("{x:g}")
     ax.plot(*envelope(t, value), color=MEASURED, marker="o" if usable.sum() < 20 else "", markersize=3)
     ax.axhline(limit, color=ALARM, linewidth=1.0, linestyle=(0, (5, 2.5)))
     level = np.where(usable & (trace.level > 0.0), np.maximum(limit * trace.level, lowest), np.nan)
@@ -96,7 +93,8 @@ def plot_statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     highest = np.fmax(value, level)
     over = np.where(usable, np.maximum(highest, limit), np.nan)
     ax.fill_between(*envelope(t, over), limit, color=ALARM, alpha=0.16, linewidth=0)
-    ax.set_ylim(lowest, 3.0 * max(float(np.nanmax(highest)), limit))
+    ax.set(yscale="log", ylim=(lowest, 3.0 * max(float(np.nanmax(highest)), limit)))
+    ax.yaxis.set_major_formatter("{x:g}")
     ax.margins(x=0.0)
     if usable.sum() == 1:
         ax.set_xlim(t[usable][0] - 1.0, t[usable][0] + 1.0)
@@ -237,8 +235,8 @@ def _plane(ax: Axes, trace: Trace, i: int, usable: BoolArray, onset: float) -> N
         ax.plot(H.real, H.imag, marker, markersize=5.5, mfc=face, mec=edge, zorder=4)
         shown.append(np.array([[H.real, H.imag]]))
     certain = np.vstack(shown[1:]) if len(shown) > 1 else shown[0]
-    ax.set_xlim(robust_range(shown[0][:, 0], certain[:, 0], room=MAX_AXES_FACTOR))
-    ax.set_ylim(robust_range(shown[0][:, 1], certain[:, 1], room=MAX_AXES_FACTOR))
+    x, y = (robust_range(shown[0][:, i], certain[:, i], room=MAX_AXES_FACTOR) for i in (0, 1))
+    ax.set(xlim=x, ylim=y)
     ax.locator_params(nbins=4)
     ax.grid(visible=True, color=RULE, linewidth=0.6)
 
@@ -311,9 +309,7 @@ def _single(one: FaultEstimate, other: FaultEstimate | None) -> Figure:
     for i, (_, fault, colour) in enumerate(shown):
         _interval(ax, fault, -i, colour)
     ax.set_yticks([-i for i in range(len(shown))], [name for name, _, _ in shown])
-    ax.set_ylim(0.6 - len(shown), 0.6)
-    ax.set_xlabel(f"{text_symbol(one.parameter)}, {translate('relative to healthy')}")
-    ax.grid(visible=True, axis="x", color=RULE, linewidth=0.6)
+    _size_axis(ax, one, 0.6 - len(shown), 0.6)
     return figure
 
 
@@ -325,11 +321,14 @@ def _pair(best: Candidate) -> Figure:
         ax = axes[key]
         _interval(ax, fault, 0.0, MEASURED)
         ax.set_yticks([0.0], ["refit"])
-        ax.set_ylim(-1.0, 1.0)
-        ax.set_xlabel(f"{text_symbol(fault.parameter)}, {translate('relative to healthy')}")
-        ax.grid(visible=True, axis="x", color=RULE, linewidth=0.6)
+        _size_axis(ax, fault, -1.0, 1.0)
     _joint(axes["both"], best)
     return figure
+
+
+def _size_axis(ax: Axes, fault: FaultEstimate, low: float, high: float) -> None:
+    ax.set(ylim=(low, high), xlabel=f"{text_symbol(fault.parameter)}, {translate('relative to healthy')}")
+    ax.grid(visible=True, axis="x", color=RULE, linewidth=0.6)
 
 
 def _interval(ax: Axes, fault: FaultEstimate, at: float, colour: str) -> None:
@@ -350,8 +349,7 @@ def _joint(ax: Axes, best: Candidate) -> None:
     ax.fill(x, y, facecolor=MEASURED, alpha=0.24, linewidth=0)
     ax.plot(x, y, color=MEASURED, linewidth=1.1)
     ax.plot(one.ratio, other.ratio, "o", markersize=5.5, color=MEASURED)
-    ax.set_xlabel(text_symbol(one.parameter))
-    ax.set_ylabel(text_symbol(other.parameter))
+    ax.set(xlabel=text_symbol(one.parameter), ylabel=text_symbol(other.parameter))
     ax.set_title("both at once, 95 %", loc="left", fontweight="bold")
     ax.locator_params(nbins=4)
     ax.grid(visible=True, color=RULE, linewidth=0.6)

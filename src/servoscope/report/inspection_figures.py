@@ -76,9 +76,8 @@ def _plot_spectra(inspection: Inspection, traces: InspectionTraces) -> Figure:
             axis.axvspan(inspection.band.low_hz, inspection.band.high_hz, color=COLOUR_OF_SIGNAL["y"], alpha=0.08)
         axis.legend(loc="lower left")
     top.set_ylabel("amplitude density,\nrelative to its peak")
-    bottom.set_ylabel("coherence")
-    bottom.set_ylim(-0.02, 1.05)
-    bottom.set_xlabel("frequency [Hz]; dotted: monitored, shaded: usable")
+    words = "frequency [Hz]; dotted: monitored, shaded: usable"
+    bottom.set(ylabel="coherence", ylim=(-0.02, 1.05), xlabel=words)
     return figure
 
 
@@ -88,14 +87,11 @@ def _plot_residual(traces: InspectionTraces, recording: Recording) -> Figure:
     unit, factor = time_axis_unit(recording.duration_s)
     v = np.where(traces.used, traces.v, np.nan)
     top.plot(*envelope(recording.t / factor, v, recording.restart), color=COLOUR_OF_SIGNAL["u"], linewidth=0.8)
-    top.set_ylim(robust_range(v, room=5.0))
-    top.set_ylabel("residual\n(filtered u)")
-    top.set_xlabel(f"time [{unit}]")
+    top.set(ylim=robust_range(v, room=5.0), ylabel="residual\n(filtered u)", xlabel=f"time [{unit}]")
     bottom.plot(
         np.arange(traces.rho.size) / recording.sample_rate, traces.rho, color=COLOUR_OF_SIGNAL["y"], linewidth=1.0
     )
     bound = 2.0 / np.sqrt(max(int(traces.used.sum()), 1))
     bottom.axhspan(-bound, bound, color=MUTED, alpha=0.2)
-    bottom.set_ylabel("autocorrelation")
-    bottom.set_xlabel("lag [s]; shaded: what white noise would show")
+    bottom.set(ylabel="autocorrelation", xlabel="lag [s]; shaded: what white noise would show")
     return figure

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Any
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.workers import Worker, WorkerError
+from servoscope.core.workers import WorkerError, Workers
 from servoscope.design.operating_limits import OperatingLimit
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.assets.checkpoint import AssetState
@@ -31,7 +31,7 @@ class DiagnosisWorker:
 
     def __init__(self) -> None:
         self._executor = ThreadPoolExecutor(1, "full-diagnosis")  # waits for results
-        self._worker = Worker()
+        self._workers = Workers()
         self._closed = False
 
     def submit(self, baseline: Baseline, name: str, blocks: Sequence[Block]) -> Future[StoredDiagnosis]:
@@ -45,14 +45,14 @@ class DiagnosisWorker:
             since = max(due.since, last_renewal(store, name) or due.since)
             series = query_sizes(store, name, due.fault, since)
             columns = {key: getattr(series, key).tolist() for key in ("t", "value", "std")}
-            return Prognosis.model_validate(self._worker.run(PROGNOSIS_TASK, due.fault, columns, due.limit))
+            return Prognosis.model_validate(self._workers.run(PROGNOSIS_TASK, due.fault, columns, due.limit))
 
         return self._executor.submit(ask)
 
     def close(self) -> None:
         """Stop; a diagnosis under way is dropped."""
         self._closed = True
-        self._worker.stop()
+        self._workers.close()
         self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _diagnose(self, baseline: Baseline, name: str, blocks: list[Block]) -> StoredDiagnosis:
@@ -60,7 +60,7 @@ class DiagnosisWorker:
         packed = [(block.sequence, block.pack()) for block in blocks]
         for _ in range(MAX_ATTEMPTS):
             try:
-                return StoredDiagnosis.model_validate(self._worker.run(TASK, text, name, packed))
+                return StoredDiagnosis.model_validate(self._workers.run(TASK, text, name, packed))
             except WorkerError as error:
                 if self._closed:  # on purpose, then
                     break

@@ -13,17 +13,17 @@ from servoscope.service.alarms import LifecycleEvent, OperatorCommand
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.clock import SteadyClock
-from servoscope.service.config import ServiceFile
+from servoscope.service.config import ServiceFile, StoreSettings
 from servoscope.service.log import log
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.notifications import Notifier
-from servoscope.service.retention import delete_old_rows
 from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.inbox import Inbox
 from servoscope.service.store import CommandOutcome, CommandRow, Store
 from servoscope.service.store.series import thin_sizes
 from servoscope.service.writer import StoreWriter
 
+DAY_S = 86400.0
 RETENTION_EVERY_S = 3600.0
 THIN_WITHIN_S = 1800.0  # the sizes of all assets are thinned, some at each look, a millisecond each
 REJECTIONS_EVERY_S = 60.0  # between two audit rows about a flood of bad messages
@@ -169,3 +169,30 @@ class Housekeeping:
             self._thinned[name] = self._to_thin.pop(name)
         if thinned:
             log("info", "old sizes thinned", rows=thinned)
+
+
+def delete_old_rows(
+    store: Store, settings: StoreSettings, service: str, clocks: Mapping[str, float], now: float
+) -> dict[str, int]:
+    """Delete what is older than the settings say; return how many rows of which table.
+
+    `clocks`: by each asset that `service` follows, its own time [UTC s]; `now`: that of this machine [UTC s].
+    """
+    written, counts = store.checkpoint_times(), {}
+    for table, days in (
+        ("residuals", settings.residual_days),
+        ("sizes", settings.size_days),
+        ("diagnoses", settings.event_days),
+        ("transitions", settings.event_days),
+    ):
+        if days is None:
+            continue
+        before = {name: t - days * DAY_S for name, t in clocks.items()}
+        # of an asset that nobody follows any more, all rows are older than its last checkpoint
+        before |= {name: math.inf for name, at in written.items() if name not in clocks and at < now - days * DAY_S}
+        if table == "transitions":
+            before[service] = now - days * DAY_S
+        counts[table] = store.delete_before(table, before)
+    if settings.event_days is not None:
+        counts |= store.delete_events(service, list(clocks), now - settings.event_days * DAY_S)
+    return {table: count for table, count in counts.items() if count}

@@ -17,8 +17,7 @@ from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
 from servoscope.web.login_gate import LoginGate
 from servoscope.web.login_state import LoginStates
-from servoscope.web.storage import FileStorage
-from servoscope.web.upload_storage import UploadStorage
+from servoscope.web.storage import FileStorage, UploadStorage
 
 if TYPE_CHECKING:
     from servoscope.web.oidc_client import OidcClient  # which needs an extra

@@ -25,8 +25,7 @@ from servoscope.web.connections import ConnectionTable, HttpProtocol, TlsListene
 from servoscope.web.dependencies import Context, SingleSignOn
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
-from servoscope.web.storage import FileStorage
-from servoscope.web.upload_storage import UploadStorage
+from servoscope.web.storage import FileStorage, UploadStorage
 
 STORE_TIMEOUT_S = 5.0  # s
 STOPS_WITHIN_S = 5

@@ -1,4 +1,4 @@
-// A sender over MQTT of another library, with JSON messages; benchmarks/reliability/plc.py starts and kills it.
+// A sender over MQTT of another library, with JSON messages; tests/support/reliability/plc.py starts and kills it.
 //
 //     node tests/support/mqtt_sender/sender.js SETTINGS
 "use strict";

@@ -1,4 +1,4 @@
-// An OPC UA server of another stack whose assets write blocks as a PLC would; benchmarks/reliability/plc.py is its twin.
+// An OPC UA server of another stack whose assets write blocks as a PLC would; tests/support/reliability/plc.py is its twin.
 //
 //     node tests/support/opcua_server/blocks.js SETTINGS
 "use strict";

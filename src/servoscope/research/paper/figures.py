@@ -93,8 +93,8 @@ def figure_5(seed: int, version: str) -> Figure:
             ax.plot(healthy.t, healthy.theta[:, i], color=METHOD_COLOURS[method], linewidth=1.0, label=NAMES[method])
         ax.axhline(nominal[i], color=COLOURS["alarm"], linewidth=0.9, linestyle="--", label="nominal")
         late = [tracking_traces(method, seed)[0].between(10.0, 60.0).theta[:, i] for method in methods]
-        ax.set_ylim(robust_range(np.concatenate(late), np.array([nominal[i]])))
-        ax.set_ylabel(f"$c_{i}$" if version == "paper" else rf"$\theta_{i}$")
+        symbol = f"$c_{i}$" if version == "paper" else rf"$\theta_{i}$"
+        ax.set(ylim=robust_range(np.concatenate(late), np.array([nominal[i]])), ylabel=symbol)
     for ax in axes[2:]:
         ax.set_xlabel("t [s]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
@@ -120,14 +120,12 @@ def figure_6(seed: int, version: str) -> Figure:
     plane.plot(square.real, square.imag, "s", color=INK, markersize=6.0, label="p_s +40 %", linestyle="")
     late = np.concatenate([tracking_traces(method, seed)[1].between(15.0, 60.0).H[:, 0] for method in methods])
     always = np.array([star, square])
-    plane.set_xlim(robust_range(late.real, always.real))
-    plane.set_ylim(robust_range(late.imag, always.imag))
+    plane.set(xlim=robust_range(late.real, always.real), ylim=robust_range(late.imag, always.imag))
     plane.set(xlabel="Re H at 1 Hz [A/m]", ylabel="Im H at 1 Hz [A/m]", title="(a)")
     for ax, word in zip(axes, ("real", "imag"), strict=True):
         levels = getattr(star, word), getattr(square, word)
         ax.plot([0.0, FAULT_AT, FAULT_AT, 60.0], np.repeat(levels, 2), color=COLOURS["alarm"], linestyle="--", lw=0.9)
-        ax.set_ylim(robust_range(getattr(late, word), np.array(levels)))
-        ax.set_ylabel("Re H" if word == "real" else "Im H")
+        ax.set(ylim=robust_range(getattr(late, word), np.array(levels)), ylabel="Re H" if word == "real" else "Im H")
     axes[0].set_title("(b)")
     axes[1].set_xlabel("t [s]")
     left.legend(*plane.get_legend_handles_labels(), loc="outside lower center", ncols=4)

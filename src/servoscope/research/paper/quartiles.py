@@ -1,27 +1,20 @@
-"""Medians and quartiles over the seeds, in words, and the verdict that follows from them."""
+"""Medians and quartiles over the seeds, as numbers and in words."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
 
 import numpy as np
 
-ClaimVerdict = Literal["holds", "holds partly", "does not hold"]
 MetricSamples = Mapping[str, Sequence[float]]
 
 
-class ClaimResult(NamedTuple):
-    """What was measured, in words, the verdict that follows from it, and whether the presumed cause was confirmed."""
-
-    measured: str
-    verdict: ClaimVerdict
-    cause_confirmed: bool = True
-
-
-def claim_verdict(holds: bool, partly: bool = False) -> ClaimVerdict:
-    """Return the verdict."""
-    return "holds" if holds else "holds partly" if partly else "does not hold"
+SCALES = {
+    "": (1.0, ""),
+    "%": (100.0, " %"),
+    "mm": (1e3, ""),
+}  # of numbers in sentences, by what stands behind their names
 
 
 class MetricQuartiles:
@@ -51,6 +44,10 @@ class MetricQuartiles:
             return f"{middle:.3g}{unit}"
         return f"{middle:.3g}{unit} [{low:.3g}, {high:.3g}]"
 
-    def percent(self, key: str) -> str:
-        """Return ``median % [low, high]``."""
-        return self.text(key, 100.0, " %")
+    def fill(self, template: str, counts: Sequence[int] = ()) -> str:
+        """Return a sentence with medians, quartiles and `counts` in the place of their names and numbers in braces."""
+
+        def value(name: re.Match[str]) -> str:
+            return str(counts[int(name[1])]) if name[1].isdigit() else self.text(name[1], *SCALES[name[2]])
+
+        return re.sub(r"\{([^}:]+):?([^}]*)\}", value, template)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from servoscope.core.files import atomic_write, make_folder
-from servoscope.core.workers import WorkerError, WorkerGroup, available_cores
+from servoscope.core.workers import WorkerError, Workers, available_cores
 from servoscope.research.paper import claims, jobs
 from servoscope.research.paper.claims import Claim
 from servoscope.research.paper.jobs import SeedJob
@@ -63,7 +63,7 @@ def run_jobs(work: Sequence[SeedJob], processes: int) -> Iterator[tuple[SeedJob,
     if processes <= 1:
         yield from ((job, jobs.run_job(job)) for job in work)
         return
-    pool = WorkerGroup(environment={**os.environ, **dict.fromkeys(ONE_THREAD, "1")})
+    pool = Workers(environment={**os.environ, **dict.fromkeys(ONE_THREAD, "1")})
     for job, found in pool.map(f"{__name__}:run_in_worker", work, processes):
         if isinstance(found, WorkerError):
             raise found

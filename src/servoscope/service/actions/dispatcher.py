@@ -13,7 +13,7 @@ from servoscope.service.actions.delivery import deliver_together
 from servoscope.service.actions.mail import HourlyLimit
 from servoscope.service.actions.settings import EmailSettings
 from servoscope.service.clock import SteadyClock
-from servoscope.service.store import OutboxRow, Store
+from servoscope.service.store import Store
 
 POLL_S = 0.5
 MAX_ROWS = 20
@@ -69,25 +69,21 @@ class OutboxDispatcher:
                     rows += self._store.due_deliveries(now, MAX_ROWS_AS_ONE, self._service, others)
             except StoreError:
                 continue  # the service notices for itself
-            due = {(row["key"], row["attempts"]): row for row in rows}
+            due = {(row["key"], row["attempts"]): OutboxEntry(**row) for row in rows}
             self._in_progress = {one: sink for one, sink in self._in_progress.items() if one in due or sink in busy}
-            new = {one: row for one, row in due.items() if one not in self._in_progress}
-            self._in_progress |= {one: row["sink"] for one, row in new.items()}
-            for sink in {row["sink"] for row in new.values()}:
+            new = {one: entry for one, entry in due.items() if one not in self._in_progress}
+            self._in_progress |= {one: entry.sink for one, entry in new.items()}
+            for sink in {entry.sink for entry in new.values()}:
                 self._busy.add(sink)
-                job = sink, [row for row in new.values() if row["sink"] == sink]
-                threading.Thread(target=self._deliver_rows, args=job, name=f"delivery to {sink}", daemon=True).start()
+                job = sink, [entry for entry in new.values() if entry.sink == sink]
+                threading.Thread(target=self._deliver, args=job, name=f"delivery to {sink}", daemon=True).start()
             self.idle = not rows and not self._busy
 
-    def _deliver_rows(self, sink: str, rows: Sequence[OutboxRow]) -> None:
+    def _deliver(self, sink: str, entries: Sequence[OutboxEntry]) -> None:
         """Deliver to one sink, one after the other."""
         try:
             sink_settings = self._settings.sinks.get(sink)
             limit = self._limits.setdefault(sink, HourlyLimit())
-            entries = [
-                OutboxEntry(row["key"], row["sink"], row["event"], row["created"], row["due"] or 0.0, row["attempts"])
-                for row in rows
-            ]
             together = isinstance(sink_settings, EmailSettings) and self._held.pop(sink, None) is not None
             for group in [entries] if together else [[entry] for entry in entries]:
                 if self._stop_event.is_set():

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import mmap
 import os
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from servoscope.core.errors import MessageError, OutputError
 from servoscope.core.files import atomic_write
-from servoscope.core.workers import ProcessLimits, Worker, WorkerError
+from servoscope.core.workers import ProcessLimits, WorkerError, Workers
 from servoscope.service.log import log
 
 TRIAL_S = 10.0  # for one message in a process of its own; the largest that is accepted takes a second
@@ -82,17 +83,16 @@ class MessageGuard:
 
     def _try(self, address: str, content: bytes) -> str:
         """Return why a message cannot be decoded within the limits; empty: it can, whatever comes of it."""
-        worker = Worker(TRIAL_LIMITS)
-        try:
-            worker.run(*self._task, "", b"")  # imports what it needs, which may take its time
+        with closing(Workers(TRIAL_LIMITS)) as workers:
             try:
-                worker.run(*self._task, address, content, timeout_s=TRIAL_S)
+                workers.run(*self._task, "", b"")  # imports what it needs, which may take its time
+            except WorkerError as error:
+                log("error", "no process to try a message in", why=str(error))
+                return ""
+            try:
+                workers.run(*self._task, address, content, timeout_s=TRIAL_S)
             except WorkerError as error:
                 return str(error)
-        except WorkerError as error:
-            log("error", "no process to try a message in", why=str(error))
-        finally:
-            worker.stop()
         return ""
 
     def _set_aside(self, mark: int, address: str, content: bytes, why: str) -> MessageError:

@@ -25,18 +25,6 @@ class CheckpointRow(TypedDict):
     at: float  # when it was written [UTC s]
 
 
-class OutboxRow(TypedDict):
-    """An event for one sink; `due` is None when it is delivered or given up."""
-
-    key: str
-    sink: str
-    event: dict[str, Any]
-    created: float
-    due: float | None
-    attempts: int
-    outcome: str
-
-
 class CommandDocument(TypedDict, total=False):
     """Why an operator asks for a command, and what became of it."""
 

@@ -31,7 +31,6 @@ from servoscope.service.store.rows import (
     CommandDocument,
     CommandOutcome,
     CommandRow,
-    OutboxRow,
     Row,
 )
 
@@ -311,7 +310,7 @@ class Store:
         end = time.monotonic() + OPENING_S  # another worker may write to the same file meanwhile
         self._retry(end, lambda connection: dissolve_rows_of_others(connection, owner, assets))
 
-    def due_deliveries(self, now: float, limit: int, service: str, busy: Collection[str] = ()) -> list[OutboxRow]:
+    def due_deliveries(self, now: float, limit: int, service: str, busy: Collection[str] = ()) -> list[Row]:
         """Return up to `limit` rows of a service's outbox whose next attempt is due, the oldest first.
 
         Without those for sinks that are busy.
@@ -319,8 +318,8 @@ class Store:
         table = tables.outbox
         due = table.c.due.is_not(None) & (table.c.due <= now) & table.c.sink.not_in(busy)
         own = table.c.event["service"].as_string() == service
-        query = sa.select(table).where(due & own).order_by(table.c.due, table.c.key).limit(limit)
-        return cast(list[OutboxRow], self.fetch(query))
+        columns = [column for column in table.c if column.name != "outcome"]
+        return self.fetch(sa.select(*columns).where(due & own).order_by(table.c.due, table.c.key).limit(limit))
 
     def delete_before(self, table: str, before: Mapping[str, float]) -> int:
         """Delete rows of a table that are older, by the asset's own clock; return how many."""

@@ -38,10 +38,7 @@ def parse_moment(text: str) -> tuple[int | None, float] | None:
     slashes is month, day, year, unless the first is more than 12.
     """
     text = text.strip()
-    if not text or not text[0].isdigit():
-        duration = DURATION.fullmatch(text)
-        return (None, float(duration[1]) * DURATIONS[duration[2]]) if duration else None
-    found = MOMENT.fullmatch(text)
+    found = MOMENT.fullmatch(text) if text[:1].isdigit() else None
     if found is None or (found["date"] is None and found["h"] is None):
         duration = DURATION.fullmatch(text)
         return (None, float(duration[1]) * DURATIONS[duration[2]]) if duration else None

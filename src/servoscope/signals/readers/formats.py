@@ -54,24 +54,22 @@ class Reader(NamedTuple):
         return opened
 
 
-_READERS_PACKAGE = "servoscope.signals.readers"
-CSV, PARQUET = (
-    Reader("CSV", f"{_READERS_PACKAGE}.csv", "open_csv"),
-    Reader("Parquet", f"{_READERS_PACKAGE}.parquet", "open_parquet"),
-)
-MAT = Reader("MAT", f"{_READERS_PACKAGE}.mat", "open_mat")
-HDF5 = Reader("HDF5", f"{_READERS_PACKAGE}.mat", "open_hdf5", bounded=True)
-MDF = Reader("MDF", f"{_READERS_PACKAGE}.mdf_tdms", "open_mdf", "asammdf", "mdf", bounded=True)
-TDMS = Reader("TDMS", f"{_READERS_PACKAGE}.mdf_tdms", "open_tdms", "nptdms", "tdms", bounded=True)
-SHEET = Reader("Excel", f"{_READERS_PACKAGE}.programs", "open_sheet", "python_calamine", "formats", bounded=True)
-LVM = Reader("LVM", f"{_READERS_PACKAGE}.programs", "open_lvm", "lvm_read", "formats", bounded=True)
-MCAP = Reader("MCAP", f"{_READERS_PACKAGE}.topics", "open_mcap", "mcap_ros2", "formats", bounded=True)
-ULOG = Reader("ULog", f"{_READERS_PACKAGE}.topics", "open_ulog", "pyulog", "formats", bounded=True)
+_PACKAGE = "servoscope.signals.readers"
 BUILT_IN = {
-    **{".csv": CSV, ".txt": CSV, ".tsv": CSV, ".dat": CSV, ".asc": CSV, ".log": CSV},
-    **{".parquet": PARQUET, ".pq": PARQUET, ".mat": MAT, ".mf4": MDF, ".mdf": MDF, ".tdms": TDMS},
-    **{".h5": HDF5, ".hdf5": HDF5, ".xlsx": SHEET, ".xls": SHEET, ".ods": SHEET, ".lvm": LVM},
-    **{".mcap": MCAP, ".ulg": ULOG},
+    suffix: Reader(format_, f"{_PACKAGE}.{module}", *rest)
+    for suffixes, format_, module, *rest in (
+        (".csv .txt .tsv .dat .asc .log", "CSV", "csv", "open_csv"),
+        (".parquet .pq", "Parquet", "parquet", "open_parquet"),
+        (".mat", "MAT", "mat", "open_mat"),
+        (".mf4 .mdf", "MDF", "mdf_tdms", "open_mdf", "asammdf", "mdf", True),
+        (".tdms", "TDMS", "mdf_tdms", "open_tdms", "nptdms", "tdms", True),
+        (".h5 .hdf5", "HDF5", "mat", "open_hdf5", "", "", True),
+        (".xlsx .xls .ods", "Excel", "programs", "open_sheet", "python_calamine", "formats", True),
+        (".lvm", "LVM", "programs", "open_lvm", "lvm_read", "formats", True),
+        (".mcap", "MCAP", "topics", "open_mcap", "mcap_ros2", "formats", True),
+        (".ulg", "ULog", "topics", "open_ulog", "pyulog", "formats", True),
+    )
+    for suffix in suffixes.split()
 }
 MAGIC = {
     b"PAR1": "Parquet",

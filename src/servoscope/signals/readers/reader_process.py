@@ -13,14 +13,14 @@ from typing import Any
 
 from servoscope.core.errors import RecordingError
 from servoscope.core.sandbox import Sandbox
-from servoscope.core.workers import ProcessLimits, Progress, WorkerError, WorkerGroup
+from servoscope.core.workers import ProcessLimits, Progress, WorkerError, Workers
 from servoscope.signals.readers.table import Table, TableFile
 
 BASE_S, BYTES_PER_S = 15.0, 5e5  # that a small file may take, and what is larger, by the clock on the wall
 LIMITS = ProcessLimits(cpu_s=1e6, memory_mb=8000.0, file_mb=1e6)  # a task's time is bound, not the process's
 LIBRARIES = ("pandas", "pyarrow", "h5py")  # what most readers use; Arrow looks for pandas at its first array
 
-_workers = WorkerGroup(LIMITS)  # kept, because starting one and loading its libraries takes a second
+_workers = Workers(LIMITS)  # kept, because starting one and loading its libraries takes a second
 atexit.register(_workers.close)
 _opened: dict[tuple[str, int, int], TableFile] = {}  # in a worker: the file that it read last
 

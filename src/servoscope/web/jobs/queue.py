@@ -11,14 +11,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
 
 from starlette.exceptions import HTTPException
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import SETTING, current_language, message, render
 from servoscope.core.sandbox import Sandbox
-from servoscope.core.workers import ProcessLimits, Progress, Worker
+from servoscope.core.workers import ProcessLimits, Progress, Workers
 from servoscope.web import errors
 from servoscope.web.schemas.responses import JobResponse, JsonObject
 
@@ -48,19 +48,12 @@ class Job:
     out: Path | None  # the folder into which it writes
     finish: Callable[[Any], JsonObject]  # turns the task's result into the job's, in a thread
     discard: Callable[[], None] = lambda: None  # removes what a failed job leaves
-    id: str = field(default_factory=lambda: secrets.token_hex(8))
-    state: Literal["queued", "running", "done", "failed"] = "queued"
-    step: str | None = None
-    created: float = field(default_factory=time.time)
-    finished: float | None = None
-    result: JsonObject | None = None
-    problem: JsonObject | None = None
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     handle: asyncio.Task[None] | None = None
+    response: JobResponse = field(init=False)  # what users see of it
 
-    def response(self) -> JobResponse:
-        """Return what users see of it."""
-        return JobResponse(**{name: getattr(self, name) for name in JobResponse.model_fields})
+    def __post_init__(self) -> None:
+        self.response = JobResponse(id=secrets.token_hex(8), kind=self.kind, created=time.time())
 
 
 class JobQueue:
@@ -75,14 +68,14 @@ class JobQueue:
 
     def submit(self, job: Job) -> JobResponse:
         """Put a job into the queue; raises HTTPException 429 if too many wait."""
-        if sum(one.finished is None for one in self._jobs.values()) >= MAX_QUEUED:
+        if sum(one.response.finished is None for one in self._jobs.values()) >= MAX_QUEUED:
             asyncio.get_running_loop().run_in_executor(None, job.discard)
             raise HTTPException(429, "too many jobs wait, try again later", headers={"Retry-After": "10"})
-        for old in [one for one in self._jobs.values() if one.finished is not None][: -MAX_FINISHED or None]:
-            del self._jobs[old.id]
-        self._jobs[job.id] = job
+        for old in [one for one in self._jobs.values() if one.response.finished is not None][: -MAX_FINISHED or None]:
+            del self._jobs[old.response.id]
+        self._jobs[job.response.id] = job
         job.handle = asyncio.create_task(self._run(job))
-        return job.response()
+        return job.response
 
     def find(self, id_: str) -> Job:
         """Return a job; raises HTTPException 404 if there is none, or it ended long ago."""
@@ -92,12 +85,14 @@ class JobQueue:
 
     def cancel(self, job: Job) -> None:
         """Stop a job."""
-        if job.handle is not None and job.finished is None:
+        if job.handle is not None and job.response.finished is None:
             job.handle.cancel()
 
     async def close(self) -> None:
         """Stop all jobs."""
-        handles = [job.handle for job in self._jobs.values() if job.handle is not None and job.finished is None]
+        handles = [
+            job.handle for job in self._jobs.values() if job.handle is not None and job.response.finished is None
+        ]
         for handle in handles:
             handle.cancel()
         await asyncio.gather(*handles, return_exceptions=True)
@@ -112,30 +107,32 @@ class JobQueue:
         return Sandbox((str(folder), *reads), writes, self._user)
 
     async def _run(self, job: Job) -> None:
+        shown = job.response
+
         def show(step: str) -> None:
-            job.step = step
+            shown.step = step
 
         try:
             async with self._slots:
-                job.state = "running"
+                shown.state = "running"
                 sandbox = self._sandbox(job.folder, job.reads, job.out)
                 result = await run_task(job.task, job.arguments, job.folder, self._limits, sandbox, show)
-                job.result = await asyncio.to_thread(job.finish, result)
-            job.state = "done"
+                shown.result = await asyncio.to_thread(job.finish, result)
+            shown.state = "done"
         except ServoscopeError as error:
-            job.problem = errors.problem(errors.http_status(error), str(error))
+            shown.problem = errors.problem(errors.http_status(error), str(error))
         except HTTPException as error:
-            job.problem = errors.problem(error.status_code, str(error.detail))
+            shown.problem = errors.problem(error.status_code, str(error.detail))
         except asyncio.CancelledError:
-            job.problem = errors.problem(409, render(message("web.job_stopped")))
+            shown.problem = errors.problem(409, render(message("web.job_stopped")))
         except Exception:
-            job.problem = errors.problem(500, render(message("web.job_failed")))
+            shown.problem = errors.problem(500, render(message("web.job_failed")))
             raise
         finally:
-            if job.problem is not None:
-                job.state = "failed"
+            if shown.problem is not None:
+                shown.state = "failed"
                 await asyncio.to_thread(job.discard)
-            job.finished, job.step = time.time(), None
+            shown.finished, shown.step = time.time(), None
             job.ended.set()
 
 
@@ -151,19 +148,19 @@ async def run_task(
 
     Raises WorkerError if it failed, or needed more than its limits.
     """
-    worker = Worker(limits, folder=folder, environment=_environment())
+    workers = Workers(limits, folder=folder, environment=_environment())
 
     def run() -> Any:
         with TemporaryDirectory(prefix="servoscope-job-") as temporary:
             walls = replace(sandbox, write=(temporary, *sandbox.write))
             timeout_s = START_S + WALL_TIME_FACTOR * limits.cpu_s
-            return worker.run(f"{TASKS}:{task}", *arguments, progress=progress, timeout_s=timeout_s, sandbox=walls)
+            return workers.run(f"{TASKS}:{task}", *arguments, progress=progress, timeout_s=timeout_s, sandbox=walls)
 
     try:
         return await asyncio.get_running_loop().run_in_executor(_threads, run)
     finally:
         # the wait for the process is milliseconds: it is killed
-        worker.stop()
+        workers.close()
 
 
 def _cache_folders() -> tuple[str, ...]:

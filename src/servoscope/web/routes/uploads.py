@@ -118,12 +118,12 @@ async def start_proposal(context: ContextDep, who: Operator, request: ProposalRe
 async def get_job(context: ContextDep, id: str, query: Annotated[JobQuery, Query()]) -> JobResponse:
     """Return how far a job is; with `wait`, as soon as it has ended."""
     job = context.jobs.find(id)
-    if query.wait and job.finished is None:
+    if query.wait and job.response.finished is None:
         try:
             await asyncio.wait_for(job.ended.wait(), query.wait)
         except TimeoutError:
-            return job.response()
-    return job.response()
+            return job.response
+    return job.response
 
 
 @router.delete("/jobs/{id}", status_code=HTTP_204_NO_CONTENT)

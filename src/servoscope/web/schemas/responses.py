@@ -68,12 +68,12 @@ class JobResponse(ApiResponse):
 
     id: str
     kind: str
-    state: Literal["queued", "running", "done", "failed"]
-    step: str | None
+    state: Literal["queued", "running", "done", "failed"] = "queued"
+    step: str | None = None
     created: float
-    finished: float | None
-    result: JsonObject | None
-    problem: JsonObject | None
+    finished: float | None = None
+    result: JsonObject | None = None
+    problem: JsonObject | None = None
 
 
 class StorageRecord(ApiResponse):

@@ -1,6 +1,11 @@
 """Let the service run through a day of 200 assets in minutes, disturb it, and write docs/reliability.md.
 
-    python benchmarks/reliability/run.py [sqlite|postgresql ...] [--hours 24] [--assets 200] [--speed 40] [--render]
+    python benchmarks/soak.py [sqlite|postgresql ...] [--hours 24] [--assets 200] [--speed 40] [--render]
+    python benchmarks/soak.py --kills 200 [--json]
+
+The second kills a service again and again on each store, lets the store fail now and then, and looks at what is stored.
+Each next service is forked from a warm process there, so that there is time for many kills; the first starts whole
+processes.
 
 Everything is on this machine: the full disk is a file system in memory, and the database a server of its own, on
 loopback. --render writes the tables from the results that are there; together with names, after running them.
@@ -12,29 +17,26 @@ import argparse
 import json
 import math
 import os
+import random
 import re
-import shutil
 import signal
-import socket
-import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `reliability` is a package, and `tables` lies
+BENCHMARKS = Path(__file__).resolve().parent
+sys.path.insert(1, str(BENCHMARKS.parent / "tests" / "support"))  # where `reliability` is a package
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from tables import machine  # noqa: E402
-
-from reliability.checks import check  # noqa: E402
+from reliability.carrying import Carrier  # noqa: E402
+from reliability.checks import check, opened  # noqa: E402
 from reliability.fleet import BLOCK_S, Fleet  # noqa: E402
-from reliability.servers import Postgres, programs  # noqa: E402
-from reliability.trial import Disturbance, Measured, Trial, quantile  # noqa: E402
+from reliability.trial import Measured, Trial, quantile  # noqa: E402
+from reliability.workplace import database, free_port, workplace  # noqa: E402
+from tables import Table, machine, show  # noqa: E402
+
 from servoscope.core.files import atomic_write  # noqa: E402
 from servoscope.service import log  # noqa: E402
 from servoscope.service.metrics import BUCKETS_S  # noqa: E402
@@ -46,9 +48,19 @@ COMPARED = 10  # assets that are run once more without disturbance
 CALM = 0.25  # share of the run at the end that is left in peace
 EVERY_S = 25.0  # mean time between disturbances
 FULL_DAY = 24.0 * 200
-DISK_MB = 256
-DISK_MB_OF_ASSET_HOUR = 0.25  # rows and their log; the disk must be full only when it is filled on purpose
 BUSY = 1.0  # load from which times mean little
+STORES = {"sqlite": ("SQLite", "full disk"), "postgresql": ("PostgreSQL", "database crash")}
+LIFE_S = 0.1, 1.5  # a commit is made every 0.5 s: some lives store nothing, some store twice
+OUTAGE_EVERY = 20  # kills
+OUTAGE_S = 1.0
+COLUMNS = (
+    "store", "kill -9", "outages", "blocks", "of them stored at the last kill", "lost, twice, other samples",
+    "rows; missing or twice", "assets run once more; different in any bit",
+)  # fmt: skip
+NOTE = (
+    "A service follows 10 assets at 100 Hz, 40 times as fast, in blocks of 5 s, and lives for 0.1 to 1.5 s. "
+    "The outages (of SQLite a full disk, of PostgreSQL a crash) come between, last for 1 s, and end in a kill as well."
+)
 
 
 def trial(name: str, fleet_of: tuple[int, float, float], every_s: float, seed: int = 1) -> dict[str, Any]:
@@ -100,72 +112,55 @@ def told(measured: Measured) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def workplace(asset_hours: float) -> Iterator[tuple[Path, Path | None]]:
-    """Make a folder, and a small disk in memory, which only root can: None where that is not possible."""
-    folder = Path(tempfile.mkdtemp(prefix="servoscope-reliability-"))
-    disk = folder / "disk"
-    disk.mkdir()
-    size = f"size={DISK_MB + round(DISK_MB_OF_ASSET_HOUR * asset_hours)}m"
-    mounted = (
-        not os.geteuid()
-        and not subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", size, "none", str(disk)], capture_output=True, check=False
-        ).returncode
+def killed(name: str, kills: int, hours: float, seed: int = 1) -> tuple[str, ...]:
+    """Kill a service so many times on one store, let the last one end, and return the row of what was found."""
+    chance, outages = random.Random(seed), 0
+    with workplace(1000.0) as (folder, disk):
+        fleet = Fleet(folder, 10, hours, 40.0, block_s=5.0)
+        fleet.make()
+        with database(name, disk) as (url, disturbances), Carrier(_warm(fleet)) as carrier:
+            config = fleet.config("fleet", url, "", fleet.names, fleet.speed)
+            outage = next((each for each in disturbances if not each.kills), None)
+            for number in range(kills):
+                process = carrier.start(config)
+                time.sleep(chance.uniform(*LIFE_S))
+                if outage is not None and number % OUTAGE_EVERY == OUTAGE_EVERY - 1:
+                    outage.begin()
+                    time.sleep(OUTAGE_S)
+                    outage.end()
+                    outages += 1
+                carrier.kill(process)
+            stored = _stored(config, fleet)
+            if stored == 0:
+                raise SystemExit(f"{name}: no life was long enough to store a block, so the kills show nothing")
+            carrier.start(fleet.config("fleet", url, "", fleet.names, 0.0))
+            assert carrier.wait() == 0
+            found = check(fleet, config, fleet.names)
+    title, what = STORES[name]
+    return (
+        title,
+        str(kills),
+        f"{what}: {outages}",
+        str(found.blocks),
+        str(stored),
+        f"{found.lost}, {found.duplicated}, {found.other}",
+        f"{found.rows}; {found.misnumbered}",
+        f"{found.compared}; {found.different}",
     )
-    try:
-        yield folder, disk if mounted else None
-    finally:
-        if mounted:
-            subprocess.run(["umount", "-l", str(disk)], check=False)
-        shutil.rmtree(folder)
 
 
-@contextmanager
-def database(name: str, disk: Path | None) -> Iterator[tuple[str, list[Disturbance]]]:
-    """Make a store, and what can happen to it beside kills of the service."""
-    kill = Disturbance("kill -9", nothing, nothing, 0.0, kills=True)
-    if name == "sqlite":
-        if disk is None:
-            print("no disk of its own can be mounted here: the disk is not filled", file=sys.stderr)
-            yield "fleet.sqlite", [kill]
-        else:
-            ballast = disk / "ballast"
-            full = Disturbance("full disk", lambda: fill(ballast), ballast.unlink, 4.0)
-            yield str(disk / "fleet.sqlite"), [kill, kill, full]
-        return
-    found = programs()
-    if found is None:
-        sys.exit("PostgreSQL is not on this machine: scripts/install-test-servers installs it")
-    server = Postgres.temporary(found)
-    server.start()
-    try:
-        crash = Disturbance("database crash", lambda: server.stop("immediate"), server.start, 2.0)
-        yield server.url, [kill, kill, crash]
-    finally:
-        server.remove()
+def _warm(fleet: Fleet) -> Path:
+    """Return the file of a short service, which has all compiled and loaded when it ends."""
+    # all assets, since one alone does not go through the kernels of many
+    return fleet.config("warm", "warm.sqlite", "", fleet.names, 0.0)
 
 
-def nothing() -> None:
-    """Do nothing."""
-
-
-def fill(path: Path) -> None:
-    """Write until the disk is full."""
-    chunk = bytes(2**16)
-    with path.open("wb", buffering=0) as file:
-        try:
-            while True:
-                file.write(chunk)
-        except OSError:
-            return
-
-
-def free_port() -> int:
-    """Return a port that nobody has."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+def _stored(config: Path, fleet: Fleet) -> int:
+    """Return how many blocks are stored."""
+    store = opened(config)
+    found = store.statuses(fleet.names)
+    store.close()
+    return sum(each["status"]["counted"]["blocks"] for each in found.values())
 
 
 def render() -> None:
@@ -232,21 +227,28 @@ def main() -> None:
     """Run the command line of this process."""
     command = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     command.add_argument("names", nargs="*", metavar="NAME", help=f"trials: {', '.join(TRIALS)}; default: all")
-    command.add_argument("--hours", type=float, default=24.0, help="simulated hours")
+    command.add_argument("--hours", type=float, help="simulated hours: 24, or 3 in which all kills have to fit")
     command.add_argument("--assets", type=int, default=200, help="assets")
     command.add_argument("--speed", type=float, default=40.0, help="times true speed")
     command.add_argument("--every", type=float, default=EVERY_S, help="mean time between disturbances, in s")
     command.add_argument("--render", action="store_true", help="write docs/reliability.md from the results")
+    command.add_argument("--kills", type=int, help="kill it so many times on each store instead")
+    command.add_argument("--json", action="store_true", help="with --kills: print JSON")
     given = command.parse_args()
     if strange := set(given.names) - set(TRIALS):
         command.error(f"{min(strange)}: no such trial, choose from {', '.join(TRIALS)}")
     log.set_up_logging("error")
+    if given.kills is not None:
+        rows = tuple(killed(name, given.kills, given.hours or 3.0) for name in STORES)
+        show([Table("Kills", NOTE, COLUMNS, rows)], given.json)
+        return
+    hours = given.hours or 24.0
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # disks are unmounted and servers stopped then
     if given.names or not given.render:
         for name in given.names or TRIALS:
-            found = trial(name, (given.assets, given.hours, given.speed), given.every)
+            found = trial(name, (given.assets, hours, given.speed), given.every)
             RESULTS.mkdir(exist_ok=True)
-            full = given.hours * given.assets >= FULL_DAY
+            full = hours * given.assets >= FULL_DAY
             file = RESULTS / (f"{name}.json" if full else f"{name}-reduced.json")
             atomic_write(file, (json.dumps(found, indent=1) + "\n").encode())
             print(json.dumps(found, indent=1))

@@ -14,7 +14,7 @@ from servoscope.signals import writers
 from servoscope.signals.readers import read
 from servoscope.simulation import FaultEvent, reference, simulate
 
-LOOP = Path(__file__).parents[2] / "src/servoscope/simulation/reference-rig.toml"
+LOOP = Path(__file__).parents[3] / "src/servoscope/simulation/reference-rig.toml"
 MINUTES = 10  # of each recording
 LEAKS_AT = 300  # s into the recording with a fault
 BLOCK_S = 30.0  # of a block: of 200 assets, 40 times as fast, 267 come per second

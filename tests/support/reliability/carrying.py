@@ -1,6 +1,6 @@
 """Services that are killed: a warm process from which each next one is forked, so that a kill costs 0.1 s.
 
-    python benchmarks/reliability/carrying.py WARM
+    python tests/support/reliability/carrying.py WARM
 
 runs the service of this file to its end, and reads lines from stdin, each the name of a file: its service is started
 and ``runs`` printed with its process id; when it has ended, ``ended`` with its exit code.

@@ -1,6 +1,6 @@
 """Senders of other libraries whose assets write blocks as a PLC would: processes of their own, to be killed.
 
-    python benchmarks/reliability/plc.py SETTINGS
+    python tests/support/reliability/plc.py SETTINGS
 
 Two are OPC UA servers, asyncua's (this file) and node-opcua's (`tests/support/opcua_server/blocks.js`), one sends over
 MQTT by mqtt.js (`tests/support/mqtt_sender/sender.js`), all with the same settings, a JSON file. Which block is written
@@ -20,9 +20,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
+SUPPORT = Path(__file__).resolve().parent.parent
 if __name__ == "__main__":
-    sys.path[0] = str(BENCHMARKS)
+    sys.path[0] = str(SUPPORT)
 
 from reliability.fleet import LOOP, Fleet  # noqa: E402
 from servoscope.models.loop import Loop  # noqa: E402
@@ -35,7 +35,6 @@ __all__ = ["SENDER", "STACKS", "Plc", "tape"]
 REMEMBERED = 60  # blocks of each asset in the server's history, which dies with it
 STACKS = {"asyncua": 2, "node": 1}  # OPC UA servers, and the namespace of their nodes
 SENDER = "mqttjs"
-SUPPORT = BENCHMARKS.parent / "tests" / "support"
 SCRIPTS = {"node": SUPPORT / "opcua_server" / "blocks.js", SENDER: SUPPORT / "mqtt_sender" / "sender.js"}
 
 

@@ -1,7 +1,7 @@
 """Publisher, broker, OPC UA servers, database and service, killed at random, cables pulled, a clock that jumps.
 
-    python benchmarks/reliability/chaos.py [sqlite|postgresql] [--hours 1] [--assets 200] [--speed 1] [--block 1]
-    python benchmarks/reliability/chaos.py --render
+    python benchmarks/chaos.py [sqlite|postgresql] [--hours 1] [--assets 200] [--speed 1] [--block 1]
+    python benchmarks/chaos.py --render
 
 The assets are sent by `servoscope publish`. One more, `plain`, has a sender that keeps nothing and whose clock jumps,
 some are sent as JSON by mqtt.js, and some are nodes of OPC UA servers, one of asyncua's and one of node-opcua's, whose
@@ -28,19 +28,20 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `reliability` is a package, and `tables` lies
+BENCHMARKS = Path(__file__).resolve().parent
+sys.path.insert(1, str(BENCHMARKS.parent / "tests" / "support"))  # where `reliability` is a package
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-from tables import machine  # noqa: E402
 
 from reliability.aftermath import looked_at  # noqa: E402
 from reliability.fleet import BEGAN, LOOP, Fleet  # noqa: E402
 from reliability.plain import Plain  # noqa: E402
 from reliability.plc import SENDER, STACKS, Plc  # noqa: E402
-from reliability.run import PAGE, RESULTS, TRIALS, free_port  # noqa: E402
 from reliability.servers import Cable, Mosquitto, Postgres, mosquitto, programs  # noqa: E402
 from reliability.trial import CALM_S, Latencies, quantile  # noqa: E402
+from reliability.workplace import free_port  # noqa: E402
+from soak import PAGE, RESULTS, TRIALS  # noqa: E402
+from tables import machine  # noqa: E402
+
 from servoscope.core.files import atomic_write  # noqa: E402
 
 LONGEST_S = 900.0  # until results are stored again
