@@ -23,10 +23,9 @@ from test_opcua import NODES, RATE, STATUS, Plant, free_port
 from servoscope.models.loop import Loop
 from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
 from servoscope.service.opcua.settings import OpcuaNodes
-from servoscope.service.sources.base import CHECKS, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import Content, InboxMessage
+from servoscope.service.sources.message import CHECKS, Content, InboxMessage, SourceAsset
 from servoscope.signals import clean, writers
 
 # asyncua leaves sockets of connections that were cut to the garbage collector

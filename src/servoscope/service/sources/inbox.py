@@ -17,10 +17,17 @@ from servoscope.core.messages import render
 from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.log import log
 from servoscope.service.sources.assembly import AssetStream, Receipt
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.guard import MessageGuard
-from servoscope.service.sources.message import Content, Decoder, InboxMessage, SignalValue, Transport
+from servoscope.service.sources.message import (
+    Content,
+    Decoder,
+    InboxMessage,
+    RejectionCounter,
+    SignalValue,
+    SourceAsset,
+    Transport,
+)
 
 MAX_QUIET_S = 2.0  # without a message of an asset for so long, what has come of it is made a block, however short
 MAX_TURN_S = 0.25  # that messages are decoded at once: then it is the turn of other sources
