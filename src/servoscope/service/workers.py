@@ -57,7 +57,7 @@ def merge_metrics(texts: Iterable[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-class _Worker:
+class _Follower:
     """One of the processes, and where it answers; empty: it has not said so yet.
 
     `anew`: assets that begin with a new state when it first starts; `files`: as in `ProcessSupervisor`.
@@ -129,7 +129,7 @@ class WorkerPool:
     config: ServiceFile
     path: Path
     restarted: Collection[str] = ()
-    _workers: list[_Worker] = field(default_factory=list)
+    _workers: list[_Follower] = field(default_factory=list)
     _stopping: threading.Event = field(default_factory=threading.Event)
     _reload: threading.Event = field(default_factory=threading.Event)
     last_turn: float = field(default_factory=time.monotonic)
@@ -225,7 +225,7 @@ class WorkerPool:
         restarted, self.restarted = self.restarted, ()  # once
         for number in sorted(self.config.shard_numbers() - running):
             own = {*self.config.shard(number).assets, self.config.shard_name(number)}
-            worker = _Worker(self.config, self.path, number, [one for one in restarted if one in own], files)
+            worker = _Follower(self.config, self.path, number, [one for one in restarted if one in own], files)
             self._workers.append(worker)
             worker.supervisor.start()
 

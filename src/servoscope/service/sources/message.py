@@ -147,9 +147,7 @@ class Decoder(ABC):
 class Transport(ABC):
     """Receives messages. What its own thread appends to `waiting` is handed over; or it overrides `receive`."""
 
-    clock_rate = (
-        1.0  # how fast its samples' clock runs: 1 where they are measured now; 0 where it waits for polls
-    )
+    clock_rate = 1.0  # how fast its samples' clock runs: 1 where they are measured now; 0 where it waits for polls
     keeps = True  # whether what was not released comes again, so that messages may wait; else blocks are dropped
     connected = True
     trouble = ""  # why nothing can be received, in words; empty: nothing is wrong
