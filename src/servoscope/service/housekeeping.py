@@ -17,8 +17,8 @@ from servoscope.service.config import ServiceFile, StoreSettings
 from servoscope.service.log import log
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.notifications import Notifier
-from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.store import CommandOutcome, CommandRow, Store
 from servoscope.service.store.series import thin_sizes
 from servoscope.service.writer import StoreWriter
