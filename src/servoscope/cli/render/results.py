@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
 from unicodedata import category
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -14,20 +14,15 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import translate, translate_range
+from servoscope.learning.inspection import Inspection
+from servoscope.models.loop import Columns
 from servoscope.report.format_values import DASH, format_duration, format_percent
-from servoscope.report.page import say
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from servoscope.baseline.baseline import Baseline
-    from servoscope.learning.inspection import Inspection
-    from servoscope.models.loop import Columns
-    from servoscope.report.page import ResultTable
-    from servoscope.signals import Recording
-    from servoscope.signals.readers import ChannelInfo
-    from servoscope.simulation import Truth
+from servoscope.report.page import ResultTable, say
+from servoscope.signals import Recording
+from servoscope.signals.readers import ChannelInfo
+from servoscope.simulation import Truth
 
 COLOURS = {
     "healthy": "green",
