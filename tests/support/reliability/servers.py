@@ -100,7 +100,7 @@ class Postgres:
 
 def mosquitto() -> Path | None:
     """Return the broker's program, which Debian keeps off the path of most users; None where there is none."""
-    found = shutil.which("mosquitto", path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
+    found = shutil.which("mosquitto", path=os.pathsep.join([os.environ.get("PATH", ""), str(Path("/", "usr", "sbin"))]))
     return Path(found) if found else None
 
 
