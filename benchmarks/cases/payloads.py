@@ -20,10 +20,9 @@ from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import payload_class
 from servoscope.service.mqtt.payload import decode_block, encode_json
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import InboxMessage, Transport
+from servoscope.service.sources.message import InboxMessage, RejectionCounter, SourceAsset, Transport
 
 SAMPLES, RATE, ROUNDS = 10_000, 100.0, 3
 FORMS: dict[str, dict[str, Any]] = {

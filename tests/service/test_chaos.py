@@ -11,9 +11,7 @@ from reliability.servers import mosquitto
 @pytest.mark.slow
 def test_nothing_is_lost_between_senders_and_the_store() -> None:
     if mosquitto() is None or not all(one.with_name("node_modules").is_dir() for one in SCRIPTS.values()):
-        pytest.skip(
-            "Mosquitto, node-opcua or mqtt.js is not on this machine: scripts/install-test-servers installs them"
-        )
+        pytest.skip("Mosquitto, node-opcua or mqtt.js is missing: scripts/install-test-servers installs them")
     found = chaos.trial("sqlite", (3, 0.5, 40.0), block_s=30.0, every_s=3.0)
     assert found["blocks"] == 3 * 60
     assert {key: found[key] for key in ("lost", "doubled", "other", "misnumbered")} == dict.fromkeys(

@@ -36,9 +36,9 @@ from servoscope.service.kafka.source import KafkaSourceSettings
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.opcua.settings import OpcuaNodes
 from servoscope.service.opcua.source import OpcuaSourceSettings
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import RejectionCounter, SourceAsset
 from servoscope.service.sources.resample import Resampler
 from servoscope.signals import clean, writers
 

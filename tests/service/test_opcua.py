@@ -29,9 +29,9 @@ from servoscope.service.opcua.server import OpcuaServer, OpcuaServerSettings
 from servoscope.service.opcua.settings import OpcuaNodes
 from servoscope.service.opcua.source import OpcuaSourceSettings
 from servoscope.service.opcua.subscriptions import parse_block, parse_value, read_history
-from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import SourceAsset
 from servoscope.service.sources.resample import Resampler
 
 RATE = 20.0

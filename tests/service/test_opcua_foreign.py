@@ -20,9 +20,9 @@ from servoscope.service.opcua.monitored_items import ItemGrant
 from servoscope.service.opcua.settings import OpcuaNodes, describe_expiry
 from servoscope.service.opcua.source import OpcuaSourceSettings
 from servoscope.service.opcua.subscriptions import ScalarSubscription
-from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.sources.resample import Resampler
 from servoscope.service.sources.update_rate import STEPS, UpdateRate
 

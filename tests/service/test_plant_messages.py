@@ -28,8 +28,8 @@ from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder, encode_rebirth, payload_class
 from servoscope.service.sources import inbox as inbox_module
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
+from servoscope.service.sources.message import RejectionCounter, SourceAsset
 from servoscope.signals.readers import read
 
 NEW_YEAR = 1767225600.0  # 2026-01-01T00:00:00Z, the time of the page's examples

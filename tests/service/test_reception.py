@@ -217,7 +217,7 @@ def test_a_dead_broker_and_an_asset_that_never_comes_are_alarms_from_the_start(
     dead = '[sources.dead]\nkind = "mqtt"\nhost = "127.0.0.1"\nport = 1\n'
     service = service_of(tmp_path, f'{text}{dead}[assets.lift]\nbaseline = "press.json"\nsource = "dead"\n')
     running, config = Running(service), tmp_path / "hall.toml"
-    server = serve_health(service, "127.0.0.1:0")
+    server = serve_health(service.health_report(), "127.0.0.1:0")
     query = "SELECT asset, alarm FROM transitions WHERE after = 'unacknowledged' ORDER BY asset"
     # on a busy machine the board is not connected at once either
     until(lambda: set(asked(config, query)) >= {("hall", "connection.dead"), ("press", "reception")}, 30.0)

@@ -235,7 +235,7 @@ def test_a_webhook_is_told_once_and_after_a_restart(folder: Path) -> None:
 def test_health_and_metrics(folder: Path) -> None:
     config = hall(folder, "served", speed=50.0)
     service = service_of(config)
-    server = serve_health(service, "127.0.0.1:0")
+    server = serve_health(service.health_report(), "127.0.0.1:0")
     running = threading.Thread(target=service.run)
     running.start()
     try:

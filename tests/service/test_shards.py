@@ -155,7 +155,7 @@ def test_shards_say_what_one_process_says_although_one_is_killed(tmp_path: Path)
     alone, config = halls.hall(tmp_path, "alone"), shared_hall(tmp_path, "shared", 12.0)
     halls.service_of(alone).run()
     pool = WorkerPool(ServiceFile.load(config), config)
-    server, thread = serve_health(pool, "127.0.0.1:0"), threading.Thread(target=pool.run)
+    server, thread = serve_health(pool.health_report(), "127.0.0.1:0"), threading.Thread(target=pool.run)
     port = int(server.server_address[1])
     thread.start()
     try:

@@ -10,10 +10,9 @@ from typing import Any
 
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import InboxMessage, Transport
+from servoscope.service.sources.message import InboxMessage, RejectionCounter, SourceAsset, Transport
 
 STUB = SourceAsset(SimpleNamespace(columns=SimpleNamespace(covariates={}), sample_rate=100.0), None)  # type: ignore[arg-type]
 

@@ -13,10 +13,10 @@ import numpy as np
 from brokers import until
 
 from servoscope.models.loop import Loop
-from servoscope.service.sources.base import Rejection, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.folder import FolderSettings
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import Rejection, SourceAsset
 
 LOOP = Loop.load(halls.LOOP)  # at 100 Hz
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z

@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from servoscope.core.networks import is_member
 from servoscope.service.access import WebSettings
-from servoscope.service.health import serve_health
+from servoscope.service.health import HealthReport, serve_health
 from servoscope.web.connections import ConnectionTable, HttpProtocol
 
 HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
@@ -209,13 +209,7 @@ def test_half_sent_headers_do_not_close_the_server(served: Served) -> None:
 
 
 def test_half_sent_headers_do_not_use_up_the_threads_of_a_service() -> None:
-    class Source:
-        last_turn, unready_reason = time.monotonic(), ""
-        metrics = None
-
-    source: Any = Source()
-    source.metrics = type("Metrics", (), {"render": lambda self: b""})()
-    server, before = serve_health(source, "127.0.0.1:0"), threading.active_count()
+    server, before = serve_health(HealthReport(bytes, str), "127.0.0.1:0"), threading.active_count()
     try:
         host, port = str(server.server_address[0]), int(server.server_address[1])
         with contextlib.ExitStack() as stack:

@@ -20,6 +20,7 @@ from servoscope.cli.options import (
     with_reading_options,
 )
 from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output, recording_stem
+from servoscope.cli.progress import show_steps
 
 if TYPE_CHECKING:
     from servoscope.signals import Recording
@@ -39,7 +40,6 @@ def inspect(
     logs = arguments.expand_files(logs)
     check_output(report, "--report", REPORTS, [*logs, *filter(None, [loop])], folder=True)
 
-    from servoscope.cli.progress import show_steps
     from servoscope.cli.render import results
     from servoscope.learning import inspection
     from servoscope.models.loop import Loop
@@ -127,7 +127,6 @@ def learn(
     check_output(output, "-o", (), [loop, *files, *alike, *filter(None, [compare])])
 
     from servoscope.baseline.baseline import Baseline
-    from servoscope.cli.progress import show_steps
     from servoscope.cli.render import results
     from servoscope.diagnosis import operating_points
     from servoscope.learning.learn import nominal_baseline
@@ -201,7 +200,6 @@ def diagnose(
     check_output(trace, "--trace", TRACES, inputs, folder=True)
 
     from servoscope.baseline.baseline import Baseline
-    from servoscope.cli.progress import show_steps
     from servoscope.cli.render import diagnosis, results
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
     from servoscope.diagnosis.diagnose import diagnose_with_trace

@@ -108,7 +108,7 @@ def run(
             service = WorkerPool(settings, config, anew or ())
         else:
             service = Service(settings, build_components(settings, anew or ()))
-        server = serve_health(service, settings.service.listen) if settings.service.listen else None
+        server = serve_health(service.health_report(), settings.service.listen) if settings.service.listen else None
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
     if worker is not None:

@@ -18,7 +18,9 @@ from servoscope.cli.options import (
     with_reading_options,
 )
 from servoscope.cli.output_paths import RECORDINGS, REPORTS, check_output
+from servoscope.cli.progress import show_steps
 from servoscope.core.errors import LoopError
+from servoscope.core.files import atomic_write, exclusive_folder
 
 if TYPE_CHECKING:
     from servoscope.design import BaselineStudy
@@ -52,7 +54,6 @@ def simulate(
     events = arguments.parse_fault_events(fault or [])
 
     from servoscope import simulation
-    from servoscope.cli.progress import show_steps
     from servoscope.cli.render import results
     from servoscope.models.loop import Loop
     from servoscope.report import plain_values
@@ -102,7 +103,6 @@ def design(
     arguments.check_reference(reference)
 
     from servoscope.baseline.baseline import Baseline
-    from servoscope.cli.progress import show_steps
     from servoscope.cli.render import design as studies
     from servoscope.cli.render import results
     from servoscope.design import DesignStudy, design_study, study_baseline
@@ -154,9 +154,7 @@ def reproduce(
     as_json: JsonOption = False,
 ) -> None:
     """Reproduce the source paper: its figures, and every claim of it beside the measured number."""
-    from servoscope.cli.progress import show_steps
     from servoscope.cli.render import results
-    from servoscope.core.files import exclusive_folder
     from servoscope.research.paper import jobs, reproduction
 
     numbers = range(1, seeds + 1)
@@ -180,7 +178,6 @@ def demo(
 ) -> None:
     """Simulate a rig, break it, learn and diagnose: the main job in four commands."""
     from servoscope.cli import demo as demonstration
-    from servoscope.core.files import exclusive_folder
 
     with exclusive_folder(output):
         demonstration.run_demo(output, lambda words: app(list(words), standalone_mode=False))
@@ -194,7 +191,6 @@ def tutorial(
 ) -> None:
     """Write the four logs that the tutorial reads: a motor axis, healthy on three days and faulty on Friday."""
     from servoscope.cli.render import results
-    from servoscope.core.files import atomic_write, exclusive_folder
     from servoscope.report.page import say
     from servoscope.simulation.tutorial import DAYS, tutorial_log
 

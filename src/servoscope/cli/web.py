@@ -11,7 +11,7 @@ import typer
 from servoscope.cli.app import app
 from servoscope.cli.exit import print_json
 from servoscope.cli.service import check_web_extra
-from servoscope.service.access import ROLES, Role
+from servoscope.service.access import ROLES, Role, Users
 
 if TYPE_CHECKING:
     from servoscope.service.access import WebSettings
@@ -95,8 +95,6 @@ def add(
     ] = False,
 ) -> None:
     """Add a user, or give one a new role and password."""
-    from servoscope.service.access import Users
-
     chosen: Role | None = next((one for one in ROLES if one == role), None)
     if chosen is None:
         raise typer.BadParameter(f"--role {role}: choose from {', '.join(ROLES)}")
@@ -115,8 +113,6 @@ def print_users(
     file: UsersOption = DEFAULT_USERS_FILE, as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False
 ) -> None:
     """List users and roles."""
-    from servoscope.service.access import Users
-
     users = Users(file).all()
     if as_json:
         print_json(users, lines=False)
@@ -128,7 +124,5 @@ def print_users(
 @users_app.command()
 def remove(name: NameArgument, file: UsersOption = DEFAULT_USERS_FILE) -> None:
     """Remove a user; its sessions end."""
-    from servoscope.service.access import Users
-
     Users(file).remove(name)
     typer.echo(f"{file}: {name} is removed")

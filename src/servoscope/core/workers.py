@@ -95,9 +95,9 @@ class Workers:
         folder: Path | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self._start = partial(_Worker, limits, folder, environment)
+        self._start = partial(_TaskProcess, limits, folder, environment)
         self._lock = threading.Lock()
-        self._idle, self._busy = list[_Worker](), set[_Worker]()
+        self._idle, self._busy = list[_TaskProcess](), set[_TaskProcess]()
         self._stopped = False
 
     def run(
@@ -173,7 +173,7 @@ class Workers:
                 worker.end()
 
 
-class _Worker:
+class _TaskProcess:
     """A process that runs one task after the other, until one fails."""
 
     def __init__(

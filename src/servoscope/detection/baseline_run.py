@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.expectation import NO_REFERENCE, Expectation, MeanPropagator
 from servoscope.detection.cusum_design import build_cusum_constants, sure_level, worst_case_hypotheses
+from servoscope.estimation.kernel.cusum import CusumConstants
 from servoscope.estimation.pipeline import EstimationRunner, Pipeline
-
-if TYPE_CHECKING:
-    from servoscope.estimation.kernel.cusum import CusumConstants
 
 
 class BaselineRun(NamedTuple):

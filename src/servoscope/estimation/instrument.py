@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -18,11 +18,9 @@ from servoscope.core.arrays import FloatArray, IndexArray
 from servoscope.estimation.filter_bank import InstrumentModel, instrument_system
 from servoscope.estimation.two_stage import laguerre_functions
 from servoscope.models.lfilter import lfilter
+from servoscope.models.loop import Loop
 from servoscope.models.lti import LinearSystem, sample_system, tapped_delay_line
 from servoscope.signals import Recording
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
 
 FUNCTIONS = 8  # Laguerre functions of r
 POLES = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99)  # of theirs, per sample, out of which the one that explains y best is taken

@@ -76,13 +76,9 @@ def load_day_monitor(path: str, assets: int, window_s: float) -> DayMonitor:
 
     Raises BaselineError if the file is missing or damaged.
     """
-    return _day_monitor(Baseline.load(path), assets, window_s)
+    return DayMonitor(Baseline.load(path).shared(assets), window_s)
 
 
 @lru_cache(maxsize=MAX_CACHED_MONITORS)
 def _parse_day_monitor(text: str, assets: int, window_s: float) -> DayMonitor:
-    return _day_monitor(Baseline.model_validate_json(text), assets, window_s)
-
-
-def _day_monitor(baseline: Baseline, assets: int, window_s: float) -> DayMonitor:
-    return DayMonitor(baseline.shared(assets), window_s)
+    return DayMonitor(Baseline.model_validate_json(text).shared(assets), window_s)

@@ -28,9 +28,9 @@ from servoscope.service.assets.reception import UNHEARD_RECEPTION
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
 from servoscope.service.publishers.base import StatusPublisher
-from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import SourceAsset
 from servoscope.service.store import CheckpointRow, Store
 from servoscope.service.store.engine import parse_store_url
 

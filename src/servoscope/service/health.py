@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servoscope.core.errors import ConfigError
 from servoscope.service.assets.status import AssetStatus
@@ -86,29 +86,6 @@ def alarm_gauge(count: Mapping[tuple[str, str, str], int]) -> Metric:
     return alarms
 
 
-class _Metrics(Protocol):
-    def render(self) -> bytes:
-        """Return them in the format of Prometheus."""
-
-
-class HealthSource(Protocol):
-    """What the server needs of a service."""
-
-    last_turn: float  # when its loop last turned, by the monotonic clock [s]
-
-    @property
-    def metrics(self) -> _Metrics:
-        """Its metrics."""
-
-    @property
-    def unready_reason(self) -> str:
-        """Why it is not ready; empty: it is."""
-
-    @property
-    def degraded_reason(self) -> str:
-        """What it does not do although it is ready; empty: nothing."""
-
-
 class _HealthServer(ThreadingHTTPServer):
     """Keeps few connections: clients that are slow must not use up threads and files."""
 
@@ -139,17 +116,11 @@ class _HealthServer(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-def serve_health(service: HealthSource, listen: str) -> ThreadingHTTPServer:
+def serve_health(report: HealthReport, listen: str) -> ThreadingHTTPServer:
     """Answer on ``host:port`` until ``shutdown`` is called; port 0 takes a free one.
 
     Raises ConfigError if the address cannot be had.
     """
-    report = HealthReport(
-        service.metrics.render,
-        lambda: service.unready_reason,
-        lambda: service.degraded_reason,
-        lambda: service.last_turn,
-    )
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"

@@ -15,13 +15,11 @@ from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile, StoreSettings
 from servoscope.service.log import log
-from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.metrics import MetricsContext, ServiceMetrics
 from servoscope.service.notifications import Notifier
-from servoscope.service.sources.base import RejectionCounter
-from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.store import CommandOutcome, CommandRow, Store
 from servoscope.service.store.series import thin_sizes
-from servoscope.service.writer import StoreWriter
 
 DAY_S = 86400.0
 RETENTION_EVERY_S = 3600.0
@@ -29,22 +27,15 @@ THIN_WITHIN_S = 1800.0  # the sizes of all assets are thinned, some at each look
 REJECTIONS_EVERY_S = 60.0  # between two audit rows about a flood of bad messages
 
 
-class HousekeepingContext(Protocol):
+class HousekeepingContext(MetricsContext, Protocol):
     """What housekeeping needs of a service."""
 
     config: ServiceFile
-    assets: dict[str, Asset]
     clock: SteadyClock
-    sources: dict[str, Inbox]
     store: Store
-    writer: StoreWriter
     notifier: Notifier
     dispatcher: OutboxDispatcher
     metrics: ServiceMetrics
-
-    @property
-    def troubles(self) -> Mapping[str, str]:
-        """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
 
     def note_refusal(self, name: str, why: str) -> None:
         """Note that something of an asset came and could not be used."""

@@ -15,8 +15,8 @@ from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.metrics import write_asset_series
 from servoscope.service.health import alarm_gauge
 from servoscope.service.layer_times import LayerTimes
-from servoscope.service.sources.base import Rejection
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import Rejection
 from servoscope.service.writer import StoreWriter
 
 if TYPE_CHECKING:

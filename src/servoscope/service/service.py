@@ -25,6 +25,7 @@ from servoscope.service.build import ServiceComponents
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile
 from servoscope.service.diagnosis_worker import DiagnosisWorker, find_due_prognosis
+from servoscope.service.health import HealthReport
 from servoscope.service.housekeeping import Housekeeping
 from servoscope.service.log import log, set_level
 from servoscope.service.metrics import ServiceMetrics
@@ -65,8 +66,7 @@ class Service:
         self._next_commit = self._next_housekeeping = 0.0
         self._stopping = self._is_behind = False  # _is_behind: whether the last turn left blocks for the next
         self._reload_from: Path | None = None
-        self.layers = components.groups.layers
-        self.last_turn = monotonic()  # a service that hangs is not alive
+        self.layers, self.last_turn = components.groups.layers, monotonic()  # a service that hangs is not alive
 
     def _take_components(self, config: ServiceFile, components: ServiceComponents) -> None:
         self.config, self._components = config, components
@@ -88,9 +88,14 @@ class Service:
         """Why it is not ready; empty where it is."""
         if self._stopping:
             return "stopping"
-        if self.writer.unavailable_since is not None:
-            return f"the store is unavailable, {self.writer.waiting} blocks wait"
-        return ""
+        is_away = self.writer.unavailable_since is not None
+        return f"the store is unavailable, {self.writer.waiting} blocks wait" if is_away else ""
+
+    def health_report(self) -> HealthReport:
+        """Return what it reports of itself over HTTP."""
+        return HealthReport(
+            self.metrics.render, lambda: self.unready_reason, lambda: self.degraded_reason, lambda: self.last_turn
+        )
 
     def run(self, announce: Callable[[], None] = lambda: None) -> None:
         """Run; `announce` is called when assets that begin anew have their new states in the store.
@@ -367,13 +372,8 @@ class Service:
     @property
     def _ended(self) -> bool:
         """Whether there is nothing left to do, and never will be."""
-        return (
-            self._exhausted
-            and not self._diagnosis_jobs
-            and not self._prognosis_jobs
-            and self.writer.empty
-            and self.dispatcher.idle
-        )
+        is_waiting = self._diagnosis_jobs or self._prognosis_jobs
+        return self._exhausted and not is_waiting and self.writer.empty and self.dispatcher.idle
 
     @property
     def _pause_s(self) -> float:

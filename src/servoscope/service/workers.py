@@ -17,7 +17,7 @@ from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import count_words
 from servoscope.service.build import check_restarted, check_service_file
 from servoscope.service.config import ServiceFile
-from servoscope.service.health import STALL_S
+from servoscope.service.health import STALL_S, HealthReport
 from servoscope.service.log import log
 from servoscope.service.process_supervisor import ProcessSupervisor
 from servoscope.service.store import Store
@@ -109,17 +109,6 @@ class _Follower:
 
 
 @dataclass
-class WorkerMetrics:
-    """Metrics of all workers."""
-
-    ask_all: Callable[[str], list[bytes]]
-
-    def render(self) -> bytes:
-        """Return all of them in the format of Prometheus."""
-        return merge_metrics(answer.decode() for answer in self.ask_all("/metrics")).encode()
-
-
-@dataclass
 class WorkerPool:
     """A service whose assets are shared out among processes; each follows those of its shard as a service of its own.
 
@@ -134,10 +123,14 @@ class WorkerPool:
     _reload: threading.Event = field(default_factory=threading.Event)
     last_turn: float = field(default_factory=time.monotonic)
 
-    @property
-    def metrics(self) -> WorkerMetrics:
-        """Its metrics."""
-        return WorkerMetrics(self._ask_all)
+    def health_report(self) -> HealthReport:
+        """Return what it reports of itself over HTTP."""
+        return HealthReport(
+            lambda: merge_metrics(answer.decode() for answer in self._ask_all("/metrics")).encode(),
+            lambda: self.unready_reason,
+            lambda: self.degraded_reason,
+            lambda: self.last_turn,
+        )
 
     def _ask_all(self, path: str) -> list[bytes]:
         found = []

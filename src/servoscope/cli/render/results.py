@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
 from unicodedata import category
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -14,20 +14,15 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import translate, translate_range
+from servoscope.learning.inspection import Inspection
+from servoscope.models.loop import Columns
 from servoscope.report.format_values import DASH, format_duration, format_percent
-from servoscope.report.page import say
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from servoscope.baseline.baseline import Baseline
-    from servoscope.learning.inspection import Inspection
-    from servoscope.models.loop import Columns
-    from servoscope.report.page import ResultTable
-    from servoscope.signals import Recording
-    from servoscope.signals.readers import ChannelInfo
-    from servoscope.simulation import Truth
+from servoscope.report.page import ResultTable, say
+from servoscope.signals import Recording
+from servoscope.signals.readers import ChannelInfo
+from servoscope.simulation import Truth
 
 COLOURS = {
     "healthy": "green",
@@ -131,23 +126,21 @@ def _print_operating_point(out: Console, b: Baseline) -> None:
         (name, f"{value:.5g}", f"{s:.2g}", f"{100.0 * abs(s / value):.2g} %" if value else DASH)
         for name, value, s in zip(b.names, b.theta, std, strict=True)
     ]
-    print_table(out, ("coefficient", "value", "std. dev.", "relative"), rows)
-    out.print()
-    if b.ratios:
-        print_table(out, ("parameter", "healthy / nominal"), [(name, f"{x:.4g}") for name, x in b.ratios.items()])
-        out.print()
-    if b.promises:
-        header = ("fault",) if all(p.name == p.parameter for p in b.promises) else ("fault", "parameter")
-        promised = [
-            (*(p.name, p.parameter)[: len(header)], format_percent(p.change) if p.change is not None else "never")
-            for p in b.promises
-        ]
-        print_table(out, (*header, "detected from a change of"), promised, words=len(header))
-        out.print()
-    if b.learned:
-        severity = [(f.name, f"{len(f.shares)}", f"{min(f.shares):.2f} to {max(f.shares):.2f}") for f in b.learned]
-        print_table(out, ("labelled fault", "recordings", "severity"), severity)
-        out.print()
+    header = ("fault",) if all(p.name == p.parameter for p in b.promises) else ("fault", "parameter")
+    promised = [
+        (*(p.name, p.parameter)[: len(header)], format_percent(p.change) if p.change is not None else "never")
+        for p in b.promises
+    ]
+    severity = [(f.name, f"{len(f.shares)}", f"{min(f.shares):.2f} to {max(f.shares):.2f}") for f in b.learned]
+    for head, cells, words in (
+        (("coefficient", "value", "std. dev.", "relative"), rows, 1),
+        (("parameter", "healthy / nominal"), [(name, f"{x:.4g}") for name, x in b.ratios.items()], 1),
+        ((*header, "detected from a change of"), promised, len(header)),
+        (("labelled fault", "recordings", "severity"), severity, 1),
+    ):
+        if cells:
+            print_table(out, head, cells, words)
+            out.print()
     print_facts(out, _baseline_facts(b))
     print_notes(out, b.notes)
 

@@ -19,10 +19,9 @@ from servoscope.service.log import log
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.network import TlsSettings
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import InboxMessage, Transport
+from servoscope.service.sources.message import InboxMessage, RejectionCounter, SourceAsset, Transport
 from servoscope.service.sources.settings import SourceSettings
 
 FETCH_S = 0.2  # how long one call of the client waits for messages

@@ -27,9 +27,15 @@ from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mapping.sparkplug import SparkplugDecoder
 from servoscope.service.mqtt.payload import parse_json
 from servoscope.service.sources.assembly import SIGNALS
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import MAX_TIME_S
-from servoscope.service.sources.message import Content, Decoder, InboxMessage, SignalValue
+from servoscope.service.sources.message import (
+    Content,
+    Decoder,
+    InboxMessage,
+    RejectionCounter,
+    SignalValue,
+    SourceAsset,
+)
 from servoscope.signals.readers.clock import ZoneOffset
 
 PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # whole: nanoseconds are more than a binary64 counts

@@ -31,9 +31,8 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import MessageError
 from servoscope.service.mqtt.topics import data_topic, parse_asset
-from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import MAX_COUNT, MAX_TIME_S, Block
-from servoscope.service.sources.message import Content, Decoder, InboxMessage
+from servoscope.service.sources.message import Content, Decoder, InboxMessage, SourceAsset
 
 MAGIC, VERSION = b"SVSB", 1
 HEADER = struct.Struct("<4sBBHII")

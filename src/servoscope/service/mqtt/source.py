@@ -17,10 +17,9 @@ from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mqtt import topics
 from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_bulk_client
 from servoscope.service.mqtt.payload import BlockMessages
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import Decoder, InboxMessage, Transport
+from servoscope.service.sources.message import Decoder, InboxMessage, RejectionCounter, SourceAsset, Transport
 from servoscope.service.sources.settings import SourceSettings
 
 if TYPE_CHECKING:

@@ -39,10 +39,9 @@ from servoscope.service.opcua.settings import (
     import_asyncua,
 )
 from servoscope.service.opcua.subscriptions import QUEUE_MARGIN, ArraySubscription, ScalarSubscription, timestamp
-from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import BlockDecoder, InboxMessage, Transport
+from servoscope.service.sources.message import BlockDecoder, InboxMessage, SourceAsset, Transport
 from servoscope.service.sources.settings import SourceSettings
 
 SETTLING_S = 2.0  # behind the server's clock: a change that has not been reported by then has not happened

@@ -16,8 +16,8 @@ from servoscope.core.messages import message, render
 from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.opcua.monitored_items import ItemGrant
 from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
-from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import MAX_TIME_S, Block, ResumePosition
+from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.sources.resample import CLOCK_STEP_S
 from servoscope.service.sources.update_rate import MAX_PERIODS
 

@@ -14,9 +14,8 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import message, render
 from servoscope.service.assets.reception import AssetTrouble
-from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
-from servoscope.service.sources.message import SignalValue
+from servoscope.service.sources.message import RejectionCounter, SignalValue
 from servoscope.service.sources.resample import Resampler, SampleGap
 from servoscope.service.sources.update_rate import UpdateRate
 

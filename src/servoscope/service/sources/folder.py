@@ -27,7 +27,6 @@ from servoscope.core.settings import NonEmptyStr
 from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.config_types import Seconds
 from servoscope.service.log import log
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.log_files import (
@@ -42,7 +41,15 @@ from servoscope.service.sources.log_files import (
     find_first_time,
     parse_file,
 )
-from servoscope.service.sources.message import POLL_S, Content, Decoder, InboxMessage, Transport
+from servoscope.service.sources.message import (
+    POLL_S,
+    Content,
+    Decoder,
+    InboxMessage,
+    RejectionCounter,
+    SourceAsset,
+    Transport,
+)
 
 DONE, FAILED = "done", "failed"  # subfolders that files are moved to
 MAX_CLOCK_DIFFERENCE_S = 3600.0  # between the file server and whoever writes the time stamps

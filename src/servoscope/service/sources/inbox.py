@@ -17,10 +17,17 @@ from servoscope.core.messages import render
 from servoscope.service.assets.reception import AssetTrouble
 from servoscope.service.log import log
 from servoscope.service.sources.assembly import AssetStream, Receipt
-from servoscope.service.sources.base import RejectionCounter, SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.guard import MessageGuard
-from servoscope.service.sources.message import Content, Decoder, InboxMessage, SignalValue, Transport
+from servoscope.service.sources.message import (
+    Content,
+    Decoder,
+    InboxMessage,
+    RejectionCounter,
+    SignalValue,
+    SourceAsset,
+    Transport,
+)
 
 MAX_QUIET_S = 2.0  # without a message of an asset for so long, what has come of it is made a block, however short
 MAX_TURN_S = 0.25  # that messages are decoded at once: then it is the turn of other sources
@@ -118,8 +125,8 @@ class Inbox:
     @property
     def pause_s(self) -> float:
         """How long an asset may pause without being silent [s]; infinite while something may be on its way."""
-        is_due = self.transport.pause_s > 0.0 and self.next_block_s == 0.0
-        return math.inf if is_due else self.transport.pause_s
+        pause_s = self.transport.pause_s  # first: what its thread hands over meanwhile is seen behind it
+        return math.inf if pause_s > 0.0 and self.next_block_s == 0.0 else pause_s
 
     @property
     def next_block_s(self) -> float:
@@ -141,7 +148,8 @@ class Inbox:
         while len(self._ready) < limit:
             can_go_on = next(self._steps, None)
             if can_go_on is None:
-                messages = self.transport.receive(limit - len(self._ready))
+                room = limit - len(self._ready)
+                messages = self.transport.receive(room) if room > 0 else ()
                 if not messages:
                     break
                 self._steps = self._take(messages)
@@ -163,6 +171,7 @@ class Inbox:
         decode = self._decode_guarded if self._guard is not None else self.decoder.decode_all
         found = decode(messages)
         for message in messages:
+            yield True
             while (content := next(found)) is None:
                 yield False
             for address, request in self.decoder.requests():
@@ -172,16 +181,14 @@ class Inbox:
                     self.transport.leave(message.address)
                 self.rejections.add(self.decoder.find_asset(message.address), content.kind, str(content))
                 message.release()
-                yield True
                 continue
             receipt = Receipt(message.release)
             if content.values or content.gone:
                 self._take_values(message, content, receipt)
             for block in content.blocks:
+                yield True  # before it is taken: behind the last one the message is released without another poll
                 self._take_block(block, receipt)
-                yield True
             receipt.release()
-            yield True
 
     def _decode_guarded(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError | None]:
         """Yield what each message holds, or why it is refused; None while one is tried in another process."""
@@ -196,10 +203,11 @@ class Inbox:
                     yield None
             try:
                 self._guard.check(*tried)
-                self._guard.begin(mark)
-                yield self.decoder.decode(message)
             except MessageError as error:
                 yield error
+            else:
+                self._guard.begin(mark)
+                yield self.decoder.try_decode(message)
 
     def _take_block(self, block: Block, receipt: Receipt) -> None:
         """Take a block that its sender has numbered, unless it sends again one that comes before."""

@@ -2,19 +2,71 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from abc import ABC, abstractmethod
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from servoscope.core.errors import MessageError
+from servoscope.models.loop import Loop
 from servoscope.service.assets.reception import AssetTrouble
-from servoscope.service.sources.base import RejectionCounter
 from servoscope.service.sources.block import Block, ResumePosition
 
 POLL_S = 0.02  # between two looks at a transport whose messages come from a thread of its own
 NOTHING: Mapping[Any, Any] = MappingProxyType({})
+
+CHECKS = {  # what every source guarantees; tests/service/test_source_contract.py runs them for each kind
+    "numbering": "the blocks of an asset are numbered 0, 1, 2 ... without holes",
+    "limit": "`poll` returns at most as many blocks as it was asked for, and each block once",
+    "idle": "`poll` and `next_block_s` return at once where there is nothing",
+    "repetition": "a block that was not acknowledged is returned again after a restart",
+    "resumption": "after a restart an asset continues behind the block that was counted last",
+    "closing": "`close` may be called twice, and before anything has come",
+}
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Messages of one kind that could not be used: of which asset, how many, and why the last one."""
+
+    asset: str
+    kind: str
+    count: int
+    reason: str
+
+
+class RejectionCounter:
+    """Counts rejected messages, from any thread; its memory stays bounded whatever comes."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._reasons: dict[tuple[str, str], str] = {}
+
+    def add(self, asset: str, kind: str, reason: str, count: int = 1) -> None:
+        """Count one; `asset` must be a known one, or empty."""
+        with self._lock:
+            self._counts[asset, kind] += count
+            self._reasons[asset, kind] = reason
+
+    def take(self) -> list[Rejection]:
+        """Return what was rejected since the last call."""
+        with self._lock:
+            counts, self._counts = self._counts, Counter()
+        return [Rejection(*key, count, self._reasons[key]) for key, count in counts.items()]
+
+
+class SourceAsset(NamedTuple):
+    """What a source is told of an asset: its loop, and the value of the settings' `asset_key`, if they have one."""
+
+    loop: Loop
+    address: Any
+    ahead_s: float = math.inf  # how far its time stamps may be ahead of our clock [s]
+    covariates: tuple[str, ...] = ()  # channels that its blocks carry beside r, u and y
 
 
 def _forget() -> None:
@@ -74,13 +126,18 @@ class Decoder(ABC):
     def decode(self, message: InboxMessage) -> Content:
         """Return what a message holds; raises MessageError if nothing of it can be used."""
 
+    def try_decode(self, message: InboxMessage) -> Content | MessageError:
+        """Return what a message holds, or why nothing of it can be used: no message ends the service."""
+        try:
+            return self.decode(message)
+        except MessageError as error:
+            return error
+        except Exception as error:  # decoders of other packages raise what they like
+            return MessageError("not a block", f"{type(error).__name__}: {' '.join(str(error).split())[:100]}")
+
     def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
-        """Yield what each message holds, or why nothing of it can be used."""
-        for message in messages:
-            try:
-                yield self.decode(message)
-            except MessageError as error:
-                yield error
+        """Yield what `try_decode` returns of each message."""
+        return map(self.try_decode, messages)
 
     def requests(self) -> Iterable[tuple[str, bytes]]:
         """Return messages, with their addresses, that ask senders for what it lacks."""
@@ -90,7 +147,7 @@ class Decoder(ABC):
 class Transport(ABC):
     """Receives messages. What its own thread appends to `waiting` is handed over; or it overrides `receive`."""
 
-    clock_rate = 1.0  # how fast the clock of its samples runs, as in `BlockSource`
+    clock_rate = 1.0  # how fast its samples' clock runs: 1 where they are measured now; 0 where it waits for polls
     keeps = True  # whether what was not released comes again, so that messages may wait; else blocks are dropped
     connected = True
     trouble = ""  # why nothing can be received, in words; empty: nothing is wrong

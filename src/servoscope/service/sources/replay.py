@@ -16,10 +16,9 @@ from pydantic import AwareDatetime
 from servoscope.core.settings import NonNegative
 from servoscope.models.loop import Loop
 from servoscope.service.config_types import Seconds
-from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import BlockDecoder, InboxMessage, Transport
+from servoscope.service.sources.message import BlockDecoder, InboxMessage, SourceAsset, Transport
 from servoscope.service.sources.settings import SourceSettings
 from servoscope.signals import Recording
 from servoscope.signals.readers import is_address, read

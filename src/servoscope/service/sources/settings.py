@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Self
 from pydantic import PrivateAttr
 
 from servoscope.core.settings import Settings
-from servoscope.service.sources.base import SourceAsset
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.message import SourceAsset
 
 
 class SourceSettings(Settings):

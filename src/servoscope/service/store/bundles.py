@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import sqlalchemy as sa
 
@@ -141,14 +142,10 @@ def restore_times(stored: bytes) -> bytes:
 
 
 def _write_contents(parts: Sequence[BundlePart]) -> str:
-    import msgspec
-
     return msgspec.json.encode(parts).decode()
 
 
 def _read_contents(contents: str) -> list[BundlePart]:
-    import msgspec
-
     return msgspec.json.decode(contents, type=list[BundlePart])
 
 
