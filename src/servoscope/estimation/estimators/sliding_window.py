@@ -21,9 +21,7 @@ EXCEPTIONS = {
 }
 
 
-MIN_COLUMN_SHARE = 8.0 * math.sqrt(
-    sys.float_info.epsilon
-)  # of a column: what a sample has to say of a coefficient
+MIN_COLUMN_SHARE = 8.0 * math.sqrt(sys.float_info.epsilon)  # of a column: what a sample has to say of a coefficient
 
 
 def extra_state_size(n: int, memory: float) -> int:
