@@ -55,7 +55,7 @@ sbom: $(STAMP)     ## the software bill of materials of a release, as CycloneDX:
 	$(BIN)/python scripts/sbom.py -o servoscope.cdx.json
 
 clean:          ## remove what the other targets made
-	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist src/servoscope/site src/servoscope/core/jit/kernels
+	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist src/servoscope/site
 	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Done again only when one of the two files has changed; .venv itself is kept then, unless its Python is gone.

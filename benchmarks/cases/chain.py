@@ -221,14 +221,14 @@ def _measure_steps(baseline: Baseline, recording: Recording, amount: BenchmarkSi
 
 @contextmanager
 def _single_core() -> Iterator[None]:
-    from servoscope.estimation import recursion
+    from servoscope.estimation.kernel import threads
 
-    cores = recursion._cores
-    recursion._cores = lambda: 1
+    cores = threads.core_count
+    threads.core_count = lambda: 1
     try:
         yield
     finally:
-        recursion._cores = cores
+        threads.core_count = cores
 
 
 def _measure_fleet(
@@ -260,14 +260,14 @@ def _measure_fleet(
             jobs[f"{name}, 1 core"] = alone
     timings = time_interleaved(jobs, repeats)
     figures = [_benchmark_row(name, measured, total) for name, measured in timings.items()]
-    from servoscope.estimation.recursion import _cores
+    from servoscope.estimation.kernel.threads import core_count
 
     first = next(iter(timings))
     single, whole = timings[f"{first}, 1 core"], timings[first]
     return figures, {
-        "scaling of a fleet over cores, share of the ideal": single.median / whole.median / _cores(),
+        "scaling of a fleet over cores, share of the ideal": single.median / whole.median / core_count(),
         "processor time of a fleet on one core, share of that on all": single.processor / whole.processor,
-        "cores": float(_cores()),
+        "cores": float(core_count()),
     }
 
 

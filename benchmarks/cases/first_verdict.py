@@ -3,8 +3,7 @@
 python benchmarks/speed.py first_verdict [--json]
 
 Processor time of whole commands, children included, in processes of their own: with an empty cache of compiled code,
-again with what the first has left there, and with an empty cache and without the kernels that come with an
-installation. The kernels are made when the package is installed; without them the program says so and stops.
+and again with what the first has left there.
 """
 
 from __future__ import annotations
@@ -20,13 +19,7 @@ from pathlib import Path
 
 from tables import Table, parser, show
 
-from servoscope.core.jit import cache
-
 RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
-BARE = (  # the same command line, blind to the kernels that came with the installation
-    "import sys, pathlib; from servoscope.core.jit import cache; cache.SHIPPED = pathlib.Path('/nowhere');"
-    "from servoscope.cli import main; main()"
-)
 
 
 def rows() -> list[tuple[str, ...]]:
@@ -43,21 +36,16 @@ def rows() -> list[tuple[str, ...]]:
             "demo": ["demo", "-o", str(Path(folder) / "demo")],
         }
         for words, command in commands.items():
-            times = []
-            for bare in (False, True):
-                with tempfile.TemporaryDirectory() as fresh:
-                    times += [run(command, fresh, bare) for _ in range(1 if bare else 2)]
-            (first, wall), (second, _), (alone, _) = times
-            found.append(
-                (words, f"{first:.2f}", f"{second:.2f}", f"{first / second:.2f}", f"{alone:.1f}", f"{wall:.1f}")
-            )
+            with tempfile.TemporaryDirectory() as fresh:
+                (first, wall), (second, _) = (run(command, fresh) for _ in range(2))
+            found.append((words, f"{first:.2f}", f"{second:.2f}", f"{first / second:.2f}", f"{wall:.1f}"))
     return found
 
 
-def run(command: list[str], cache_folder: str, bare: bool = False) -> tuple[float, float]:
+def run(command: list[str], cache_folder: str) -> tuple[float, float]:
     """Return processor time and wall time of a command [s]."""
     before, begin = used(), time.monotonic()
-    start = [sys.executable, *(("-c", BARE) if bare else ("-m", "servoscope")), *command]
+    start = [sys.executable, "-m", "servoscope", *command]
     environment = os.environ | {"NUMBA_CACHE_DIR": cache_folder}
     subprocess.run(start, check=True, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     return used() - before, time.monotonic() - begin
@@ -72,15 +60,6 @@ def used() -> float:
 def main() -> None:
     """Run the command line of this process."""
     given = parser(__doc__).parse_args()
-    if not cache.SHIPPED.is_dir():
-        sys.exit("this installation has no kernels: install it again, without SERVOSCOPE_KERNELS=none")
-    heads = (
-        "processor time",
-        "first, s",
-        "second, s",
-        "first over second",
-        "first, without these kernels, s",
-        "first, wall, s",
-    )
+    heads = "processor time", "first, s", "second, s", "first over second", "first, wall, s"
     note = f"Caches empty for the first; load average before {os.getloadavg()[0]:.1f}."
     show([Table("First verdict", note, heads, tuple(rows()))], given.json)

@@ -9,6 +9,7 @@ import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -63,14 +64,15 @@ def constants(n: int = 4, frequencies: int = 3) -> RecursionConstants:
 def operations(c: RecursionConstants) -> float:
     """Return how many additions and multiplications one sample takes, its share of an evaluation included."""
     recursion = Recursion([c])
-    steps = SampleSteps(recursion._spec, lambda R, phi: [x * (1.0 / (R + sum(p * p for p in phi))) for x in phi])
+    gain = SimpleNamespace(steady_gain=lambda R, phi: [x * (1.0 / (R + sum(p * p for p in phi))) for x in phi])
+    steps = SampleSteps(recursion._spec, gain)
     row = [Tally(x) for x in recursion._table[0]]
     s, h = ([Tally(0.1)] * size for size in (recursion.sizes.floats, 8))
     v, status, q = ([Tally(1.0)] * size for size in (recursion.sizes.rows, 1, recursion.sizes.row))
     tile = [Tally(0.1)] * (4 * TILE)
     Tally.done = 0
     steps.advance_filters(row, s, h, status, v, [], tile, 0, True)
-    steps.update_estimate(row, s, h, v, [], [])
+    steps.update_estimate(row, s, h, v, [], [], [])
     each, Tally.done = Tally.done, 0
     for i in range(recursion.sizes.floats):
         s[i] = Tally(1.0 + i % 3)
@@ -115,9 +117,9 @@ def main() -> None:
     command = parser(__doc__)
     command.add_argument("-o", "--output", type=Path, help="also draw it")
     given = command.parse_args()
-    from servoscope.estimation import recursion
+    from servoscope.estimation.kernel import threads
 
-    recursion._cores = lambda: 1
+    threads.core_count = lambda: 1
     taps = "taps of stage 1 (FIR), one log"
     loops = {
         "assets": {A: (constants(), A, max(100, 100_000 // A)) for A in (1, 4, 16, 64, 1000, 10_000, 100_000)},

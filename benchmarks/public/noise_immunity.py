@@ -21,7 +21,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -29,8 +29,8 @@ import numpy as np
 from tables import Table, parser, show
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel, specialise
 from servoscope.estimation import estimators
+from servoscope.estimation.update import run_updates
 from servoscope.research.paper import metrics
 from servoscope.research.paper.conditions import FREQUENCIES, TRACKING_CASE, OperatingConditions, paper_loop
 from servoscope.research.paper.method import ResidualGenerator, ResidualTrace
@@ -119,29 +119,19 @@ def river_bayes(given: Regression) -> FloatArray:
 
 def own(name: str) -> Estimator:
     """Return an estimator of servoscope, as the recursion runs it."""
-    run = kernel(specialise(_update_all, {"_update": estimators.load_estimator(name).update}, f"noise_immunity_{name}"))
+    estimator = estimators.load_estimator(name)
 
     def estimate(given: Regression) -> FloatArray:
         n = given.theta.size
-        theta, P, out = given.theta.copy(), given.P_d.copy(), np.empty_like(given.phi)
+        theta, P, K, out = given.theta.copy(), given.P_d.copy(), np.zeros(n), np.empty_like(given.phi)
         extra = np.zeros(estimators.extra_state_size(name, n, given.memory))
-        run(given.eta, given.phi, given.P_d, given.memory, theta, P, extra, out)
+        for k in range(len(given.phi)):
+            signals = given.eta[k : k + 1], given.phi[k : k + 1], given.phi[k : k + 1]
+            run_updates(estimator, theta, P, given.P_d, 1.0, given.memory, *signals, K, extra)
+            out[k] = theta
         return out
 
     return estimate
-
-
-_update: Any = None
-
-
-def _update_all(
-    eta: FloatArray, phi: FloatArray, P_d: FloatArray, memory: float,
-    theta: FloatArray, P: FloatArray, extra: FloatArray, out: FloatArray,
-) -> None:  # fmt: skip
-    K = np.zeros(len(theta))
-    for k in range(len(eta)):
-        _update(theta, P, P_d, 1.0, memory, eta[k], phi[k], phi[k], K, extra)
-        out[k] = theta
 
 
 ESTIMATORS: dict[tuple[str, str], Estimator] = {

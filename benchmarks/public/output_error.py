@@ -66,7 +66,14 @@ def simulate_free(
     position = float(recording.y[first])
     if plant.derivative:
         position, speed = 0.0, position
-    run_free_axis(axis_constants([plant], loop), position, speed, np.ascontiguousarray(u[first:]), y)
+    run_free_axis(
+        axis_constants([plant], loop),
+        position,
+        speed,
+        np.ascontiguousarray(u[first:]),
+        y,
+        order=2 if "inertia" in plant.names else 1,
+    )
     return y
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -12,17 +11,6 @@ from servoscope.core.arrays import FloatArray
 from tools import oracle
 
 Peer = Callable[[], FloatArray]
-
-_update: Any = None
-
-
-def run_estimator(
-    eta: FloatArray, phi: FloatArray, P_d: FloatArray, R: float, memory: float, theta: FloatArray, P: FloatArray
-) -> None:
-    """Update theta and P through all regressors."""
-    K = np.zeros(len(theta))
-    for k in range(len(eta)):
-        _update(theta, P, P_d, R, memory, eta[k], phi[k], phi[k], K, K[:0])
 
 
 def kalman_jobs(eta: FloatArray, phi: FloatArray, P_d: FloatArray, R: float, memory: float) -> dict[str, Peer]:
@@ -85,14 +73,14 @@ def least_squares_jobs(eta: FloatArray, phi: FloatArray, memory: float) -> dict[
 
 
 def _servoscope_job(name: str, eta: FloatArray, phi: FloatArray, P_d: FloatArray, R: float, memory: float) -> Peer:
-    from servoscope.core.jit import kernel, specialise
     from servoscope.estimation import estimators
+    from servoscope.estimation.update import run_updates
 
-    run = kernel(specialise(run_estimator, {"_update": estimators.load_estimator(name).update}, name))
+    estimator = estimators.load_estimator(name)
 
     def servoscope() -> FloatArray:
         theta, P = np.zeros(phi.shape[1]), P_d.copy()
-        run(eta, phi, P_d, R, memory, theta, P)
+        run_updates(estimator, theta, P, P_d, R, memory, eta, phi, phi, np.empty_like(theta), np.zeros(0))
         return theta
 
     return servoscope

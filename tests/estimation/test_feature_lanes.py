@@ -1,4 +1,4 @@
-"""Windows of several assets in one call: the bits of each alone, whatever the layouts, gaps, blocks and backend."""
+"""Windows of several assets in one call: the bits of each alone, whatever the layouts, gaps and blocks."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import pytest
 
-from servoscope.core.jit import plain, specialise
-from servoscope.estimation import window_features
 from servoscope.estimation.window_features import FeatureLayout, Window, WindowFeatures, WindowLanes
 
 LAYOUT = FeatureLayout(
@@ -75,13 +72,3 @@ def test_each_asset_has_the_bits_that_it_has_alone() -> None:
             assert rows[i, own].tobytes() == state.tobytes()
             untouched[own] = False
         assert (rows[i, untouched] == 7.0).all()  # it writes nowhere else
-
-
-def test_without_the_compiler_the_bits_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows, found = together()
-    part = plain.trace_function(window_features.pass_bands, window_features.VECTOR_WIDTH, "x")
-    kernel = specialise(window_features._accumulate, {"_pass_bands": part})
-    monkeypatch.setattr(window_features, "_compile", lambda: kernel)
-    slow_rows, slow = together()
-    assert slow == found
-    np.testing.assert_array_equal(slow_rows, rows)

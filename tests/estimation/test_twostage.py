@@ -77,7 +77,7 @@ def test_the_noise_of_a_sample_has_no_share_in_its_own_u_a(rig: dict[str, Any]) 
     assert same[20:1001].all() and not same[1001]
 
 
-@pytest.mark.parametrize("name", [name for name in estimators.estimator_names() if name != "sliding-window"])
+@pytest.mark.parametrize("name", estimators.estimator_names())
 def test_every_estimator_runs_stage_one_and_blocks_change_nothing(rig: dict[str, Any], name: str) -> None:
     loop = loop_of(rig, estimator=name, stage_one="laguerre", stage_one_length=6)
     healthy = recorded(loop, 1, 30.0)

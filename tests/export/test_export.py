@@ -36,9 +36,7 @@ from servoscope.simulation import FaultEvent, reference, simulate
 
 AXIS: dict[str, Any] = {"kind": "polynomial", "order": 2, "coefficients": {"viscous_friction": 200.0, "inertia": 90.0}}
 WITH_COVARIANCE = [
-    name
-    for name in estimators.estimator_names()
-    if not hasattr(estimators.load_estimator(name), "steady_gain") and name != "sliding-window"  # which is refused
+    name for name in estimators.estimator_names() if not hasattr(estimators.load_estimator(name), "steady_gain")
 ]
 RIG = Path(str(files("servoscope").joinpath("simulation", "reference-rig.toml")))
 
@@ -318,10 +316,6 @@ class TestRefusals:
         settings["plant"] |= {"valve_law": "square-root"}
         with pytest.raises(BaselineError, match=r"valve_law = 'square-root'"):
             export_c(fresh(demo().model_copy(update={"loop_settings": settings})))
-
-    def test_an_estimator_without_a_counterpart(self) -> None:
-        with pytest.raises(BaselineError, match=r"estimator = 'sliding-window'.*line \d+"):
-            export_c(fresh(altered(demo(), estimator="sliding-window")))
 
     def test_features(self) -> None:
         with pytest.raises(BaselineError, match=r"features beside.*feature_false_alarms = 0, or give --only-coef"):

@@ -6,10 +6,7 @@ translation alone, which knows few statements, and demands that every name is de
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,27 +20,17 @@ from structured_text import FunctionBlock
 from test_export import altered, demo, fresh
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.errors import BaselineError
+from servoscope.core.jit import symbolic
 from servoscope.core.jit.st_source import st_literal
 from servoscope.detection.statistic import apply_alarm_delays
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.estimation import moments, recursion
+from servoscope.estimation.kernel import cusum, sample_steps
+from servoscope.estimation.kernel import run as kernels
 from servoscope.export import export_st
 from servoscope.export.golden import golden_signals
 
 SAMPLES = 3000
-# products and sums rounded one after the other: the monitor in plain Python, without the fused multiply-add
-UNFUSED = """
-import sys
-import numpy as np
-from servoscope import Baseline, Monitor
-from servoscope.core.jit import symbolic
-symbolic._fma_double = lambda a, b, c: a * b + c
-monitor = Monitor(Baseline.load(sys.argv[1]))
-signals = np.load(sys.argv[2])
-_, trace = monitor.run(monitor.init(), *signals[:3], signals[3] > 0.0)
-rows = np.column_stack([trace.statistic, trace.level, trace.theta, trace.covariance.reshape(len(trace.t), -1)])
-np.save(sys.argv[3], np.column_stack([rows, trace.ifrf.H.real, trace.ifrf.H.imag]))
-"""
 
 
 def rows_of(block: FunctionBlock, signals: Any, frequencies: int) -> npt.NDArray[np.float64]:
@@ -58,16 +45,18 @@ def rows_of(block: FunctionBlock, signals: Any, frequencies: int) -> npt.NDArray
     return np.array(rows)
 
 
-def test_bits_of_the_monitor_without_fused_multiply_adds(tmp_path: Path) -> None:
+def test_bits_of_the_monitor_without_fused_multiply_adds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Gaps, NaN and restarts are among the samples."""
-    signals = golden_signals(demo(), 1000)
-    demo().save(tmp_path / "baseline.json")
-    np.save(tmp_path / "signals.npy", np.stack(signals))
-    files = [str(tmp_path / name) for name in ("baseline.json", "signals.npy", "rows.npy")]
-    environment = os.environ | {"SERVOSCOPE_JIT": "plain"}
-    subprocess.run([sys.executable, "-c", UNFUSED, *files], env=environment, check=True, timeout=300)
-    found = rows_of(FunctionBlock(export_st(demo())), signals, len(demo().loop.monitor.frequencies))
-    assert found[:, :-1].tobytes() == np.load(tmp_path / "rows.npy").tobytes()
+    signals, text = golden_signals(demo(), 1000), export_st(demo())
+    for module in (symbolic, moments, sample_steps, cusum):
+        monkeypatch.setattr(module, "fma", lambda a, b, c: a * b + c)
+    monkeypatch.setattr(recursion, "compile_function", kernels.compile_function.__wrapped__)
+    monitor = Monitor(demo())
+    _, trace = monitor.run(monitor.init(), *signals)
+    rows = np.column_stack([trace.statistic, trace.level, trace.theta, trace.covariance.reshape(len(trace.t), -1)])
+    expected = np.column_stack([rows, trace.ifrf.H.real, trace.ifrf.H.imag])
+    found = rows_of(FunctionBlock(text), signals, len(demo().loop.monitor.frequencies))
+    assert found[:, :-1].tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize("settings", [{}, {"on_delay": 0.3, "off_delay": 1.5}, {"sequential_step": "update"}], ids=str)
@@ -122,13 +111,18 @@ def test_every_temporary_is_written_before_it_is_read() -> None:
     written: set[str] = set()
     for line in body.splitlines():
         target, _, value = line.strip().partition(" := ")
-        assert set(re.findall(r"\b[tb]\d+\b", value or target)) <= written, line
+        assert set(re.findall(r"\b[tbkx]\d+\b", value or target)) <= written, line
         written.add(target)
 
 
-def test_estimators_with_a_covariance_of_their_own_are_refused() -> None:
-    with pytest.raises(BaselineError, match=r"estimator = 'iv-akf'.*Structured Text"):
-        export_st(fresh(altered(demo(), estimator="iv-akf")))
+@pytest.mark.parametrize("estimator", ["iv-akf", "kf", "rls", "rls-reset", "dfrls", "nlms", "sliding-window"])
+def test_estimators_with_a_covariance_of_their_own(estimator: str) -> None:
+    baseline = fresh(altered(demo(), estimator=estimator, memory=2.0))
+    signals, monitor = golden_signals(baseline, 700), Monitor(baseline)
+    _, trace = monitor.run(monitor.init(), *signals)
+    found = rows_of(FunctionBlock(export_st(baseline)), signals, len(baseline.loop.monitor.frequencies))
+    assert np.allclose(found[:, 0], trace.statistic, rtol=1e-6, atol=0.0)
+    assert np.allclose(found[:, 2 : 2 + len(baseline.names)], trace.theta, rtol=1e-6, atol=0.0)
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))

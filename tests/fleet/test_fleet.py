@@ -80,12 +80,13 @@ def test_each_asset_of_a_fleet_is_itself_alone_to_the_last_bit(own: bool) -> Non
 
 def test_many_samples_on_all_cores_are_the_same_as_a_few(monkeypatch: pytest.MonkeyPatch) -> None:
     from servoscope.estimation import recursion
+    from servoscope.estimation.kernel import threads
 
     monkeypatch.setattr(recursion, "MIN_PARALLEL_SAMPLES", 1)
     r, u, y, restart = signals(LANE_COUNT["float64"] + 5)
     monitor = Monitor([learned()] * len(r))
     together = monitor.run(monitor.init(), r, u, y, restart)
-    monkeypatch.setattr(recursion, "_cores", lambda: 1)
+    monkeypatch.setattr(threads, "core_count", lambda: 1)
     alone = monitor.run(monitor.init(), r, u, y, restart)
     assert np.array_equal(together[0], alone[0])
     assert np.array_equal(together[1].statistic, alone[1].statistic)

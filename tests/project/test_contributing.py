@@ -15,8 +15,10 @@ ESTIMATOR = '''"""Adaptive Kalman filter whose P stays at P_d: one gain matrix."
 
 from __future__ import annotations
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel
+from typing import Any
+
+from servoscope.core.jit import sum_products
+from servoscope.estimation.update import Matrix, Numbers, Update
 
 NAME = "fixed-gain"
 NEEDS_INSTRUMENT = False
@@ -26,24 +28,14 @@ EXCEPTIONS = {
 }
 
 
-@kernel
 def update(
-    theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
-    phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
-) -> int:  # fmt: skip
+    theta: Numbers, P: Matrix, P_d: Matrix, R: Any, memory: Any, eta: Any, phi: Numbers, z: Numbers, extra: Any
+) -> Update:
     """Take one step K = P_d phi/(R + phi' P_d phi)."""
-    n = len(theta)
-    e, denominator = eta, R
-    for i in range(n):
-        K[i] = 0.0
-        for j in range(n):
-            K[i] += P_d[i, j] * phi[j]
-        e -= phi[i] * theta[i]
-        denominator += phi[i] * K[i]
-    for i in range(n):
-        K[i] /= denominator
-        theta[i] += K[i] * e
-    return 0
+    g = [sum_products(row, phi) for row in P_d]
+    e, denominator = sum_products([-x for x in phi], theta, eta), sum_products(phi, g, R)
+    K = [x / denominator for x in g]
+    return Update([x + gain * e for x, gain in zip(theta, K, strict=True)], P, K)
 '''
 # step 4: the obvious version
 NAIVE = """

@@ -16,8 +16,6 @@ from pathlib import Path
 
 import pytest
 
-from servoscope.core.jit import cache
-
 BUILD = "import hatchling.build, sys; print(hatchling.build.build_wheel(sys.argv[1]))"
 
 
@@ -30,14 +28,13 @@ def pinned(path: Path) -> dict[str, str]:
 def build(source: Path, folder: Path, umask: int, seconds: int) -> Path:
     """Return the wheel of a copy of the source whose files have another time and other permissions."""
     for name in ("src", "docs"):
-        shutil.copytree(source / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "site", "kernels"))
+        shutil.copytree(source / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "site"))
     for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
         shutil.copy(source / name, folder)
     for path in folder.rglob("*"):
         os.utime(path, (seconds, seconds))
         path.chmod(path.stat().st_mode & ~umask)
     environment = {name: value for name, value in os.environ.items() if name != "SOURCE_DATE_EPOCH"}
-    environment["SERVOSCOPE_KERNELS"] = "none"  # they have a test of their own: compiling all takes a minute
     argv = [sys.executable, "-c", BUILD, str(folder / "dist")]
     done = subprocess.run(argv, cwd=folder, env=environment | {"TZ": "Asia/Tokyo"}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -85,66 +82,11 @@ def test_a_wheel_brings_the_site_which_asks_for_nothing_from_outside(
     assert gone.returncode == 1 and "make docs" in gone.stderr
 
 
-# simulate with the kernels of a folder on a processor that has, or lacks, what they need; say what was compiled
-SIMULATE = """
-import sys
-from numba.core.event import Listener, install_listener
-from servoscope.core.jit import cache
-folder, lacks = sys.argv[1:3]
-cache.SHIPPED, features = cache.Path(folder), cache.get_host_cpu_features()
-cache.get_host_cpu_features = lambda: features | {lacks: False}
-class Counter(Listener):
-    count = 0
-    def on_start(self, event):
-        self.count += 1
-    def on_end(self, event):
-        pass
-from servoscope.cli import main
-counter, sys.argv = Counter(), ["servoscope", *sys.argv[3:]]
-try:
-    with install_listener("numba:compile", counter):
-        main()
-finally:
-    print(counter.count, file=sys.stderr)
-"""
-
-
-@pytest.mark.slow
-def test_kernels_are_the_same_bytes_everywhere_and_serve_processors_that_can_run_them(
-    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(project))
-    from hatch_build import compile_kernels
-
-    rig = str(project / "src" / "servoscope" / "simulation" / "reference-rig.toml")
-    words = f"simulate {rig} -o"
-    folders = tmp_path / "one", tmp_path / "two"
-    for folder in folders:  # from copies of the sources in folders of other names
-        monkeypatch.setenv("PYTHONHASHSEED", str(len(folder.name)))
-        compile_kernels(project / "src", folder, (f"{words} x.csv",))
-    files = [{path.name: path.read_bytes() for path in folder.iterdir()} for folder in folders]
-    assert files[0] == files[1] and any(name.endswith(".nbc") for name in files[0])
-    compiled, logs = [], []
-    for lacks in ("nothing", "avx2"):
-        environment = {**os.environ, "PYTHONPATH": str(project / "src"), "NUMBA_CACHE_DIR": str(tmp_path / lacks)}
-        argv = [sys.executable, "-c", SIMULATE, str(folders[0]), lacks, *words.split(), f"{lacks}.csv"]
-        done = subprocess.run(argv, cwd=tmp_path, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        compiled.append(int(done.stderr.split()[-1]))
-        logs.append((tmp_path / f"{lacks}.csv").read_bytes())
-    assert logs[0] == logs[1] and compiled[1] > 0
-    features = cache.get_host_cpu_features()
-    assert (compiled[0] == 0) == all(features.get(name) for name in cache.SHIPPED_NEEDS)
-
-
-def test_wheels_are_built_with_the_tested_makers_of_pages_and_kernels(project: Path) -> None:
+def test_wheels_are_built_with_the_tested_makers_of_pages(project: Path) -> None:
     settings = tomllib.loads((project / "pyproject.toml").read_text())
-    extra = settings["project"]["optional-dependencies"]["docs"]
-    requires = [each.split(";")[0] for each in settings["build-system"]["requires"]]
-    compiler = [each for each in requires if each.startswith(("numpy", "numba", "llvmlite"))]
-    assert set(extra) <= set(requires) and len(compiler) == 3
-    tested = pinned(project / "requirements-dev.lock")
-    assert dict(each.split("==") for each in extra + compiler).items() <= tested.items()
+    extra, requires = settings["project"]["optional-dependencies"]["docs"], settings["build-system"]["requires"]
+    assert set(extra) <= set(requires) and not [each for each in requires if each.startswith(("numba", "llvmlite"))]
+    assert dict(each.split("==") for each in extra).items() <= pinned(project / "requirements-dev.lock").items()
 
 
 def test_a_container_installs_what_the_tests_run_with_and_nothing_without_a_hash(project: Path) -> None:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import struct
-import subprocess
-import sys
 import zlib
 from pathlib import Path
 
@@ -236,24 +233,3 @@ def test_covariates_that_an_asset_needs_are_asked_for(monkeypatch: pytest.Monkey
     assert not isinstance(found, MessageError) and found.completed_at == 1.5
     assert isinstance(refused, MessageError) and refused.kind == "covariates"
     assert not list(decode_blocks([]))
-
-
-PLAIN = """
-import sys
-from servoscope.service.mqtt.block_kernels import parse_regular
-with open(sys.argv[1], "rb") as file:
-    messages = eval(file.read())
-found = parse_regular(messages)
-print([one and (one[:3], one.signals.tobytes(), one.checksum) for one in found])
-"""
-
-
-def test_without_a_compiler_the_bits_are_the_same(tmp_path: Path) -> None:
-    messages = [one for one in regular_messages() if len(one) < 1000] + [message_of(one) for one in HARD]
-    (tmp_path / "messages").write_text(repr(messages))
-    environment = {"PYTHONPATH": str(PROJECT / "src"), **os.environ, "SERVOSCOPE_JIT": "plain"}
-    argv = [sys.executable, "-c", PLAIN, str(tmp_path / "messages")]
-    done = subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=300)
-    assert not done.stderr
-    found = parse_regular(messages)
-    assert eval(done.stdout) == [one and (one[:3], one.signals.tobytes(), one.checksum) for one in found]

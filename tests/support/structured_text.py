@@ -15,10 +15,17 @@ STATEMENTS = (
     (re.compile(r"IF (.+) THEN"), r"if \1:"),
     (re.compile(r"ELSIF (.+) THEN"), r"elif \1:"),
     (re.compile(r"ELSE"), "else:"),
-    (re.compile(r"FOR (\w+) := (\d+) TO (\d+) DO"), r"for \1 in range(\2, \3 + 1):"),
+    (re.compile(r"FOR (\w+) := (.+) TO (.+) DO"), r"for \1 in range(\2, \3 + 1):"),
     (re.compile(r"END_(?:IF|FOR);"), ""),
 )
 WORDS = {"AND": "and", "OR": "or", "NOT": "not", "TRUE": "True", "FALSE": "False", "ABS": "abs"}
+FUNCTIONS: dict[str, Any] = {
+    "SEL": lambda g, in0, in1: in1 if g else in0,
+    "SQRT": lambda x: float(np.sqrt(x)),
+    "TRUNC": int,
+    "DINT_TO_LREAL": float,
+}
+PYTHON = "if", "elif", "else", "for", "in", "range"
 DECLARED = "VAR_INPUT|VAR_OUTPUT|VAR RETAIN|VAR CONSTANT|VAR_TEMP|VAR"
 
 
@@ -52,6 +59,8 @@ class FunctionBlock:
 
     def _initial(self, kind: str, value: str | None) -> Any:
         if size := SIZE.fullmatch(kind):
+            if repeated := re.fullmatch(r"\[(\d+)\(0\.0\)\]", value or ""):
+                return [0.0] * int(repeated[1])
             numbers = [float(x) for x in value.strip("[] \n").split(",")] if value else [0.0] * (int(size[1]) + 1)
             assert len(numbers) == int(size[1]) + 1, kind
             return numbers
@@ -73,7 +82,7 @@ class FunctionBlock:
             depth -= line.startswith(("END_", "ELS"))
             lines.append("    " * depth + (re.sub(r"\b[A-Za-z_]\w*\b", self._word, python) or "pass"))
             depth += python.endswith(":")
-        space: dict[str, Any] = {"SEL": lambda g, in0, in1: in1 if g else in0, "SQRT": lambda x: float(np.sqrt(x))}
+        space = dict(FUNCTIONS)
         exec("\n".join(lines), space)
         return lambda: space["run"](self.variables)
 
@@ -81,7 +90,18 @@ class FunctionBlock:
         word = match[0]
         if word in WORDS:
             return WORDS[word]
-        if word in ("SEL", "SQRT", "if", "elif", "else", "for", "in", "range") or re.fullmatch(r"E\d+", word):
+        if word in (
+            "SEL",
+            "SQRT",
+            "TRUNC",
+            "DINT_TO_LREAL",
+            "if",
+            "elif",
+            "else",
+            "for",
+            "in",
+            "range",
+        ) or re.fullmatch(r"E\d+", word):
             return word
         assert word in self.variables, f"{word} is not declared"
         return f"V[{word!r}]"

@@ -291,8 +291,8 @@ class MeanPropagator:
         self._samples += len(which)
         P_d, R, every = tuning.P_d, tuning.R, self._pipeline.every
         path = np.empty((self._samples // every - number // every, len(P_d)))
-        room = np.empty((2, len(P_d)))
-        mean_path(g.eta, g.phi, g.z, g.ok, which, *self._moments, P_d, R, self._theta, number, every, room, path)
+        signals = (np.ascontiguousarray(part) for part in (g.eta, g.phi, g.z, g.ok, which))
+        mean_path(*signals, *self._moments, P_d, R, self._theta, number, every, path, n=len(P_d))
         return path
 
 

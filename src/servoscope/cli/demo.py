@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import shlex
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
@@ -84,33 +82,24 @@ def run_demo(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
     `run` runs a command and returns its exit code, or None for 0.
     """
     from servoscope.cli.render import diagnosis, results
-    from servoscope.core.jit import on_compilation
     from servoscope.diagnosis.result import Diagnosis
 
     write_loop_file(folder)
     out = results.create_console()
-    stream = sys.stdout
-
-    @functools.cache  # say it once
-    def announce_compilation() -> None:
-        with redirect_stdout(stream):  # not among what a command prints into a file
-            out.print(Text("  compiling, once: the next time this starts at once", style="dim"))
-
-    with on_compilation(announce_compilation):
-        for step in demo_steps(folder):
-            out.print(Text(step.purpose, style="bold"))
-            out.print(Text(_format_command(step), style="cyan"), soft_wrap=True)
-            if step.output is None:
+    for step in demo_steps(folder):
+        out.print(Text(step.purpose, style="bold"))
+        out.print(Text(_format_command(step), style="cyan"), soft_wrap=True)
+        if step.output is None:
+            _exit_on_failure(run(step.arguments))
+        else:
+            printed = io.StringIO()
+            with redirect_stdout(printed):
                 _exit_on_failure(run(step.arguments))
-            else:
-                printed = io.StringIO()
-                with redirect_stdout(printed):
-                    _exit_on_failure(run(step.arguments))
-                atomic_write(step.output, printed.getvalue().encode())
-                diagnosis.print_diagnosis(out, Diagnosis.model_validate_json(printed.getvalue()))
-            if step.note:
-                results.print_notes(out, [step.note], "blue", "-")
-            out.print()
+            atomic_write(step.output, printed.getvalue().encode())
+            diagnosis.print_diagnosis(out, Diagnosis.model_validate_json(printed.getvalue()))
+        if step.note:
+            results.print_notes(out, [step.note], "blue", "-")
+        out.print()
     out.print(
         Text(f"Open {folder / 'report.html'} in a browser; {folder / 'loop.toml'} describes the rig."),
         soft_wrap=True,

@@ -1,4 +1,4 @@
-"""Progress on stderr: bars on a terminal, with what is compiled meanwhile; elsewhere a line now and then."""
+"""Progress on stderr: bars on a terminal; elsewhere a line now and then."""
 
 from __future__ import annotations
 
@@ -37,10 +37,6 @@ class StepProgress:
         self._steps_done, self._step = min(self._steps_done + 1, self._each), step
         self._show()
 
-    def show_compilation(self) -> None:
-        """Show why this takes longer than it will the next time."""
-        self._show(" (compiling, once)")
-
     @contextmanager
     def pause(self) -> Iterator[None]:
         """Take the bar away while something else is printed."""
@@ -57,10 +53,10 @@ class StepProgress:
         """Return what goes on."""
         return ": ".join(filter(None, (self._part_name, self._step)))
 
-    def _show(self, more: str = "") -> None:
+    def _show(self) -> None:
         if self._bar is not None and self._task is not None:
             done = self._part * self._each + self._steps_done
-            self._bar.update(self._task, completed=done, description=self.describe() + more)
+            self._bar.update(self._task, completed=done, description=self.describe())
 
 
 @contextmanager
@@ -74,10 +70,7 @@ def show_steps(parts: int, each: int) -> Iterator[StepProgress]:
             with _lines(steps.describe):
                 yield steps
             return
-        from servoscope.core.jit import on_compilation  # loads Numba: only where a bar is shown
-
-        with on_compilation(steps.show_compilation):
-            yield steps
+        yield steps
 
 
 @contextmanager

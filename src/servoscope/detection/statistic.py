@@ -43,12 +43,12 @@ def whiten(covariance: FloatArray, deviation: FloatArray) -> FloatArray:
 
     `covariance`: shape (K, n, n); `deviation`: shape (K, n) or (K, n, m).
     """
-    from servoscope.estimation.moments import whiten_each  # late: loads numba
+    from servoscope.estimation.moments import whiten_each
 
     columns = deviation if deviation.ndim == 3 else deviation[..., None]
     C, d = np.ascontiguousarray(covariance, dtype=np.float64), np.ascontiguousarray(columns, dtype=np.float64)
     white, n = np.empty(d.shape), C.shape[-1]
-    if not whiten_each(C, d, np.empty(n), np.empty((n, n)), white):
+    if not whiten_each(C, d, np.empty((n, n)), white):
         raise np.linalg.LinAlgError("a covariance is not positive definite")
     return white[..., 0] if deviation.ndim == 2 else white
 

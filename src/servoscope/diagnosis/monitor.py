@@ -121,8 +121,7 @@ class Monitor:
         self._side_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
         self._sides = SideLanes([each.side for each in self._constants_of], self._side_at)
         self._size = self._side_at + self._sides.size
-        self._step: Callable[[FloatArray, FloatArray, float, float, float], bool] | None = None
-        self._step_constants = np.zeros(0)
+        self._step: Callable[[FloatArray, float, float, float], bool] | None = None
 
     @classmethod
     def join(cls, monitors: Sequence[Monitor]) -> Self:
@@ -291,14 +290,14 @@ class Monitor:
                 raise RecordingError(
                     "step follows one asset: give the state of a monitor with one baseline, or use run"
                 )
-            self._step, self._step_constants = self._groups[0][1].stepper
+            self._step = self._groups[0][1].stepper
         if self._prefix_size or self._size > self._side_at:  # arrays of one number take longer than the step itself
             one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
             self._follow_sides(state[None, :], list(one), gap, {})
             if self._prefix_size:
                 u = float(self._apply_input_stages(state[None, :], one[0], one[1], one[2], gap)[0, 0])
                 state = state[self._prefix_size :]
-        return self._step(self._step_constants, state, r, u, y)
+        return self._step(state, r, u, y)
 
     def _apply_input_stages(
         self, rows: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, flags: npt.NDArray[np.bool_]

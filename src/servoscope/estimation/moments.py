@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Sequence
 from typing import Any
 
-from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.core.jit import dot, fma, kernel, tril_index
+from servoscope.core.jit import dot, fma, maximum, sqrt, sum_products, tril_index, where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
+
+MIN_POWER = 2.2250738585072014e-308  # smallest variance by which units are evened out
 
 
 def propagate_covariance(c: Any, model: int, s: Any, at: int, lags: int, phi: Sequence[Any], K: Sequence[Any]) -> None:
@@ -49,82 +50,74 @@ def propagate_initial_share(s: Any, at: int, phi: Sequence[Any], K: Sequence[Any
             s[at + n * i + j] = fma(-K[i], left, s[at + n * i + j])
 
 
-@functools.partial(kernel, heap=False)
-def add_products(rows: IntArray, columns: IntArray, weights: FloatArray, x: FloatArray, out: FloatArray) -> None:
+@ArrayFunction
+def add_products(printer: Any, rows: Any, columns: Any, weights: Any, x: Any, out: Any) -> None:
     """Add the elements of a matrix, one after the other, each times a row of x (m, K), to the rows of out (p, K)."""
-    for e in range(len(weights)):
+    for e in printer.loop(0, weights.shape[0]):
         i, j, weight = rows[e], columns[e], weights[e]
-        for k in range(x.shape[1]):
-            out[i, k] += weight * x[j, k]
+        for k in printer.loop(0, x.shape[1]):
+            out[i, k] = out[i, k] + weight * x[j, k]
 
 
-@functools.partial(kernel, heap=False)
-def whiten_each(
-    covariance: FloatArray, deviation: FloatArray, size: FloatArray, L: FloatArray, out: FloatArray
-) -> bool:
+@ArrayFunction
+def whiten_each(printer: Any, covariance: Any, deviation: Any, L: Any, out: Any) -> Any:
     """Write L^-1 d of each of K deviations (K, n, m), where L L' is its covariance (K, n, n); return whether L exists.
 
-    Units are evened out by `size` (n,), scratch memory like `L` (n, n).
+    Units are evened out by the standard deviations; L (n, n) is scratch memory.
     """
-    K, n, m = deviation.shape
-    tiny = 2.2250738585072014e-308
-    for k in range(K):
-        for i in range(n):
-            power = covariance[k, i, i]
-            size[i] = math.sqrt(tiny if power < tiny else power)
-        for i in range(n):
-            for j in range(i + 1):
-                left = covariance[k, i, j] / (size[i] * size[j]) + (1e-12 if i == j else 0.0)
-                for l in range(j):
-                    left -= L[i, l] * L[j, l]
-                if i == j:
-                    if not left > 0.0:
-                        return False
-                    L[i, i] = math.sqrt(left)
-                else:
-                    L[i, j] = left / L[j, j]
-            for c in range(m):
-                rest = deviation[k, i, c] / size[i]
-                for l in range(i):
-                    rest -= L[i, l] * out[k, l, c]
-                out[k, i, c] = rest / L[i, i]
-    return True
+    (K, n, m), failures = deviation.shape, Variable(printer, 0)
+    for k in printer.loop(0, K):
+
+        def size(i: Any, k: Any = k) -> Any:
+            return sqrt(maximum(covariance[k, i, i], MIN_POWER))
+
+        for i in printer.loop(0, n):
+            for j in printer.loop(0, i + 1):
+                start = covariance[k, i, j] / (size(i) * size(j)) + where(i.is_equal(j), 1e-12, 0.0)
+                left = Variable(printer, start)
+                for l in printer.loop(0, j):
+                    left.value = left.value - L[i, l] * L[j, l]
+                with printer.when(i.is_equal(j)):
+                    failures.value = where(left.value > 0.0, failures.value, 1)
+                    L[i, i] = sqrt(left.value)
+                with printer.when(j < i):
+                    L[i, j] = left.value / L[j, j]
+            for c in printer.loop(0, m):
+                rest = Variable(printer, deviation[k, i, c] / size(i))
+                for l in printer.loop(0, i):
+                    rest.value = rest.value - L[i, l] * out[k, l, c]
+                out[k, i, c] = rest.value / L[i, i]
+    return 1 - failures.value
 
 
-@functools.partial(kernel, heap=False)
+@ArrayFunction
 def mean_path(
-    eta: FloatArray, phi: FloatArray, z: FloatArray, ok: BoolArray, which: IntArray, c: FloatArray, S: FloatArray,
-    P_d: FloatArray, R: float, theta: FloatArray, number: int, every: int, room: FloatArray, path: FloatArray,
+    printer: Any, eta: Any, phi: Any, z: Any, ok: Any, which: Any, c: Any, S: Any, P_d: Any, R: Any, theta: Any,
+    number: Any, every: Any, path: Any, *, n: int,
 ) -> None:  # fmt: skip
     """Follow the mean of theta_hat at P = P_d for noise-free regressors plus the noise's moments, to path (K, n).
 
     ``theta += (P_d z (eta - phi' theta) + P_d (c - S theta)) / (R + phi' P_d z + tr(P_d S))``; c (p, n) and S
     (p, n, n) are the noise's E[phi eta] and E[phi phi'] with the plant ``which[k]`` (N,). `theta` (n,) changes in
-    place, `number` samples were before these, and `room` (2, n) is scratch memory.
+    place, `number` samples were before these.
     """
-    N, n = phi.shape
-    done = 0
-    for k in range(N):
-        if ok[k]:
-            p = which[k]
-            e = eta[k]
-            denominator = R
+    done, weights = Variable(printer, 0), [[P_d[i, j] for j in range(n)] for i in range(n)]
+    for k in printer.loop(0, phi.shape[0]):
+        with printer.when(ok[k] > 0):
+            p, e, denominator, pull, gain = which[k], eta[k], R, [], []
+            old = [theta[i] for i in range(n)]
             for i in range(n):
-                e -= phi[k, i] * theta[i]
-                gain = 0.0
-                pull = c[p, i]
+                e = e - phi[k, i] * old[i]
+                pull.append(c[p, i])
+                gain.append(0.0)
                 for j in range(n):
-                    gain += P_d[i, j] * z[k, j]
-                    pull -= S[p, i, j] * theta[j]
-                    denominator += P_d[i, j] * S[p, j, i]
-                denominator += phi[k, i] * gain
-                room[0, i], room[1, i] = gain, pull
+                    gain[i] = weights[i][j] * z[k, j] + gain[i]
+                    pull[i] = pull[i] - S[p, i, j] * old[j]
+                    denominator = denominator + weights[i][j] * S[p, j, i]
+                denominator = denominator + phi[k, i] * gain[i]
             for i in range(n):
-                step = room[0, i] * e
-                for j in range(n):
-                    step += P_d[i, j] * room[1, j]
-                theta[i] += step / denominator
-        if (number + k + 1) % every == 0:
+                theta[i] = old[i] + sum_products(weights[i], pull, gain[i] * e) / denominator
+        with printer.when(((number + k + 1) % every).is_equal(0)):
             for i in range(n):
-                path[done, i] = theta[i]
-            done += 1
+                path[done.value, i] = theta[i]
+            done.value = done.value + 1

@@ -9,29 +9,28 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import functools
 import itertools
 import math
-import os
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.core.jit.native import address
+from servoscope.estimation.kernel import threads
 from servoscope.estimation.kernel.buffers import BufferPool
-from servoscope.estimation.kernel.build import build_kernels
 from servoscope.estimation.kernel.cusum import LAGS, CusumConstants, evaluation_weights
-from servoscope.estimation.kernel.sample_steps import CUSUM_BATCH, HEADER_SIZE, SAMPLE, KernelSizes, KernelSpec
+from servoscope.estimation.kernel.run import compile_function
+from servoscope.estimation.kernel.sample_steps import CUSUM_BATCH, HEADER_SIZE, SAMPLE
 from servoscope.estimation.kernel.sparse_lti import pack_coefficients, pad_system, pairs_structure, sparsity_pattern
+from servoscope.estimation.kernel.spec import KernelSizes, KernelSpec
 from servoscope.models.lti import LinearSystem
 from servoscope.models.plants import Column
 
 LANE_COUNT = {"float64": 8, "float32": 16}  # assets side by side: one vector; twice as many leave the first-level cache
-VECTOR_WIDTH = {"float64": 8, "float32": 16}  # numbers in a vector
 ZERO_TOLERANCE = 1e-12  # of the first coefficient of a filter
 MIN_PARALLEL_SAMPLES = 200_000  # samples from which a second core pays
 PARTS_PER_CORE = 12  # taken in turn, so that a core that is held up leaves its share to the others
@@ -139,9 +138,6 @@ class Recursion:
         self._lanes = 1 if (len(self.constants) == 1 and not single) or first.extra else LANE_COUNT[self._type.name]
         self._blocks = -(-len(self.constants) // self._lanes)
         self._block_constants = self._arrange_constants()
-        self._code = build_kernels(
-            self._spec, self._lanes, min(self._lanes, VECTOR_WIDTH[self._type.name]), int(self._per_asset)
-        )
 
     @property
     def layout(self) -> Hashable:
@@ -211,21 +207,26 @@ class Recursion:
         new = self._buffers.empty(state.shape, state.dtype)
         out = self._buffers.empty((len(state), len(self.rows(state, r.shape[1])), self.sizes.row), self._type)
         flags = np.zeros((0, 0), dtype=np.bool_) if restart is None else restart
-        signals = state, new, r, u, y, flags, c.every, c.stride
+        run_blocks = compile_function("run_blocks", self._spec, self._lanes, self._type == np.float32, self._per_asset)
+        signals = [np.ascontiguousarray(x, dtype=self._type) for x in (r, u, y)]
+        arrays = [self._block_constants, state, new, *signals, np.ascontiguousarray(flags), out]
+        step = self._block_constants.shape[1] if self._per_asset else 0
+        sizes = step, *r.shape, len(flags), c.every, c.stride, out.shape[1] * out.shape[2]
+        places = [address(array) for array in arrays]
 
-        workers = min(_cores(), self._blocks) if r.size >= MIN_PARALLEL_SAMPLES else 1
+        workers = min(threads.core_count(), self._blocks) if r.size >= MIN_PARALLEL_SAMPLES else 1
         edges = np.linspace(0, self._blocks, PARTS_PER_CORE * workers + 1 if workers > 1 else 2).astype(int).tolist()
         parts = deque(itertools.pairwise(edges))
 
         def work() -> None:
             with contextlib.suppress(IndexError):  # there is no part left
                 while True:
-                    self._code.run_blocks(self._block_constants, *signals, out.reshape(len(out), -1), *parts.popleft())
+                    run_blocks(*places, *sizes, *parts.popleft())
 
         if workers == 1:
             work()
         else:  # this thread works as well: waking another one takes time
-            others = [_pool(workers - 1).submit(work) for _ in range(workers - 1)]
+            others = [threads.thread_pool(workers - 1).submit(work) for _ in range(workers - 1)]
             work()
             for other in others:
                 if not other.cancel():
@@ -233,16 +234,25 @@ class Recursion:
         return new, out
 
     @property
-    def stepper(self) -> tuple[Callable[[FloatArray, FloatArray, float, float, float], bool], FloatArray]:
-        """The kernel for one sample of the first asset, and its first argument; the second is the state (size,)."""
-        return build_kernels(self._spec, 1, 1, 1).run_sample, np.ascontiguousarray(self._table[0])
+    def stepper(self) -> Callable[[FloatArray, float, float, float], bool]:
+        """The function that takes one sample of the first asset; the state (size,) is changed in place."""
+        function, constants = compile_function("run_sample", self._spec), np.ascontiguousarray(self._table[0])
+        last, places = constants, (address(constants), 0)
+
+        def step(state: FloatArray, r: float, u: float, y: float) -> bool:
+            nonlocal last, places
+            if state is not last:  # to ask where an array lies takes as long as a step
+                last, places = state, (address(constants), address(state))
+            return function(*places, r, u, y)  # type: ignore[no-any-return]
+
+        return step
 
     def evaluate(self, state: FloatArray) -> FloatArray:
         """Return the evaluations of states as they are, shape (assets, row)."""
-        out = np.empty((len(state), self.sizes.row))
-        build_kernels(self._spec, 1, 1, int(self._per_asset)).evaluate_states(
-            self._table, np.ascontiguousarray(state), out
-        )
+        out, rows = np.empty((len(state), self.sizes.row)), np.ascontiguousarray(state, dtype=np.float64)
+        table = np.ascontiguousarray(self._table, dtype=np.float64)
+        step = table.shape[1] if self._per_asset else 0
+        compile_function("evaluate_states", self._spec)(address(table), address(rows), address(out), step, len(rows))
         return out
 
     def regressors(
@@ -251,24 +261,11 @@ class Recursion:
         """Return [eta, phi, z] of every sample of the first asset (N, rows) and its status (N,); change the state."""
         out = np.zeros((len(r), self.sizes.rows))  # a missing sample writes nothing
         ok = np.empty(len(r), dtype=np.int64)
-        build_kernels(self._spec, 1, 1, 1).write_regressors(
-            self._table[0], state, r, u, y, restart, self.constants[0].stride, out, ok
-        )
+        signals = [np.ascontiguousarray(x, dtype=np.float64) for x in (self._table[0], r, u, y)]
+        arrays = [signals[0], state, *signals[1:], np.ascontiguousarray(restart), out, ok]
+        function = compile_function("write_regressors", self._spec)
+        function(*(address(array) for array in arrays), len(r), self.constants[0].stride)
         return out, ok
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@functools.cache
-def _pool(workers: int) -> ThreadPoolExecutor:
-    """Return threads that stay alive: starting them takes as long as ten thousand samples."""
-    return ThreadPoolExecutor(workers, "servoscope")
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # its threads did not come along
 
 
 def structure_key(c: RecursionConstants) -> Hashable:

@@ -9,6 +9,8 @@ inverse model's.
 from __future__ import annotations
 
 import functools
+import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,9 +19,14 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import NotEnoughError
-from servoscope.core.jit import dot, fma
+from servoscope.core.jit import Bool, Float, dot, fma, maximum, minimum
+from servoscope.core.jit.llvm_text import LlvmPrinter
+from servoscope.core.jit.memory import Memory, apply
+from servoscope.core.jit.native import address, native_function
+from servoscope.core.jit.symbolic import Int
 from servoscope.estimation import estimators
 from servoscope.estimation.kernel import sparse_lti
+from servoscope.estimation.update import read_matrix, write_matrix
 from servoscope.models.lti import LinearSystem, tapped_delay_line
 from servoscope.signals import Recording
 
@@ -52,7 +59,7 @@ class StageOneConstants(NamedTuple):
 
     functions: FloatArray
     X0: FloatArray
-    limits: FloatArray
+    limits: tuple[float, float]
     wait: int
     theta: FloatArray
     P_d: FloatArray
@@ -108,7 +115,7 @@ class StageOneRunner:
         self._constants = StageOneConstants(
             functions=sparse_lti.pack_coefficients(pattern, system),
             X0=np.ascontiguousarray(system.steady[:, 0]),
-            limits=np.array(limits, dtype=np.float64),
+            limits=limits,
             wait=basis_settling_samples(system),
             theta=np.array(tuning.theta, dtype=np.float64),
             P_d=np.pad(P_d, padding),
@@ -140,7 +147,10 @@ class StageOneRunner:
         if not self.size:
             return u
         u_a = np.empty(len(r))
-        self._block(self._constants, state, r, u, restart, u_a)
+        c = self._constants
+        signals = (np.ascontiguousarray(x, dtype=np.float64) for x in (r, u))
+        arrays = [state, c.functions, c.X0, c.P_d, *signals, np.ascontiguousarray(restart), u_a]
+        self._block(*map(address, arrays), c.R, c.memory, float(c.wait), *c.limits, len(r))
         return u_a
 
 
@@ -180,93 +190,43 @@ def tune_stage_one(loop: Loop, recordings: Sequence[Recording]) -> StageOneTunin
     return StageOneTuning(tuple(theta.tolist()), tuple(tuple(row) for row in P_d.tolist()), R)
 
 
-# what the templates are filled with
-_UNFILLED: Any = None
-_states = _padded = _lane_view = _functions = _products = _column = _steady = _update_theta = _update = _UNFILLED
-
-
-def update_steady(
-    c: StageOneConstants, s: FloatArray, theta: FloatArray, phi: FloatArray, K: FloatArray, sums: FloatArray, eta: float
-) -> None:
-    """Update theta where P stays at P_d: K = P_d phi/(R + phi' P_d phi)."""
-    denominator, residual = c.R, eta
-    for i in range(VECTOR_WIDTH):
-        residual -= sums[i]
-        denominator += sums[VECTOR_WIDTH + i]
-    step = residual / denominator
-    for i in range(len(theta)):
-        theta[i] += K[i] * step
-
-
-def update_general(
-    c: StageOneConstants, s: FloatArray, theta: FloatArray, phi: FloatArray, K: FloatArray, sums: FloatArray, eta: float
-) -> None:
-    """Update theta and P by any estimator."""
-    n = len(c.theta)
-    P = s[HEADER_SIZE + _states + n : HEADER_SIZE + _states + n + n * n].reshape((n, n))
-    extra = s[HEADER_SIZE + _states + n + n * n :]
-    _update(theta[:n], P, c.P_d[:n, :n], c.R, c.memory, eta, phi[:n], phi[:n], K[:n], extra)
-
-
-def run_stage_one(
-    c: StageOneConstants, s: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray, u_a: FloatArray
-) -> None:
-    """Write u_a of a block."""
-    n = len(c.theta)
-    x = _lane_view(s[HEADER_SIZE : HEADER_SIZE + _states], 1, 1)
-    weights, P_d = _lane_view(c.functions, 1, 1), _lane_view(c.P_d.reshape(c.P_d.size), VECTOR_WIDTH, 1)
-    w, sums = np.empty((1, 1)), np.zeros(2 * VECTOR_WIDTH)
-    phi, K, theta = np.zeros(_padded), np.zeros(_padded), np.zeros(_padded)
-    theta[:n] = s[HEADER_SIZE + _states : HEADER_SIZE + _states + n]
-    one, wide = _lane_view(phi, 1, 1), _lane_view(phi, VECTOR_WIDTH, 1)
-    weight, gain = _lane_view(theta, VECTOR_WIDTH, 1), _lane_view(K, VECTOR_WIDTH, 1)
-    parts = _lane_view(sums, VECTOR_WIDTH, 1)
-    for k in range(len(r)):
-        u_a[k] = np.nan
-        if not (np.isfinite(r[k]) and np.isfinite(u[k])):
-            s[ARMED] = 0.0
-            continue
-        if restart[k] or s[ARMED] == 0.0:
-            s[ARMED] = 1.0
-            s[WAIT] = c.wait
-            for i in range(_states):
-                x[i, 0] = c.X0[i] * r[k]
-        w[0, 0] = r[k]
-        _functions(0, weights, x, w, one)
-        if s[WAIT] > 0.0:
-            s[WAIT] -= 1.0
-            continue
-        if _steady:
-            K[:] = 0.0
-            for j in range(0, _padded, VECTOR_WIDTH):
-                _column(0, P_d, one, gain, j)
-        _products(0, wide, weight, gain, parts)
-        total = 0.0
-        for i in range(VECTOR_WIDTH):
-            total += sums[i]
-        u_a[k] = total
-        _update_theta(c, s, theta, phi, K, sums, min(max(u[k], c.limits[0]), c.limits[1]))
-    s[HEADER_SIZE + _states : HEADER_SIZE + _states + n] = theta[:n]
+ARGUMENTS = (
+    *((name, "ptr") for name in ("state", "functions", "X0", "P_d", "r", "u", "restart", "u_a")),
+    *((name, "double") for name in ("R", "memory", "wait", "low", "high")),
+    ("samples", "i64"),
+)
 
 
 @functools.cache
 def compile_stage_one(estimator: str, pattern: sparse_lti.SparsityPattern) -> Callable[..., None]:
-    """Compile stage 1 around one estimator and the functions of r: ``block(c, state, r, u, restart, u_a)``."""
-    from servoscope.core.jit import inline, kernel, lane_view, specialise, trace_function
+    """Compile stage 1 around one estimator and the functions of r; its arguments are `ARGUMENTS`.
 
-    module, n = estimators.load_estimator(estimator), len(pattern[0])
-    steady, rows = hasattr(module, "steady_gain"), _vector_count(n)
+    Products of long vectors are summed up in `VECTOR_WIDTH` lanes.
+    """
+    p, module = LlvmPrinter(ARGUMENTS), estimators.load_estimator(estimator)
+    n, states, steady = len(pattern[0]), len(pattern[1]), hasattr(module, "steady_gain")
+    rows, size = _vector_count(n), _vector_count(n) * VECTOR_WIDTH
+    R, memory, wait, low, high = (Float(p, f"%{name}", "double") for name in ("R", "memory", "wait", "low", "high"))
+    head, functions, X0, P_d = (Memory(p, f"%{name}", "double") for name in ("state", "functions", "X0", "P_d"))
+    x = head.behind(HEADER_SIZE)
+    weights, private = x.behind(states), x.behind(states + n + n * n)
+    phi, theta, K, sums = (Memory(p, p.stack("double", max(size, 2 * VECTOR_WIDTH)), "double") for _ in range(4))
 
-    def functions(c: Any, s: Any, w: Any, v: Any) -> None:
-        for i, number in enumerate(sparse_lti.advance_system(pattern, c, 0, s, 0, [w[0]])):
-            v[i] = number
+    def begin(s: Any, x: Any, X0: Any, r: Any) -> None:
+        s[ARMED], s[WAIT] = 1.0, wait
+        for i in range(states):
+            x[i] = X0[i] * r[0]
 
-    def column(P_d: Any, one: Any, K: Any, j: Any) -> None:
-        """Add the columns of P_d from j on, as many as fit a vector, each times its phi, to K."""
-        for i in range(rows):
-            total = K[i]
-            for k in range(VECTOR_WIDTH):
-                total = fma(P_d[j * rows + (k * rows + i)], one[j + k], total)
+    def evaluate_functions(c: Any, x: Any, r: Any, phi: Any) -> None:
+        for i, number in enumerate(sparse_lti.advance_system(pattern, c, 0, x, 0, [r[0]])):
+            phi[i] = number
+
+    def multiply(P_d: Any, phi: Any, K: Any) -> None:
+        """Put P_d phi into K, column by column."""
+        totals = [Float(p, p.constant(0.0, K.kind), K.kind)] * rows
+        for k in range(size):
+            totals = [fma(P_d[k * rows + i], phi[k], total) for i, total in enumerate(totals)]
+        for i, total in enumerate(totals):
             K[i] = total
 
     def products(phi: Any, theta: Any, K: Any, sums: Any) -> None:
@@ -274,20 +234,62 @@ def compile_stage_one(estimator: str, pattern: sparse_lti.SparsityPattern) -> Ca
         for place, other in enumerate((theta, K)):
             sums[place] = dot([phi[i] for i in range(rows)], [other[i] for i in range(rows)])
 
-    names: dict[str, object] = {
-        "_states": len(pattern[1]),
-        "_padded": rows * VECTOR_WIDTH,
-        "_update": module.update,
-        "_lane_view": lane_view,
-        "_steady": steady,
-    }
-    names |= {
-        "_functions": trace_function(functions),
-        "_products": trace_function(products, VECTOR_WIDTH),
-        "_column": trace_function(column, VECTOR_WIDTH, "one"),
-    }
-    names["_update_theta"] = inline(specialise(update_steady if steady else update_general, names), heap=True)
-    return kernel(specialise(run_stage_one, names, repr((estimator, pattern))))
+    def output(sums: Any, u_a: Any) -> None:
+        u_a[0] = functools.reduce(operator.add, [sums[i] for i in range(VECTOR_WIDTH)], 0.0)
+
+    def update_steady(theta: Any, K: Any, sums: Any, u: Any) -> None:
+        """Update theta where P stays at P_d: K = P_d phi/(R + phi' P_d phi)."""
+        residual, denominator = minimum(maximum(u[0], low), high), R
+        for i in range(VECTOR_WIDTH):
+            residual, denominator = residual - sums[i], denominator + sums[VECTOR_WIDTH + i]
+        for i in range(n):
+            theta[i] = theta[i] + K[i] * (residual / denominator)
+
+    def update_general(theta: Any, phi: Any, P: Any, P_d: Any, u: Any, extra: Any) -> None:
+        """Update theta and P by any estimator."""
+        signals, w = [phi[i] for i in range(n)], minimum(maximum(u[0], low), high)
+        matrices = read_matrix(P, n), read_matrix(P_d, n, apart=size)
+        new = module.update([theta[i] for i in range(n)], *matrices, R, memory, w, signals, signals, extra)
+        for i in range(n):
+            theta[i] = new.theta[i]
+        write_matrix(P, new.P)
+
+    def process(r: Memory, u: Memory, u_a: Memory, k: Int) -> None:
+        flag = p.compare_whole(">", p.assign(f"zext i8 {p.load('i8', p.place('i8', '%restart', k))} to i64"), "0")
+        with p.when(Bool(p, flag, "i1") | (Float(p, head.load(ARMED), "double") <= 0.0)):
+            apply(begin, head, x, X0, r)
+        apply(evaluate_functions, functions, x, r, phi)
+        waiting = Float(p, head.load(WAIT), "double")
+        with p.when(waiting > 0.0):
+            head.store(WAIT, (waiting - 1.0).text)
+        with p.when(waiting <= 0.0):
+            wide = [each.regrouped(VECTOR_WIDTH) for each in (phi, theta, K, sums)]
+            if steady:
+                apply(multiply, P_d.regrouped(VECTOR_WIDTH), phi.regrouped(VECTOR_WIDTH, shared=True), wide[2])
+            apply(products, *wide)
+            apply(output, sums, u_a)
+            if steady:
+                apply(update_steady, theta, K, sums, u)
+            else:
+                apply(update_general, theta, phi, weights.behind(n), P_d, u, private)
+
+    for i in p.loop(0, size):
+        for each in (phi, theta, K):
+            each.store(i, p.constant(0.0, "double"))
+    for i in p.loop(0, n):
+        theta.store(i, weights.load(i))
+    for k in p.loop(0, p.argument("samples")):
+        r, u, u_a = (Memory(p, p.place("double", f"%{name}", k), "double") for name in ("r", "u", "u_a"))
+        u_a.store(0, p.constant(math.nan, "double"))
+        finite = (abs(Float(p, r.load(0), "double")) < math.inf) & (abs(Float(p, u.load(0), "double")) < math.inf)
+        with p.when(finite):
+            process(r, u, u_a, k)
+        with p.when(~finite):
+            head.store(ARMED, p.constant(0.0, "double"))
+    for i in p.loop(0, n):
+        weights.store(i, theta.load(i))
+    p.write("ret void")
+    return native_function(p.text(), ARGUMENTS)
 
 
 def _vector_count(n: int) -> int:

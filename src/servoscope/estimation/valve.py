@@ -7,14 +7,15 @@ pressure comes from the motion, p_L = (m_p y'' + b_p y' + k_p y)/A_p, with y as 
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.jit import maximum, minimum, sqrt, sum_products, where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.models.discretise import split_delay
 from servoscope.models.loop import Loop
@@ -70,7 +71,6 @@ class ValveLaw:
             delay=split_delay(loop.delay, rate)[0],
         )
         self.size = HEADER_SIZE + len(filtered.A) + self._constants.delay
-        self._run = _compile_law()
 
     def start(self) -> FloatArray:
         """Return the state before the first sample, shape (size,)."""
@@ -84,44 +84,32 @@ class ValveLaw:
         if not self.size:
             return u
         out = np.empty(len(u))
-        self._run(self._constants, state, u, y, restart, out)
+        _run_square_root(self._constants, state, u, y, restart, out, n=len(self._constants.X0))
         return out
 
 
-def _square_root(
-    c: ValveConstants, s: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray, out: FloatArray
+@ArrayFunction
+def _run_square_root(
+    printer: Any, c: ValveConstants, s: Any, u: Any, y: Any, restart: Any, out: Any, *, n: int
 ) -> None:
-    n = len(c.X0)
-    x, past = s[HEADER_SIZE : HEADER_SIZE + n], s[HEADER_SIZE + n :]
-    new = np.empty(n)
-    for k in range(len(u)):
-        if not (abs(u[k]) < MAX_PHYSICAL and abs(y[k]) < MAX_PHYSICAL):
-            s[ARMED] = 0.0
-            out[k] = np.nan
-            continue
-        now = min(max(u[k], c.low), c.high)
-        if restart[k] or s[ARMED] == 0.0:
-            s[ARMED] = 1.0
+    for k in printer.loop(0, u.shape[0]):
+        known = (abs(u[k]) < MAX_PHYSICAL) & (abs(y[k]) < MAX_PHYSICAL)
+        with printer.when(~known):
+            s[ARMED], out[k] = 0.0, math.nan
+        with printer.when(known):
+            now = Variable(printer, minimum(maximum(u[k], c.low), c.high))
+            past = HEADER_SIZE + n
+            with printer.when((restart[k] > 0) | s[ARMED].is_equal(0.0)):
+                s[ARMED] = 1.0
+                for i in range(n):
+                    s[HEADER_SIZE + i] = c.X0[i] * y[k]
+                for i in printer.loop(0, c.delay):
+                    s[i + past] = now.value
+            x, pressure = [s[HEADER_SIZE + i] for i in range(n)], c.D * y[k]
             for i in range(n):
-                x[i] = c.X0[i] * y[k]
-            past[:] = now
-        pressure = c.D * y[k]
-        for i in range(n):
-            pressure += c.C[i] * x[i]
-        for i in range(n):
-            new[i] = c.B[i] * y[k]
-            for j in range(n):
-                new[i] += c.A[i, j] * x[j]
-        for i in range(n):
-            x[i] = new[i]
-        for i in range(c.delay):
-            now, past[i] = past[i], now
-        left = 1.0 - pressure if c.sign * now > 0.0 else 1.0 + pressure
-        out[k] = now * np.sqrt(max(left, 0.0))
-
-
-@functools.cache
-def _compile_law() -> Callable[..., None]:
-    from servoscope.core.jit import kernel  # late: it imports Numba
-
-    return kernel(_square_root)
+                pressure = pressure + c.C[i] * x[i]
+                s[HEADER_SIZE + i] = sum_products([c.A[i, j] for j in range(n)], x, c.B[i] * y[k])
+            for i in printer.loop(0, c.delay):
+                now.value, s[i + past] = s[i + past], now.value
+            left = where(c.sign * now.value > 0.0, 1.0 - pressure, 1.0 + pressure)
+            out[k] = now.value * sqrt(maximum(left, 0.0))

@@ -17,7 +17,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.core.jit import where
 
 MOTIONS = ("forward", "backward", "rest")
 SIGNALS = ("u", "e")
@@ -25,7 +24,6 @@ MAX_PHYSICAL = 1e100  # as in the recursion: no physical signal, and it would st
 SPEED_TIME = 0.02  # s: time constant behind the speed of the reference
 MIN_POSITIVE = np.finfo(np.float64).tiny
 MIN_MOTION_SAMPLES = 3  # samples of a motion from which a window speaks for it
-VECTOR_WIDTH = 8  # numbers in a vector
 HEADER = 8  # numbers of the state before those of the filters; see `_accumulate`
 ROW_HEADER = 3  # numbers of a row before the sums: sample, level, span
 
@@ -178,6 +176,13 @@ class WindowLanes:
                 yield asset, one.window(row)
 
 
+@functools.cache
+def _compile() -> Callable[..., int]:
+    from servoscope.core.jit import kernel  # late: it imports Numba
+
+    return kernel(_accumulate)
+
+
 def _accumulate(
     table: FloatArray,
     states: FloatArray,
@@ -193,8 +198,8 @@ def _accumulate(
     # smoothing; then edges [samples], b and both a of the band-pass filters
     # a state: armed, sample, samples of the window, windows of the span, span, reference before, speed, 4 times the
     # samples since the motion began plus the motion; then filters, then sums level by level
-    rows, lanes = 0, (2 * int(table[:, 5].max()) + VECTOR_WIDTH - 1) // VECTOR_WIDTH * VECTOR_WIDTH
-    weights, filters, square, x = np.zeros((4, lanes)), np.zeros((4, lanes)), np.zeros((4, lanes)), np.zeros((2, lanes))
+    rows, lanes = 0, 2 * int(table[:, 5].max())
+    weights, filters, square = np.zeros((4, lanes)), np.zeros((4, lanes)), np.zeros((4, lanes))
     for asset in range(len(table)):
         c, s = table[asset], states[asset, begins[asset] :]
         r, u, y, restart = R[asset], U[asset], Y[asset], restarts[asset]
@@ -239,9 +244,17 @@ def _accumulate(
                 if since >= c[9 + edge]:
                     place += 1
             settled = sample > settling
-            for i in range(0, 2 * bands, VECTOR_WIDTH):
-                x[0, i], x[1, i] = u[k], r[k] - y[k]
-                _pass_bands(i, weights, filters, x, square, motion if settled else 3)
+            row, error = motion if settled else 3, r[k] - y[k]
+            for i in range(lanes):  # u or e, twice through a band-pass
+                b, a, a_last = weights[0, i], weights[1, i], weights[2, i]
+                value = u[k] if weights[3, i] > 0.0 else error
+                first = b * value + filters[0, i]
+                filters[0, i] = filters[1, i] - a * first
+                filters[1, i] = -b * value - a_last * first
+                passed = b * first + filters[2, i]
+                filters[2, i] = filters[3, i] - a * passed
+                filters[3, i] = -b * first - a_last * passed
+                square[row, i] += passed * passed
             if not settled:
                 continue
             s[begin + 1 + bins + place] += u[k]
@@ -284,24 +297,3 @@ def _accumulate(
                 s[HEADER + 4 * (2 * (i % bands) + i // bands) + row] = filters[row, i]
         s[0], s[1], s[5], s[6], s[7] = armed, sample, before, speed, moving
     return rows
-
-
-def pass_bands(weights: Any, filters: Any, x: Any, square: Any, row: Any) -> None:
-    """Pass u or e, x of shape (2, 1), twice through the band-pass of each lane; add its square to a row."""
-    b, a, a_last = weights[0], weights[1], weights[2]
-    value = where(weights[3] > 0.0, x[0], x[1])
-    first = b * value + filters[0]
-    filters[0] = filters[1] - a * first
-    filters[1] = -b * value - a_last * first
-    passed = b * first + filters[2]
-    filters[2] = filters[3] - a * passed
-    filters[3] = -b * first - a_last * passed
-    square[row] = square[row] + passed * passed
-
-
-@functools.cache
-def _compile() -> Callable[..., int]:
-    from servoscope.core.jit import kernel, specialise, trace_function  # late: they import Numba
-
-    part = trace_function(pass_bands, VECTOR_WIDTH, "x")
-    return kernel(specialise(_accumulate, {"_pass_bands": part}))

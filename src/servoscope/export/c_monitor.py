@@ -15,7 +15,8 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.files import atomic_write, exclusive_folder
 from servoscope.core.jit.c_source import c_literal
-from servoscope.estimation.kernel.sample_steps import HEADER_SIZE, KernelSpec
+from servoscope.estimation.kernel.sample_steps import HEADER_SIZE
+from servoscope.estimation.kernel.spec import KernelSpec
 from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text
 from servoscope.export.golden import GoldenRun, golden_text
 from servoscope.export.image import pack_image

@@ -12,7 +12,8 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
 from servoscope.diagnosis.monitor_constants import MonitorConstants
 from servoscope.estimation.frequency_response import FrequencyResponse
-from servoscope.estimation.kernel.sample_steps import ARMED, SAMPLE, KernelSpec
+from servoscope.estimation.kernel.sample_steps import ARMED, SAMPLE
+from servoscope.estimation.kernel.spec import KernelSpec
 from servoscope.estimation.recursion import Recursion
 from servoscope.export.image import fingerprint
 

@@ -28,7 +28,7 @@ def export_st(baseline: Baseline, name: str = NAME, *, only_coefficients: bool =
     Parameters
     ----------
     baseline
-        Of one operating point, with an estimator whose P stays.
+        Of one operating point.
     name
         Of the function block.
     only_coefficients
@@ -58,6 +58,7 @@ def _words(made: ExportConstants) -> dict[str, Any]:
         "number": size.floats,
         "counter": HEADER_SIZE,
         "cusum": max(size.watched, 1),
+        "private": max(size.extra, 1),
         "regressor": size.rows,
         "whitened": made.spec.columns + 1,
         "constant": len(made.table),
@@ -75,6 +76,7 @@ def _words(made: ExportConstants) -> dict[str, Any]:
             "numbers": _list(made.start[HEADER_SIZE:begin]),
             "counters": _list(made.start[:HEADER_SIZE]),
             "cusums": _list(np.zeros(last["cusum"])),
+            "private": f"[{last['private']}(0.0)]",
             "healthy": _list(x for H in made.healthy.H for x in (H.real, H.imag)),
             "constants": "\n".join(wrapped(map(st_literal, made.table))).rstrip(","),
             "temporaries": _declarations(texts),
@@ -122,9 +124,8 @@ def _indented(lines: Iterable[str], depth: int) -> str:
 
 
 def _declarations(texts: StepTexts) -> str:
-    numbers, flags = temporaries(texts)
     lines = []
-    for names, kind in ((numbers, "LREAL"), (flags, "BOOL")):
+    for kind, names in temporaries(texts).items():
         for begin in range(0, len(names), 16):
             lines.append(f"    {', '.join(names[begin : begin + 16])} : {kind};")
     return "\n".join(lines)

@@ -7,12 +7,12 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from servoscope.core.jit.c_source import CBuilder, CRows, c_literal
+from servoscope.core.jit.c_source import CPrinter, CRows, c_literal
 from servoscope.estimation import estimators
 from servoscope.estimation.kernel.cusum import update_cusum, update_cusum_by_sums
 from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
-from servoscope.estimation.kernel.sample_steps import TILE, KernelSpec, SampleSteps
-from servoscope.export.estimator_c import translate_update
+from servoscope.estimation.kernel.sample_steps import TILE, SampleSteps
+from servoscope.estimation.kernel.spec import KernelSpec
 
 __all__ = ["step_functions"]
 
@@ -32,14 +32,15 @@ def _functions(spec: KernelSpec, members: int, single: bool) -> list[str]:
     """Return the functions; the type of most numbers is called `number` there, counters are doubles always."""
     size = spec.sizes
     estimator = estimators.load_estimator(spec.estimator)
-    steps = SampleSteps(spec, getattr(estimator, "steady_gain", None), single_lane=True)
+    steps = SampleSteps(spec, estimator, single_lane=True)
+
+    def update(s: CRows, h: CRows, v: CRows, shadow: CRows, e: CRows, extra: Any = None) -> None:
+        steps.update_estimate(CRows(s.printer, "c"), s, h, v, shadow, e, extra)
+
     made = [_begin_filters(steps, single), _advance_filters(steps, single)]
     made.append(_function("reset_noise", STATE, steps.reset_noise, single))
-    if size.steady:
-        update = _traced("update_estimate", (*STATE, *REGRESSORS, "number *e"), steps.update_estimate, single)
-        made.append(update)
-    else:
-        made += _general_update(spec, steps)
+    private = () if size.steady else ("double *extra",)
+    made.append(_function("update_estimate", (*STATE, *REGRESSORS, "number *e", *private), update, single))
     if size.shadow:
         made.append(_function("begin_evaluation", STATE, steps.begin_evaluation, single))
     if size.watched:
@@ -55,20 +56,20 @@ def _function(
     body: Callable[..., Any],
     single: bool,
     places: Mapping[str, dict[int, str]] | None = None,
-    extra: Callable[[CBuilder], tuple[Any, ...]] = lambda builder: (),
+    extra: Callable[[CPrinter], tuple[Any, ...]] = lambda printer: (),
 ) -> str:
     """Return a function of C: `body` is called with one array per parameter that is a pointer, and with `extra`."""
-    builder = CBuilder(single)
+    printer = CPrinter(single)
     rows = [
-        CRows(builder, name, wide="double" in kind)
+        CRows(printer, name, wide="double" in kind)
         for kind, star, name in (parameter.partition("*") for parameter in parameters)
         if star
     ]
-    rows += [CRows(builder, "", place) for place in (places or {}).values()]
-    body(*rows, *extra(builder))
+    rows += [CRows(printer, "", place) for place in (places or {}).values()]
+    body(*rows, *extra(printer))
     for row in rows:
         row.flush()
-    return format_function(f"static void {name}", parameters, builder.text())
+    return format_function(f"static void {name}", parameters, [*printer.declarations(), *printer.lines()])
 
 
 def format_function(head: str, parameters: tuple[str, ...], lines: list[str]) -> str:
@@ -80,64 +81,26 @@ def format_function(head: str, parameters: tuple[str, ...], lines: list[str]) ->
     return f"{head}({', '.join(parameters)})\n{{\n{unused}{text}\n}}"
 
 
-def _traced(name: str, parameters: tuple[str, ...], step: Callable[..., Any], single: bool) -> str:
-    """Return a step that takes the constants first, then state and counters, then the other arrays."""
-    return _function(name, parameters, lambda s, h, *rest: step(CRows(s.builder, "c"), s, h, *rest), single)
-
-
 def _begin_filters(steps: SampleSteps, single: bool) -> str:
     def body(s: CRows, h: CRows, tile: CRows) -> None:
-        steps.begin_filters(CRows(s.builder, "c"), s, h, tile, 0)
+        steps.begin_filters(CRows(s.printer, "c"), s, h, tile, 0)
 
     return _function("begin_filters", (*STATE, *SAMPLE_PARAMETERS), body, single, {"tile": SAMPLE})
 
 
 def _advance_filters(steps: SampleSteps, single: bool) -> str:
     def body(s: CRows, h: CRows, v: CRows, shadow: CRows, status: CRows, tile: CRows, due: Any) -> None:
-        steps.advance_filters(CRows(s.builder, "c"), s, h, status, v, shadow, tile, 0, due)
+        steps.advance_filters(CRows(s.printer, "c"), s, h, status, v, shadow, tile, 0, due)
 
     parameters = (*STATE, *REGRESSORS, "double *status", *SAMPLE_PARAMETERS, "int due")
     return _function(
-        "advance_filters", parameters, body, single, {"tile": SAMPLE}, lambda builder: (builder.condition("due"),)
+        "advance_filters", parameters, body, single, {"tile": SAMPLE}, lambda printer: (printer.condition("due"),)
     )
-
-
-def _general_update(spec: KernelSpec, steps: SampleSteps) -> list[str]:
-    """Return the functions of an estimator with a P of its own, in the order of `kernel.tile.learn_general`."""
-    n, rows, to, at = spec.sizes.n, spec.sizes.rows, dict(spec.to), dict(spec.at)
-    module = estimators.load_estimator(spec.estimator)
-    pointers = ("theta", "P", "P_d", "phi", "z", "K", "extra")
-    read_only = ("P_d", "phi", "z")
-    parameters = [f"{'const ' if name in read_only else ''}double *{name}" for name in pointers]
-    parameters[3:3] = ["double R", "double memory", "double eta"]
-    update = format_function("static int update", tuple(parameters), translate_update(module, n).splitlines())
-    lines = [
-        f"double k[{n + 2}];",
-        "double residual = v[0];",
-        "int i;",
-        "int refused;",
-        f"for (i = 0; i < {n}; i++) {{",
-        f"    const double part = v[1 + i] * s[{to['theta']} + i];",
-        "    residual = residual - part;",
-        "}",
-        f"refused = update(&s[{to['theta']}], &s[{to['P']}], &c[{at['P_d']}], c[{at['R']}], c[{at['memory']}], v[0], "
-        f"&v[1], &v[{rows - n}], k, extra);",
-        f"k[{n}] = residual;",
-        f"k[{n + 1}] = (double)refused;",
-        "record_update(s, h, v, shadow, e, k);",
-    ]
-    parameters_of_both = (*STATE, *REGRESSORS, "number *e")
-    record = _traced("record_update", (*parameters_of_both, "double *k"), steps.record_update, False)
-    return [
-        update,
-        record,
-        format_function("static void update_estimate", (*parameters_of_both, "double *extra"), lines),
-    ]
 
 
 def _store_residual(steps: SampleSteps, single: bool) -> str:
     def body(s: CRows, h: CRows, status: CRows, e: CRows, w: CRows, when: CRows) -> None:
-        steps.store_residual(CRows(s.builder, "c"), s, h, status, e, w, when, 0)
+        steps.store_residual(CRows(s.printer, "c"), s, h, status, e, w, when, 0)
 
     return _function(
         "store_residual", (*STATE, "double *status", "number *e", "number *w", "double *when"), body, single
@@ -146,16 +109,16 @@ def _store_residual(steps: SampleSteps, single: bool) -> str:
 
 def _update_cusums(spec: KernelSpec, members: int, single: bool) -> str:
     """Return the loop over the CUSUMs; those that only fill up a vector stay at zero and are left out."""
-    builder, columns, watched, tail = CBuilder(single), spec.columns, spec.sizes.watched, dict(spec.at)["tail"]
-    table = [builder.read(f"c[{tail + watched * k} + j]") for k in range(spec.sums or columns + 1)]
-    observed = [builder.read(f"w[{k}]") for k in range(spec.sums or columns + 1)]
+    printer, columns, watched, tail = CPrinter(single), spec.columns, spec.sizes.watched, dict(spec.at)["tail"]
+    table = [printer.read(f"c[{tail + watched * k} + j]") for k in range(spec.sums or columns + 1)]
+    observed = [printer.read(f"w[{k}]") for k in range(spec.sums or columns + 1)]
     if spec.sums:
-        new = update_cusum_by_sums(table, observed, builder.read("g[j]"))
+        new = update_cusum_by_sums(table, observed, printer.read("g[j]"))
     else:
-        new = update_cusum(table[:-1], observed[:-1], observed[-1], builder.read("g[j]"), table[-1])
-    builder.store("g[j]", new)
-    builder.store("level", new)
-    inside = builder.text()
+        new = update_cusum(table[:-1], observed[:-1], observed[-1], printer.read("g[j]"), table[-1])
+    printer.store(new.kind, new.text, "g[j]")
+    printer.store(new.kind, new.text, "level")
+    inside = printer.lines()
     lines = [
         f"number top = {c_literal(0.0, single)};",
         "number level;",
@@ -193,7 +156,7 @@ def _evaluate(spec: KernelSpec, single: bool) -> str:
     steps, size = EvaluationSteps(spec), spec.sizes
 
     def body(s: CRows, h: CRows, q: CRows) -> None:
-        c = CRows(s.builder, "c")
+        c = CRows(s.printer, "c")
         steps.write_evaluation(c, s, h, q)
         for f in range(size.frequencies):
             steps.write_response(c, s, f, q)

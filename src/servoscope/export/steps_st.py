@@ -6,13 +6,13 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from servoscope.core.errors import BaselineError
 from servoscope.core.jit.c_source import CRows
-from servoscope.core.jit.st_source import STBuilder
+from servoscope.core.jit.st_source import STPrinter
 from servoscope.estimation import estimators
 from servoscope.estimation.kernel.cusum import update_cusum, update_cusum_by_sums
 from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
-from servoscope.estimation.kernel.sample_steps import TILE, KernelSpec, SampleSteps
+from servoscope.estimation.kernel.sample_steps import TILE, SampleSteps
+from servoscope.estimation.kernel.spec import KernelSpec
 
 __all__ = ["StepTexts", "step_texts"]
 
@@ -27,33 +27,25 @@ VARIABLES = {
     "w": "whitened",
     "g": "cusums",
     "when": "moment",
+    "extra": "private_state",
 }
-TEMPORARY = re.compile(r"\b[tb]\d+\b")
+TEMPORARY = re.compile(r"\b[tbkx]\d+\b")
+KINDS = {"t": "LREAL", "b": "BOOL", "k": "DINT", "x": "DINT"}  # of temporaries, by their first letter
 
 StepTexts = dict[str, list[str]]
 
 
 def step_texts(spec: KernelSpec, members: int) -> StepTexts:
-    """Return the statements of each step by its name; `members` is the number of CUSUMs.
-
-    Raises
-    ------
-    BaselineError
-        If the estimator's P moves: its loops and branches are translated to C only.
-    """
+    """Return the statements of each step by its name; `members` is the number of CUSUMs."""
     size = spec.sizes
-    if not size.steady:
-        raise BaselineError(
-            f"[monitor] estimator = {spec.estimator!r} cannot be exported as Structured Text: take akf, or export C"
-        )
-    steps = SampleSteps(spec, estimators.load_estimator(spec.estimator).steady_gain, single_lane=True)
+    steps = SampleSteps(spec, estimators.load_estimator(spec.estimator), single_lane=True)
     texts = {
         "begin_filters": _traced(
             lambda c, s, h, tile: steps.begin_filters(c, s, h, tile, 0), ("c", "s", "h"), tile=SIGNALS
         ),
         "advance_filters": _advance_filters(steps),
         "reset_noise": _traced(steps.reset_noise, ("s", "h")),
-        "update_estimate": _traced(steps.update_estimate, ("c", "s", "h", "v", "shadow", "e")),
+        "update_estimate": _traced(steps.update_estimate, ("c", "s", "h", "v", "shadow", "e", "extra")),
         "begin_evaluation": _traced(steps.begin_evaluation, ("s", "h")),
         "store_residual": [],
         "update_cusums": [],
@@ -75,48 +67,50 @@ def step_texts(spec: KernelSpec, members: int) -> StepTexts:
     return texts
 
 
-def temporaries(texts: StepTexts) -> tuple[list[str], list[str]]:
-    """Return the names of numbers and of conditions that the statements need between them."""
+def temporaries(texts: StepTexts) -> dict[str, list[str]]:
+    """Return the names of the numbers, conditions and whole numbers that the statements need between them, by type."""
     found = {name for lines in texts.values() for line in lines for name in TEMPORARY.findall(line)}
-    names = sorted(found, key=lambda name: int(name[1:]))
-    return [name for name in names if name[0] == "t"], [name for name in names if name[0] == "b"]
+    kinds: dict[str, list[str]] = {kind: [] for kind in KINDS.values()}
+    for name in sorted(found, key=lambda name: (name[0], int(name[1:]))):
+        kinds[KINDS[name[0]]].append(name)
+    return kinds
 
 
 def _traced(
-    body: Callable[..., Any], parameters: Sequence[str], /, builder: STBuilder | None = None, **places: dict[int, str]
+    body: Callable[..., Any], parameters: Sequence[str], /, printer: STPrinter | None = None, **places: dict[int, str]
 ) -> list[str]:
     """Return the statements of a step, which is called with one array per parameter and per table of places."""
-    builder = builder or STBuilder()
-    rows = [CRows(builder, VARIABLES.get(name, name)) for name in parameters]
-    rows += [CRows(builder, "", place) for place in places.values()]
+    printer = printer or STPrinter()
+    rows = [CRows(printer, VARIABLES.get(name, name)) for name in parameters]
+    rows += [CRows(printer, "", place) for place in places.values()]
     body(*rows)
     for row in rows:
         row.flush()
-    return builder.text()
+    return printer.lines()
 
 
 def _advance_filters(steps: SampleSteps) -> list[str]:
-    builder = STBuilder()
-    due = builder.condition("update_due")
+    printer = STPrinter()
+    due = printer.condition("update_due")
 
     def body(c: CRows, s: CRows, h: CRows, status: CRows, v: CRows, shadow: CRows, tile: CRows) -> None:
         steps.advance_filters(c, s, h, status, v, shadow, tile, 0, due)
 
-    return _traced(body, ("c", "s", "h", "status", "v", "shadow"), builder, tile=SIGNALS)
+    return _traced(body, ("c", "s", "h", "status", "v", "shadow"), printer, tile=SIGNALS)
 
 
 def _update_cusums(spec: KernelSpec, members: int) -> list[str]:
     """Return the loop over the CUSUMs; those that only fill up a vector stay at zero and are left out."""
-    builder, columns, watched, tail = STBuilder(), spec.columns, spec.sizes.watched, dict(spec.at)["tail"]
-    table = [builder.read(f"constants[{tail + watched * k} + j]") for k in range(spec.sums or columns + 1)]
+    printer, columns, watched, tail = STPrinter(), spec.columns, spec.sizes.watched, dict(spec.at)["tail"]
+    table = [printer.read(f"constants[{tail + watched * k} + j]") for k in range(spec.sums or columns + 1)]
     if spec.sums:
-        sums = [builder.read(f"numbers[{dict(spec.to)['sums'] + k}]") for k in range(spec.sums)]
-        new = update_cusum_by_sums(table, sums, builder.read("cusums[j]"))
+        sums = [printer.read(f"numbers[{dict(spec.to)['sums'] + k}]") for k in range(spec.sums)]
+        new = update_cusum_by_sums(table, sums, printer.read("cusums[j]"))
     else:
-        *psi, e = [builder.read(f"whitened[{k}]") for k in range(columns + 1)]
-        new = update_cusum(table[:-1], psi, e, builder.read("cusums[j]"), table[-1])
-    builder.store("cusums[j]", new)
-    inside = [*builder.text(), "top[0] := SEL(top[0] > cusums[j], cusums[j], top[0]);"]
+        *psi, e = [printer.read(f"whitened[{k}]") for k in range(columns + 1)]
+        new = update_cusum(table[:-1], psi, e, printer.read("cusums[j]"), table[-1])
+    printer.store(new.kind, new.text, "cusums[j]")
+    inside = [*printer.lines(), "top[0] := SEL(top[0] > cusums[j], cusums[j], top[0]);"]
     return [
         "top[0] := 0.0;",
         f"FOR j := 0 TO {members - 1} DO",

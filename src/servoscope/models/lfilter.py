@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import functools
+from typing import Any
 
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit.array_function import ArrayFunction
 
 
 def lfilter(
@@ -24,16 +24,16 @@ def lfilter(
     b, a = (np.pad(np.asarray(c, dtype=np.float64), (0, order + 1 - len(c))) for c in (numerator, denominator))
     out = np.empty_like(columns)
     z = np.zeros((columns.shape[1], order + 1)) if state is None else state
-    _lfilter_kernel(b, a, columns, z, out)
+    _lfilter_loop(b, a, columns, z, out)
     return out.reshape(signals.shape)
 
 
-@functools.partial(kernel, heap=False)
-def _lfilter_kernel(b: FloatArray, a: FloatArray, x: FloatArray, z: FloatArray, out: FloatArray) -> None:
+@ArrayFunction
+def _lfilter_loop(printer: Any, b: Any, a: Any, x: Any, z: Any, out: Any) -> None:
     """Write what leaves the filter; z (m, order + 1) is its state, whose last one stays zero."""
-    for m in range(x.shape[1]):
-        for k in range(len(x)):
+    for m in printer.loop(0, x.shape[1]):
+        for k in printer.loop(0, x.shape[0]):
             y = b[0] * x[k, m] + z[m, 0]
-            for i in range(len(b) - 1):
+            for i in printer.loop(0, b.shape[0] - 1):
                 z[m, i] = b[i + 1] * x[k, m] + z[m, i + 1] - a[i + 1] * y
             out[k, m] = y

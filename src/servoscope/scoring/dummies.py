@@ -42,7 +42,9 @@ def cusum(residuals: FloatArray, k: float = 0.5, h: float = 5.0) -> BoolArray:
     """
     from servoscope.scoring.kernels import run_cusum
 
-    return run_cusum(np.ascontiguousarray(residuals, dtype=np.float64), k, h)
+    alarm = np.zeros(len(residuals), dtype=np.bool_)
+    run_cusum(np.ascontiguousarray(residuals, dtype=np.float64), float(k), float(h), alarm)
+    return alarm
 
 
 DUMMIES: Mapping[str, Detector] = {"always": always, "never": never, "CUSUM": cusum}

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit import maximum, where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
 
 
-@kernel
-def run_cusum(x: FloatArray, k: float, h: float) -> BoolArray:
-    """Return the alarms (N,) of `servoscope.scoring.cusum`."""
-    alarm = np.zeros(x.size, dtype=np.bool_)
-    up = 0.0
-    down = 0.0
-    for t in range(x.size):
-        up = max(0.0, up + x[t] - k)
-        down = max(0.0, down - x[t] - k)
-        if up > h or down > h:
-            alarm[t] = True
-            up = 0.0
-            down = 0.0
-    return alarm
+@ArrayFunction
+def run_cusum(printer: Any, x: Any, k: Any, h: Any, alarm: Any) -> None:
+    """Write the alarms (N,) of `servoscope.scoring.cusum`, 0 or 1."""
+    up, down = Variable(printer, 0.0), Variable(printer, 0.0)
+    for t in printer.loop(0, x.shape[0]):
+        up.value, down.value = maximum(up.value + x[t] - k, 0.0), maximum(down.value - x[t] - k, 0.0)
+        exceeded = (up.value > h) | (down.value > h)
+        alarm[t] = where(exceeded, printer.whole(1), 0)
+        up.value, down.value = where(exceeded, 0.0, up.value), where(exceeded, 0.0, down.value)

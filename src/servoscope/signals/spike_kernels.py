@@ -2,74 +2,68 @@
 
 from __future__ import annotations
 
-import functools
+import math
+from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from servoscope.core.arrays import FloatArray, IndexArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit import maximum, minimum, where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
 
 
-@functools.partial(kernel, heap=False)
+@ArrayFunction
 def write_excursions(
-    z: FloatArray,
-    run: npt.NDArray[np.int32],
-    at: IndexArray,
-    width: int,
-    smallest: float,
-    at_edge: float,
-    start: IndexArray,
-    height: FloatArray,
-) -> int:
+    printer: Any, z: Any, run: Any, at: Any, width: Any, smallest: Any, at_edge: Any, start: Any, height: Any
+) -> Any:
     """Write where `width` samples of one run stand above or below both neighbours, and how far; return how many do.
 
     They are looked for at some places. They must do so by more than `smallest`; at the edge of a run, where there is
     one neighbour, by more than `at_edge`.
     """
-    found = 0
-    for i in at:
-        last = i + width - 1
-        if last >= len(z) or run[i] != run[last]:
-            continue
-        low, high = z[i], z[i]
-        for k in range(i + 1, last + 1):
-            low, high = min(low, z[k]), max(high, z[k])
-        before = i > 0 and run[i - 1] == run[i]
-        after = last + 1 < len(z) and run[last + 1] == run[last]
-        if not (before or after):
-            continue
-        below = max(z[i - 1] if before else -np.inf, z[last + 1] if after else -np.inf)
-        above = min(z[i - 1] if before else np.inf, z[last + 1] if after else np.inf)
-        size = max(low - below, above - high)
-        if size > (smallest if before and after else at_edge):
-            start[found], height[found] = i, size
-            found += 1
-    return found
+    count, end = Variable(printer, 0), z.shape[0] - 1
+    for place in printer.loop(0, at.shape[0]):
+        first = at[place]
+        last = first + width - 1
+        inside = minimum(last, end)
+        with printer.when((last <= end) & run[first].is_equal(run[inside])):
+            low, high = Variable(printer, z[first]), Variable(printer, z[first])
+            for k in printer.loop(first + 1, last + 1):
+                low.value, high.value = minimum(low.value, z[k]), maximum(high.value, z[k])
+            left, right = maximum(first - 1, 0), minimum(last + 1, end)
+            before = (first > 0) & run[left].is_equal(run[first])
+            after = (last < end) & run[right].is_equal(run[last])
+            below = maximum(where(before, z[left], -math.inf), where(after, z[right], -math.inf))
+            above = minimum(where(before, z[left], math.inf), where(after, z[right], math.inf))
+            size = maximum(low.value - below, above - high.value)
+            with printer.when((before | after) & (size > where(before & after, smallest, at_edge))):
+                start[count.value], height[count.value] = first, size
+                count.value = count.value + 1
+    return count.value
 
 
-@functools.partial(kernel, heap=False)
-def write_local_steps(z: FloatArray, start: IndexArray, width: IndexArray, around: FloatArray, out: FloatArray) -> None:
+@ArrayFunction
+def write_local_steps(printer: Any, z: Any, start: Any, width: Any, around: Any, out: Any) -> None:
     """Write the upper quartile of the steps around places of some width; `out` has their number.
 
     Mirrored at the ends, a place's own width away, so that one at the end is not compared with itself; of the
     steps on either side, as many are taken as `around` has room for.
     """
-    count, size = len(z) - 1, len(around)
-    for i in range(len(start)):
-        for k in range(size):
+    count, size = z.shape[0] - 1, around.shape[0]
+    for i in printer.loop(0, start.shape[0]):
+        for k in printer.loop(0, size):
             offset = k - size // 2
-            at = start[i] + offset if offset < 0 else start[i] + width[i] + offset
-            if at < 0:
-                at = width[i] - at
-            if at >= count:
-                at = 2 * count - 2 - at - width[i]
-            at = min(max(at, 0), count - 1)
-            step, j = abs(z[at + 1] - z[at]), k
-            while j > 0 and around[j - 1] > step:  # sorted as they come: few, and a tenth of the compiling
-                around[j] = around[j - 1]
-                j -= 1
-            around[j] = step
-        place = 0.75 * (size - 1)
-        below = int(place)
-        out[i] = around[below] + (around[below + 1] - around[below]) * (place - below)
+            place = where(offset < 0, start[i] + offset, start[i] + width[i] + offset)
+            place = where(place < 0, width[i] - place, place)
+            place = where(place >= count, 2 * count - 2 - place - width[i], place)
+            place = minimum(maximum(place, 0), count - 1)
+            step, j = abs(z[place + 1] - z[place]), Variable(printer, k)
+
+            def is_later(step: Any = step, j: Any = j) -> Any:
+                return (j.value > 0) & (around[maximum(j.value - 1, 0)] > step)
+
+            for _ in printer.loop_while(is_later):  # sorted as they come: few
+                around[j.value] = around[j.value - 1]
+                j.value = j.value - 1
+            around[j.value] = step
+        place = (printer.number(size) - 1.0) * 0.75
+        below = printer.truncate(place)
+        out[i] = around[below] + (around[below + 1] - around[below]) * (place - printer.number(below))

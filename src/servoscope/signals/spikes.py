@@ -160,7 +160,7 @@ def _find_excursions(
     z: FloatArray, run: npt.NDArray[np.int32], at: IndexArray, width: int, smallest: float, at_edge: float
 ) -> tuple[IndexArray, FloatArray]:
     """Find at which places `width` samples stand above or below both neighbours: where (n,), and heights (n,)."""
-    from servoscope.signals.spike_kernels import write_excursions  # late: loads numba
+    from servoscope.signals.spike_kernels import write_excursions
 
     start, height, count = np.empty(at.size, dtype=np.intp), np.empty(at.size), 0
     for places in outofcore.iter_chunks(0, at.size, z, run, at_once=CHUNK_PLACES):
@@ -170,7 +170,7 @@ def _find_excursions(
 
 def _local_step_quartile(z: FloatArray, start: IndexArray, width: IndexArray) -> FloatArray:
     """Upper quartile of the steps around each place, shape (n,)."""
-    from servoscope.signals.spike_kernels import write_local_steps  # late: loads numba
+    from servoscope.signals.spike_kernels import write_local_steps
 
     if start.size == 0 or z.size < 2:
         return np.zeros(start.size)

@@ -130,12 +130,15 @@ class LoopSimulation:
             self._kernel, states = nonlinear_run(loop, plants, settings), 5
         elif loop.plant.extras:
             motion, states = linear_kernels.axis_constants(plants, loop), 2
-            self._kernel = lambda which, *signals: linear_kernels.run_axis(motion, which, settings, *signals)
+            order = 2 if "inertia" in plants[0].names else 1
+            self._kernel = lambda which, *signals: linear_kernels.run_axis(
+                motion, which, settings, *signals, order=order
+            )
         else:
             A, b_next, b_now, b_late, c = (np.stack([each[i] for each in discrete]) for i in range(5))
             states = c.shape[1]
             self._kernel = lambda which, *signals: linear_kernels.run_linear(
-                A, b_next, b_now, b_late, c, np.zeros(c.shape[1]), which, settings, *signals
+                A, b_next, b_now, b_late, c, which, settings, *signals, n=states
             )
         self._state, self._past_input = (
             np.zeros(linear_kernels.HEADER_SIZE + states),

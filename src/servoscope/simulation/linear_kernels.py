@@ -1,22 +1,22 @@
-"""The compiled inner loops: PI controller and plant, sample by sample; importing this file imports numba.
+"""The compiled inner loops: PI controller and plant, sample by sample.
 
 The state that a loop carries from chunk to chunk is one row of floats, zero before the first sample: the controller's
 sum, the number of the last plant (counted from 1), and the plant's state. What acts on the plant has the m + 2 samples
-before the chunk in front of its own. All arrays come from outside: kernels that neither allocate nor slice compile
-three times as fast.
+before the chunk in front of its own.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from servoscope.core.arrays import FloatArray, IntArray
+from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
-from servoscope.core.jit import kernel, subroutine
+from servoscope.core.jit import maximum, minimum, where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
 from servoscope.models.discretise import transition
 from servoscope.models.plants import Column, Plant
 
@@ -43,7 +43,6 @@ class ControllerConstants(NamedTuple):
 class AxisConstants(NamedTuple):
     """A motor axis of order 1 or 2 per plant p and direction d (0 forward, 1 backward) over one sub-step."""
 
-    order: int
     Phi: FloatArray  # (p, d, 2, 2), of (y, y')
     g: FloatArray  # (p, d, 2), response to a unit force
     gain: FloatArray  # (p,), input_gain
@@ -58,10 +57,9 @@ class AxisConstants(NamedTuple):
     speed: bool  # whether y is the speed
 
 
-@subroutine
 def control_step(
-    settings: ControllerConstants, r: float, n_u: float, n_y: float, free: float, share: float, total: float
-) -> tuple[float, float, float, float]:
+    settings: ControllerConstants, r: Any, n_u: Any, n_y: Any, free: Any, share: Any, total: Any
+) -> tuple[Any, Any, Any, Any]:
     """One update u = k_p e + k_i T sum e; returns u, u after the limits, what acts on the plant, the new sum.
 
     ``free`` is y without the present u and ``share`` how much of u reaches y at once, with a first-order
@@ -69,57 +67,57 @@ def control_step(
     """
     gain = settings.proportional_gain + settings.integral_gain
     u = (gain * (r - n_y - free - share * n_u) + total) / (1.0 + gain * share)
-    limited = min(max(u, settings.low), settings.high)
-    passed = 0.0 if settings.deadzone_low <= limited <= settings.deadzone_high else limited
+    limited = minimum(maximum(u, settings.low), settings.high)
+    passed = where((limited >= settings.deadzone_low) & (limited <= settings.deadzone_high), 0.0, limited)
     e = r - n_y - free - share * (passed + n_u)
     return gain * e + total, limited, passed + n_u, total + settings.integral_gain * e
 
 
-@functools.partial(kernel, heap=False)
+@ArrayFunction
 def run_linear(
-    A: FloatArray, b_next: FloatArray, b_now: FloatArray, b_late: FloatArray, c: FloatArray, fresh: FloatArray,
-    which: IntArray, settings: ControllerConstants, r: FloatArray, n_u: FloatArray, n_y: FloatArray, s: FloatArray,
-    u: FloatArray, limited: FloatArray, acting: FloatArray, y: FloatArray,
+    printer: Any, A: Any, b_next: Any, b_now: Any, b_late: Any, c: Any, which: Any, settings: ControllerConstants,
+    r: Any, n_u: Any, n_y: Any, s: Any, u: Any, limited: Any, acting: Any, y: Any, *, n: int,
 ) -> None:  # fmt: skip
     """Run the closed loop of linear plants; which[k] names the plant from sample k to k + 1.
 
-    Shapes: A (p, n, n), b_next, b_now, b_late, c (p, n), fresh (n,) to work in; which, r, n_u, n_y (N,). Writes u, u
-    after the limits, and y without noise, each (N,), what acts on the plant (m + 2 + N,), and carries s (HEAD + n,) on.
+    Shapes: A (p, n, n), b_next, b_now, b_late, c (p, n); which, r, n_u, n_y (N,). Writes u, u after the limits, and y
+    without noise, each (N,), what acts on the plant (m + 2 + N,), and carries s (HEAD + n,) on.
     """
-    N, n, m = len(r), len(fresh), settings.delay_samples
-    past, total, last = m + 2, s[INTEGRAL], int(s[LAST_PLANT])
-    for k in range(N):
-        p = which[k - 1] if k > 0 else max(last - 1, 0)
-        free = 0.0
-        share = 0.0
-        if k > 0 or last > 0:
-            ahead = acting[past + k - m] if m > 0 else 0.0
-            now = acting[past + k - 1 - m]
-            late = acting[past + k - 2 - m]
+    N, m = r.shape[0], settings.delay_samples
+    past, total, last = m + 2, Variable(printer, s[INTEGRAL]), printer.truncate(s[LAST_PLANT])
+    at_once: Any = m <= 0
+    for k in printer.loop(0, N):
+        p = where(k > 0, which[maximum(k - 1, 0)], maximum(last - 1, 0))
+        free, share = Variable(printer, 0.0), Variable(printer, 0.0)
+        goes_on = (k > 0) | (last > 0)
+        with printer.when(goes_on):
+            ahead = where(m > 0, acting[past + k - m], 0.0)
+            now, late, state = (
+                acting[past + k - 1 - m],
+                acting[past + k - 2 - m],
+                [s[HEADER_SIZE + j] for j in range(n)],
+            )
             for i in range(n):
                 value = b_next[p, i] * ahead + b_now[p, i] * now + b_late[p, i] * late
                 for j in range(n):
-                    value += A[p, i, j] * s[HEADER_SIZE + j]
-                fresh[i] = value
-                free += c[p, i] * value
-                if m == 0:
-                    share += c[p, i] * b_next[p, i]
+                    value = value + A[p, i, j] * state[j]
+                s[HEADER_SIZE + i] = value
+                free.value = free.value + c[p, i] * value
+                share.value = share.value + where(at_once, c[p, i] * b_next[p, i], 0.0)
+        step = control_step(settings, r[k], n_u[k], n_y[k], free.value, share.value, total.value)
+        u[k], limited[k], acting[past + k], total.value = step
+        with printer.when(at_once & goes_on):
             for i in range(n):
-                s[HEADER_SIZE + i] = fresh[i]
-        u[k], limited[k], drive, total = control_step(settings, r[k], n_u[k], n_y[k], free, share, total)
-        acting[past + k] = drive
-        if m == 0 and (k > 0 or last > 0):
-            for i in range(n):
-                s[HEADER_SIZE + i] += b_next[p, i] * drive
-        y[k] = free + share * drive
-    s[INTEGRAL] = total
-    s[LAST_PLANT] = which[N - 1] + 1 if N > 0 else last
+                s[HEADER_SIZE + i] = s[HEADER_SIZE + i] + b_next[p, i] * step[2]
+        y[k] = free.value + share.value * step[2]
+    s[INTEGRAL] = total.value
+    s[LAST_PLANT] = printer.number(where(N > 0, which[maximum(N - 1, 0)] + 1, last))
 
 
-@functools.partial(kernel, heap=False)
+@ArrayFunction
 def run_axis(
-    motion: AxisConstants, which: IntArray, settings: ControllerConstants, r: FloatArray, n_u: FloatArray,
-    n_y: FloatArray, s: FloatArray, u: FloatArray, limited: FloatArray, acting: FloatArray, y: FloatArray,
+    printer: Any, motion: AxisConstants, which: Any, settings: ControllerConstants, r: Any, n_u: Any, n_y: Any,
+    s: Any, u: Any, limited: Any, acting: Any, y: Any, *, order: int,
 ) -> None:  # fmt: skip
     """Run the closed loop of axes with friction; arguments as in `run_linear`, the plant's state has n = 2.
 
@@ -127,52 +125,62 @@ def run_axis(
     below the Coulomb friction, and then the axis sticks; otherwise the whole Coulomb friction is. So it
     stops without chatter.
     """
-    m, past = settings.delay_samples, settings.delay_samples + 2
-    position, speed, total = s[HEADER_SIZE], s[HEADER_SIZE + 1], s[INTEGRAL]
-    for k in range(len(r)):
-        y[k] = speed if motion.speed else position
-        u[k], limited[k], acting[past + k], total = control_step(settings, r[k], n_u[k], n_y[k], y[k], 0.0, total)
-        p = which[k]
+    m = settings.delay_samples
+    past, total = m + 2, Variable(printer, s[INTEGRAL])
+    position, speed = Variable(printer, s[HEADER_SIZE]), Variable(printer, s[HEADER_SIZE + 1])
+    for k in printer.loop(0, r.shape[0]):
+        output = speed.value if motion.speed else position.value
+        y[k] = output
+        u[k], limited[k], acting[past + k], total.value = control_step(
+            settings, r[k], n_u[k], n_y[k], output, 0.0, total.value
+        )
         now, late = acting[past + k - m], acting[past + k - 1 - m]
-        for step in range(motion.steps):
-            arrived = (step + 0.5) / motion.steps >= settings.delay_fraction
-            position, speed = _axis_step(motion, p, position, speed, motion.gain[p] * (now if arrived else late))
-    s[HEADER_SIZE], s[HEADER_SIZE + 1], s[INTEGRAL] = position, speed, total
+        for step in printer.loop(0, motion.steps):
+            arrived = (printer.number(step) + 0.5) / printer.number(motion.steps) >= settings.delay_fraction
+            drive = motion.gain[which[k]] * where(arrived, now, late)
+            _advance_axis(printer, motion, which[k], position, speed, drive, order)
+    s[HEADER_SIZE], s[HEADER_SIZE + 1], s[INTEGRAL] = position.value, speed.value, total.value
 
 
-@kernel
-def run_free_axis(motion: AxisConstants, position: float, speed: float, u: FloatArray, y: FloatArray) -> None:
+@ArrayFunction
+def run_free_axis(
+    printer: Any, motion: AxisConstants, position: Any, speed: Any, u: Any, y: Any, *, order: int
+) -> None:
     """Run the first axis driven by what acts on it, u (N,), from a position and a speed on; y (N,) is filled."""
-    for k in range(len(u)):
-        y[k] = speed if motion.speed else position
-        for _ in range(motion.steps):
-            position, speed = _axis_step(motion, 0, position, speed, motion.gain[0] * u[k])
+    at, v = Variable(printer, position), Variable(printer, speed)
+    for k in printer.loop(0, u.shape[0]):
+        y[k] = v.value if motion.speed else at.value
+        for _ in printer.loop(0, motion.steps):
+            _advance_axis(printer, motion, 0, at, v, motion.gain[0] * u[k], order)
 
 
-@kernel
-def _axis_step(motion: AxisConstants, p: int, position: float, speed: float, drive: float) -> tuple[float, float]:
-    drive -= motion.offset[p]
-    for w in range(motion.waves.shape[1]):
-        drive -= motion.waves[p, w, 0] * np.sin(motion.waves[p, w, 1] * position + motion.waves[p, w, 2])
-    push = drive - motion.stiffness[p] * position
-    heading = speed if speed != 0.0 and motion.order == 2 else push
-    d = 0 if heading >= 0.0 else 1
+def _advance_axis(
+    printer: Any, motion: AxisConstants, p: Any, position: Variable, speed: Variable, drive: Any, order: int
+) -> None:
+    """Write one sub-step of an axis, driven by a force."""
+    at, v, force = position.value, speed.value, Variable(printer, drive - motion.offset[p])
+    for w in printer.loop(0, motion.waves.shape[1]):
+        wave = motion.waves[p, w]
+        force.value = force.value - wave[0] * printer.call_library("sin", wave[1] * at + wave[2])
+    drive = force.value
+    push = drive - motion.stiffness[p] * at
+    heading = where(v.is_equal(0.0), push, v) if order == 2 else push
+    d = where(heading >= 0.0, printer.whole(0), 1)
     Phi, g = motion.Phi[p, d], motion.g[p, d]
-    if motion.order == 1:
-        left = max(abs(push) - motion.coulomb[p], 0.0)
-        step = g[0] * (left if push > 0.0 else -left)
-        return position + step, step
-    coasting = Phi[1, 0] * position + Phi[1, 1] * speed + g[1] * drive
-    coulomb = motion.coulomb[p] + motion.stribeck[p, 0] / (1.0 + (motion.stribeck[p, 1] * speed) ** 2)
-    coulomb += motion.load[p, 0] * abs(np.sin(motion.load[p, 1] * position + motion.load[p, 2]))
-    if abs(coasting) <= coulomb * g[1]:
-        force = drive - coasting / g[1]
-        return Phi[0, 0] * position + Phi[0, 1] * speed + g[0] * force, 0.0
-    force = drive - coulomb if coasting > 0.0 else drive + coulomb
-    return (
-        Phi[0, 0] * position + Phi[0, 1] * speed + g[0] * force,
-        Phi[1, 0] * position + Phi[1, 1] * speed + g[1] * force,
-    )
+    if order == 1:
+        left = maximum(abs(push) - motion.coulomb[p], 0.0)
+        step = g[0] * where(push > 0.0, left, -left)
+        position.value, speed.value = at + step, step
+        return
+    coasting = Phi[1, 0] * at + Phi[1, 1] * v + g[1] * drive
+    slowness = motion.stribeck[p, 1] * v
+    coulomb = motion.coulomb[p] + motion.stribeck[p, 0] / (1.0 + slowness * slowness)
+    angle = motion.load[p, 1] * at + motion.load[p, 2]
+    coulomb = coulomb + motion.load[p, 0] * abs(printer.call_library("sin", angle))
+    sticks = abs(coasting) <= coulomb * g[1]
+    net = where(sticks, drive - coasting / g[1], where(coasting > 0.0, drive - coulomb, drive + coulomb))
+    position.value = Phi[0, 0] * at + Phi[0, 1] * v + g[0] * net
+    speed.value = where(sticks, 0.0, Phi[1, 0] * at + Phi[1, 1] * v + g[1] * net)
 
 
 SUB_STEPS = 20  # per sample; the axis stops and reverses to within one of them
@@ -195,7 +203,6 @@ def axis_constants(plants: Sequence[Plant], loop: Loop) -> AxisConstants:
     )
     columns = [_shaped_columns(plant) for plant in plants]
     return AxisConstants(
-        order=2 if "inertia" in values[0] else 1,
         Phi=np.array([[Phi for Phi, _ in pair] for pair in steps]),
         g=np.array([[g for _, g in pair] for pair in steps]),
         gain=np.array([plant.input_gain for plant in plants], dtype=np.float64),

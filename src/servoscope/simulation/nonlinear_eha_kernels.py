@@ -1,13 +1,16 @@
-"""The compiled loop of the nonlinear rig: controller, valve, oil, friction and stops; importing this imports numba."""
+"""The compiled loop of the nonlinear rig: controller, valve, oil, friction and stops."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel, subroutine
+from servoscope.core.jit import maximum, sqrt, where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Array, Variable
 from servoscope.simulation.linear_kernels import HEADER_SIZE, INTEGRAL, ControllerConstants, control_step
 
 
@@ -30,59 +33,49 @@ class RigConstants(NamedTuple):
     substeps: int
 
 
-@subroutine
-def derivative(p: RigConstants, row: FloatArray, x: FloatArray, drive: float, out: FloatArray) -> None:
-    """Write the time derivative of x = [y, y', p_L, spool, spool'] under a held drive to `out`; row as in `run_rig`."""
+def derivative(printer: Any, p: RigConstants, row: Any, x: Sequence[Any], drive: Any) -> list[Any]:
+    """Return the time derivative of x = [y, y', p_L, spool, spool'] under a held drive; row as in `run_rig`."""
     speed, pressure = x[1], x[2]
-    spool = x[3] if p.valve > 0.0 else drive
-    flow = row[0] * spool
+    has_valve = p.valve > 0.0
+    spool = where(has_valve, x[3], drive)
+    flow, friction = row[0] * spool, Variable(printer, row[3] * speed)
     if p.square_root:
-        left = 1.0 - pressure * row[1] if spool > 0.0 else 1.0 + pressure * row[1]
-        flow *= np.sqrt(left) if left >= 0.0 else -np.sqrt(-left)
-    friction = row[3] * speed
-    if p.coulomb + p.breakaway > 0.0:
+        left = where(spool > 0.0, 1.0 - pressure * row[1], 1.0 + pressure * row[1])
+        flow = flow * where(left >= 0.0, sqrt(left), -sqrt(-left))
+    with printer.when(p.coulomb + p.breakaway > 0.0):
         ratio = speed / p.stribeck_speed
-        friction += (p.coulomb + p.breakaway * np.exp(-ratio * ratio)) * np.tanh(speed / p.smooth_speed)
-    out[0] = speed
-    out[1] = (p.area * pressure - friction - p.stiffness * x[0]) * p.mobility
-    out[2] = (flow - row[2] * pressure - p.area * speed) * row[4]
-    if p.valve > 0.0:
-        out[3] = x[4]
-        out[4] = p.valve * (p.valve * (drive - x[3]) - 2.0 * p.damping * x[4])
+        stribeck = p.coulomb + p.breakaway * printer.call_library("exp", -ratio * ratio)
+        friction.value = friction.value + stribeck * printer.call_library("tanh", speed / p.smooth_speed)
+    return [
+        speed,
+        (p.area * pressure - friction.value - p.stiffness * x[0]) * p.mobility,
+        (flow - row[2] * pressure - p.area * speed) * row[4],
+        where(has_valve, x[4], 0.0),
+        where(has_valve, p.valve * (p.valve * (drive - x[3]) - 2.0 * p.damping * x[4]), 0.0),
+    ]
 
 
-@subroutine
-def integrate_state(
-    p: RigConstants, row: FloatArray, x: FloatArray, drive: float, duration: float, k: FloatArray
-) -> None:
-    """Move the state x (5,) on under a held drive: Runge and Kutta's fourth order; k (5, 5) is room to work in.
+def integrate_state(printer: Any, p: RigConstants, row: Any, x: Any, drive: Any, duration: Any) -> None:
+    """Move the state x (5,) on under a held drive: Runge and Kutta's fourth order.
 
     A stop takes all momentum: beyond it the piston is put back and rests.
     """
-    steps = max(1, int(np.ceil(p.substeps * duration / p.T - 1e-9)))
-    h = duration / steps
-    at = k[4]
-    n = 5 if p.valve > 0.0 else 3
-    for _ in range(steps):
-        derivative(p, row, x, drive, k[0])
-        for i in range(n):
-            at[i] = x[i] + 0.5 * h * k[0, i]
-        derivative(p, row, at, drive, k[1])
-        for i in range(n):
-            at[i] = x[i] + 0.5 * h * k[1, i]
-        derivative(p, row, at, drive, k[2])
-        for i in range(n):
-            at[i] = x[i] + h * k[2, i]
-        derivative(p, row, at, drive, k[3])
-        for i in range(n):
-            x[i] += h / 6.0 * (k[0, i] + 2.0 * k[1, i] + 2.0 * k[2, i] + k[3, i])
-        if abs(x[0]) >= p.half_stroke:
-            x[0] = p.half_stroke if x[0] > 0.0 else -p.half_stroke
-            if x[0] * x[1] > 0.0:
-                x[1] = 0.0
+    steps = maximum(printer.truncate((printer.number(p.substeps) * duration / p.T - 1e-9).call("ceil")), 1)
+    h = duration / printer.number(steps)
+    for _ in printer.loop(0, steps):
+        begin, slopes = [x[i] for i in range(5)], []
+        at = begin
+        for share in (0.5, 0.5, 1.0, None):
+            slopes.append(derivative(printer, p, row, at, drive))
+            if share is not None:
+                at = [value + share * h * slope for value, slope in zip(begin, slopes[-1], strict=True)]
+        for i, (a, b, c, d) in enumerate(zip(*slopes, strict=True)):
+            x[i] = begin[i] + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+        with printer.when(abs(x[0]) >= p.half_stroke):
+            x[0] = where(x[0] > 0.0, p.half_stroke, -p.half_stroke)
+            x[1] = where(x[0] * x[1] > 0.0, 0.0, x[1])
 
 
-@kernel
 def run_rig(
     p: RigConstants, settings: ControllerConstants, rows: FloatArray, r: FloatArray, n_u: FloatArray,
     n_y: FloatArray, s: FloatArray, u: FloatArray, limited: FloatArray, acting: FloatArray, y: FloatArray,
@@ -93,22 +86,34 @@ def run_rig(
     n_u, n_y have shape (N,). Writes u, u after the limits, what acts on the valve before the delay (m + 2 + N,), and y;
     returns y as measured, load pressure and spool, each (N,).
     """
-    N, m = r.size, settings.delay_samples
-    measured, pressure, spool = np.empty(N), np.empty(N), np.empty(N)
-    x, room, past = s[HEADER_SIZE : HEADER_SIZE + 5], np.empty((5, 5)), m + 2
-    total = s[INTEGRAL]
-    for k in range(N):
-        y[k], pressure[k], spool[k] = x[0], x[2], x[3]
-        measured[k] = y[k] + n_y[k]
-        if p.resolution > 0.0:
-            measured[k] = p.resolution * np.rint(measured[k] / p.resolution)
-        error = measured[k] - y[k]
-        u[k], limited[k], acting[past + k], total = control_step(settings, r[k], n_u[k], error, y[k], 0.0, total)
-        now, late = acting[past + k - m], acting[past + k - 1 - m]
-        if settings.delay_fraction > 0.0:
-            integrate_state(p, rows[k], x, late, settings.delay_fraction * p.T, room)
-        integrate_state(p, rows[k], x, now, (1.0 - settings.delay_fraction) * p.T, room)
-        if p.valve == 0.0:
-            x[3], x[4] = now, 0.0
-    s[INTEGRAL] = total
+    measured, pressure, spool = np.empty((3, r.size))
+    _run_rig(p, settings, rows, r, n_u, n_y, s, u, limited, acting, y, measured, pressure, spool)
     return measured, pressure, spool
+
+
+@ArrayFunction
+def _run_rig(
+    printer: Any, p: RigConstants, settings: ControllerConstants, rows: Any, r: Any, n_u: Any, n_y: Any, s: Any,
+    u: Any, limited: Any, acting: Any, y: Any, measured: Any, pressure: Any, spool: Any,
+) -> None:  # fmt: skip
+    m, x, total = settings.delay_samples, Array.scratch(printer, "double", 5), Variable(printer, s[INTEGRAL])
+    past, first = m + 2, settings.delay_fraction * p.T
+    for i in range(5):
+        x[i] = s[HEADER_SIZE + i]
+    for k in printer.loop(0, r.shape[0]):
+        y[k], pressure[k], spool[k] = x[0], x[2], x[3]
+        seen = x[0] + n_y[k]
+        rounded = p.resolution * (seen / p.resolution).call("rint")
+        measured[k] = where(p.resolution > 0.0, rounded, seen)
+        error = measured[k] - x[0]
+        u[k], limited[k], acting[past + k], total.value = control_step(
+            settings, r[k], n_u[k], error, x[0], 0.0, total.value
+        )
+        now, late = acting[past + k - m], acting[past + k - 1 - m]
+        with printer.when(settings.delay_fraction > 0.0):
+            integrate_state(printer, p, rows[k], x, late, first)
+        integrate_state(printer, p, rows[k], x, now, (1.0 - settings.delay_fraction) * p.T)
+        x[3], x[4] = where(p.valve > 0.0, x[3], now), where(p.valve > 0.0, x[4], 0.0)
+    for i in range(5):
+        s[HEADER_SIZE + i] = x[i]
+    s[INTEGRAL] = total.value

@@ -1,69 +1,54 @@
-"""The compiler of kernels: plain Python functions, and traced arithmetic, to machine code; the one door to it.
+"""The door to machine code: arithmetic written once for every language, and loops that Numba compiles.
 
-A *kernel* is a function over arrays that Python calls and that is compiled on its first call. A *subroutine* is a part
-of kernels. A *template* is a plain function in which `specialise` replaces names by sizes and by other parts. *Traced*
-functions are straight-line arithmetic, run once with symbols (`trace_function`); they become vector instructions.
-
-Two backends offer the same names: `compile` (Numba) and `plain`, the same arithmetic interpreted; see `backend`. Those
-of the backend are loaded when they are first used (PEP 562), for importing Numba takes longer than all else.
+*Traced* functions are straight-line arithmetic (`core.jit.symbolic`), run once with symbols. They become vector
+instructions (`core.jit.llvm_text`, `core.jit.native`), C (`core.jit.c_source`) or Structured Text
+(`core.jit.st_source`). Loops over arrays are traced in the same way (`core.jit.array_function`, `core.jit.arrays`).
+A *kernel* is a plain loop that Numba compiles on its first call (`core.jit.loops`): readers of messages and windows of
+features. Those are loaded when they are first used (PEP 562), for importing Numba takes longer than all else.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from servoscope.core.jit.symbolic import Bool, dot, fma, maximum, minimum, sine, sqrt, tril_index, where
-from servoscope.core.jit.template import specialise
+from servoscope.core.jit.symbolic import (
+    Bool,
+    Float,
+    dot,
+    fma,
+    maximum,
+    minimum,
+    sine,
+    sqrt,
+    sum_products,
+    tril_index,
+    where,
+)
 
 __all__ = [
     "Bool",
-    "as_float",
+    "Float",
     "dot",
     "fma",
     "inline",
     "kernel",
-    "lane_view",
-    "leading_zeros",
-    "load_word",
-    "make_transpose",
     "maximum",
     "minimum",
-    "multiply_high",
-    "on_compilation",
-    "prefetch",
     "sine",
-    "specialise",
     "sqrt",
-    "stack_array",
     "subroutine",
-    "trace_function",
-    "trailing_zeros",
+    "sum_products",
     "tril_index",
     "where",
 ]
 
 if TYPE_CHECKING:
-    from servoscope.core.jit.compile import (
-        as_float,
-        inline,
-        kernel,
-        lane_view,
-        leading_zeros,
-        load_word,
-        make_transpose,
-        multiply_high,
-        on_compilation,
-        prefetch,
-        stack_array,
-        subroutine,
-        trace_function,
-        trailing_zeros,
-    )
+    from servoscope.core.jit.loops import inline, kernel, subroutine
 else:  # hidden from type checkers, which would otherwise accept any name
 
     def __getattr__(name: str) -> object:
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from servoscope.core.jit.backend import load_backend
+        from servoscope.core.jit import loops
 
-        return getattr(load_backend(), name)
+        return getattr(loops, name)

@@ -1,4 +1,4 @@
-"""Traced arithmetic as C: the symbols of `core.jit.symbolic` around a builder that writes statements of C99.
+"""Traced arithmetic as C: a printer that writes statements of C99.
 
 The text is in static single assignment: one operation, one constant of type `double`. So no compiler may fuse a product
 with a sum (C99 6.5p8 lets it do so within an expression only); where the arithmetic has a fused multiply-add, the text
@@ -7,18 +7,19 @@ says ``fma``. Constants are hexadecimal, exact to the last bit.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from servoscope.core.jit.symbolic import Bool, Float
+from servoscope.core.jit.symbolic import Bool, Float, Int, SymbolRows
 
-__all__ = ["CBuilder", "CRows", "c_literal"]
+__all__ = ["CPrinter", "CRows", "c_literal"]
 
-OPERATORS = {"fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/"}
+NAME = re.compile(r"\b[tbkx]\d+\b")
 
 
 def c_literal(number: float, single: bool = False) -> str:
@@ -35,34 +36,22 @@ def c_literal(number: float, single: bool = False) -> str:
     return float(number).hex() + suffix
 
 
-@dataclass(frozen=True, eq=False)
-class CValue:
-    """A constant of the C text: its name, and its type as a compiler would have it."""
-
-    name: str
-    type: Any
-
-
-@dataclass(frozen=True, eq=False)
-class _Statement:
-    target: str  # empty: it stores
+class _Statement(NamedTuple):
+    target: str  # empty: it stores, or begins or ends a block
     text: str
-    needs: tuple[str, ...]
 
 
-class CBuilder:
-    """Stands in the place of LLVM's builder in symbols, and writes each operation down as a statement.
+class CPrinter:
+    """Writes each operation down as a statement; with `single`, numbers are floats where nothing else is said.
 
-    Another language is a subclass with its own literals, assignments, selections and calls. With `single`, numbers are
-    floats where nothing else is said.
-
-    Attributes
-    ----------
-    module
-        What symbols declare functions in; nothing of it is used.
+    Another language is a subclass with its own literals, assignments, selections, calls and blocks. `variables` are
+    those that it needs beside the constants: their names and kinds.
     """
 
-    AND, OR = "&", "|"
+    OPERATORS: ClassVar[dict[str, str]] = {
+        **{"fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/", "and": "&", "or": "|"},
+        **{"add": "+", "sub": "-", "mul": "*", "urem": "%", "==": "=="},
+    }
     SELECT = "({0} != 0) ? {1} : {2}"
     # The larger and smaller of two numbers as comparisons: that is one instruction of a processor, which ISO C's fmax,
     # with its rule for NaN, is not.
@@ -73,152 +62,166 @@ class CBuilder:
         "maxnum": "({0} > {1}) ? {0} : {1}",
         "minnum": "({0} < {1}) ? {0} : {1}",
     }
+    WORDS: ClassVar[dict[str, str]] = {"i1": "int", "i64": "int", "double": "double", "float": "float"}
+    LOOP = "for ({0} = {1}; {0} < {2}; {0}++) {{", "}"
+    BRANCH = "if ({0} != 0) {{", "}"
 
     def __init__(self, single: bool = False) -> None:
-        from llvmlite import ir
-
-        self.module = ir.Module()
-        self.double, self._flag = ir.DoubleType(), ir.IntType(1)
-        self.kind = ir.FloatType() if single else self.double
+        self.kind = "float" if single else "double"
+        self.variables: dict[str, str] = {}
         self._statements: list[_Statement] = []
         self._known: dict[str, str] = {}
 
-    def read(self, place: str, kind: Any = None) -> Float:
-        """Return what stands at a place, as a number of the builder's kind or another; it is read now."""
-        return Float(self, self._assign(place, (), kind or self.kind, pure=False))
+    def read(self, place: str, kind: str = "") -> Float:
+        """Return what stands at a place, as a number of the printer's kind or another; it is read now."""
+        return Float(self, self.load(kind or self.kind, place), kind or self.kind)
 
     def condition(self, text: str) -> Bool:
         """Return an expression of C of type int, 0 or 1, as a condition."""
-        return Bool(self, CValue(text, self._flag))
+        return Bool(self, text, "i1")
 
-    def store(self, place: str, number: Float) -> None:
-        """Write a number to a place."""
-        name = self._name(number.value)
-        self._statements.append(_Statement("", self.assignment(place, name), (name,)))
-
-    def literal(self, number: float, kind: Any) -> str:
-        """Return how a number is written."""
-        return c_literal(number, kind != self.double)
-
-    def assignment(self, place: str, text: str) -> str:
-        """Return the statement that writes a value to a place."""
-        return f"{place} = {text};"
-
-    def definition(self, name: str, text: str, kind: Any) -> str:
-        """Return the statement that makes a number or a condition."""
-        word = "int" if kind is self._flag else "double" if kind == self.double else "float"
-        return f"const {word} {name} = {text};"
-
-    def text(self) -> list[str]:
+    def lines(self) -> list[str]:
         """Return the statements that lead to a store."""
         needed: set[str] = set()
         lines = []
         for statement in reversed(self._statements):
             if not statement.target or statement.target in needed:
-                needed.update(statement.needs)
+                needed.update(NAME.findall(statement.text))
                 lines.append(statement.text)
         return lines[::-1]
 
-    def fadd(self, a: Any, b: Any) -> CValue:
-        """Write a + b."""
-        return self._operate("fadd", a, b)
+    def declarations(self) -> list[str]:
+        """Return the declarations of the variables."""
+        return [f"{self.WORDS[kind]} {name} = 0;" for name, kind in self.variables.items()]
 
-    def fsub(self, a: Any, b: Any) -> CValue:
-        """Write a - b."""
-        return self._operate("fsub", a, b)
+    # what differs between languages
 
-    def fmul(self, a: Any, b: Any) -> CValue:
-        """Write a b."""
-        return self._operate("fmul", a, b)
+    def literal(self, number: float, kind: str) -> str:
+        """Return how a number is written."""
+        return c_literal(number, kind == "float")
 
-    def fdiv(self, a: Any, b: Any) -> CValue:
-        """Write a / b."""
-        return self._operate("fdiv", a, b)
+    def assignment(self, place: str, text: str) -> str:
+        """Return the statement that writes a value to a place."""
+        return f"{place} = {text};"
 
-    def fneg(self, a: Any) -> CValue:
-        """Write -a."""
-        return self._assign(f"-{self._name(a)}", (a,), a.type)
+    def definition(self, name: str, text: str, kind: str) -> str:
+        """Return the statement that makes a number or a condition."""
+        return f"const {self.WORDS[kind]} {name} = {text};"
 
-    def fpext(self, a: Any, kind: Any) -> CValue:
-        """Write a as a double."""
-        return self._assign(f"(double){self._name(a)}", (a,), kind)
+    # operations
 
-    def fptrunc(self, a: Any, kind: Any) -> CValue:
-        """Write a, rounded to a float."""
-        return self._assign(f"(float){self._name(a)}", (a,), kind)
-
-    def fcmp_ordered(self, sign: str, a: Any, b: Any) -> CValue:
-        """Write a comparison, which does not hold where one of the two is NaN."""
-        return self._assign(f"{self._name(a)} {sign} {self._name(b)}", (a, b), self._flag)
-
-    def and_(self, a: Any, b: Any) -> CValue:
-        """Write that both conditions hold."""
-        return self._assign(f"{self._name(a)} {self.AND} {self._name(b)}", (a, b), self._flag)
-
-    def or_(self, a: Any, b: Any) -> CValue:
-        """Write that one of the conditions holds."""
-        return self._assign(f"{self._name(a)} {self.OR} {self._name(b)}", (a, b), self._flag)
-
-    def select(self, condition: Any, a: Any, b: Any) -> CValue:
-        """Write a where the condition holds, b where not."""
-        text = self.SELECT.format(self._name(condition), self._name(a), self._name(b))
-        return self._assign(text, (condition, a, b), a.type)
-
-    def call(self, function: Any, arguments: Sequence[Any], fastmath: Iterable[str] = ()) -> CValue:
-        """Write a call of one of LLVM's own functions as the same in C."""
-        name = function.name.split(".")[1]
-        text = self.CALLS[name].format(*map(self._name, arguments))
-        if arguments[0].type != self.double:
-            text = text.replace(f"{name}(", f"{name}f(")
-        return self._assign(text, arguments, arguments[0].type)
-
-    def _operate(self, operation: str, a: Any, b: Any) -> CValue:
-        return self._assign(f"{self._name(a)} {OPERATORS[operation]} {self._name(b)}", (a, b), a.type)
-
-    def _name(self, value: Any) -> str:
-        """Return how a value is written: by its name, or as a constant."""
-        if isinstance(value, CValue):
-            return f"({value.name})" if value.name.startswith("-") else value.name
-        text = self.literal(float(value.constant), value.type)
+    def constant(self, number: float, kind: str) -> str:
+        """Return a constant."""
+        text = self.literal(number, kind)
         return f"({text})" if text.startswith("-") else text
 
-    def _assign(self, text: str, needs: Sequence[Any], kind: Any, pure: bool = True) -> CValue:
+    def operate(self, name: str, kind: str, a: str, b: str) -> str:
+        """Write an operation on two numbers; those on whole numbers stand within an expression."""
+        text = f"{a} {self.OPERATORS[name]} {b}"
+        return f"({text})" if kind == "i64" else self._assign(text, kind)
+
+    def negate(self, kind: str, a: str) -> str:
+        """Write -a."""
+        return self._assign(f"-{a}", kind)
+
+    def convert(self, kind: str, a: str, target: str) -> str:
+        """Write a number in another precision."""
+        return self._assign(f"({target}){a}", target)
+
+    def compare(self, sign: str, kind: str, a: str, b: str) -> tuple[str, str]:
+        """Write a comparison, which does not hold where one of the two is NaN."""
+        return self._assign(f"{a} {sign} {b}", "i1"), "i1"
+
+    def compare_whole(self, sign: str, a: str, b: str) -> str:
+        """Write a comparison of whole numbers."""
+        return self._assign(f"{a} {self.OPERATORS.get(sign, sign)} {b}", "i1")
+
+    combine = operate
+
+    def select(self, condition_kind: str, condition: str, kind: str, a: str, b: str) -> str:
+        """Write a where the condition holds, b where not."""
+        return self._assign(self.SELECT.format(condition, a, b), kind)
+
+    def call(self, name: str, kind: str, arguments: Sequence[str]) -> str:
+        """Write a call of a function."""
+        text = self.CALLS[name].format(*arguments)
+        return self._assign(text.replace(f"{name}(", f"{name}f(") if kind == "float" else text, kind)
+
+    def number_kind(self, condition_kind: str) -> str:
+        """Return the type of numbers that a condition chooses from, where nothing else is said."""
+        return "double"
+
+    def truncate(self, number: Float) -> Int:
+        """Return a number without what follows its point."""
+        return Int(self, self._assign(f"(int){number.text}", "i64"))
+
+    def number(self, whole: Int) -> Float:
+        """Return a whole number as a number."""
+        return Float(self, self._assign(f"(double){whole}", "double"), "double")
+
+    def whole(self, number: int) -> Int:
+        """Return a constant whole number."""
+        return Int(self, str(number))
+
+    # places, loops and branches
+
+    def load(self, kind: str, place: str) -> str:
+        """Read a place, now."""
+        return self._assign(place, kind, pure=False)
+
+    def store(self, kind: str, text: str, place: str) -> None:
+        """Write a number to a place."""
+        self._statements.append(_Statement("", self.assignment(place, text)))
+
+    def variable(self, kind: str) -> str:
+        """Return the place of a number that changes."""
+        name = f"x{len(self.variables)}"
+        self.variables[name] = kind
+        return name
+
+    def loop(self, begin: Int | int, end: Int | int, step: int = 1) -> Iterator[Int]:
+        """Write a loop over whole numbers."""
+        name = self.variable("i64")
+        with self._block(self.LOOP, name, begin, end):
+            yield Int(self, name)
+
+    def when(self, condition: Bool) -> contextlib.AbstractContextManager[None]:
+        """Write what happens only where a condition holds."""
+        return self._block(self.BRANCH, condition.text)
+
+    @contextlib.contextmanager
+    def _block(self, words: tuple[str, str], *names: Any) -> Iterator[None]:
+        known = dict(self._known)
+        self._statements.append(_Statement("", words[0].format(*names)))
+        yield
+        self._statements.append(_Statement("", words[1]))
+        self._known = known  # what was computed inside is not known outside
+
+    def _assign(self, text: str, kind: str, pure: bool = True) -> str:
         if pure and text in self._known:
-            return CValue(self._known[text], kind)
-        flag = kind is self._flag
-        target = f"{'b' if flag else 't'}{len(self._statements)}"
-        needed = tuple(self._name(x) for x in needs)
-        self._statements.append(_Statement(target, self.definition(target, text, kind), needed))
+            return self._known[text]
+        target = f"{'b' if kind == 'i1' else 'k' if kind == 'i64' else 't'}{len(self._statements)}"
+        self._statements.append(_Statement(target, self.definition(target, text, kind)))
         if pure:
             self._known[text] = target
-        return CValue(target, kind)
+        return target
 
 
-class CRows:
-    """An array as traced arithmetic reads and stores it: each row is read once, and `flush` writes what changed.
+class CRows(SymbolRows):
+    """An array as traced arithmetic reads and stores it; its numbers are of the printer's kind, or `wide` doubles."""
 
-    Its numbers are of the builder's kind, or doubles if it is `wide`.
-    """
+    def __init__(self, printer: CPrinter, name: str, places: dict[int, str] | None = None, wide: bool = False) -> None:
+        self.printer, self.kind = printer, "double" if wide else printer.kind
+        self._name, self._places = name, places
+        super().__init__(self)
 
-    def __init__(self, builder: CBuilder, name: str, places: dict[int, str] | None = None, wide: bool = False) -> None:
-        self.builder, self._name, self._places = builder, name, places
-        self._kind = builder.double if wide else builder.kind
-        self._values: dict[int, Float] = {}
-        self._written: set[int] = set()
+    def load(self, row: int | Int) -> str:
+        """Read a row."""
+        return str(self.printer.load(self.kind, self._place(row)))
 
-    def __getitem__(self, row: int) -> Float:
-        if row not in self._values:
-            self._values[row] = self.builder.read(self._place(row), self._kind)
-        return self._values[row]
+    def store(self, row: int | Int, text: str) -> None:
+        """Write a row."""
+        self.printer.store(self.kind, text, self._place(row))
 
-    def __setitem__(self, row: int, number: Any) -> None:
-        self._values[row] = Float(self.builder, Float(self.builder, CValue("", self._kind)).to_operand(number))
-        self._written.add(row)
-
-    def flush(self) -> None:
-        """Write the rows that were stored."""
-        for row in sorted(self._written):
-            self.builder.store(self._place(row), self._values[row])
-
-    def _place(self, row: int) -> str:
-        return f"{self._name}[{row}]" if self._places is None else self._places[row]
+    def _place(self, row: int | Int) -> str:
+        return self._places[row] if self._places is not None and isinstance(row, int) else f"{self._name}[{row}]"

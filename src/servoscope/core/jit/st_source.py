@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar
 
-from servoscope.core.jit.c_source import CBuilder, CValue
+from servoscope.core.jit.c_source import CPrinter
+from servoscope.core.jit.symbolic import Float, Int
 
-__all__ = ["STBuilder", "st_literal"]
+__all__ = ["STPrinter", "st_literal"]
 
 UNKNOWN = -1.0  # in the place of NaN
 
@@ -30,10 +31,10 @@ def st_literal(number: float) -> str:
     return f"{mantissa if '.' in mantissa else mantissa + '.0'}E{int(exponent)}"
 
 
-class STBuilder(CBuilder):
-    """Writes operations down as statements of Structured Text; `numbers` and `flags` are the variables they need."""
+class STPrinter(CPrinter):
+    """Writes operations down as statements of Structured Text."""
 
-    AND, OR = "AND", "OR"
+    OPERATORS: ClassVar[dict[str, str]] = CPrinter.OPERATORS | {"and": "AND", "or": "OR", "urem": "MOD", "==": "="}
     SELECT = "SEL({0}, {2}, {1})"
     CALLS: ClassVar[dict[str, str]] = {
         "fabs": "ABS({})",
@@ -41,8 +42,10 @@ class STBuilder(CBuilder):
         "maxnum": "SEL({0} > {1}, {1}, {0})",
         "minnum": "SEL({0} < {1}, {1}, {0})",
     }
+    LOOP = "FOR {0} := {1} TO {2} - 1 DO", "END_FOR;"
+    BRANCH = "IF {0} THEN", "END_IF;"
 
-    def literal(self, number: float, kind: Any) -> str:
+    def literal(self, number: float, kind: str) -> str:
         """Return how a number is written."""
         return st_literal(number)
 
@@ -50,13 +53,25 @@ class STBuilder(CBuilder):
         """Return the statement that writes a value to a place."""
         return f"{place} := {text};"
 
-    def definition(self, name: str, text: str, kind: Any) -> str:
+    def definition(self, name: str, text: str, kind: str) -> str:
         """Return the statement that makes a number or a condition; its variable is declared elsewhere."""
         return self.assignment(name, text)
 
-    def call(self, function: Any, arguments: Sequence[Any], fastmath: Iterable[str] = ()) -> CValue:
-        """Write a call of one of LLVM's own functions; a fused multiply-add as two operations."""
-        if function.name.startswith("llvm.fma."):
+    def convert(self, kind: str, a: str, target: str) -> str:
+        """Return a number as it is: there is one precision."""
+        return a
+
+    def call(self, name: str, kind: str, arguments: Sequence[str]) -> str:
+        """Write a call of a function; a fused multiply-add as two operations."""
+        if name == "fma":
             a, b, c = arguments
-            return self.fadd(self.fmul(a, b), c)
-        return super().call(function, arguments, fastmath)
+            return self.operate("fadd", kind, self.operate("fmul", kind, a, b), c)
+        return super().call(name, kind, arguments)
+
+    def number(self, whole: Int) -> Float:
+        """Return a whole number as a number."""
+        return Float(self, self._assign(f"DINT_TO_LREAL({whole})", "double"), "double")
+
+    def truncate(self, number: Float) -> Int:
+        """Return a number without what follows its point."""
+        return Int(self, self._assign(f"TRUNC({number.text})", "i64"))

@@ -1,72 +1,63 @@
-"""Arithmetic on numbers or on symbols that write machine code, so that mathematics is written once, in plain Python.
+"""Arithmetic on symbols that write text, so that mathematics is written once, in plain Python, for every language.
 
-A function written with these computes when it is given floats and lists. Given symbols, it records every operation,
-loops and all, as straight-line code, which `core.jit.trace_function` makes a part of a kernel. Such code has no
-branches: both values are computed, and `where` selects one.
+A function that is called with symbols writes down every operation, loops and all, as straight-line text of a *printer*:
+LLVM's assembly (`core.jit.llvm_text`), C (`core.jit.c_source`) or Structured Text (`core.jit.st_source`). Such text has
+no branches: both values are computed, and `where` selects one.
 
 The fused multiply-add is explicit, not left to the compiler's choice. So one sample, a log and a fleet round alike, to
-the last bit, however the code around them was vectorised, and so does plain Python.
+the last bit, however the code around them was vectorised, and so does C on any processor.
 """
 
 from __future__ import annotations
 
-import ctypes
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
-import numpy as np
 
-FASTMATH_FLAGS = ("nnan", "nsz")  # no NaN comes this far; without these flags no maximum could be vectorised
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Bool:
-    """A condition: builder of the code, and its value."""
+    """A condition: its printer, its text, and its type there."""
 
-    builder: Any
-    value: Any
+    printer: Any
+    text: str
+    kind: str
 
     def __and__(self, other: Bool) -> Bool:
-        return Bool(self.builder, self.builder.and_(self.value, other.value))
+        return Bool(self.printer, self.printer.combine("and", self.kind, self.text, other.text), self.kind)
 
     def __or__(self, other: Bool) -> Bool:
-        return Bool(self.builder, self.builder.or_(self.value, other.value))
+        return Bool(self.printer, self.printer.combine("or", self.kind, self.text, other.text), self.kind)
 
-    @property
-    def all_lanes(self) -> Any:
-        """Whether it holds in all lanes, as one value."""
-        from llvmlite import ir
-
-        kind = self.value.type
-        if not hasattr(kind, "count"):
-            return self.value
-        name, module = f"llvm.vector.reduce.and.v{kind.count}i1", self.builder.module
-        signature = ir.FunctionType(ir.IntType(1), [kind])
-        return self.builder.call(module.globals.get(name) or ir.Function(module, signature, name), [self.value])
+    def __invert__(self) -> Bool:
+        return Bool(self.printer, self.printer.opposite(self.kind, self.text), self.kind)
 
 
 def _binary(name: str, *, reflected: bool = False) -> Callable[[Float, Any], Float]:
     def operate(self: Float, other: Any) -> Float:
-        operands = self.value, self.to_operand(other)
-        return Float(self.builder, getattr(self.builder, name)(*(reversed(operands) if reflected else operands)))
+        if isinstance(other, Complex):
+            return NotImplemented  # type: ignore[no-any-return]
+        a, b = self.text, self.to_operand(other)
+        return Float(self.printer, self.printer.operate(name, self.kind, *((b, a) if reflected else (a, b))), self.kind)
 
     return operate
 
 
 def _comparison(sign: str) -> Callable[[Float, Any], Bool]:
-    return lambda self, other: Bool(self.builder, self.builder.fcmp_ordered(sign, self.value, self.to_operand(other)))
+    def compare(self: Float, other: Any) -> Bool:
+        return Bool(self.printer, *self.printer.compare(sign, self.kind, self.text, self.to_operand(other)))
+
+    return compare
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Float:
-    """A number that code computes, or one number per lane: builder of the code, and its value."""
+    """A number that the text computes, or one number per lane: its printer, its text, and its type there."""
 
-    builder: Any
-    value: Any
+    printer: Any
+    text: str
+    kind: str
 
     __add__ = _binary("fadd")
     __radd__ = _binary("fadd")
@@ -81,105 +72,187 @@ class Float:
     __gt__ = _comparison(">")
     __ge__ = _comparison(">=")
 
+    is_equal = _comparison("==")
+
     def __neg__(self) -> Float:
-        return Float(self.builder, self.builder.fneg(self.value))
+        return Float(self.printer, self.printer.negate(self.kind, self.text), self.kind)
 
     def __abs__(self) -> Float:
-        return self.call("fabs", self)
+        return self.call("fabs")
 
-    def to_operand(self, other: Any) -> Any:
-        """Return another number, or a constant, as a value of the same precision."""
-        from llvmlite import ir
-
-        kind = self.value.type
-        element = getattr(kind, "element", kind)
+    def to_operand(self, other: Any) -> str:
+        """Return another number, or a constant, as text of the same type."""
         if not isinstance(other, Float):
-            one = ir.Constant(element, float(other))
-            return one if element is kind else ir.Constant(kind, [one] * kind.count)
-        if other.value.type == kind:
-            return other.value
-        wider = isinstance(element, ir.DoubleType)
-        return (self.builder.fpext if wider else self.builder.fptrunc)(other.value, kind)
+            return str(self.printer.constant(float(other), self.kind))
+        if other.kind == self.kind:
+            return other.text
+        return str(self.printer.convert(other.kind, other.text, self.kind))
 
-    def call(self, name: str, *numbers: Any, flags: tuple[str, ...] = ()) -> Float:
-        """Return the result of one of LLVM's own functions."""
-        from llvmlite import ir
+    def cast(self, other: Any) -> Float:
+        """Return another number, or a constant, as a number of the same type."""
+        return Float(self.printer, self.to_operand(other), self.kind)
 
-        kind = self.value.type
-        width = f"v{kind.count}" if hasattr(kind, "count") else ""
-        signature = ir.FunctionType(kind, [kind] * len(numbers))
-        full = f"llvm.{name}.{width}{getattr(kind, 'element', kind).intrinsic_name}"
-        module = self.builder.module
-        function = module.globals.get(full) or ir.Function(module, signature, full)
-        return Float(self.builder, self.builder.call(function, [self.to_operand(x) for x in numbers], fastmath=flags))
+    def widen(self) -> Float:
+        """Return the number in double precision."""
+        kind = self.kind.replace("float", "double")
+        return Float(self.printer, "", kind).cast(self)
+
+    def call(self, name: str, *numbers: Any) -> Float:
+        """Return the result of a function, of this number where no others are given."""
+        arguments = [self.to_operand(x) for x in numbers or (self,)]
+        return Float(self.printer, self.printer.call(name, self.kind, arguments), self.kind)
 
 
-@dataclass(frozen=True, eq=False)
-class Int:
-    """The number of a row that code computes."""
+@dataclass(frozen=True, eq=False, slots=True)
+class Complex:
+    """A complex number that the text computes."""
 
-    builder: Any
-    value: Any
+    real: Any
+    imag: Any
 
-    def _operand(self, other: Int | int) -> Any:
-        return other.value if isinstance(other, Int) else self.value.type(other)
+    @classmethod
+    def of(cls, number: Any) -> Complex:
+        """Return any number as a complex one."""
+        return number if isinstance(number, Complex) else cls(number, 0.0)
 
-    def __add__(self, other: Int | int) -> Int:
-        return Int(self.builder, self.builder.add(self.value, self._operand(other)))
+    def __add__(self, other: Any) -> Complex:
+        other = Complex.of(other)
+        return Complex(self.real + other.real, self.imag + other.imag)
 
-    def __mul__(self, other: Int | int) -> Int:
-        return Int(self.builder, self.builder.mul(self.value, self._operand(other)))
+    def __sub__(self, other: Any) -> Complex:
+        return self + -Complex.of(other)
+
+    def __rsub__(self, other: Any) -> Complex:
+        return Complex.of(other) + -self
+
+    def __neg__(self) -> Complex:
+        return Complex(-self.real, -self.imag)
+
+    def __mul__(self, other: Any) -> Complex:
+        if not isinstance(other, Complex):
+            return Complex(self.real * other, self.imag * other)
+        a, b, c, d = self.real, self.imag, other.real, other.imag
+        return Complex(a * c - b * d, a * d + b * c)
+
+    def __truediv__(self, other: Any) -> Complex:
+        if not isinstance(other, Complex):
+            return Complex(self.real / other, self.imag / other)
+        size = other.real * other.real + other.imag * other.imag
+        product = self * Complex(other.real, -other.imag)
+        return Complex(product.real / size, product.imag / size)
+
+    def __rtruediv__(self, other: Any) -> Complex:
+        return Complex.of(other).__truediv__(self)
 
     __radd__, __rmul__ = __add__, __mul__
 
 
-def _symbol(*numbers: Any) -> Float | None:
-    return next((x for x in numbers if isinstance(x, Float)), None)
+def _whole(name: str, *, reflected: bool = False) -> Callable[[Int, Int | int], Int]:
+    def operate(self: Int, other: Int | int) -> Int:
+        a, b = (other, self) if reflected else (self, other)
+        return Int(self.printer, self.printer.operate(name, "i64", str(a), str(b)))
+
+    return operate
 
 
-def _load_fma(name: str, kind: Any) -> Callable[[float, float, float], float]:
-    try:  # of the C library, which every Python is linked with
-        function = getattr(ctypes.CDLL("ucrtbase" if sys.platform == "win32" else None), name)
-    except (AttributeError, OSError):
-        return _exact_fma
-    function.argtypes, function.restype = [kind] * 3, kind
-    return function  # type: ignore[no-any-return]
+def _whole_comparison(sign: str) -> Callable[[Int, Int | int], Bool]:
+    return lambda self, other: Bool(self.printer, self.printer.compare_whole(sign, self.text, str(other)), "i1")
 
 
-def _exact_fma(a: float, b: float, c: float) -> float:
-    if not all(map(math.isfinite, (a, b, c))):
-        return a * b + c
-    return float(Fraction(a) * Fraction(b) + Fraction(c)) or a * b + c  # the latter for the sign of zero
+@dataclass(frozen=True, eq=False, slots=True)
+class Int:
+    """A whole number that the text computes, not negative where it is divided."""
+
+    printer: Any
+    text: str
+
+    __add__ = _whole("add")
+    __radd__ = _whole("add")
+    __sub__ = _whole("sub")
+    __rsub__ = _whole("sub", reflected=True)
+    __mul__ = _whole("mul")
+    __rmul__ = _whole("mul")
+    __mod__ = _whole("urem")
+    __floordiv__ = _whole("udiv")
+    __lt__ = _whole_comparison("<")
+    __le__ = _whole_comparison("<=")
+    __gt__ = _whole_comparison(">")
+    __ge__ = _whole_comparison(">=")
+
+    def __str__(self) -> str:
+        return self.text
+
+    def is_equal(self, other: Int | int) -> Bool:
+        """Return whether it equals another one."""
+        return Bool(self.printer, self.printer.compare_whole("==", self.text, str(other)), "i1")
 
 
-_fma_double, _fma_single = _load_fma("fma", ctypes.c_double), _load_fma("fmaf", ctypes.c_float)
+class SymbolRows:
+    """The rows of a memory as traced arithmetic reads and stores them: each once, and `flush` stores what changed.
+
+    A memory has a `printer`, a `kind`, and `load` and `store` of a row. Those whose number is itself computed are read
+    and stored at once; they must not be among the others.
+    """
+
+    def __init__(self, memory: Any) -> None:
+        self.memory, self.printer, self.kind = memory, memory.printer, memory.kind
+        self.values: dict[int, Float] = {}
+        self.written: set[int] = set()
+
+    def __getitem__(self, row: int | Int) -> Float:
+        if isinstance(row, Int):
+            return self._load(row)
+        if row not in self.values:
+            self.values[row] = self._load(row)
+        return self.values[row]
+
+    def __setitem__(self, row: int | Int, number: Any) -> None:
+        value = Float(self.printer, "", self.kind).cast(number)
+        if isinstance(row, Int):
+            self.memory.store(row, value.text)
+            return
+        self.values[row] = value
+        self.written.add(row)
+
+    def flush(self, mask: Bool | None = None) -> None:
+        """Store what was written, where a condition holds."""
+        for row in sorted(self.written):
+            value = self.values[row]
+            self.memory.store(row, (value if mask is None else where(mask, value, self._load(row))).text)
+
+    def _load(self, row: int | Int) -> Float:
+        return Float(self.printer, self.memory.load(row), self.kind)
+
+
+def _symbol(*numbers: Any) -> Any:
+    return next((x for x in numbers if isinstance(x, Float | Int)), None)
 
 
 def fma(a: Any, b: Any, c: Any) -> Any:
-    """Return a b + c, rounded once."""
+    """Return a b + c, rounded once; of plain numbers, which only tests compute with, rounded twice."""
     symbol = _symbol(a, b, c)
-    if symbol is not None:
-        return symbol.call("fma", a, b, c)
-    if isinstance(a, np.float32) or (isinstance(b, np.float32) and not isinstance(a, np.float64)):
-        return np.float32(_fma_single(float(a), float(b), float(c)))
-    return _fma_double(a, b, c)
+    return a * b + c if symbol is None else symbol.call("fma", a, b, c)
 
 
 def maximum(a: Any, b: Any) -> Any:
-    """Return the larger of two numbers."""
+    """Return the larger of two numbers, neither of which is NaN."""
     symbol = _symbol(a, b)
-    return max(a, b) if symbol is None else symbol.call("maxnum", a, b, flags=FASTMATH_FLAGS)
+    if isinstance(symbol, Int):
+        return where(symbol > (b if symbol is a else a), symbol, b if symbol is a else a)
+    return max(a, b) if symbol is None else symbol.call("maxnum", a, b)
 
 
 def minimum(a: Any, b: Any) -> Any:
-    """Return the smaller of two numbers."""
+    """Return the smaller of two numbers, neither of which is NaN."""
     symbol = _symbol(a, b)
-    return min(a, b) if symbol is None else symbol.call("minnum", a, b, flags=FASTMATH_FLAGS)
+    if isinstance(symbol, Int):
+        return where(symbol < (b if symbol is a else a), symbol, b if symbol is a else a)
+    return min(a, b) if symbol is None else symbol.call("minnum", a, b)
 
 
 def sqrt(x: Any) -> Any:
     """Return the square root."""
-    return x.call("sqrt", x) if isinstance(x, Float) else np.sqrt(x)
+    return x.call("sqrt") if isinstance(x, Float) else math.sqrt(x)
 
 
 MAX_SINE_ANGLE = 2000.0  # angle of `sine`; larger ones count as this
@@ -209,14 +282,13 @@ def where(condition: Any, a: Any, b: Any) -> Any:
     """Return a where the condition holds, and b where not."""
     if not isinstance(condition, Bool):
         return a if condition else b
-    from llvmlite import ir
-
-    symbol = _symbol(a, b)
+    printer, symbol = condition.printer, _symbol(a, b)
+    if isinstance(symbol, Int):
+        return Int(printer, printer.select(condition.kind, condition.text, "i64", str(a), str(b)))
     if symbol is None:
-        lanes, double = getattr(condition.value.type, "count", 0), ir.DoubleType()
-        kind = ir.VectorType(double, lanes) if lanes else double
-        symbol = Float(condition.builder, ir.Constant(kind, ir.Undefined))
-    return Float(symbol.builder, symbol.builder.select(condition.value, symbol.to_operand(a), symbol.to_operand(b)))
+        symbol = Float(printer, "", printer.number_kind(condition.kind))
+    operands = symbol.to_operand(a), symbol.to_operand(b)
+    return Float(printer, printer.select(condition.kind, condition.text, symbol.kind, *operands), symbol.kind)
 
 
 def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
@@ -225,6 +297,13 @@ def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     for x, y in zip(a[1:], b[1:], strict=True):
         total = fma(x, y, total)
     return total
+
+
+def sum_products(a: Sequence[Any], b: Sequence[Any], start: Any = 0.0) -> Any:
+    """Return a number plus the products of two sequences, one after the other, each operation rounded."""
+    for x, y in zip(a, b, strict=True):
+        start = start + x * y
+    return start
 
 
 def tril_index(i: int, j: int) -> int:

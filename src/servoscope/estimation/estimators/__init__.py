@@ -1,18 +1,18 @@
 """Recursive estimators, one file each; they know eta, phi, z, theta and P, and nothing of plants and loops.
 
-Each module offers ``NAME`` (as in a loop file), ``NEEDS_INSTRUMENT`` and a compiled
+Each module offers ``NAME`` (as in a loop file), ``NEEDS_INSTRUMENT`` and a traced function (`core.jit.symbolic`)
 
-    update(theta, P, P_d, R, memory, eta, phi, z, K, extra) -> status
+    update(theta, P, P_d, R, memory, eta, phi, z, extra) -> Update
 
-that changes `theta` (n,) and `P` (n, n) in place, writes the gain it used into `K` (n,), and returns 0 when it
-updated or 1 when a guard made it skip (then theta and P are untouched and K is zero). It starts at P = P_d, and
-`memory` N, in updates, means the same in all of them: what was true N updates ago weighs 1/e under the excitation
-that P_d was tuned on. P carries R: where a textbook has unit residual variance, its P is P/R here.
+that returns theta (n,) and P (n, n) after an update, the gain K (n,) it used, and whether a guard made it skip (then
+theta and P are as before and K is zero). It starts at P = P_d, and `memory` N, in updates, means the same in all of
+them: what was true N updates ago weighs 1/e under the excitation that P_d was tuned on. P carries R: where a textbook
+has unit residual variance, its P is P/R here. `run_updates` (`estimation.update`) takes one through samples by itself.
 
-Optional: ``extra_state_size(n, memory)``, the size of a private state that arrives as `extra`, zero at the start
-(without it, `extra` has length zero); ``steady_gain(R, phi) -> K``, the gain where P stays at P_d once it is there, in
-coordinates in which P_d is the identity (a recursion that starts there needs no P); and ``EXCEPTIONS``: which of the
-`CHECKS` that estimators have in common it cannot pass, and why.
+Optional: ``extra_state_size(n, memory)``, the size of a private state that arrives as `extra` and is changed in place,
+zero at the start (without it, `extra` has no numbers); ``steady_gain(R, phi) -> K``, the gain where P stays at P_d
+once it is there, in coordinates in which P_d is the identity (a recursion that starts there needs no P); and
+``EXCEPTIONS``: which of the `CHECKS` that estimators have in common it cannot pass, and why.
 
 A monitor runs with any of them. Without "covariance" and "mean" among its exceptions, an estimator's statistic and
 fault sizes are valid under any excitation; the others are for comparison.

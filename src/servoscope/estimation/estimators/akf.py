@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import dot, kernel
+from servoscope.core.jit import dot, sum_products
+from servoscope.estimation.update import Matrix, Numbers, Update, symmetric
 
 NAME = "akf"
 NEEDS_INSTRUMENT = False
@@ -23,36 +21,19 @@ def steady_gain(R: Any, phi: Sequence[Any]) -> list[Any]:
     return [x * factor for x in phi]
 
 
-@kernel
 def update(
-    theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
-    phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
-) -> int:  # fmt: skip
+    theta: Numbers, P: Matrix, P_d: Matrix, R: Any, memory: Any, eta: Any, phi: Numbers, z: Numbers, extra: Any
+) -> Update:
     """Take one step of eqs. (7) to (9) and (11); the erratum of (10), P(k-1) in the denominator, is mended.
 
     Source: Stenlund and Gustafsson (2002); Medvedev (2003). At phi = 0 nothing moves: no covariance windup.
     """
-    n = len(theta)
-    e = eta
-    denominator = R
-    denominator_d = R
-    g = np.empty_like(theta)
-    g_d = np.empty_like(theta)
-    for i in range(n):
-        g[i] = 0.0
-        g_d[i] = 0.0
-        for j in range(n):
-            g[i] += P[i, j] * phi[j]
-            g_d[i] += P_d[i, j] * phi[j]
-        e -= phi[i] * theta[i]
-        denominator += phi[i] * g[i]
-        denominator_d += phi[i] * g_d[i]
-    for i in range(n):
-        K[i] = g[i] / denominator
-        theta[i] += K[i] * e
-    for i in range(n):
-        for j in range(i + 1):
-            # computed once and mirrored: P stays symmetric to the last bit
-            P[i, j] += g_d[i] * g_d[j] / denominator_d - g[i] * g[j] / denominator
-            P[j, i] = P[i, j]
-    return 0
+    g, g_d = ([sum_products(row, phi) for row in matrix] for matrix in (P, P_d))
+    e = sum_products([-x for x in phi], theta, eta)
+    denominator, denominator_d = sum_products(phi, g, R), sum_products(phi, g_d, R)
+    K = [x / denominator for x in g]
+    return Update(
+        [x + gain * e for x, gain in zip(theta, K, strict=True)],
+        symmetric(lambda i, j: P[i][j] + (g_d[i] * g_d[j] / denominator_d - g[i] * g[j] / denominator), len(theta)),
+        K,
+    )

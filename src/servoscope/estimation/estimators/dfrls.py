@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit import sqrt, sum_products, where
+from servoscope.estimation.update import Matrix, Numbers, Update, symmetric
 
 NAME = "dfrls"
 NEEDS_INSTRUMENT = False
@@ -15,11 +15,9 @@ EXCEPTIONS = {
 }
 
 
-@kernel
 def update(
-    theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
-    phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
-) -> int:  # fmt: skip
+    theta: Numbers, P: Matrix, P_d: Matrix, R: Any, memory: Any, eta: Any, phi: Numbers, z: Numbers, extra: Any
+) -> Update:
     """Take one step of Kulhavy and Karny's recursion, with l = N/(N + n) for a memory of N updates.
 
     With s = phi' P phi/R (their z, P carries R here) and eps = l - (1 - l)/s: K = P phi/(R (1 + s)),
@@ -38,30 +36,21 @@ def update(
     Source: Kulhavy and Karny, Tracking of slowly varying parameters by directional forgetting (1984).
     """
     n = len(theta)
-    e = eta
-    strength = 0.0  # phi' P phi
-    g = np.empty_like(theta)  # P phi
-    for i in range(n):
-        g[i] = 0.0
-        for j in range(n):
-            g[i] += P[i, j] * phi[j]
-        e -= phi[i] * theta[i]
-        strength += phi[i] * g[i]
-    if not strength > 0.0:
-        for i in range(n):
-            K[i] = 0.0
-        return 0 if strength == 0.0 else 1
-    l = memory / (memory + n)
-    root = np.sqrt(strength)
+    g = [sum_products(row, phi) for row in P]
+    e = sum_products([-x for x in phi], theta, eta)
+    strength = sum_products(phi, g)
+    excited = strength > 0.0
+    l = memory / (memory + float(n))
     s = strength / R
-    for i in range(n):
-        K[i] = g[i] / (R + strength)
-        theta[i] += K[i] * e
-        g[i] /= root  # now |g[i]| <= sqrt(P[i, i]) however small phi is: nothing below can overflow
+    K = [x / (R + strength) for x in g]
+    h = [
+        x / sqrt(where(excited, strength, 1.0)) for x in g
+    ]  # |h[i]| <= sqrt(P[i][i]) however small phi is: nothing below can overflow
     # s eps/(1 + s eps) with 1 + s eps = l (1 + s)
     step = (l * s - (1.0 - l)) / (l * (1.0 + s))
-    for i in range(n):
-        for j in range(i + 1):
-            P[i, j] -= step * g[i] * g[j]
-            P[j, i] = P[i, j]
-    return 0
+    new = Update(
+        [x + gain * e for x, gain in zip(theta, K, strict=True)],
+        symmetric(lambda i, j: P[i][j] - step * h[i] * h[j], n),
+        K,
+    )
+    return new.where(excited, theta, P, where(excited | (strength >= 0.0), 0.0, 1.0))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit import sum_products
+from servoscope.estimation.update import Matrix, Numbers, Update, symmetric
 
 NAME = "kf"
 NEEDS_INSTRUMENT = False
@@ -16,11 +16,9 @@ EXCEPTIONS = {
 }
 
 
-@kernel
 def update(
-    theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
-    phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
-) -> int:  # fmt: skip
+    theta: Numbers, P: Matrix, P_d: Matrix, R: Any, memory: Any, eta: Any, phi: Numbers, z: Numbers, extra: Any
+) -> Update:
     """Take one step of eqs. (7) to (10), with P(k-1) in the denominator of (10) as in (9), and Q = P_d / memory.
 
     With P_d = (R/N) R_phi^-1, the mean of (10) has the fixed point P R_phi P / R = Q = P_d / N, that is P = P_d: gain
@@ -31,22 +29,12 @@ def update(
 
     Source: Gustafsson, Adaptive Filtering and Change Detection (2000), algorithm 8.1.
     """
-    n = len(theta)
-    e = eta
-    strength = 0.0  # phi' P phi
-    g = np.empty_like(theta)  # P phi
-    for i in range(n):
-        g[i] = 0.0
-        for j in range(n):
-            g[i] += P[i, j] * phi[j]
-        e -= phi[i] * theta[i]
-        strength += phi[i] * g[i]
-    for i in range(n):
-        K[i] = g[i] / (R + strength)
-        theta[i] += K[i] * e
-    for i in range(n):
-        for j in range(i + 1):
-            # computed once and mirrored: P stays symmetric to the last bit
-            P[i, j] += P_d[i, j] / memory - g[i] * g[j] / (R + strength)
-            P[j, i] = P[i, j]
-    return 0
+    g = [sum_products(row, phi) for row in P]
+    e = sum_products([-x for x in phi], theta, eta)
+    denominator = R + sum_products(phi, g)
+    K = [x / denominator for x in g]
+    return Update(
+        [x + gain * e for x, gain in zip(theta, K, strict=True)],
+        symmetric(lambda i, j: P[i][j] + (P_d[i][j] / memory - g[i] * g[j] / denominator), len(theta)),
+        K,
+    )

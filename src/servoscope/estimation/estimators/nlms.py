@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel
+from typing import Any
+
+from servoscope.core.jit import sum_products
+from servoscope.estimation.update import Matrix, Numbers, Update
 
 NAME = "nlms"
 NEEDS_INSTRUMENT = False
@@ -14,11 +16,9 @@ EXCEPTIONS = {
 }
 
 
-@kernel
 def update(
-    theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
-    phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
-) -> int:  # fmt: skip
+    theta: Numbers, P: Matrix, P_d: Matrix, R: Any, memory: Any, eta: Any, phi: Numbers, z: Numbers, extra: Any
+) -> Update:
     """Take one step K = phi/(N + phi' phi), N the memory.
 
     In the metric of P_d, NLMS is K = P_d phi/(R + phi' P_d phi): the AKF at P = P_d, to the last digit, so there would
@@ -32,13 +32,7 @@ def update(
 
     Source: Haykin, Adaptive Filter Theory (2002), chapter 6.
     """
-    n = len(theta)
-    e = eta
-    denominator = memory
-    for i in range(n):
-        e -= phi[i] * theta[i]
-        denominator += phi[i] * phi[i]
-    for i in range(n):
-        K[i] = phi[i] / denominator
-        theta[i] += K[i] * e
-    return 0
+    e = sum_products([-x for x in phi], theta, eta)
+    denominator = sum_products(phi, phi, memory)
+    K = [x / denominator for x in phi]
+    return Update([x + gain * e for x, gain in zip(theta, K, strict=True)], P, K)

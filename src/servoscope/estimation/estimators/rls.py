@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+import functools
+import math
+import sys
+from typing import Any
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit import maximum, sum_products, where
+from servoscope.estimation.update import Matrix, Numbers, Update, symmetric
 
 NAME = "rls"
 NEEDS_INSTRUMENT = False
@@ -16,11 +19,9 @@ EXCEPTIONS = {
 }
 
 
-@kernel
 def update(
-    theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
-    phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
-) -> int:  # fmt: skip
+    theta: Numbers, P: Matrix, P_d: Matrix, R: Any, memory: Any, eta: Any, phi: Numbers, z: Numbers, extra: Any
+) -> Update:
     """Take one step: K = P phi/(l R + phi' P phi), P <- (P - K phi' P)/l, with l = 1 - 1/memory.
 
     P carries R: with the textbook's p = P/R these are K = p phi/(l + phi' p phi) and p <- (p - K phi' p)/l. Tuned with
@@ -35,30 +36,18 @@ def update(
 
     Source: Ljung, System Identification (1999), section 11.2.
     """
-    l = 1.0 - 1.0 / max(memory, 2.0)
     n = len(theta)
-    e = eta
-    strength = 0.0  # phi' P phi
-    g = np.empty_like(theta)  # P phi
-    for i in range(n):
-        g[i] = 0.0
-        for j in range(n):
-            g[i] += P[i, j] * phi[j]
-        e -= phi[i] * theta[i]
-        strength += phi[i] * g[i]
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, P[i, i])
-    if not (0.0 <= strength < np.inf and largest < 0.5 * l * np.finfo(P.dtype).max):
-        for i in range(n):
-            K[i] = 0.0
-        return 1
+    l = 1.0 - 1.0 / maximum(memory, 2.0)
+    g = [sum_products(row, phi) for row in P]
+    e = sum_products([-x for x in phi], theta, eta)
+    strength = sum_products(phi, g)
+    largest = functools.reduce(maximum, (P[i][i] for i in range(n)))
     denominator = l * R + strength
-    for i in range(n):
-        K[i] = g[i] / denominator
-        theta[i] += K[i] * e
-    for i in range(n):
-        for j in range(i + 1):
-            P[i, j] = (P[i, j] - g[i] * K[j]) / l
-            P[j, i] = P[i, j]
-    return 0
+    K = [x / denominator for x in g]
+    new = Update(
+        [x + gain * e for x, gain in zip(theta, K, strict=True)],
+        symmetric(lambda i, j: (P[i][j] - g[i] * K[j]) / l, n),
+        K,
+    )
+    valid = (strength >= 0.0) & (strength < math.inf) & (largest < 0.5 * l * sys.float_info.max)
+    return new.where(valid, theta, P, where(valid, 0.0, 1.0))

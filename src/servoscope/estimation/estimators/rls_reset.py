@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from typing import Any
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit import sum_products, where
+from servoscope.estimation.update import Matrix, Numbers, Update, symmetric
 
 NAME = "rls-reset"
 NEEDS_INSTRUMENT = False
@@ -20,11 +21,9 @@ def extra_state_size(n: int, memory: float) -> int:
     return 1
 
 
-@kernel
 def update(
-    theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
-    phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
-) -> int:  # fmt: skip
+    theta: Numbers, P: Matrix, P_d: Matrix, R: Any, memory: Any, eta: Any, phi: Numbers, z: Numbers, extra: Any
+) -> Update:
     """Take one step of RLS without forgetting (l = 1); after every `memory` excited updates P becomes (e - 1) P_d.
 
     P_d = (R/N) R_phi^-1 is worth N samples, so (e - 1) P_d is worth N/(e - 1) of them, and N further ones leave the
@@ -36,26 +35,17 @@ def update(
 
     Source: Goodwin and Sin, Adaptive Filtering Prediction and Control (1984), section 3.3.
     """
-    n = len(theta)
-    e = eta
-    strength = 0.0  # phi' P phi
-    g = np.empty_like(theta)  # P phi
-    for i in range(n):
-        g[i] = 0.0
-        for j in range(n):
-            g[i] += P[i, j] * phi[j]
-        e -= phi[i] * theta[i]
-        strength += phi[i] * g[i]
-    for i in range(n):
-        K[i] = g[i] / (R + strength)
-        theta[i] += K[i] * e
-    if strength > 0.0:
-        extra[0] += 1.0
-    again = extra[0] >= memory
-    if again:
-        extra[0] = 0.0
-    for i in range(n):
-        for j in range(i + 1):
-            P[i, j] = (np.e - 1.0) * P_d[i, j] if again else P[i, j] - g[i] * g[j] / (R + strength)
-            P[j, i] = P[i, j]
-    return 0
+    g = [sum_products(row, phi) for row in P]
+    e = sum_products([-x for x in phi], theta, eta)
+    strength = sum_products(phi, g)
+    K = [x / (R + strength) for x in g]
+    age = where(strength > 0.0, extra[0] + 1.0, extra[0])
+    again = age >= memory
+    extra[0] = where(again, 0.0, age)
+    return Update(
+        [x + gain * e for x, gain in zip(theta, K, strict=True)],
+        symmetric(
+            lambda i, j: where(again, (math.e - 1.0) * P_d[i][j], P[i][j] - g[i] * g[j] / (R + strength)), len(theta)
+        ),
+        K,
+    )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
+import sys
+from typing import Any
 
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit import Bool, maximum, minimum, sqrt, sum_products, where
+from servoscope.estimation.update import Matrix, Numbers, Update, symmetric
 
 NAME = "sliding-window"
 NEEDS_INSTRUMENT = False
@@ -19,102 +21,76 @@ EXCEPTIONS = {
 }
 
 
+MIN_COLUMN_SHARE = 8.0 * math.sqrt(sys.float_info.epsilon)  # of a column: what a sample has to say of a coefficient
+
+
 def extra_state_size(n: int, memory: float) -> int:
     """Return the size of the private state: a place, the running factor, and one factor for each of N samples."""
-    return 1 + (max(1, round(memory)) + 1) * (n * (n + 3) // 2)
+    return 1 + (max(1, int(memory + 0.5)) + 1) * (n * (n + 3) // 2)
 
 
-@kernel
-def givens_update(F: FloatArray, row: FloatArray, first: int) -> None:
-    """Rotate one row [phi' eta] into a triangular factor (Givens); `row` is used up.
+def rotate_row(F: Matrix, row: Numbers, first: int = 0) -> Matrix:
+    """Return a triangular factor after one more row [phi' eta] (Givens).
 
-    F holds the n rows of the upper triangular factor of [phi' eta], each from its diagonal on, end to end; `first` is
-    the first column in which `row` may differ from zero.
+    F holds the n rows of the upper triangular factor of [phi' eta], each from its diagonal on; `first` is the first
+    column in which `row` may differ from zero.
     """
-    n = len(row) - 1
-    at = 0
-    for i in range(first):
-        at += n + 1 - i
-    for i in range(first, n):
-        if row[i] != 0.0:
-            length = np.sqrt(1.0 * F[at] * F[at] + 1.0 * row[i] * row[i])  # in double precision
-            if length > 0.0:
-                c = F[at] / length
-                s = row[i] / length
-                for j in range(i, n + 1):
-                    old = F[at + j - i]
-                    F[at + j - i] = c * old + s * row[j]
-                    row[j] = c * row[j] - s * old
-        at += n + 1 - i
+    new, row = F[:first], list(row)
+    for i in range(first, len(F)):
+        length = sqrt(F[i][0] * F[i][0] + row[i] * row[i])
+        turns = length > 0.0
+        divisor = where(turns, length, 1.0)
+        c, s = where(turns, F[i][0] / divisor, 1.0), where(turns, row[i] / divisor, 0.0)
+        rest = row[i:]
+        new.append([c * old + s * x for old, x in zip(F[i], rest, strict=True)])
+        row[i:] = [c * x - s * old for old, x in zip(F[i], rest, strict=True)]
+    return new
 
 
-@kernel
-def fill_prior(theta: FloatArray, P: FloatArray, R: float, slots: FloatArray) -> None:
-    """Fill the window with the prior: slot j holds the share 1 - j/N of the information R P^-1 about theta."""
+def prior_factor(theta: Numbers, P: Matrix, R: Any) -> Matrix:
+    """Return the factor of the information R P^-1 about theta."""
     n = len(theta)
-    N = len(slots)
-    L = np.zeros_like(P)  # P = L L'
-    inverse = np.zeros_like(P)
+    zero = 0.0 * R
+    L: Matrix = []  # P = L L'
+    inverse: Matrix = []
+    F = [[zero] * (n + 1 - i) for i in range(n)]
     for i in range(n):
+        L.append([])
         for j in range(i + 1):
-            rest = P[i, j]
-            for k in range(j):
-                rest -= L[i, k] * L[j, k]
-            L[i, j] = np.sqrt(rest) if i == j else rest / L[j, j]
-    row = np.empty(n + 1, dtype=theta.dtype)
-    slots[0, :] = 0.0
-    for i in range(n):
-        row[n] = 0.0
-        for j in range(n):
-            rest = 1.0 if i == j else 0.0
-            for k in range(i):
-                rest -= L[i, k] * inverse[k, j]
-            inverse[i, j] = rest / L[i, i]
-            row[j] = np.sqrt(R) * inverse[i, j]
-            row[n] += row[j] * theta[j]
-        givens_update(slots[0], row, 0)
-    for j in range(N - 1, -1, -1):
-        slots[j] = slots[0] * np.sqrt((N - j) / N)
+            rest = sum_products([-x for x in L[i]], L[j][:j], P[i][j])
+            L[i].append(sqrt(rest) if i == j else rest / L[j][j])
+        above = [[inverse[k][j] for k in range(i)] for j in range(n)]
+        inverse.append(
+            [sum_products([-x for x in L[i][:i]], above[j], zero + float(i == j)) / L[i][i] for j in range(n)]
+        )
+        row = [sqrt(R) * x for x in inverse[i]]
+        F = rotate_row(F, [*row, sum_products(row, theta)])
+    return F
 
 
-@kernel
-def solve_factor(F: FloatArray, w: FloatArray, S: FloatArray) -> bool:
-    """Solve the triangular system of a factor: w (n,), and S = the inverse of its triangle (n, n).
+def solve_factor(F: Matrix) -> tuple[Numbers, Matrix, Bool]:
+    """Solve the triangular system of a factor: its solution (n,), the inverse of its triangle (n, n), and its validity.
 
-    Returns False where the factor says too little of one coefficient beside the others; it does so at any units.
+    It is not valid where the factor says too little of one coefficient beside the others; it is so at any units.
     """
-    n = len(w)
-    T = np.zeros_like(S)
-    at = 0
-    for i in range(n):
-        for j in range(i, n):
-            T[i, j] = F[at + j - i]
-        w[i] = F[at + n - i]
-        at += n + 1 - i
-    weakest = 8.0 * np.sqrt(np.finfo(F.dtype).eps)
+    n = len(F)
+    sizes = [sum_products([F[i][j - i] for i in range(j + 1)], [F[i][j - i] for i in range(j + 1)]) for j in range(n)]
+    valid = abs(F[0][0]) > 0.0
     for j in range(n):
-        size = 0.0
-        for i in range(j + 1):
-            size += 1.0 * T[i, j] * T[i, j]
-        if not abs(T[j, j]) > weakest * np.sqrt(size):
-            return False
+        valid = valid & (abs(F[j][0]) > MIN_COLUMN_SHARE * sqrt(sizes[j]))
+    pivots = [where(abs(row[0]) > 0.0, row[0], 1.0) for row in F]
+    w, S = [0.0 * F[0][0]] * n, [[0.0 * F[0][0]] * n for _ in range(n)]
     for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            w[i] -= T[i, j] * w[j]
-        w[i] /= T[i, i]
-        for k in range(n):
-            rest = 1.0 if i == k else 0.0
-            for j in range(i + 1, k + 1):
-                rest -= T[i, j] * S[j, k]
-            S[i, k] = rest / T[i, i] if k >= i else 0.0
-    return True
+        right = [-x for x in F[i][1:-1]]
+        w[i] = sum_products(right, w[i + 1 :], F[i][-1]) / pivots[i]
+        for k in range(i, n):
+            S[i][k] = sum_products(right[: k - i], [S[j][k] for j in range(i + 1, k + 1)], float(i == k)) / pivots[i]
+    return w, S, valid
 
 
-@kernel
 def update(
-    theta: FloatArray, P: FloatArray, P_d: FloatArray, R: float, memory: float, eta: float,
-    phi: FloatArray, z: FloatArray, K: FloatArray, extra: FloatArray,
-) -> int:  # fmt: skip
+    theta: Numbers, P: Matrix, P_d: Matrix, R: Any, memory: Any, eta: Any, phi: Numbers, z: Numbers, extra: Any
+) -> Update:
     """Make theta the least-squares fit to the last N = memory samples and P = R (sum phi phi')^-1.
 
     At the start the window is full of the baseline, R P^-1 about theta; each of the first N samples pushes out 1/N of
@@ -129,54 +105,46 @@ def update(
     T^2 are about right there. While excitation comes and goes they are not: samples that leave at rest raise the
     variance of theta_hat, and no gain tells.
     """
-    n = len(theta)
+    p, n = extra.printer, len(theta)
     size = n * (n + 3) // 2
-    running = extra[1 : 1 + size]
-    slots = extra[1 + size :].reshape((-1, size))
-    N = len(slots)
-    if extra[0] == 0.0:
-        fill_prior(theta, P, R, slots)
-        extra[0] = 1.0
-    k = int(extra[0]) - 1  # samples in the running block
-    row = np.empty(n + 1, dtype=theta.dtype)
-    row[:n] = phi
-    row[n] = eta
-    slots[k, : n + 1] = row
-    givens_update(running, row, 0)
-    joined = running.copy()
-    if k + 1 < N:
-        at = 0
-        for i in range(n):
-            for j in range(i, n + 1):
-                row[j] = slots[k + 1, at + j - i]
-            givens_update(joined, row, i)
-            at += n + 1 - i
-        extra[0] += 1.0
-    else:
-        running[:] = 0.0
-        for i in range(N - 1, -1, -1):
-            row[:] = slots[i, : n + 1]
-            givens_update(running, row, 0)
-            slots[i] = running
-        running[:] = 0.0
-        extra[0] = 1.0
-    w = np.empty_like(theta)
-    S = np.empty_like(P)
-    if not solve_factor(joined, w, S):
-        for i in range(n):
-            K[i] = 0.0
-        return 1
-    leverage = 0.0
-    for i in range(n):
-        theta[i] = w[i]
-        K[i] = 0.0
-        for j in range(n):
-            G = 0.0
-            for m in range(max(i, j), n):
-                G += S[i, m] * S[j, m]
-            P[i, j] = R * G
-            K[i] += G * phi[j]
-        leverage += phi[i] * K[i]
-    for i in range(n):
-        K[i] *= 2.0 / (1.0 + 2.0 * leverage)
-    return 0
+    start, N = p.whole(0), maximum(p.truncate(memory + 0.5), 1)
+
+    def read_factor(at: Any) -> Matrix:
+        numbers = [extra[at + k] for k in range(size)]
+        return [[numbers.pop(0) for _ in range(n + 1 - i)] for i in range(n)]
+
+    def store_factor(F: Matrix, at: Any) -> None:
+        for k, number in enumerate(number for row in F for number in row):
+            extra[at + k] = number
+
+    with p.when(extra[start] <= 0.0):  # slot j holds the share 1 - j/N of what is known before
+        prior = prior_factor(theta, P, R)
+        for j in p.loop(0, N):
+            share = sqrt(p.number(N - j) / p.number(N))
+            store_factor([[x * share for x in row] for row in prior], j * size + (1 + size))
+        extra[start] = 1.0
+    k = p.truncate(extra[start]) - 1  # samples in the running block
+    for i, number in enumerate((*phi, eta)):
+        extra[k * size + (1 + size + i)] = number
+    running = rotate_row(read_factor(start + 1), [*phi, eta])
+    store_factor(running, start + 1)
+    goes_on = k + 1 < N
+    joined = running
+    for i, row in enumerate(read_factor(minimum(k + 1, N - 1) * size + (1 + size))):
+        joined = rotate_row(joined, [*([0.0 * R] * i), *(where(goes_on, x, 0.0) for x in row)], i)
+    extra[start] = p.number(k + 2)
+    with p.when(k + 1 >= N):
+        store_factor([[0.0 * x for x in row] for row in running], start + 1)
+        for i in p.loop(0, N):
+            at = (N - 1 - i) * size + (1 + size)
+            factor = rotate_row(read_factor(start + 1), [extra[at + j] for j in range(n + 1)])
+            store_factor(factor, start + 1)
+            store_factor(factor, at)
+        store_factor([[0.0 * x for x in row] for row in running], start + 1)
+        extra[start] = 1.0
+    w, S, valid = solve_factor(joined)
+    G = symmetric(lambda i, j: sum_products(S[i][i:], S[j][i:]), n)
+    gain = [sum_products(row, phi) for row in G]
+    factor = 2.0 / (1.0 + 2.0 * sum_products(phi, gain))
+    new = Update(w, [[R * x for x in row] for row in G], [x * factor for x in gain])
+    return new.where(valid, theta, P, where(valid, 0.0, 1.0))

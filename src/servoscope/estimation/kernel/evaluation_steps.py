@@ -11,7 +11,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from servoscope.core.jit import dot, maximum, sqrt, tril_index, where
-from servoscope.estimation.kernel.sample_steps import CROSSED, SKIPPED, UPDATES, KernelSpec
+from servoscope.estimation.kernel.sample_steps import CROSSED, SKIPPED, UPDATES
+from servoscope.estimation.kernel.spec import KernelSpec
 
 MIN_VARIANCE = 1e-30  # no variance is smaller; a number of single precision, too
 

@@ -7,22 +7,22 @@ one lane it is the recursion of one series, kept in registers; with many, the sa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
-from servoscope.core.jit import Bool, dot, fma, maximum, minimum, where
+from servoscope.core.jit import Bool, Float, dot, fma, maximum, minimum, sum_products, where
 from servoscope.estimation.kernel import sparse_lti
 from servoscope.estimation.kernel.cusum import (
     CLIP,
-    LAGS,
     accumulate_sums,
     update_cusum,
     update_cusum_by_sums,
     whiten_sample,
 )
-from servoscope.estimation.kernel.sparse_lti import SparsityPattern
+from servoscope.estimation.kernel.spec import KernelSpec
 from servoscope.estimation.moments import propagate_covariance, propagate_initial_share
-from servoscope.models.plants.columns import COLUMN_FORMS, Column
+from servoscope.estimation.update import read_matrix, write_matrix
+from servoscope.models.plants.columns import COLUMN_FORMS
 
 # counters at the head of a state row
 ARMED, WAIT, SAMPLE, UPDATES, SKIPPED, STILL, WHITENED, CROSSED = range(8)
@@ -38,55 +38,6 @@ MAX_PHYSICAL = 1e100  # larger is no physical signal; its square would overflow 
 TILE = 16  # largest number of samples that are fetched together
 
 
-class KernelSizes(NamedTuple):
-    """The sizes that code is compiled for."""
-
-    n: int
-    rows: int
-    inputs: int
-    states: int
-    speed: int
-    gated: bool
-    nonlinear: tuple[Column, ...]
-    lags: int
-    shadow: int
-    memory: int
-    watched: int
-    steady: bool
-    extra: int
-    frequencies: int
-    start: bool
-    row: int
-    floats: int
-    directions: int  # of changes, whose sums move the CUSUMs once per evaluation
-
-
-class KernelSpec(NamedTuple):
-    """Sizes of a recursion and its offsets in state (`to`) and constants (`at`); equal ones share machine code."""
-
-    estimator: str
-    sizes: KernelSizes
-    to: tuple[tuple[str, int], ...]
-    at: tuple[tuple[str, int], ...]
-    bank: SparsityPattern
-    shadow: SparsityPattern
-
-    @property
-    def sums(self) -> int:
-        """Number of sums that are taken over an evaluation's updates; 0: each update moves the CUSUMs."""
-        return self.sizes.directions * (self.sizes.directions + 3) // 2
-
-    @property
-    def shadow_rows(self) -> int:
-        """Number of outputs of the shadow, room for as many where there is none."""
-        return len(self.shadow[0]) or self.sizes.n + 1
-
-    @property
-    def columns(self) -> int:
-        """Number of white columns that the sequential test takes of each update."""
-        return self.sizes.directions or self.sizes.n + LAGS
-
-
 class SampleSteps:
     """The steps of one sample for the sizes of a specification.
 
@@ -95,9 +46,9 @@ class SampleSteps:
     `single_lane`, neighbouring CUSUMs of one asset are the lanes of `update_cusums`.
     """
 
-    def __init__(self, spec: KernelSpec, steady: Any, single_lane: bool = False) -> None:
+    def __init__(self, spec: KernelSpec, estimator: ModuleType, single_lane: bool = False) -> None:
         self.size, self.to, self.at = spec.sizes, SimpleNamespace(**dict(spec.to)), SimpleNamespace(**dict(spec.at))
-        self._bank, self._shadow, self._steady, self.single_lane = spec.bank, spec.shadow, steady, single_lane
+        self._bank, self._shadow, self._estimator, self.single_lane = spec.bank, spec.shadow, estimator, single_lane
         self.sums, self.columns = spec.sums, spec.columns
 
     def begin_evaluation(self, s: Any, h: Any) -> None:
@@ -106,6 +57,10 @@ class SampleSteps:
             level = s[self.to.level]
             h[CROSSED] = where(level < 1.0, 0.0, h[CROSSED])
             s[self.to.peak] = level
+
+    def clear_size(self, e: Any) -> None:
+        """Begin the sums of `accumulate_size`."""
+        e[0] = e[1] = 0.0
 
     def accumulate_size(self, e: Any, tile: Any, i: Any) -> None:
         """Sum up the magnitudes of samples, and count restarts."""
@@ -147,13 +102,25 @@ class SampleSteps:
             e = self._whiten(c, s, h, w[row + self.columns], [w[row + k] for k in range(self.size.n)])
             self._store_whitened(s, e, h[WHITENED] > c[self.at.warm], w, i)
 
-    def count_sample(self, h: Any, tile: Any, i: Any) -> Bool:
-        """Count a sample; return whether it is complete and continues the one before."""
+    def classify_sample(self, h: Any, status: Any, tile: Any, i: Any) -> tuple[Bool, Bool]:
+        """Count a sample; return whether it is complete, and whether the filters begin with it.
+
+        Numbers of one that is missing become zeros: nothing may depend on them.
+        """
         h[SAMPLE] = h[SAMPLE] + 1.0
-        r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
-        complete = (abs(r) < MAX_PHYSICAL) & (abs(u) < MAX_PHYSICAL) & (abs(y) < MAX_PHYSICAL)
-        continues: Bool = complete & (tile[i + 3 * TILE] <= 0.0) & (h[ARMED] > 0.0)
-        return continues
+        status[0] = MISSING
+        r, u, y = (tile[i + k * TILE] for k in range(3))
+        complete: Bool = (abs(r) < MAX_PHYSICAL) & (abs(u) < MAX_PHYSICAL) & (abs(y) < MAX_PHYSICAL)
+        if not self.single_lane:
+            for k, number in enumerate((r, u, y)):
+                tile[i + k * TILE] = where(complete, number, 0.0)
+        begins: Bool = complete & ((tile[i + 3 * TILE] > 0.0) | (h[ARMED] <= 0.0))
+        h[ARMED] = where(complete, h[ARMED], 0.0)
+        return complete, begins
+
+    def classify_update(self, status: Any) -> tuple[Bool, Bool]:
+        """Return whether a sample updates the estimator, and whether its noise is forgotten."""
+        return self.is_update(status), status[0] < USED
 
     def begin_filters(self, c: Any, s: Any, h: Any, tile: Any, i: Any) -> None:
         """Put the filters into their steady state at one sample, after a gap."""
@@ -176,11 +143,11 @@ class SampleSteps:
 
     def advance_filters(
         self, c: Any, s: Any, h: Any, status: Any, v: Any, shadow: Any, tile: Any, i: Any, due: Any
-    ) -> Bool:
-        """Pass one complete sample through the filters; return whether its status is `USED`.
+    ) -> None:
+        """Pass one complete sample through the filters.
 
-        It is `HELD` while the filters settle, the axis rests or u is in the dead zone, and `BETWEEN` where no update is
-        due.
+        Its status is `USED`, but `HELD` while the filters settle, the axis rests or u is in the dead zone, and
+        `BETWEEN` where no update is due.
         """
         r, u, y = tile[i], tile[i + TILE], tile[i + 2 * TILE]
         speed: Any = None
@@ -220,30 +187,39 @@ class SampleSteps:
         )
         held = settling if hold is None else hold | settling
         status[0] = where(held, HELD, where(due, USED, BETWEEN))
-        return self.is_update(status)
 
     def is_update(self, status: Any) -> Bool:
         """Return whether the sample updates the estimator."""
         used: Bool = (status[0] >= USED) & (status[0] <= USED)
         return used
 
-    def update_estimate(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any) -> None:
-        """Update theta with an estimator whose P stays at P_d, then all that follows from the update."""
-        phi = self._update_theta(c, s, h, v)
+    def update_estimate(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, extra: Any) -> None:
+        """Update theta and P, then all that follows from the update; `extra` is the estimator's private state."""
+        phi = self._update_theta(c, s, h, v) if self.size.steady else self._update_all(c, s, h, v, extra)
         if self.size.shadow:
             self._test_update(c, s, h, v, shadow, e, phi)
 
-    def record_update(self, c: Any, s: Any, h: Any, v: Any, shadow: Any, e: Any, k: Any) -> None:
-        """Do what follows from an update of theta and P by any estimator; k holds its gain, residual and status."""
-        n = self.size.n
-        refused = k[n + 1]
-        h[UPDATES] = h[UPDATES] + (1.0 - refused)
-        h[SKIPPED] = h[SKIPPED] + refused
-        s[self.to.power] = where(refused > 0.0, s[self.to.power], self._mean_square(c, s, k[n]))
-        phi = [v[1 + i] for i in range(n)]
-        self._propagate(c, s, phi, [k[i] for i in range(n)])
-        if self.size.shadow:
-            self._test_update(c, s, h, v, shadow, e, phi)
+    def _update_all(self, c: Any, s: Any, h: Any, v: Any, extra: Any) -> list[Any]:
+        """Update theta and P by any estimator, in double precision; return phi."""
+        n, to, at = self.size.n, self.to, self.at
+        theta, phi = [s[to.theta + i] for i in range(n)], [v[1 + i] for i in range(n)]
+        residual = sum_products([-x for x in phi], theta, v[0])
+        z = [v[self.size.rows - n + i] for i in range(n)]
+        vectors = ([x.widen() for x in vector] for vector in (theta, phi, z))
+        matrices = read_matrix(s, n, to.P), read_matrix(c, n, at.P_d)
+        P, P_d = ([[x.widen() for x in row] for row in matrix] for matrix in matrices)
+        numbers = c[at.R].widen(), c[at.memory].widen(), v[0].widen()
+        wide_theta, *signals = vectors
+        new = self._estimator.update(wide_theta, P, P_d, *numbers, *signals, extra)
+        for i in range(n):
+            s[to.theta + i] = new.theta[i]
+        write_matrix(s, new.P, to.P)
+        h[UPDATES] = h[UPDATES] + (1.0 - new.refused)
+        h[SKIPPED] = h[SKIPPED] + new.refused
+        power = self._mean_square(c, s, residual)
+        s[to.power] = where(new.refused > 0.0, s[to.power], power)
+        self._propagate(c, s, phi, [Float(v.printer, "", v.kind).cast(K) for K in new.K])
+        return phi
 
     def reset_noise(self, s: Any, h: Any) -> None:
         """Forget the noise before a gap or a rest."""
@@ -290,12 +266,12 @@ class SampleSteps:
         for k in range(self.sums):
             s[self.to.sums + k] = 0.0
 
-    def reduce_cusums(self, top: Any, i: Any) -> None:
-        """Write the largest of neighbouring CUSUMs of one asset to the first of them."""
+    def reduce_cusums(self, top: Any, level: Any, i: Any) -> None:
+        """Write the largest of neighbouring CUSUMs of one asset as its level."""
         levels = [top[i * CUSUM_BATCH + j] for j in range(CUSUM_BATCH)]
         while len(levels) > 1:
             levels = [maximum(a, b) for a, b in zip(levels[::2], levels[1::2], strict=True)]
-        top[i * CUSUM_BATCH] = levels[0]
+        level[i] = levels[0]
 
     def update_alarm(self, s: Any, h: Any, top: Any, when: Any, i: Any) -> None:
         """Store the level of the largest CUSUM, and the first sample at which one passes its limit."""
@@ -331,7 +307,7 @@ class SampleSteps:
         phi = [v[1 + i] for i in range(self.size.n)]
         theta = [s[self.to.theta + i] for i in range(self.size.n)]
         residual = v[0] - dot(phi, theta)
-        K = self._steady(c[self.at.R], phi)
+        K = self._estimator.steady_gain(c[self.at.R], phi)
         for i, gain in enumerate(K):
             s[self.to.theta + i] = fma(gain, residual, theta[i])
         h[UPDATES] = h[UPDATES] + 1.0

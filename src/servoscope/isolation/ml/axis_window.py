@@ -12,7 +12,8 @@ import numpy as np
 from servoscope.baseline.axis_model import AxisModel
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.core.jit import kernel
+from servoscope.core.jit import minimum, where
+from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.estimation.axis_filter import NO_LAG, AxisFilter, AxisSignals, DriveLag
 from servoscope.estimation.noise_model import sample_autocovariance
 from servoscope.isolation.ml.kernels import Array
@@ -232,11 +233,13 @@ class AxisWindow(ChangeWindow):
         added = np.array([changed - healthy, *moved]) @ self.columns
         e = np.asarray(self.innovations(np.array([healthy, healthy]), at))
 
+        before = np.zeros((len(e) + 1, 1 + Q.shape[1]))
+        np.cumsum(e[:, None] * np.column_stack([e, Q]), axis=0, out=before[1:])
+        signals, V = (self.filter.to_acceleration, self.filter.poles, added, e, self._weight, self.restart), len(added)
+
         def sums(onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
-            f = self.filter
-            found = onset_sums(
-                f.to_acceleration, f.poles, added, e, self._weight, self.restart, onsets, overs, np.ascontiguousarray(Q)
-            )
+            found = np.zeros((len(onsets), V, V + Q.shape[1]))
+            onset_sums(*signals, onsets, overs, Q, before, np.empty((V, 3)), np.empty(V), found)
             return found, np.zeros(len(onsets))
 
         return sums
@@ -255,49 +258,43 @@ def axis_signals(loop: Loop, recording: Recording, stride: int, drive: DriveLag 
     return AxisSignals.thinned(u, recording.y, restart, loop.sample_rate, stride, loop.plant.derivative)
 
 
-@kernel
+@ArrayFunction
 def onset_sums(
-    numerator: Array, poles: Array, added: Array, e: Array, weight: Array, restart: BoolArray,
-    onsets: IntArray, durations: IntArray, Q: Array,
-) -> Array:  # fmt: skip
-    """Sum up products of innovations and their derivatives for changes that come at many times, shape (M, V, V + m).
+    printer: Any, numerator: Any, poles: Any, added: Any, e: Any, weight: Any, restart: Any, onsets: Any,
+    durations: Any, Q: Any, before: Any, state: Any, row: Any, out: Any,
+) -> None:  # fmt: skip
+    """Sum up products of innovations and their derivatives for changes that come at many times, (M, V, V + m).
 
     `added` (V, N): accelerations that the change and its derivatives add, filtered by ``numerator/poles`` (order 3)
-    from the onset on, growing over the duration; `e` (N,): healthy innovations; Q (N, m).
+    from the onset on, growing over the duration; `e` (N,): healthy innovations; Q (N, m); `before` (N + 1, 1 + m):
+    sums of their products with e and Q up to a sample; state (V, 3) and row (V,) are scratch memory; `out` is zero.
     """
-    V, N = added.shape
-    m, M = Q.shape[1], len(onsets)
-    out = np.zeros((M, V, V + m))
-    state, row = np.zeros((V, 3)), np.zeros(V)
-    before = np.zeros((N + 1, 1 + m))
-    for k in range(N):
-        before[k + 1, 0] = before[k, 0] + e[k] * e[k]
-        for j in range(m):
-            before[k + 1, 1 + j] = before[k, 1 + j] + e[k] * Q[k, j]
-    for i in range(M):
-        first = onsets[i]
-        state[:] = 0.0
+    (V, N), m = added.shape, Q.shape[1]
+    for i in printer.loop(0, onsets.shape[0]):
+        first, duration = onsets[i], durations[i]
+        for v in printer.loop(0, V):
+            for o in range(3):
+                state[v, o] = 0.0
         out[i, 0, 0] = before[first, 0]
-        for j in range(m):
+        for j in printer.loop(0, m):
             out[i, 0, V + j] = before[first, 1 + j]
-        for k in range(first, N):
-            if restart[k]:
-                state[:] = 0.0
-            share = min((k - first) / durations[i], 1.0) if durations[i] > 0 else 1.0
-            for v in range(V):
+        for k in printer.loop(first, N):
+            grown = minimum(printer.number(k - first) / printer.number(duration), 1.0)
+            share = where(duration > 0, grown, 1.0)
+            for v in printer.loop(0, V):
+                old = [where(restart[k] > 0, 0.0, state[v, o]) for o in range(3)]
                 x = share * added[v, k]
-                y = numerator[0] * x + state[v, 0]
+                y = numerator[0] * x + old[0]
                 for o in range(2):
-                    state[v, o] = numerator[o + 1] * x - poles[o + 1] * y + state[v, o + 1]
+                    state[v, o] = numerator[o + 1] * x - poles[o + 1] * y + old[o + 1]
                 state[v, 2] = numerator[3] * x - poles[3] * y
                 row[v] = -y * weight[k]
-            row[0] += e[k]
-            for v in range(V):
-                for w in range(v + 1):
-                    out[i, v, w] += row[v] * row[w]
-                for j in range(m):
-                    out[i, v, V + j] += row[v] * Q[k, j]
-        for v in range(V):
-            for w in range(v):
+            row[0] = row[0] + e[k]
+            for v in printer.loop(0, V):
+                for w in printer.loop(0, v + 1):
+                    out[i, v, w] = out[i, v, w] + row[v] * row[w]
+                for j in printer.loop(0, m):
+                    out[i, v, V + j] = out[i, v, V + j] + row[v] * Q[k, j]
+        for v in printer.loop(0, V):
+            for w in printer.loop(0, v):
                 out[i, w, v] = out[i, v, w]
-    return out

@@ -2,61 +2,62 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.core.jit import kernel
-from servoscope.isolation.ml.kernels import Array, samples_since_restart
+from servoscope.core.arrays import FloatArray
+from servoscope.core.jit import maximum, minimum, where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
+from servoscope.isolation.ml.kernels import PlantArrays, input_before, restart_state, samples_since_restart
 from servoscope.isolation.ml.least_squares import minimise_from_grid
+from servoscope.isolation.ml.predictor import Predictor
 from servoscope.isolation.ml.window import RefitWindow
 
 GAP_COUNT = 33  # gaps, in even ratios, before the best is refined
 
 
-@kernel
+@ArrayFunction
 def backlash_innovations(
-    A: Array, b: Array, b_late: Array, c: Array, K: Array, by: Array, age: IntArray,
-    half: float, onset: int, u: Array, y: Array, restart: BoolArray,
-) -> Array:  # fmt: skip
-    """Return the innovations (in standard deviations), (N,), of a plant whose sensor lags by half a gap.
+    printer: Any, plants: PlantArrays, half: Any, onset: Any, u: Any, y: Any, restart: Any, age: Any,
+    x: Any, e: Any, *, n: int,
+) -> None:  # fmt: skip
+    """Write the innovations e (N,), in standard deviations, of a plant whose sensor lags by half a gap.
 
     From sample `onset` on the sensor stands where the actuator last pushed it, ``|c x - y| <= half``. While it stands
-    still y says nothing about the plant, and the state is not corrected.
+    still y says nothing about the plant, and the state x (n,) is not corrected.
     """
-    n = len(c)
-    x, x_next = np.zeros(n), np.zeros(n)
-    e, sensor, reach = np.empty(len(y)), 0.0, 0.0
-    for i in range(n):
-        reach += c[i] * c[i]
-    for k in range(len(y)):
-        if restart[k]:
-            sensor = y[k]
-            for i in range(n):
-                x[i] = c[i] * y[k] / reach
-        moved = 0.0
+    A, b, b_late, c, K, inverse_std = (part[0] for part in plants)
+    sensor = Variable(printer, 0.0)
+    for k in printer.loop(0, y.shape[0]):
+        restarts = restart[k] > 0
+        with printer.when(restarts):
+            sensor.value = y[k]
+            restart_state(plants, 0, x, y[k], n)
+        state, moved = [x[i] for i in range(n)], 0.0
         for i in range(n):
-            moved += c[i] * x[i]
-        gap = half if k >= onset else 0.0
-        pushed = min(max(sensor, moved - gap), moved + gap)
-        seen = 1.0 if gap == 0.0 or pushed != sensor else 0.0
-        sensor = pushed
-        j, before = age[k], u[k] if restart[k] else u[max(k - 1, 0)]
-        error = y[k] - sensor
+            moved = c[i] * state[i] + moved
+        gap = where(k >= onset, half, 0.0)
+        pushed = minimum(maximum(sensor.value, moved - gap), moved + gap)
+        seen = where(gap.is_equal(0.0) | ~pushed.is_equal(sensor.value), 1.0, 0.0)
+        sensor.value = pushed
+        error = y[k] - pushed
         for i in range(n):
-            x_next[i] = seen * K[j, i] * error + b[i] * u[k] + b_late[i] * before
+            total = seen * K[age[k], i] * error + b[i] * u[k] + b_late[i] * input_before(u, k, restarts)
             for o in range(n):
-                x_next[i] += A[i, o] * x[o]
-        for i in range(n):
-            x[i] = x_next[i]
-        e[k] = error * by[j]
-    return e
+                total = total + A[i, o] * state[o]
+            x[i] = total
+        e[k] = error * inverse_std[age[k]]
 
 
 def backlash_of_width(window: RefitWindow, onset: int, width: float) -> FloatArray:
     """Return the innovations (N,) with a gap, in the unit of y, from a sample on; healthy parameters as learned."""
-    A, b, b_late, c, K, S = (part[0] for part in window.healthy)
-    age, by, half = samples_since_restart(window.restart, len(S)), 1.0 / np.sqrt(S), 0.5 * width
-    return backlash_innovations(A, b, b_late, c, K, by, age, half, onset, window.u, window.y, window.restart)
+    healthy = Predictor(*(np.ascontiguousarray(part[:1]) for part in window.healthy))
+    age, n, e = samples_since_restart(window.restart, healthy.S.shape[1]), healthy.A.shape[1], np.empty(window.samples)
+    plants, signals = PlantArrays.of(healthy), (window.u, window.y, window.restart, age)
+    backlash_innovations(plants, 0.5 * width, onset, *signals, np.zeros(n), e, n=n)
+    return e
 
 
 def fit_backlash(window: RefitWindow, onset: int) -> float:

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.core.jit import kernel
-from servoscope.isolation.ml.kernels import Array, run_constant_plant, samples_since_restart
+from servoscope.core.arrays import FloatArray, IntArray
+from servoscope.core.jit import where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
+from servoscope.isolation.ml.kernels import (
+    Array,
+    PlantArrays,
+    advance_plant,
+    constant_plant,
+    input_before,
+    restart_state,
+    run_plants,
+    samples_since_restart,
+)
 from servoscope.isolation.ml.predictor import Predictor
 from servoscope.isolation.ml.window import RefitWindow
 
@@ -21,8 +34,12 @@ def likeliest_sequence(window: RefitWindow, predictors: Sequence[Predictor], pri
     late switch may win at first, so that this is near the optimum, no more. Not to begin healthy is a switch too.
     """
     previous = np.empty((window.samples, len(predictors)), dtype=np.int64)
-    A, b, late, c, K, S, volume = _stack(predictors)
-    cost = switching_costs(A, b, late, c, K, S, volume, prices, window.u, window.y, window.restart, previous)
+    plants_of, volume = _stack(predictors)
+    V, n = plants_of.b.shape
+    cost, x, age = np.array(prices, dtype=np.float64), np.zeros((V, n)), window_age(window, volume)
+    cost[0] = 0.0
+    signals = window.u, window.y, window.restart, age
+    switching_costs(plants_of, volume, prices, *signals, x, cost, previous, n=n)
     at, plants = int(np.argmin(cost)), np.empty(window.samples, dtype=np.int64)
     for k in range(window.samples - 1, -1, -1):
         plants[k] = at
@@ -34,70 +51,54 @@ class SequenceCost:
     """-2 log likelihood, but for a constant, of plants that hold one after the other."""
 
     def __init__(self, window: RefitWindow, healthy: Predictor, predictors: Sequence[Predictor]) -> None:
-        self.window, self.plants = window, _stack([healthy, *predictors])
+        self.window, (self.plants, self.volume) = window, _stack([healthy, *predictors])
 
     def __call__(self, starts: Sequence[int]) -> float:
         """Return it for their first samples, (V,), of which the first is 0; the state goes on."""
-        window = self.window
-        A, b, late, c, K, S, volume = self.plants
-        bounds = np.array([*starts, window.samples])
-        return float(sequence_cost(A, b, late, c, K, S, volume, bounds, window.u, window.y, window.restart))
+        window, (V, n) = self.window, self.plants.b.shape
+        age, x, e, cost = window_age(window, self.volume), np.zeros((1, n)), np.empty((1, window.samples)), 0.0
+        signals = window.u, window.y, window.restart, age
+        for v, (begin, end) in zip(range(1, V), itertools.pairwise([*starts, window.samples]), strict=True):
+            run_plants(self.plants, np.array([[v]]), begin, end, 0, 0, *signals, x, e, False, n=n)
+            cost += float(e[0, begin:end] @ e[0, begin:end] + self.volume[v, age[begin:end]].sum())
+        return cost
 
 
-def _stack(predictors: Sequence[Predictor]) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+def window_age(window: RefitWindow, volume: Array) -> IntArray:
+    """Return the samples since a restart of a window, as far as the gains change with them."""
+    return samples_since_restart(window.restart, volume.shape[1])
+
+
+def _stack(predictors: Sequence[Predictor]) -> tuple[PlantArrays, Array]:
     """Return the last plant of each predictor, and log S relative to the first one's."""
-    A, b, late, c, K, S = (np.stack([part[-1] for part in parts]) for parts in zip(*predictors, strict=True))
-    return A, b, late, c, K, S, np.log(S / S[:1])
+    last = Predictor(*(np.stack([part[-1] for part in parts]) for parts in zip(*predictors, strict=True)))
+    return PlantArrays.of(last), np.log(last.S / last.S[:1])
 
 
-@kernel
-def sequence_cost(
-    A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, volume: Array, bounds: IntArray,
-    u: Array, y: Array, restart: BoolArray,
-) -> float:  # fmt: skip
-    """Return what `SequenceCost` does: plant v, from 1 on, holds from sample bounds[v - 1] to bounds[v]."""
-    V, n = b.shape
-    age, by = samples_since_restart(restart, S.shape[1]), 1.0 / np.sqrt(S)
-    plants = np.arange(V).reshape(V, 1)
-    x, x_next, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, len(y)))
-    cost = 0.0
-    for v in range(1, V):
-        for i in range(n):
-            x[v, i] = x[v - 1, i]
-        begin, end = bounds[v - 1], bounds[v]
-        run_constant_plant(A, b, b_late, c, K, by, plants, 0, v, v + 1, begin, end, age, u, y, restart, x, x_next, e, 0)
-        for k in range(begin, end):
-            cost += e[v, k] * e[v, k] + volume[v, age[k]]
-    return cost
-
-
-@kernel
+@ArrayFunction
 def switching_costs(
-    A: Array, b: Array, b_late: Array, c: Array, K: Array, S: Array, volume: Array, prices: FloatArray,
-    u: Array, y: Array, restart: BoolArray, previous: IntArray,
-) -> Array:  # fmt: skip
-    """Return the cost of the cheapest sequence that ends in each of V plants, shape (V,).
+    printer: Any, plants: PlantArrays, volume: Any, prices: Any, u: Any, y: Any, restart: Any, age: Any,
+    x: Any, cost: Any, previous: Any, *, n: int,
+) -> None:  # fmt: skip
+    """Write the cost of the cheapest sequence that ends in each of V plants, shape (V,).
 
-    `A, b, b_late, c, K, S`: the plants, shapes (V, ...), as for `innovations`; `volume`: log S relative to the
-    first plant's, shape (V, L); `previous` (N, V) becomes the plant of the sample before, on the sequence that is in a
-    plant at a sample.
+    `volume`: log S relative to the first plant's, shape (V, L); x (V, n): states, which are zero at first; `cost`
+    begins with the prices, 0 for the first plant; `previous` (N, V) becomes the plant of the sample before, on the
+    sequence that is in a plant at a sample.
     """
-    V, n, N = b.shape[0], b.shape[1], len(y)
-    age, by = samples_since_restart(restart, S.shape[1]), 1.0 / np.sqrt(S)
-    plants = np.arange(V).reshape(V, 1)
-    x, x_next, e = np.zeros((V, n)), np.zeros(n), np.zeros((V, 1))
-    cost: Array = prices.copy()
-    cost[0] = 0.0
-    for k in range(N):
-        best = int(np.argmin(cost))
-        for v in range(V):
+    V = cost.shape[0]
+    for k in printer.loop(0, y.shape[0]):
+        restarts = restart[k] > 0
+        u_before, best = input_before(u, k, restarts), Variable(printer, 0)
+        for v in printer.loop(1, V):
+            best.value = where(cost[v] < cost[best.value], v, best.value)
+        for v in printer.loop(0, V):
             previous[k, v] = v
-            if cost[best] + prices[v] < cost[v]:
-                previous[k, v], cost[v] = best, cost[best] + prices[v]
+            with printer.when(cost[best.value] + prices[v] < cost[v]):
+                previous[k, v], cost[v] = best.value, cost[best.value] + prices[v]
                 for i in range(n):
-                    x[v, i] = x[best, i]
-            run_constant_plant(
-                A, b, b_late, c, K, by, plants, 0, v, v + 1, k, k + 1, age, u, y, restart, x, x_next, e, k
-            )
-            cost[v] += e[v, 0] * e[v, 0] + volume[v, age[k]]
-    return cost
+                    x[v, i] = x[best.value, i]
+            with printer.when(restarts):
+                restart_state(plants, v, x[v], y[k], n)
+            e = advance_plant(plants, constant_plant(v), x[v], u[k], u_before, y[k], age[k], n)
+            cost[v] = cost[v] + (e * e + volume[v, age[k]])

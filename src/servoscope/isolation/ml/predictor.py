@@ -114,7 +114,7 @@ class PredictorFactory:
         noise = noise or self.noise
         variances = noise.u_std**2, noise.y_std**2
         P = self.initial_covariance.astype(kind)
-        sample_plants(F, g, 1.0 / self.loop.sample_rate, late, c, *variances, P, A, b, b_late, K, S)
+        sample_plants(F, g, 1.0 / self.loop.sample_rate, late, c, *variances, P, A, b, b_late, K, S, n=g.shape[1])
         if samples:  # one sample later than the loop file says
             b, b_late = b_late, b
         return Predictor(A, b, b_late, c, K, S)

@@ -6,6 +6,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation import estimators
+from servoscope.estimation.update import run_updates
 from servoscope.research.paper.conditions import PAPER, rig_loop
 from servoscope.research.paper.method import INITIAL_COVARIANCE_FACTOR, ResidualGenerator
 from servoscope.simulation import simulate
@@ -46,11 +47,10 @@ def covariance_without_excitation(
 ) -> float:
     """Return how much P has grown after so many updates at phi = 0."""
     n = 4
-    update = estimators.load_estimator(estimator).update
-    theta, P, P_d, phi, K = np.zeros(n), np.eye(n), np.eye(n), np.zeros(n), np.zeros(n)
+    theta, P, P_d, phi, K = np.zeros(n), np.eye(n), np.eye(n), np.zeros((updates, n)), np.zeros(n)
     extra = np.zeros(estimators.extra_state_size(estimator, n, memory))
-    for _ in range(updates):
-        update(theta, P, P_d, 1.0, memory, 0.0, phi, phi, K, extra)
+    module, eta = estimators.load_estimator(estimator), np.zeros(updates)
+    run_updates(module, theta, P, P_d, 1.0, memory, eta, phi, phi, K, extra)
     return float(np.abs(P).max())
 
 
@@ -74,14 +74,13 @@ def contraction(seed: int) -> dict[str, float]:
     values: dict[str, float] = {}
     for name, rows in (("motion", phi), ("dark", 0.0 * phi)):
         theta, P, K, extra = np.zeros(4), INITIAL_COVARIANCE_FACTOR * P_d, np.zeros(4), np.zeros(0)
-        for k in range(len(rows)):
-            akf.update(theta, P, P_d, tuning.R, generator.pipeline.memory, eta[k], rows[k], rows[k], K, extra)
-            if k + 1 in (1000, len(rows)):
-                error = np.asarray(_whiten(L, P) - np.eye(4), dtype=np.float64)
-                left = np.linalg.eigvalsh(error) / (INITIAL_COVARIANCE_FACTOR - 1.0)
-                after = "10" if k + 1 == 1000 else "60"
-                values[f"eq12.{name}.{after}.largest"] = float(left[-1])
-                values[f"eq12.{name}.{after}.smallest"] = float(left[0])
+        for after, part in (("10", slice(1000)), ("60", slice(1000, None))):
+            signals = eta[part], rows[part], rows[part]
+            run_updates(akf, theta, P, P_d, tuning.R, generator.pipeline.memory, *signals, K, extra)
+            error = np.asarray(_whiten(L, P) - np.eye(4), dtype=np.float64)
+            left = np.linalg.eigvalsh(error) / (INITIAL_COVARIANCE_FACTOR - 1.0)
+            values[f"eq12.{name}.{after}.largest"] = float(left[-1])
+            values[f"eq12.{name}.{after}.smallest"] = float(left[0])
     return values
 
 

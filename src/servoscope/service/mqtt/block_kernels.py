@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from servoscope.core.arrays import FloatArray, IntArray
-from servoscope.core.jit import as_float, kernel, load_word, subroutine
+from servoscope.core.jit import kernel, subroutine
 from servoscope.service.mqtt.number_kernels import (
     CLOSING_BYTES,
     Text,
@@ -21,6 +21,7 @@ from servoscope.service.mqtt.number_kernels import (
     read_number,
     read_whole,
 )
+from servoscope.service.mqtt.words import as_float, load_word
 from servoscope.service.sources.block import MAX_COUNT, MAX_TIME_S
 
 NAMES = b"version", b"stream", b"sequence", b"oldest", b"t0", b"dt", b"t", b"r", b"u", b"y"

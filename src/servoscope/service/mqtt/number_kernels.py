@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.core.jit import inline, leading_zeros, load_word, multiply_high, trailing_zeros
+from servoscope.core.jit import inline
+from servoscope.service.mqtt.words import leading_zeros, load_word, multiply_high, trailing_zeros
 
 Word = np.uint64
 Text = npt.NDArray[np.uint8]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-import numpy as np
-
-from servoscope.core.arrays import FloatArray
-from servoscope.core.jit import inline, kernel
+from servoscope.core.jit import maximum, minimum, where
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
 from servoscope.signals.quality.findings import KINDS
 from servoscope.signals.quality.settings import QualityLimits
 from servoscope.signals.timebase import BACKWARD_STEP, GAP_STEP, LATE_SAMPLES
@@ -23,230 +23,210 @@ NOISE_LEVELS = 8.0  # smallest changes that noise at rest has to cover ...
 TURN_SHARE = 0.4  # ... and share of samples at which it turns; white noise turns at two of three
 
 
-@kernel
+@ArrayFunction
 def check_samples(
-    limits: QualityLimits,
-    states: Any,
-    t: FloatArray,
-    r: FloatArray,
-    u: FloatArray,
-    y: FloatArray,
-    begin: int,
-    out: FloatArray,
-) -> tuple[int, int]:
-    """Check samples from `begin` on, until the block ends or `out` is full.
+    printer: Any, limits: QualityLimits, states: Any, t: Any, r: Any, u: Any, y: Any, begin: Any, out: Any, count: Any
+) -> Any:
+    """Check samples from `begin` on, until the block ends or `out` is full; return where the next call goes on.
 
     `states`: one record of `STATE_DTYPE`, changed in place, shape (1,); `t, r, u, y`: the block, shape (N,); `out`:
-    receives the findings as kind, begins, time, value, limit, shape (K, 5). Returns where the next call goes on and
-    the number of findings.
+    receives the findings as kind, begins, time, value, limit, shape (K, 5), and `count` (1,) their number.
     """
-    s, n = states[0], 0
-    for k in range(begin, len(t)):
-        if n + MAX_FINDINGS > len(out):
-            return k, n
-        now = t[k] if np.isfinite(t[k]) else s.t
-        if np.isfinite(t[k]):
-            n = _check_step(limits, s, t[k], out, n)
-        else:
-            s.missing += 1.0
-        if np.isfinite(r[k]) and np.isfinite(u[k]) and np.isfinite(y[k]):
-            n = _check_values(limits, s, now, r[k], u[k], y[k], out, n)
-        elif np.isfinite(t[k]):
-            s.missing += 1.0
-        s.samples += 1.0
-        share = _missing_share(limits, s)
-        if share > limits.missing and s.active[GAP] == 0.0:
-            n = _write_finding(s, GAP, True, now, share, limits.missing, out, n)
-        if s.samples >= limits.window:
-            n = _check_window(limits, s, now, out, n)
-    return len(t), n
+    check = SampleCheck(printer, limits, states[0], out)
+    k = Variable(printer, begin)
+    for _ in printer.loop_while(lambda: (k.value < t.shape[0]) & (check.count.value + MAX_FINDINGS <= out.shape[0])):
+        check.check_sample(t[k.value], r[k.value], u[k.value], y[k.value])
+        k.value = k.value + 1
+    count[0] = check.count.value
+    return k.value
 
 
-@kernel
-def check_rows(limits: QualityLimits, states: Any, t: FloatArray, signals: FloatArray, out: FloatArray) -> None:
+@ArrayFunction
+def check_rows(printer: Any, limits: QualityLimits, states: Any, t: Any, signals: Any, out: Any) -> None:
     """Check a block of each asset: `states` (assets,), t (assets, N), r, u and y (assets, 3, N); findings are lost."""
-    for a in range(len(t)):
-        begin = 0
-        while begin < t.shape[1]:
-            x = signals[a]
-            begin, _ = check_samples(limits, states[a : a + 1], t[a], x[0], x[1], x[2], begin, out)
+    for a in printer.loop(0, t.shape[0]):
+        check, x = SampleCheck(printer, limits, states[a], out), signals[a]
+        for k in printer.loop(0, t.shape[1]):
+            check.count.value = 0
+            check.check_sample(t[a, k], x[R, k], x[U, k], x[Y, k])
 
 
-@inline
-def _check_step(limits: QualityLimits, s: Any, t: float, out: FloatArray, n: int) -> int:
-    """Judge the step to a time stamp."""
-    step = t - s.t
-    periods = np.rint(step / limits.period)
-    far = step > limits.silent_s and s.active[SILENT] == 0.0
-    if s.count == 0.0:
-        s.since[WAITING] = t
-    elif far or step <= BACKWARD_STEP * limits.period:
-        # A silence as long as that would have been noticed: it is the clock that jumped.
-        s.jumps += 1.0
-        n = _write_finding(s, CLOCK, True, t, step, limits.silent_s, out, n)
-    else:
-        # A stamp that is late makes one step longer and the next one shorter: in whole periods the two make up.
-        if not limits.gap_s < step <= limits.silent_s:  # a log that pauses lacks nothing
-            s.missing += periods - 1.0
-        if periods < LATE_SAMPLES:  # a longer step does not tell a rate
-            s.span += step
-            s.periods += periods
-        if step <= GAP_STEP * limits.period:
-            s.steps += 1.0
-            s.jittery += abs(step - limits.period) > limits.jitter
-    s.count += 1.0
-    s.t = t
-    return n
+class SampleCheck:
+    """Writes how samples are checked: `s` is the state of an asset, `out` receives findings."""
+
+    def __init__(self, printer: Any, limits: QualityLimits, s: Any, out: Any) -> None:
+        self.printer, self.limits, self.s, self.out, self.count = printer, limits, s, out, Variable(printer, 0)
+
+    def check_sample(self, t: Any, r: Any, u: Any, y: Any) -> None:
+        """Write how one sample is checked."""
+        s, limits, when = self.s, self.limits, self.printer.when
+        timed, complete = abs(t) < math.inf, (abs(r) < math.inf) & (abs(u) < math.inf) & (abs(y) < math.inf)
+        now = where(timed, t, s.t)
+        with when(timed):
+            self._check_step(t)
+        with when(complete):
+            self._check_values(now, r, u, y)
+        s.missing = s.missing + where(timed & complete, 0.0, 1.0)
+        s.samples = s.samples + 1.0
+        share = self._missing_share()
+        with when((share > limits.missing) & self._is_quiet(GAP)):
+            self._write_finding(GAP, 1.0, now, share, limits.missing)
+        with when(s.samples >= self.printer.number(limits.window)):
+            self._check_window(now)
+
+    def _check_step(self, t: Any) -> None:
+        """Judge the step to a time stamp."""
+        s, limits, when = self.s, self.limits, self.printer.when
+        step = t - s.t
+        periods = (step / limits.period).call("rint")
+        is_first = s.count.is_equal(0.0)
+        far = (step > limits.silent_s) & self._is_quiet(SILENT)
+        jumps = ~is_first & (far | (step <= limits.period * BACKWARD_STEP))
+        with when(is_first):
+            s.since[WAITING] = t
+        with when(jumps):  # a silence as long as that would have been noticed: it is the clock that jumped
+            s.jumps = s.jumps + 1.0
+            self._write_finding(CLOCK, 1.0, t, step, limits.silent_s)
+        with when(~(is_first | jumps)):
+            # A stamp that is late makes one step longer and the next one shorter: in whole periods the two make up.
+            pauses = (step > limits.gap_s) & (step <= limits.silent_s)  # a log that pauses lacks nothing
+            s.missing = s.missing + where(pauses, 0.0, periods - 1.0)
+            tells = periods < LATE_SAMPLES  # a longer step does not tell a rate
+            s.span = s.span + where(tells, step, 0.0)
+            s.periods = s.periods + where(tells, periods, 0.0)
+            steps = step <= limits.period * GAP_STEP
+            s.steps = s.steps + where(steps, 1.0, 0.0)
+            s.jittery = s.jittery + where(steps & (abs(step - limits.period) > limits.jitter), 1.0, 0.0)
+        s.count = s.count + 1.0
+        s.t = t
+
+    def _check_values(self, t: Any, r: Any, u: Any, y: Any) -> None:
+        """Judge the values of a complete sample."""
+        s, limits, when = self.s, self.limits, self.printer.when
+        signals, e, is_first = (r, u, y), r - y, s.values.is_equal(0.0)
+        with when(is_first):
+            for epoch in range(2):
+                for i, x in enumerate((*signals, e)):
+                    s.ranges[epoch, i, 0] = s.ranges[epoch, i, 1] = x
+        for i, x in enumerate((*signals, e)):
+            _widen(s.ranges[0, i], x)
+        turned = s.direction * (y - s.last[Y]) < 0.0
+        for i, x in enumerate(signals):
+            change, smallest = abs(x - s.last[i]), s.smallest_change[i]
+            moved = change > 0.0
+            s.same[i] = where(is_first | moved, 0.0, s.same[i]) + 1.0
+            smaller = ~is_first & moved & (smallest.is_equal(0.0) | (change < smallest))
+            s.smallest_change[i] = where(smaller, change, smallest)
+        s.direction = where(y.is_equal(s.last[Y]), s.direction, y - s.last[Y])
+        s.last[R], s.last[U], s.last[Y] = signals
+        s.values = s.values + 1.0
+        new_y, new_u = s.same[Y].is_equal(1.0), s.same[U].is_equal(1.0)
+        _track_range(s.r_range, r, new_y)
+        _track_range(s.y_range, y, new_u)
+        _track_range(s.e_range, e, new_u)
+        self._learn_rest_noise(y, turned)
+        frozen = self.printer.number(limits.frozen)
+        for kind, signal, span, new in ((FROZEN_Y, Y, s.r_range, new_y), (FROZEN_U, U, s.e_range, new_u)):
+            active = ~self._is_quiet(kind)
+            with when(active & new):
+                self._write_finding(kind, 0.0, t, 0.0, frozen * limits.period)
+            with when(~active & (s.same[signal] > frozen)):
+                should_move = self._y_should_move() if signal == Y else self._u_should_move(u)
+                with when(should_move):
+                    self._write_finding(kind, 1.0, t, _width(span), frozen * limits.period)
+
+    def _learn_rest_noise(self, y: Any, turned: Any) -> None:
+        """Learn whether y is noisy while r rests: it turns at most samples, over many of its smallest changes."""
+        s, p, same = self.s, self.printer, self.s.same[R]
+        stretch, place = p.number(self.limits.frozen), Variable(p, same)
+        with p.when(same >= stretch):  # a division is what costs most, and motion needs none
+            place.value = p.number(p.truncate(same) % self.limits.frozen)
+        begins = place.value.is_equal(1.0)
+        with p.when(begins):
+            # The first stretch of a rest is left for the motion to settle.
+            turns = (same > stretch * 2.0) & (s.turns >= stretch * TURN_SHARE)
+            noisy = _width(s.rest_range) >= s.smallest_change[Y] * NOISE_LEVELS
+            s.noisy = where(turns & noisy, 1.0, s.noisy)
+            s.turns = 0.0
+        s.turns = s.turns + where(turned, 1.0, 0.0)
+        _track_range(s.rest_range, y, begins)
+
+    def _y_should_move(self) -> Any:
+        s, travel = self.s, self.limits.travel
+        # A y that has never moved has no scale of its own.
+        moved = where(s.smallest_change[Y] > 0.0, self._least_motion(Y), self._least_motion(R))
+        return (s.noisy > 0.0) | (_width(s.r_range) > where(travel > 0.0, travel, moved))
+
+    def _u_should_move(self, u: Any) -> Any:
+        """Return whether the controller has had to act; at the end of its range u is limited, and not frozen."""
+        s = self.s
+        lowest, highest = (limit(s.ranges[0, U, j], s.ranges[1, U, j]) for j, limit in enumerate((minimum, maximum)))
+        inside = (lowest < u) & (u < highest) & (highest - lowest > s.smallest_change[U] * MOTION_STEPS)
+        acted = _width(s.e_range) > self._range(E) * MOTION_SHARE
+        return inside & acted & (_width(s.y_range) > self._least_motion(Y))
+
+    def _least_motion(self, i: int) -> Any:
+        """Return how far a signal goes without moving: a share of its range, a few of its steps."""
+        return maximum(self._range(i) * MOTION_SHARE, self.s.smallest_change[i] * MOTION_STEPS)
+
+    def _range(self, i: int) -> Any:
+        ranges = self.s.ranges
+        return maximum(ranges[0, i, 1], ranges[1, i, 1]) - minimum(ranges[0, i, 0], ranges[1, i, 0])
+
+    def _missing_share(self) -> Any:
+        """Return the share of the window that is missing, if no more is until its end."""
+        missing = maximum(self.s.missing, 0.0)
+        return missing / (missing + self.printer.number(self.limits.window))
+
+    def _check_window(self, t: Any) -> None:
+        """Judge a complete window, and begin the next."""
+        s, limits, when = self.s, self.limits, self.printer.when
+        # What is found ends at half of its limit, so that it does not come and go.
+        share = self._missing_share()
+        with when(~self._is_quiet(GAP) & (share < limits.missing * 0.5)):
+            self._write_finding(GAP, 0.0, t, share, limits.missing)
+        with when(~self._is_quiet(CLOCK) & s.jumps.is_equal(0.0)):
+            self._write_finding(CLOCK, 0.0, t, 0.0, limits.silent_s)
+        with when(s.steps >= self.printer.number(limits.window) * 0.5):  # fewer say nothing, good or bad
+            self._update_finding(JITTER, s.jittery / s.steps, limits.jittery, t)
+            with when((s.jittery <= limits.jittery * s.steps) & (s.span > 0.0)):  # stamps that jitter tell no rate
+                self._update_finding(RATE, s.periods * limits.period / s.span - 1.0, limits.rate_error, t)
+            with when(~self._is_quiet(WAITING)):
+                self._write_finding(WAITING, 0.0, t, 0.0, 0.0)
+        for name in ("samples", "steps", "jittery", "periods", "span", "missing", "jumps"):
+            setattr(s, name, 0.0)
+        s.windows = s.windows + 1.0
+        with when((s.windows >= EPOCH_WINDOWS) & (s.values > 0.0)):
+            s.windows = 0.0
+            for i in range(4):
+                for j in range(2):
+                    s.ranges[1, i, j] = s.ranges[0, i, j]
+                    s.ranges[0, i, j] = s.last[i] if i < E else s.last[R] - s.last[Y]
+
+    def _is_quiet(self, kind: int) -> Any:
+        return self.s.active[kind].is_equal(0.0)
+
+    def _update_finding(self, kind: int, value: Any, limit: Any, t: Any) -> None:
+        quiet, size = self._is_quiet(kind), abs(value)
+        begins = quiet & (size > limit)
+        with self.printer.when(begins | (~quiet & (size < limit * 0.5))):
+            self._write_finding(kind, where(begins, 1.0, 0.0), t, value, limit)
+
+    def _write_finding(self, kind: int, begins: Any, t: Any, value: Any, limit: Any) -> None:
+        self.s.active[kind] = begins
+        self.s.since[kind] = t
+        row = self.out[self.count.value]
+        row[0], row[1], row[2], row[3], row[4] = float(kind), begins, t, value, limit
+        self.count.value = self.count.value + 1
 
 
-@inline
-def _check_values(
-    limits: QualityLimits, s: Any, t: float, r: float, u: float, y: float, out: FloatArray, n: int
-) -> int:
-    """Judge the values of a complete sample."""
-    e = r - y
-    if s.values == 0.0:
-        for epoch in range(2):
-            for i, x in enumerate((r, u, y, e)):
-                s.ranges[epoch, i, 0] = s.ranges[epoch, i, 1] = x
-    for i, x in enumerate((r, u, y, e)):
-        _widen(s.ranges[0, i], x)
-    turned = s.direction * (y - s.last[Y]) < 0.0
-    for i, x in enumerate((r, u, y)):
-        change = abs(x - s.last[i])
-        if s.values == 0.0 or change > 0.0:
-            s.same[i] = 0.0
-        if s.values > 0.0 and change > 0.0 and (s.smallest_change[i] == 0.0 or change < s.smallest_change[i]):
-            s.smallest_change[i] = change
-        s.same[i] += 1.0
-    if y != s.last[Y]:
-        s.direction = y - s.last[Y]
-    s.last[R], s.last[U], s.last[Y] = r, u, y
-    s.values += 1.0
-    _track_range(s.r_range, r, s.same[Y] == 1.0)
-    _track_range(s.y_range, y, s.same[U] == 1.0)
-    _track_range(s.e_range, e, s.same[U] == 1.0)
-    _learn_rest_noise(limits, s, y, turned)
-    frozen_s = limits.frozen * limits.period
-    if s.active[FROZEN_Y] != 0.0 and s.same[Y] == 1.0:
-        n = _write_finding(s, FROZEN_Y, False, t, 0.0, frozen_s, out, n)
-    elif s.active[FROZEN_Y] == 0.0 and s.same[Y] > limits.frozen and _y_should_move(limits, s):
-        n = _write_finding(s, FROZEN_Y, True, t, _width(s.r_range), frozen_s, out, n)
-    if s.active[FROZEN_U] != 0.0 and s.same[U] == 1.0:
-        n = _write_finding(s, FROZEN_U, False, t, 0.0, frozen_s, out, n)
-    elif s.active[FROZEN_U] == 0.0 and s.same[U] > limits.frozen and _u_should_move(s, u):
-        n = _write_finding(s, FROZEN_U, True, t, _width(s.e_range), frozen_s, out, n)
-    return n
+def _width(span: Any) -> Any:
+    return span[1] - span[0]
 
 
-@inline
-def _learn_rest_noise(limits: QualityLimits, s: Any, y: float, turned: bool) -> None:
-    """Learn, while r rests, whether y is noisy there: it turns at most samples, over many of its smallest changes."""
-    same, stretch = s.same[R], limits.frozen
-    begins = (same if same < stretch else same % stretch) == 1.0  # a division is what costs most, and motion needs none
-    if begins:
-        # The first stretch of a rest is left for the motion to settle.
-        if same > 2.0 * stretch and s.turns >= TURN_SHARE * stretch:
-            s.noisy = max(s.noisy, 1.0 * (_width(s.rest_range) >= NOISE_LEVELS * s.smallest_change[Y]))
-        s.turns = 0.0
-    s.turns += turned
-    _track_range(s.rest_range, y, begins)
+def _widen(span: Any, x: Any) -> None:
+    span[0], span[1] = minimum(span[0], x), maximum(span[1], x)
 
 
-@inline
-def _y_should_move(limits: QualityLimits, s: Any) -> bool:
-    if s.noisy > 0.0:
-        return True
-    if limits.travel > 0.0:
-        return _width(s.r_range) > limits.travel
-    # A y that has never moved has no scale of its own.
-    return _has_moved(s, s.r_range, Y if s.smallest_change[Y] > 0.0 else R)
-
-
-@inline
-def _u_should_move(s: Any, u: float) -> bool:
-    """Tell whether the controller has had to act; at the end of its range u is limited, and not frozen."""
-    lowest, highest = min(s.ranges[0, U, 0], s.ranges[1, U, 0]), max(s.ranges[0, U, 1], s.ranges[1, U, 1])
-    inside = lowest < u < highest and highest - lowest > MOTION_STEPS * s.smallest_change[U]
-    acted = _width(s.e_range) > MOTION_SHARE * _range(s, E)
-    return bool(inside and acted and _has_moved(s, s.y_range, Y))
-
-
-@inline
-def _has_moved(s: Any, span: FloatArray, i: int) -> bool:
-    """Tell whether a signal went further than what i does without moving: a share of its range, a few of its steps."""
-    return bool(_width(span) > max(MOTION_SHARE * _range(s, i), MOTION_STEPS * s.smallest_change[i]))
-
-
-@inline
-def _range(s: Any, i: int) -> float:
-    return float(max(s.ranges[0, i, 1], s.ranges[1, i, 1]) - min(s.ranges[0, i, 0], s.ranges[1, i, 0]))
-
-
-@inline
-def _width(span: FloatArray) -> float:
-    return float(span[1] - span[0])
-
-
-@inline
-def _widen(span: FloatArray, x: float) -> None:
-    span[0] = min(span[0], x)
-    span[1] = max(span[1], x)
-
-
-@inline
-def _track_range(span: FloatArray, x: float, anew: bool) -> None:
-    if anew:
-        span[0] = span[1] = x
-    else:
-        _widen(span, x)
-
-
-@inline
-def _missing_share(limits: QualityLimits, s: Any) -> float:
-    """Return the share of the window that is missing, if no more is until its end."""
-    missing = max(s.missing, 0.0)
-    return float(missing / (missing + limits.window))
-
-
-@inline
-def _check_window(limits: QualityLimits, s: Any, t: float, out: FloatArray, n: int) -> int:
-    """Judge a complete window, and begin the next."""
-    # What is found ends at half of its limit, so that it does not come and go.
-    if s.active[GAP] != 0.0 and _missing_share(limits, s) < 0.5 * limits.missing:
-        n = _write_finding(s, GAP, False, t, _missing_share(limits, s), limits.missing, out, n)
-    if s.active[CLOCK] != 0.0 and s.jumps == 0.0:
-        n = _write_finding(s, CLOCK, False, t, 0.0, limits.silent_s, out, n)
-    if s.steps >= 0.5 * limits.window:  # fewer say nothing, good or bad
-        n = _update_finding(s, JITTER, s.jittery / s.steps, limits.jittery, t, out, n)
-        if s.jittery <= limits.jittery * s.steps and s.span > 0.0:  # stamps that jitter do not tell a rate
-            n = _update_finding(s, RATE, s.periods * limits.period / s.span - 1.0, limits.rate_error, t, out, n)
-        if s.active[WAITING] != 0.0:
-            n = _write_finding(s, WAITING, False, t, 0.0, 0.0, out, n)
-    s.samples, s.steps, s.jittery, s.periods, s.span, s.missing, s.jumps = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    s.windows += 1.0
-    if s.windows >= EPOCH_WINDOWS and s.values > 0.0:
-        s.windows = 0.0
-        for i in range(4):
-            for j in range(2):
-                s.ranges[1, i, j] = s.ranges[0, i, j]
-                s.ranges[0, i, j] = s.last[i] if i < E else s.last[R] - s.last[Y]
-    return n
-
-
-@inline
-def _update_finding(s: Any, kind: int, value: float, limit: float, t: float, out: FloatArray, n: int) -> int:
-    active = s.active[kind] != 0.0
-    if (abs(value) > limit and not active) or (abs(value) < 0.5 * limit and active):
-        return _write_finding(s, kind, not active, t, value, limit, out, n)
-    return n
-
-
-@inline
-def _write_finding(
-    s: Any, kind: int, begins: bool, t: float, value: float, limit: float, out: FloatArray, n: int
-) -> int:
-    s.active[kind] = 1.0 if begins else 0.0
-    s.since[kind] = t
-    out[n, 0], out[n, 1], out[n, 2], out[n, 3], out[n, 4] = kind, s.active[kind], t, value, limit
-    return n + 1
+def _track_range(span: Any, x: Any, anew: Any) -> None:
+    span[0], span[1] = where(anew, x, minimum(span[0], x)), where(anew, x, maximum(span[1], x))

@@ -40,10 +40,11 @@ def check_block(
     if t.ndim != 1 or not t.shape == r.shape == u.shape == y.shape:
         raise RecordingError("t, r, u and y of a block must have the same shape (N,)")
     new, findings = _copy_state(state), []
-    out, begin = np.empty((BUFFER, 5)), 0
+    out, count, begin = np.empty((BUFFER, 5)), np.empty(1, dtype=np.int64), 0
     while begin < len(t):
-        begin, count = check_samples(limits, new.view(STATE_DTYPE), t, r, u, y, begin, out)
-        findings += [QualityFinding(KINDS[int(kind)], bool(on), *rest) for kind, on, *rest in out[:count].tolist()]
+        begin = check_samples(limits, new.view(STATE_DTYPE), t, r, u, y, begin, out, count)
+        rows = out[: count[0]].tolist()
+        findings += [QualityFinding(KINDS[int(kind)], bool(on), *rest) for kind, on, *rest in rows]
     return new, tuple(findings)
 
 
@@ -57,7 +58,7 @@ def check_lanes(limits: QualityLimits, states: FloatArray, t: FloatArray, signal
 
     new = np.array(states)
     named = new.view(STATE_DTYPE)[:, 0]
-    check_rows(limits, named, t, signals, np.empty((BUFFER, 5)))
+    check_rows(limits, named, *map(np.ascontiguousarray, (t, signals)), np.empty((BUFFER, 5)))
     now = t[:, -1]
     anew = (named["seen_count"] != named["count"]) | (named["is_running"] == 0.0) | (now < named["seen_at"])
     for name, values in (("seen_count", named["count"]), ("seen_at", now), ("is_running", 1.0)):
