@@ -15,14 +15,14 @@ from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel
 from servoscope.estimation.axis_filter import AxisFilter, AxisSignals
 from servoscope.estimation.noise_model import sample_autocovariance
-from servoscope.isolation.ml.kernels import Array
+from servoscope.fit.kernels import Array
+from servoscope.fit.plant_experiment import plant_input
 from servoscope.isolation.ml.window import (
     SENSOR_GAIN,
     ChangeProfile,
     ChangeSums,
     ChangeWindow,
     delay_input,
-    plant_input,
 )
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant

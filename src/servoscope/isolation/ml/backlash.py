@@ -6,7 +6,7 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel
-from servoscope.isolation.ml.kernels import Array, samples_since_restart
+from servoscope.fit.kernels import Array, samples_since_restart
 from servoscope.isolation.ml.least_squares import minimise_from_grid
 from servoscope.isolation.ml.window import RefitWindow
 

@@ -8,13 +8,13 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel, subroutine
-from servoscope.isolation.ml.kernels import (
+from servoscope.fit.kernels import (
     Array,
     run_constant_plant,
     run_drifting_plant,
     samples_since_restart,
 )
-from servoscope.isolation.ml.predictor import PlantVariants
+from servoscope.fit.predictor import PlantVariants
 
 MAX_REMAINING_SHARE = 1e-3  # share of its state from before a change that a predictor may still hold
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import kernel
-from servoscope.isolation.ml.kernels import Array, run_constant_plant, samples_since_restart
-from servoscope.isolation.ml.predictor import Predictor
+from servoscope.fit.kernels import Array, run_constant_plant, samples_since_restart
+from servoscope.fit.predictor import Predictor
 from servoscope.isolation.ml.window import RefitWindow
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servoscope.core.jit import kernel, subroutine
-from servoscope.isolation.ml.kernels import Array
+from servoscope.fit.kernels import Array
 
 GAIN_TOLERANCE = 1e-6  # relative change of the gain from which it stays as it is
 MAX_SERIES_NORM = 0.25  # norm of a matrix up to which so many terms of the exponential are exact to the last digit
