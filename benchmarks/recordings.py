@@ -42,7 +42,7 @@ class Judged:
         diagnosis, trace = diagnose_with_trace(baseline, recording)
         seconds = time.perf_counter() - start
         top = max((float(T2) for T2 in trace.statistic[trace.ready]), default=0.0)
-        return cls(diagnosis, top, baseline.limit, seconds)
+        return cls(diagnosis, top, baseline.thresholds.statistic, seconds)
 
     @property
     def candidate(self) -> str:
@@ -111,11 +111,12 @@ def emps(data: Path) -> Iterator[Table]:
     for name, value, std in zip(baseline.names, baseline.theta, sigma, strict=True):
         off = f"{100.0 * (value / AUTHORS[name] - 1.0):+.2f} %"
         rows.append((name, f"{value:.2f}", f"{std:.2f}", f"{AUTHORS[name]:.2f}", off))
+    shares = [learned.detectability.explained for learned in (baseline, refined)]
     yield Table(
         "EMPS: parameters",
-        f"Measured positioning axis, {whole.duration_s:.1f} s at 1 kHz. The model explains {baseline.explained:.2%} of "
-        f"the variance of u; with friction by direction, {refined.explained:.2%} (residual variance "
-        f"{refined.R / baseline.R:.2f} times as large).",
+        f"Measured positioning axis, {whole.duration_s:.1f} s at 1 kHz. The model explains {shares[0]:.2%} of "
+        f"the variance of u; with friction by direction, {shares[1]:.2%} (residual variance "
+        f"{refined.recursion.R / baseline.recursion.R:.2f} times as large).",
         ("coefficient", "learned", "std. dev.", "authors", "difference"),
         tuple(rows),
     )
@@ -171,10 +172,11 @@ def pump(data: Path) -> Iterator[Table]:
     for load, stroke in ((1, 3), (3, 2), (3, 4), (5, 2), (5, 4)):
         judged = Judged.of(baseline, ss.read(folder / f"exp_data_{load}_{stroke}.csv", loop))
         rows.append((str(load), str(stroke), judged.named, _ratio(judged), f"{judged.seconds:.2f} s"))
+    explained = baseline.detectability.explained
     yield Table(
         "Pump-controlled EHA",
-        f"Measured, 31 s at 1 kHz each. Learned from load 1, stroke 4 (explained {baseline.explained:.2%} of u's "
-        "variance). A load is no fault, and no coefficient of the model: it has to be found and must not be named. "
+        f"Measured, 31 s at 1 kHz each. Learned from load 1, stroke 4 (explained {explained:.2%} of u's variance). "
+        "A load is no fault, and no coefficient of the model: it has to be found and must not be named. "
         + _promised(baseline),
         ("load", "stroke", "verdict", "largest T^2 / threshold", "time"),
         tuple(rows),
@@ -195,7 +197,8 @@ def qube(data: Path) -> Iterator[Table]:
     yield Table(
         "QUBE",
         f"Measured, three healthy runs of 20 s at 500 Hz, model_error = {loop.monitor.model_error:g}; "
-        f"{ss.learn(loop, runs).explained:.1%} of the variance of u explained. " + _promised(ss.learn(loop, runs)),
+        f"{ss.learn(loop, runs).detectability.explained:.1%} of the variance of u explained. "
+        + _promised(ss.learn(loop, runs)),
         ("learned from", "judged", "verdict", "largest T^2 / threshold", "time"),
         tuple(rows),
     )
@@ -223,7 +226,7 @@ def cranfield(data: Path) -> Iterator[Table]:
                 cells.append(f"{max(one.statistic / one.threshold for one in judged):.2f}")
             seconds += [one.seconds for one in judged]
         mean = sum(seconds) / len(seconds)
-        rows.append((f"{load} kgf", f"{baseline.explained:.1%}", *cells, f"{mean:.2f} s"))
+        rows.append((f"{load} kgf", f"{baseline.detectability.explained:.1%}", *cells, f"{mean:.2f} s"))
     yield Table(
         "Cranfield ball screw",
         "Measured, runs of 65 s at 25 Hz; u is a stepper's current. Learned per load from healthy runs 1 to 5. Alarms "
@@ -259,7 +262,7 @@ def change_u(recording: ss.Recording, baseline: ss.Baseline, name: str) -> tuple
 
 
 def _promised(baseline: ss.Baseline) -> str:
-    told = [f"{p.name} {p.change:.0%}" for p in baseline.promises if p.change is not None]
+    told = [f"{p.name} {p.change:.0%}" for p in baseline.detectability.changes if p.change is not None]
     return f"Promised to be seen from a change of: {', '.join(told)}."
 
 

@@ -31,7 +31,7 @@ EVALUATION_RATES = (1.0, 10.0, 100.0)  # Hz
 
 def seen_from(baseline: ss.Baseline, name: str) -> str:
     """Return the smallest change that a baseline promises to see."""
-    change = next(promise.change for promise in baseline.promises if promise.name == name)
+    change = next(promise.change for promise in baseline.detectability.changes if promise.name == name)
     return "never" if change is None else percent(change)
 
 
@@ -86,7 +86,7 @@ def cutoff(m: Machines) -> Iterator[Table]:
         baseline = ss.learn(changed(m.loops["emps"], cutoff=hz), [m.emps])
         theta = dict(zip(baseline.names, baseline.theta, strict=True))
         coefficients = (f"{theta[name]:.2f}" for name in ("inertia", "viscous_friction", "coulomb_friction"))
-        cells = (*coefficients, f"{100.0 * baseline.explained:.2f} %", seen_from(baseline, "inertia"))
+        cells = (*coefficients, f"{100.0 * baseline.detectability.explained:.2f} %", seen_from(baseline, "inertia"))
         rows.append((f"{hz:g} Hz", *cells))
     yield Table(
         "Cutoff",
@@ -183,7 +183,12 @@ def update_when(m: Machines) -> Iterator[Table]:
         baseline = ss.learn(changed(m.loops["eha-pump"], **settings), [m.pump(1, 4)])
         judged = (margin(Judged.of(baseline, m.pump(load, stroke))) for load, stroke in ((3, 2), (5, 4)))
         rows.append(
-            (label, f"{100.0 * baseline.explained:.2f} %", seen_from(baseline, "viscous_friction"), *judged),
+            (
+                label,
+                f"{100.0 * baseline.detectability.explained:.2f} %",
+                seen_from(baseline, "viscous_friction"),
+                *judged,
+            ),
         )
     yield Table(
         "update_when",
@@ -199,7 +204,7 @@ def friction(m: Machines) -> Iterator[Table]:
     for model in ("coulomb", "directional"):
         for source in ("output", "reference"):
             loop = changed(m.loops["cranfield"], {"friction": model, "sign_from": source})
-            learned = [ss.learn(loop, m.cranfield("normal", load, "1-5")).explained for load in LOADS]
+            learned = [ss.learn(loop, m.cranfield("normal", load, "1-5")).detectability.explained for load in LOADS]
             explained = f"{100.0 * min(learned):.0f} to {100.0 * max(learned):.0f} %"
             rows.append((f'`"{model}"`', f'`"{source}"`', explained, *m.ball_screw(loop)))
     yield Table(
@@ -215,7 +220,7 @@ def statistic(m: Machines) -> Iterator[Table]:
     rows = []
     for rate in EVALUATION_RATES:
         baseline, _, late = leaking(m, changed(m.loops["rig"], evaluation_rate=rate))
-        rows.append((f"{rate:g} Hz", f"{baseline.limit:.1f}", late))
+        rows.append((f"{rate:g} Hz", f"{baseline.thresholds.statistic:.1f}", late))
     yield Table(
         "evaluation_rate",
         "Reference rig, multisine, leakage +20 %.",
@@ -225,7 +230,7 @@ def statistic(m: Machines) -> Iterator[Table]:
     rows = []
     for budget in BUDGETS:
         baseline = ss.learn(changed(m.loops["rig"], false_alarms_per_year=budget), [m.rig[0]])
-        rows.append((f"{budget:g}", f"{baseline.limit:.1f}", seen_from(baseline, "leakage")))
+        rows.append((f"{budget:g}", f"{baseline.thresholds.statistic:.1f}", seen_from(baseline, "leakage")))
     yield Table(
         "false_alarms_per_year",
         "Reference rig, multisine.",

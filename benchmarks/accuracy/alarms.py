@@ -55,9 +55,9 @@ def raised(seed: int, kind: str, minutes: int, recordings: Iterable[ss.Recording
     """
     same = baseline(kind, 60.0 * minutes, seed, per_year=BUDGETS[0] * HOURS_PER_YEAR)
     learned = {f"{budget:g}": same.shared(round(BUDGETS[0] / budget)) for budget in BUDGETS}
-    assert same.noise is not None, "the rig has a controller and physics"
+    assert same.healthy.noise is not None, "the rig has a controller and physics"
     for recording in recordings:
-        e = innovations(recording, same.plant, same.noise)
+        e = innovations(recording, same.plant, same.healthy.noise)
         found = {budget: alarm_times(each, recording) for budget, each in learned.items()}
         yield found | {name: recording.t[events(detector(e))] for name, detector in detectors().items()}
 

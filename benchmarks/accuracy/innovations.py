@@ -8,7 +8,7 @@ import servoscope as ss
 from accuracy.rig import FAULT_AT, loop
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.isolation.ml.predictor import PredictorFactory
+from servoscope.fit.predictor import PredictorFactory
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.models.plants import Plant
 from servoscope.simulation import FaultEvent, reference

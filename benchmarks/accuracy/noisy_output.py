@@ -66,7 +66,7 @@ def pitch_job(seed: int, turbulence: float) -> Numbers:
     learned = [ss.learn(loop, [actuator("", SECONDS, own + 100 * i, turbulence)], force=True) for i in range(LEARNED)]
     found: Numbers = {"error": [one.theta[2] / TRUE["input"][2] - 1.0 for one in learned]}
     found["std"] = [float(np.sqrt(one.covariance[2][2])) / TRUE["input"][2] for one in learned]
-    found["instrument"] = all(one.instrument is not None for one in learned)
+    found["instrument"] = all(one.recursion.instrument is not None for one in learned)
     healthy = ss.diagnose(healthy_pitch(), actuator("", 600.0, own + 5, turbulence))
     found["false"] = healthy.verdict == "fault"
     for i, (fault, wanted) in enumerate(FAULTS.items()):
@@ -113,7 +113,7 @@ def bias_job(seed: int, source: str, level_db: float, kind: str = "random") -> N
     return {
         "error": (np.array(learned.theta) / true - 1.0).tolist(),
         "std": (np.sqrt(np.diag(learned.covariance_array())) / true).tolist(),
-        "instrument": learned.instrument is not None,
+        "instrument": learned.recursion.instrument is not None,
     }
 
 

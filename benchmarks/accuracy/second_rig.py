@@ -51,12 +51,12 @@ def job(seed: int, runs: int = RUNS) -> Numbers:
         parameter, ratio = drawn(rng)
         fault = FaultEvent(parameter, ratio, FAULT_AT)
         said.append(told(learned, record(seed, 1 + i, (fault,)), [fault]))
-    off = {name: [float(np.log(ratio)), learned.ratios_std[name]] for name, ratio in learned.ratios.items()}
+    off = {name: [float(np.log(ratio)), learned.healthy.std[name]] for name, ratio in learned.healthy.ratios.items()}
     return {
         "runs": said,
         "of": runs,
         "healthy": off,
-        "sequential": bool(learned.members),
+        "sequential": bool(learned.thresholds.hypotheses),
         "whiteness": [largest(e) for e in (innovations(learned, healthy), residual(learned, healthy))],
     }
 
@@ -84,8 +84,8 @@ def residual(learned: ss.Baseline, recording: ss.Recording) -> FloatArray:
     """Return the recursion's residual behind its whitening, without what the reference makes of it."""
     pipeline = learned.pipeline()
     g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
-    assert learned.noise is not None, "a loop that can be simulated has its noise split"
-    expected = Expectation(pipeline, learned.tuning, learned.noise, reference_path(recording))
+    assert learned.healthy.noise is not None, "a loop that can be simulated has its noise split"
+    expected = Expectation(pipeline, learned.tuning, learned.healthy.noise, reference_path(recording))
     theta = nominal_theta(learned.loop, learned.plant)
     v = (g.eta - g.phi @ theta)[g.ok] - expected.mean_residual(learned.plant, theta, g.ok)
     return np.asarray(learned.tuning.noise.whiten(v)[round(2.0 * RATE) :])

@@ -29,7 +29,7 @@ def job(seed: int, wrong: float = WRONG) -> Numbers:
     for i, (parameter, ratio) in enumerate(RATIOS.items() if refits else ()):
         fault = FaultEvent(parameter, ratio, FAULT_AT)
         said.append(told(learned, record(KIND, SECONDS, seed, 1 + i, (fault,)), [fault]))
-    return {"runs": said, "of": len(RATIOS), "sequential": bool(learned.members)}
+    return {"runs": said, "of": len(RATIOS), "sequential": bool(learned.thresholds.hypotheses)}
 
 
 def wrong_loop(seed: int, wrong: float) -> ss.Loop:

@@ -158,7 +158,8 @@ def _repeat_signals(recording: Recording, samples: int) -> list[np.ndarray[Any, 
 
 
 def _without_cusum(baseline: Baseline) -> Baseline:
-    return baseline.model_copy(update={"members": ()})
+    thresholds = baseline.thresholds.model_copy(update={"hypotheses": ()})
+    return baseline.model_copy(update={"thresholds": thresholds})
 
 
 def _measure_log(baseline: Baseline, recording: Recording, repeats: int, amount: BenchmarkSize) -> list[BenchmarkRow]:

@@ -57,7 +57,7 @@ def servoscope_scores(loop: ss.Loop, healthy: Sequence[ss.Recording], judged: Se
     """
     baseline = ss.learn(loop, healthy)
     features = baseline.features
-    stds = {"features": score_std(features.left_out), "t2": score_std(baseline.left_out)} if features else {}
+    stds = {"features": score_std(features.left_out), "t2": score_std(baseline.scatter.left_out)} if features else {}
     largest, order, names = [], [], []
     for recording in judged:
         diagnosis, trace = diagnose_with_trace(baseline, recording)

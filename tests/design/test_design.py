@@ -79,7 +79,9 @@ def alarms(scene: Scenario) -> AlarmPower:
 def recorded(scene: Scenario, parameter: str, x: float, seed: int) -> ss.Recording:
     """Simulate one of the loops that the baseline may have been learned from, with a fault."""
     b = scene.baseline
-    off = np.random.default_rng(seed).multivariate_normal(np.zeros(len(b.ratios)), np.array(b.ratios_covariance))
+    off = np.random.default_rng(seed).multivariate_normal(
+        np.zeros(len(b.healthy.ratios)), np.array(b.healthy.covariance)
+    )
     true = b.plant.with_ratios(dict(zip(b.plant.parameters, np.exp(off).tolist(), strict=True)))
     return simulate(
         b.loop.model_copy(update={"plant": true}),
@@ -224,7 +226,7 @@ class TestBaselineAlone:
         hidden = learned.model_copy(update={"loop_settings": settings})
         said = study_baseline(hidden)
         assert isinstance(said, BaselineStudy) and "[controller]" in said.missing
-        for promise in learned.promises:
+        for promise in learned.detectability.changes:
             assert said.faults[promise.name].detectable == promise.change
         assert said.cosines["pump"]["pump"] == pytest.approx(1.0)
         hidden.save(tmp_path / "baseline.json")

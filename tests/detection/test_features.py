@@ -233,8 +233,8 @@ class TestLearning:
         model, shared = baseline.features, baseline.shared(10_000).features
         assert model is not None and shared is not None
         assert shared.in_a_row > model.in_a_row and shared.limit == model.limit
-        assert len(baseline.left_out) == len(model.left_out) == 6
-        assert max(model.left_out) < model.limit and max(baseline.left_out) < 1.0
+        assert len(baseline.scatter.left_out) == len(model.left_out) == 6
+        assert max(model.left_out) < model.limit and max(baseline.scatter.left_out) < 1.0
 
 
 class TestVerdicts:

@@ -191,7 +191,7 @@ class TestKernel:
         e = estimates(baseline, recording)
         pipeline = baseline.pipeline()
         test = cusum_constants(baseline, pipeline)
-        assert test is not None and baseline.members
+        assert test is not None and baseline.thresholds.hypotheses
         silent = (e.index >= 2000) & (e.index < 2000 + pipeline.bank.wait + test.warm)
         before = e.level[np.flatnonzero(silent)[0] - 1]
         assert silent.sum() >= 2 and np.all(e.level[silent][1:] <= before)
@@ -202,7 +202,7 @@ class TestAlarms:
     @pytest.mark.parametrize("kind", ["multisine", "profile"])
     def test_healthy_recordings_of_any_seed_and_reference_raise_none(self, kind: str) -> None:
         baseline = learned(kind)
-        assert baseline.members
+        assert baseline.thresholds.hypotheses
         for other in ("multisine", "profile", "trapezoid"):
             for seed in (11, 12):
                 e = estimates(baseline, recorded(baseline.loop, seed, 120.0, other))
@@ -261,7 +261,10 @@ class TestAlarms:
         assert 0.5 < count / (per_hour * hours) < 2.0, count
 
     def test_both_steps_listen_for_the_same_changes_but_the_largest(self) -> None:
-        both = [{(m.parameter, m.ratio) for m in learned(step=step).members} for step in ("update", "evaluation")]
+        both = [
+            {(m.parameter, m.ratio) for m in learned(step=step).thresholds.hypotheses}
+            for step in ("update", "evaluation")
+        ]
         assert both[1] < both[0]
         for parameter, ratio in both[0] - both[1]:  # each has a smaller neighbour, which finds it as soon
             smaller = [np.log(x) / np.log(ratio) for name, x in both[1] if name == parameter]

@@ -64,9 +64,9 @@ def with_budget(per_year: float) -> Baseline:
     """The rig's baseline, whose sequential test may raise so many false alarms."""
     loop = rig().loop
     monitor = loop.monitor.model_copy(update={"false_alarms_per_year": per_year})
-    return rig().model_copy(
-        update={"loop_settings": loop.model_copy(update={"monitor": monitor}).to_dict(), "limit": 1e6}
-    )
+    settings = loop.model_copy(update={"monitor": monitor}).to_dict()
+    thresholds = rig().thresholds.model_copy(update={"statistic": 1e6})
+    return rig().model_copy(update={"loop_settings": settings, "thresholds": thresholds})
 
 
 def test_what_is_stored_is_that_of_a_full_examination() -> None:
@@ -105,17 +105,17 @@ def test_limits_that_matter_are_those_of_the_reference() -> None:
 @pytest.mark.parametrize("per_year", [1.0, 1e3, 1e5])
 def test_no_reference_makes_limits_lower_than_the_sure_level(per_year: float) -> None:
     baseline = rig()
-    loop, members = baseline.loop, baseline.members
+    loop, members = baseline.loop, baseline.thresholds.hypotheses
     sure = sure_level(members, per_year)
     assert 0.2 < sure < 1.0
     kept = [member for member in members if np.isfinite(member.limit(per_year / len(members)))]
     own = {id(member): member.limit(per_year / len(kept)) for member in kept}
     for kind in ("multisine", "trapezoid", "profile"):
         record, _ = simulate(loop, reference(kind, 30.0, loop.sample_rate), seed=1)
-        assert baseline.noise is not None and baseline.loudest is not None
-        expectation = Expectation(baseline.pipeline(), baseline.tuning, baseline.noise, reference_path(record))
-        covariance = np.array(baseline.ratios_covariance)
-        fitted = worst_case_hypotheses(expectation, baseline.plant, baseline.loudest, covariance, members)
+        assert baseline.healthy.noise is not None and baseline.healthy.loudest is not None
+        expectation = Expectation(baseline.pipeline(), baseline.tuning, baseline.healthy.noise, reference_path(record))
+        covariance = np.array(baseline.healthy.covariance)
+        fitted = worst_case_hypotheses(expectation, baseline.plant, baseline.healthy.loudest, covariance, members)
         heard = [one for one in zip(fitted, members, strict=True) if np.isfinite(one[0].limit(per_year / len(fitted)))]
         for after, before in heard:
             assert after.limit(per_year / len(heard)) >= sure * own[id(before)]

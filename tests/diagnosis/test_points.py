@@ -97,7 +97,7 @@ def test_a_healthy_recording_that_differs_is_noticed() -> None:
 
 def test_two_recordings_of_one_plant_promise_no_less_than_one(plain: ss.Baseline) -> None:
     two = ss.learn(LOOP, [record(1), record(33)])
-    for few, many in zip(plain.promises, two.promises, strict=True):
+    for few, many in zip(plain.detectability.changes, two.detectability.changes, strict=True):
         assert few.change is not None and many.change is not None and many.change < 1.1 * few.change
 
 
@@ -118,7 +118,7 @@ def test_one_that_differs_where_the_others_agree_hides_no_fault() -> None:
 def test_recordings_that_scatter_have_no_sequential_test_which_takes_the_plant_for_constant(plain: ss.Baseline) -> None:
     """A further recording of that scatter raises no alarm, from the first evaluation on."""
     learned = ss.learn(LOOP, [record(1), record(2, 1.004)])
-    assert plain.members and not learned.members
+    assert plain.thresholds.hypotheses and not learned.thresholds.hypotheses
     monitor = ss.Monitor(learned)
     for leak in (0.997, 1.007):
         further = record(34, leak)
@@ -201,7 +201,7 @@ def test_a_monitor_follows_one_point(points: ss.Baseline) -> None:
 def test_each_of_many_assets_has_its_share_of_the_budget(points: ss.Baseline) -> None:
     one = points.at("warm")
     shared = one.shared(10)
-    assert shared.limit > one.limit
+    assert shared.thresholds.statistic > one.thresholds.statistic
     assert shared.loop.monitor.false_alarms_per_year == pytest.approx(one.loop.monitor.false_alarms_per_year / 10.0)
 
 

@@ -41,8 +41,6 @@ def test_what_is_no_recording_is_told_in_one_line() -> None:
         ss.diagnose({}, signals())  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="a loop is a Loop or the path of a loop file, not int"):
         ss.inspect(signals(), 3)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="are a list, as in"):
-        ss.learn(RIG, "healthy.csv")  # type: ignore[arg-type]
     with pytest.raises(RecordingError, match=r"their lengths differ \(t 2, r 1"):
         ss.read({"t": [0.0, 1.0], "r": [0.0], "u": [0.0], "y": [0.0]})
 

@@ -91,7 +91,7 @@ class TestEMPS:
 
         loop = Loop.from_dict(settings)
         two = learn_baseline(loop, [read(file, loop)])
-        assert two.R < 0.5 * one.R
+        assert two.recursion.R < 0.5 * one.recursion.R
 
 
 class TestPumpDrivenActuator:
@@ -104,7 +104,7 @@ class TestPumpDrivenActuator:
         for said in loaded:
             assert (said["verdict"], said["faults"]) == ("fault", [])
         baseline = Baseline.load(path)
-        assert baseline.explained > 0.99
+        assert baseline.detectability.explained > 0.99
         from servoscope.diagnosis.diagnose import diagnose_with_trace
 
         T2 = [diagnose_with_trace(baseline, read(file, baseline.loop))[1].statistic.max() for file in files]

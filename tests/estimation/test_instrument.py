@@ -81,7 +81,7 @@ def baseline() -> ss.Baseline:
 def test_healthy_coefficients_are_free_of_the_noise_in_y(baseline: ss.Baseline) -> None:
     """Least squares lose a tenth of the inertia here."""
     std = np.sqrt(np.diag(baseline.covariance_array()))
-    assert baseline.instrument is not None and baseline.instrument.source == "input"
+    assert baseline.recursion.instrument is not None and baseline.recursion.instrument.source == "input"
     assert np.all(np.abs(np.array(baseline.theta) - TRUE) < 3.0 * std)
     assert std[2] < 0.06 * TRUE[2]
     rec, pipeline = pitch(180.0, 0), Pipeline.of(ss.Loop.from_dict(LOOP))
@@ -105,7 +105,7 @@ def test_a_closed_loop_takes_its_reference() -> None:
     loop = ss.Loop.from_dict({"sample_rate": RATE, "plant": {"kind": "polynomial", "order": 2}})
     healthy = [axis(60.0, seed, 0.1) for seed in range(3)]
     learned = ss.learn(loop, healthy)
-    assert learned.instrument is not None and learned.instrument.source == "reference"
+    assert learned.recursion.instrument is not None and learned.recursion.instrument.source == "reference"
     std = np.sqrt(np.diag(learned.covariance_array()))
     assert np.all(np.abs(np.array(learned.theta) - [8.0, 2.0]) < 3.0 * std)
 
@@ -129,19 +129,19 @@ def test_a_u_that_answers_the_noise_is_no_source() -> None:
     without = [clean(rec.t, rec.u, rec.u, rec.y, name=rec.name, sample_rate=RATE) for rec in (axis(60.0, 0, 0.1),)]
     assert source_of(without) == "input"
     learned = ss.learn(loop, without, force=True)  # noise leaves more of u than the motion explains
-    assert learned.instrument is None
+    assert learned.recursion.instrument is None
     assert any("u answers the noise of y" in str(note) for note in learned.notes)
 
 
 def test_what_noise_hides_is_refused_with_the_reason() -> None:
     learned = ss.learn(ss.Loop.from_dict(LOOP), [pitch(30.0, 0, noise=3.0)])
-    assert learned.instrument is None
+    assert learned.recursion.instrument is None
     assert any("noise in y biases the coefficients" in str(note) for note in learned.notes)
 
 
 def test_a_quiet_sensor_changes_nothing() -> None:
     loop = ss.Loop.from_dict({"sample_rate": RATE, "plant": {"kind": "polynomial", "order": 2}})
-    assert ss.learn(loop, [axis(60.0, 0, 1e-5)]).instrument is None
+    assert ss.learn(loop, [axis(60.0, 0, 1e-5)]).recursion.instrument is None
 
 
 def test_a_recording_without_a_reference_has_u_in_its_place(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_an_integrating_plant_has_an_instrument_from_u() -> None:
     y += 0.02 * y.std() * np.random.default_rng(5).normal(size=len(y))
     rec = clean(np.arange(len(u)) / RATE, u, u, y, name="integrator", sample_rate=RATE)
     learned = ss.learn(ss.Loop.from_dict({"sample_rate": RATE, "plant": {"kind": "polynomial", "order": 2}}), [rec])
-    assert learned.instrument is not None
+    assert learned.recursion.instrument is not None
     std = np.sqrt(np.diag(learned.covariance_array()))
     assert np.all(np.abs(np.array(learned.theta) - [8.0, 2.0]) < 3.0 * std)
 
@@ -180,7 +180,7 @@ def test_the_study_of_the_pitch_actuator_reduced() -> None:
     """A fault of a turbine's pitch actuator is named through its ray, and dated."""
     healthy = [noisy_output.actuator("", 300.0, 900 + i, 1.0) for i in range(2)]
     learned = ss.learn(ss.Loop.from_dict(noisy_output.LOOP), healthy)
-    assert learned.instrument is not None
+    assert learned.recursion.instrument is not None
     found = ss.diagnose(learned, noisy_output.actuator("air in oil", 400.0, 902, 1.0))
     assert [fault.name for fault in found.faults] == ["air_in_oil"]
     assert found.intervals[0].onset_s[1] == pytest.approx(300.0, abs=1.0)

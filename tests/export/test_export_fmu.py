@@ -87,7 +87,7 @@ def test_steps_give_the_bits_of_the_monitor(unit: Path, slave: FMU3Slave) -> Non
     assert np.array_equal(found, wanted, equal_nan=True)
     assert slave.getFloat64([at["gamma[2].real"], at["gamma[2].imag"]]) == [gamma[-1, 1].real, gamma[-1, 1].imag]
     assert slave.getInt64([at["verdict"]]) == [2], "the golden samples end with a fault"
-    assert slave.getFloat64([at["limit"]]) == [demo().limit]
+    assert slave.getFloat64([at["limit"]]) == [demo().thresholds.statistic]
 
 
 def test_a_simulator_runs_it(unit: Path) -> None:
@@ -106,7 +106,7 @@ def test_a_simulator_runs_it(unit: Path) -> None:
     _, trace = monitor.run(monitor.init(), *signals)
     last = result["statistic"][-1]
     assert last == trace.statistic[-1]
-    assert last > demo().limit
+    assert last > demo().thresholds.statistic
 
 
 def test_state_is_serialized_as_the_image_that_the_server_reads(slave: FMU3Slave) -> None:

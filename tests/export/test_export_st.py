@@ -17,7 +17,7 @@ from commands import run
 from hypothesis import given
 from hypothesis import strategies as st
 from structured_text import FunctionBlock
-from test_export import altered, demo, fresh
+from test_export import altered, demo, fresh, without_sequential_test
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.jit import symbolic
@@ -76,7 +76,7 @@ def test_verdicts_of_the_monitor(settings: dict[str, Any]) -> None:
 
 
 def test_without_the_sequential_test() -> None:
-    baseline = demo().model_copy(update={"members": ()})
+    baseline = without_sequential_test(demo())
     signals, monitor = golden_signals(baseline, SAMPLES), Monitor(baseline)
     _, trace = monitor.run(monitor.init(), *signals)
     block = FunctionBlock(export_st(baseline))

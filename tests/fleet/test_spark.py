@@ -334,8 +334,8 @@ def test_baselines_travel_as_text_or_stay_in_their_folder(plan: Plan) -> None:
     from servoscope.core.errors import BaselineError
 
     own = Baseline.load(plan.output / "baselines" / "A.json")
-    limit = own.shared(4).limit
+    limit = own.shared(4).thresholds.statistic
     for source in (own, {"A": own}, plan.output / "baselines", plan.output / "baselines" / "A.json"):
-        assert Baselines.from_source(source, 4, 60.0).day_monitor("A").baseline.limit == limit
+        assert Baselines.from_source(source, 4, 60.0).day_monitor("A").baseline.thresholds.statistic == limit
     with pytest.raises(BaselineError, match="none is called B"):
         Baselines.from_source({"A": own}, 4, 60.0).day_monitor("B")

@@ -147,7 +147,9 @@ class TestPredictor:
         """How-it-works, "Refit": 10 s of the profile, one parameter alone and all four free, in per cent."""
         learned = ss.learn(rig_loop, [simulate(rig_loop, reference("profile", 60.0, 100.0), seed=1)[0]])
         paper = ExactPredictorFit(noise=WhiteNoise(1e-4, float(np.sqrt(1e-7))), misfit=0.0)
-        known = learned.model_copy(update={"ratios": {}, "ratios_covariance": (), "exact": paper})
+        known = learned.model_copy(
+            update={"healthy": learned.healthy.model_copy(update={"ratios": {}, "covariance": ()}), "exact": paper}
+        )
         quiet, _ = simulate(rig_loop, reference("profile", 60.0, 100.0), noise_u_std=0.0, noise_y_std=0.0)
         window = RefitWindow.from_recording(known, quiet, 0, quiet.samples)
         J = window.jacobian(np.zeros(4), NAMES, ChangeProfile(0))[1000:] / np.sqrt(5.0)  # 50 s of it stand for 10 s
@@ -364,4 +366,5 @@ class TestGate:
             other = learned.model_copy(update={"loop_settings": {**loop, **changes}})
             vars(other).pop("loop", None)
             assert fit_exact_predictor(other, [rec]) is None
-        assert fit_exact_predictor(learned.model_copy(update={"noise": None}), [rec]) is None
+        unknown = learned.healthy.model_copy(update={"noise": None})
+        assert fit_exact_predictor(learned.model_copy(update={"healthy": unknown}), [rec]) is None

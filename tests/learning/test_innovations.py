@@ -69,15 +69,14 @@ class TestHealthyParameters:
     def test_baseline_keeps_refit_and_sequential_test(self) -> None:
         learned = second_baseline()
         assert learned.exact is not None and learned.exact.misfit <= 1.0
-        assert learned.members
-        for name, ratio in learned.ratios.items():
-            assert abs(math.log(ratio)) < 4.0 * learned.ratios_std[name]
+        assert learned.thresholds.hypotheses
+        for name, ratio in learned.healthy.ratios.items():
+            assert abs(math.log(ratio)) < 4.0 * learned.healthy.std[name]
 
-    def test_the_recursion_is_kept_where_it_is_right(self) -> None:
+    def test_a_right_file_keeps_its_own_parameters_free(self) -> None:
         found = fit_innovations(rig.loop(), [rig.record("multisine", 60.0, 0, 0)], PAPER)
         assert found is not None and found.names == rig.loop().plant.parameters
-        assert not found.contradicts(found.x)
-        assert found.contradicts(found.x + 6.0 * np.sqrt(np.diag(found.covariance)))
+        assert found.explains
 
 
 class TestColour:

@@ -40,8 +40,8 @@ def test_finds_noise_and_healthy_parameters(rig: dict[str, Any], record: Callabl
     loop = Loop.from_dict(rig)
     aged = loop.model_copy(update={"plant": loop.plant.with_ratios({"p_s": 0.8, "C_ie": 1.5})})
     baseline = learn_baseline(loop, [record(aged)])  # the loop file is wrong: the recording knows better
-    assert baseline.noise is not None
-    assert baseline.noise.y_std == pytest.approx(np.sqrt(1e-7), rel=0.1)
+    assert baseline.healthy.noise is not None
+    assert baseline.healthy.noise.y_std == pytest.approx(np.sqrt(1e-7), rel=0.1)
     # whether it aged in two parameters or the file is wrong in all, the coefficients do not say; they are known
     assert baseline.theta[:2] == pytest.approx(aged.plant.theta()[:2], rel=0.002)
     assert any("contradict the parameters in [plant]" in str(note) for note in baseline.notes)
@@ -56,7 +56,7 @@ def test_scatter_between_recordings_counts(rig: dict[str, Any], record: Callable
     same = learn_baseline(loop, [record(loop, seed=1), record(loop, seed=2)])
     mixed = learn_baseline(loop, [record(loop, seed=1), record(colder, seed=2)])
     assert mixed.covariance[0][0] > 10.0 * same.covariance[0][0]
-    by_parameter = {p.parameter: p.change for p in mixed.promises}
+    by_parameter = {p.parameter: p.change for p in mixed.detectability.changes}
     assert by_parameter["C_ie"] is not None and by_parameter["C_ie"] > 0.05
 
 
@@ -65,12 +65,12 @@ def test_more_data_promise_more(rig: dict[str, Any], record: Callable[..., Recor
     short, long = (learn_baseline(loop, [record(loop, seconds=seconds)]) for seconds in (30.0, 120.0))
     assert any("short" in str(note) for note in short.notes)
     assert np.all(np.diag(short.covariance_array()) > np.diag(long.covariance_array()))
-    few, many = ({p.parameter: p.change for p in baseline.promises} for baseline in (short, long))
+    few, many = ({p.parameter: p.change for p in baseline.detectability.changes} for baseline in (short, long))
     for parameter in ("b_p", "beta"):
         assert few[parameter] > many[parameter]
     for parameter in ("p_s", "C_ie"):  # the recursion's own scatter limits them; half a minute hardly tells its noise
         assert few[parameter] > 0.9 * many[parameter]
-    assert short.limit > long.limit  # the noise itself is known less well
+    assert short.thresholds.statistic > long.thresholds.statistic  # the noise itself is known less well
 
 
 def test_refuses_recordings_out_of_step(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
@@ -95,8 +95,8 @@ def test_suggests_a_model_error_where_the_model_is_wrong(rig: dict[str, Any], re
     bent = record(loop)
     bent = replace(bent, u=bent.u * (1.0 + 2.0 * np.abs(bent.u)))  # a valve that saturates
     baseline = learn_baseline(loop, [bent])
-    assert baseline.suggested_model_error > 0.001
-    assert learn_baseline(loop, [record(loop)]).suggested_model_error < 0.001
+    assert baseline.detectability.suggested_model_error > 0.001
+    assert learn_baseline(loop, [record(loop)]).detectability.suggested_model_error < 0.001
 
 
 def test_a_useless_instrument_is_replaced_and_told(rig: dict[str, Any], record: Callable[..., Recording]) -> None:
@@ -186,7 +186,8 @@ class TestFile:
             ({"loop": {"name": "x"}}, "damaged"),
             ({"unheard": 1}, "unheard"),
             ({"theta": [1.0]}, "theta must have 4"),
-            ({"R": -1.0}, "positive"),
+            ({"recursion": {"scale": [1.0]}}, "recursion"),
+            ({"thresholds": {"dof": 9.0, "statistic": -1.0, "calibration": {}}}, "positive"),
             ({"covariance": [[1.0, 0.0], [0.0, 1.0]]}, "4 by 4"),
             ({"covariance": (-np.eye(4)).tolist()}, "positive"),
         ],
@@ -219,9 +220,9 @@ def test_a_slowly_ringing_loop_keeps_its_noise_apart(rig: dict[str, Any], record
     """The closed loop's poles, not the filters', say how long the noise is remembered."""
     loop = Loop.from_dict(rig | {"delay": 0.013})
     baseline = learn_baseline(loop, [record(loop)])
-    assert baseline.noise is not None and baseline.members
-    assert baseline.noise.u_std == pytest.approx(1e-4, rel=0.6)
-    assert baseline.noise.y_std == pytest.approx(np.sqrt(1e-7), rel=0.05)
+    assert baseline.healthy.noise is not None and baseline.thresholds.hypotheses
+    assert baseline.healthy.noise.u_std == pytest.approx(1e-4, rel=0.6)
+    assert baseline.healthy.noise.y_std == pytest.approx(np.sqrt(1e-7), rel=0.05)
     assert diagnose(baseline, record(loop, seed=3)).verdict == "healthy"
 
 
@@ -251,5 +252,5 @@ def test_a_rehearsal_is_as_long_as_the_memory_asks(rig: dict[str, Any], record: 
     shares = []
     for memory in (5.0, 20.0):
         loop = Loop.from_dict(rig | {"monitor": {"memory": memory}})
-        shares.append(learn_baseline(loop, [record(loop, seconds=240.0)]).rehearsed.statistic)
+        shares.append(learn_baseline(loop, [record(loop, seconds=240.0)]).thresholds.calibration.statistic)
     assert shares[1] == pytest.approx(shares[0], rel=0.5)

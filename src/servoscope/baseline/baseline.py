@@ -9,43 +9,42 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from servoscope.baseline.axis_model import AxisModel
 from servoscope.baseline.covariates import CovariateModel
 from servoscope.baseline.feature_model import FeatureModel
-from servoscope.baseline.hypothesis import CusumHypothesis
 from servoscope.baseline.learned_fault import LearnedFault
 from servoscope.baseline.motion import MotionRange
 from servoscope.baseline.plant_fit import fault_directions, match_ratios
 from servoscope.baseline.records import (
+    AlarmThresholds,
     BaselineMemory,
     BaselineSource,
-    DetectableChange,
+    Detectability,
     ExactPredictorFit,
+    HealthyParameters,
+    HealthyScatter,
+    Matrix,
+    RecursionTuning,
+    Vector,
     parse_stored_loop,
 )
 from servoscope.baseline.sensors import SensorModel
-from servoscope.baseline.threshold import CalibrationFactors, t2_threshold
+from servoscope.baseline.threshold import t2_threshold
+from servoscope.baseline.version_2 import FLAT_VERSION, group_flat_fields
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError
 from servoscope.core.files import atomic_write
 from servoscope.core.messages import MessageText
 from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.filter_bank import nominal_theta
-from servoscope.estimation.instrument import InstrumentTuning
-from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
 from servoscope.estimation.pipeline import Pipeline, Tuning
-from servoscope.estimation.two_stage import StageOneTuning
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 
 FORMAT = "servoscope-baseline"
-VERSION = 2
-NEWER_FIELDS = "motion", "axis", "covariates", "scatter"  # what earlier versions did not know
-
-Vector = tuple[float, ...]
-Matrix = tuple[Vector, ...]
+VERSION = 3
 
 
 class Baseline(ShortRepr, BaselineMemory):
@@ -58,43 +57,19 @@ class Baseline(ShortRepr, BaselineMemory):
     names, theta, covariance
         The n coefficients: names, healthy values (n,), and the covariance (n, n) of a further healthy recording's mean
         around them: noise of the baseline, scatter between recordings and model error.
-    scale, P_d, R, noise_a, noise_b, noise_gamma, noise_variance, stage_one
-        The recursion's tuning (see `servoscope.estimation.pipeline.Tuning`), and that of stage 1 of two stages.
-    noise, ratios, ratios_std, ratios_covariance, model_theta
-        n_u and n_y; healthy parameters relative to the loop file's nominal values, standard deviations and covariance
-        (m, m) of their logarithms; the coefficients that they lead to. Without a controller or physics None or empty.
-    dof, limit, explained
-        Effective number of independent residuals; threshold of T^2; share of eta's variance that the model explains.
-    still_speed
-        Speed below which the axis stands still [output per s]; 0 where rest is part of what is expected.
+    recursion, healthy, scatter, thresholds, detectability
+        What the steps of learning found: the recursion's tuning; the healthy plant and its noise; how the recordings
+        scatter; limits of both tests; the smallest changes and the budget that the recordings support.
     delay_s
         Delay that the recordings show [s]; None where they do not show it.
-    loudest
-        The largest noise that the recordings allow; None where white noises on u and y do not explain the residual.
-    rehearsed, members
-        Counted false alarms over those of theory; the hypotheses of the sequential test, empty where there is none.
-    promises
-        Smallest changes that are detected with 90 % probability within the baseline's own excitation.
-    exact
-        What the exact predictor says of the healthy recordings; None where there is none.
     notes, learned
         Warnings of `learn`; faults known from labelled recordings.
-    sensors
-        How the sensors of the output disagree; None where it has one.
-    instrument
-        The model behind the instrument of a loop without a controller, if any.
-    features, left_out
-        What healthy recordings show besides coefficients; the largest T^2 of each over its limit when learned without
-        it. None and empty where there are fewer than four recordings.
-    motion
-        The motion that the recordings hold; None in baselines of earlier versions, and where they are very short.
-    axis
-        The healthy motor axis that the refit starts from, for that kind of plant.
-    covariates
-        How coefficients move with covariates, if any; theta is theirs in the middle of the learned range.
-    scatter
-        Covariance (n, n) of the coefficients between the recordings beyond their noise; earlier versions wrote its
-        diagonal (n,). Empty where there was only one recording.
+    exact
+        What the exact predictor says of the healthy recordings; None where there is none.
+    sensors, features, motion, axis, covariates
+        Further evidence, None where there is none: how the sensors of the output disagree; what four or more recordings
+        show besides coefficients; the motion that they hold; the healthy motor axis that its refit starts from; how
+        coefficients move with covariates, theta being theirs in the middle of the learned range.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -106,60 +81,39 @@ class Baseline(ShortRepr, BaselineMemory):
     names: tuple[str, ...]
     theta: Vector
     covariance: Matrix
-    scale: Vector
-    P_d: Matrix
-    R: float
-    noise_a: Vector
-    noise_b: Vector
-    noise_gamma: Vector
-    noise_variance: float
-    stage_one: StageOneTuning | None = None
-    noise: WhiteNoise | None
-    ratios: dict[str, float]
-    ratios_std: dict[str, float]
-    ratios_covariance: Matrix
-    model_theta: Vector
-    dof: float
-    limit: float
-    explained: float
-    still_speed: float
+    recursion: RecursionTuning
+    healthy: HealthyParameters
+    scatter: HealthyScatter
+    thresholds: AlarmThresholds
+    detectability: Detectability
     delay_s: float | None
-    suggested_model_error: float
-    supported_false_alarms_per_year: float
-    loudest: WhiteNoise | None
-    rehearsed: CalibrationFactors
-    members: tuple[CusumHypothesis, ...]
-    promises: tuple[DetectableChange, ...]
     notes: tuple[MessageText, ...]
-    exact: ExactPredictorFit | None = None
     learned: tuple[LearnedFault, ...] = ()
+    exact: ExactPredictorFit | None = None
     sensors: SensorModel | None = None
-    instrument: InstrumentTuning | None = None
     features: FeatureModel | None = None
-    left_out: Vector = ()
     motion: MotionRange | None = None
     axis: AxisModel | None = None
     covariates: CovariateModel | None = None
-    scatter: Matrix | Vector = ()
     point: str = ""
     others: tuple[Baseline, ...] = ()
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:
-        n, p = len(self.names), len(self.noise_a)
-        for name in ("theta", "scale"):
-            if len(getattr(self, name)) != n:
-                raise ValueError(f"{name} must have {n} values, one per coefficient")
-        for name in ("covariance", "P_d"):
-            rows = getattr(self, name)
+        n, tuning = len(self.names), self.recursion
+        for where, vector in (("theta", self.theta), ("recursion.scale", tuning.scale)):
+            if len(vector) != n:
+                raise ValueError(f"{where} must have {n} values, one per coefficient")
+        for where, rows in (("covariance", self.covariance), ("recursion.P_d", tuning.P_d)):
             if len(rows) != n or any(len(row) != n for row in rows):
-                raise ValueError(f"{name} must be {n} by {n}")
-        if len(self.noise_gamma) != p or not p or not (self.noise_gamma[0] > 0.0 and self.noise_variance > 0.0):
+                raise ValueError(f"{where} must be {n} by {n}")
+        gamma = tuning.noise_gamma
+        if not gamma or len(gamma) != len(tuning.noise_a) or not (gamma[0] > 0.0 and tuning.noise_variance > 0.0):
             raise ValueError("noise_a and noise_gamma must have the same length, and a positive variance")
-        if len(self.model_theta) not in (0, n):
-            raise ValueError(f"model_theta must be empty or have {n} values")
-        if not (n and self.R > 0.0 and self.limit > 0.0 and min(self.scale) > 0.0):
-            raise ValueError("names, R, limit and scale must be positive")
+        if len(self.healthy.theta) not in (0, n):
+            raise ValueError(f"healthy.theta must be empty or have {n} values")
+        if not (n and tuning.R > 0.0 and self.thresholds.statistic > 0.0 and min(tuning.scale) > 0.0):
+            raise ValueError("names, R, threshold and scale must be positive")
         C, size = np.array(self.covariance), np.sqrt(np.abs(np.diag(self.covariance)))
         scaled = C / np.outer(size, size) if size.all() else C
         if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
@@ -173,12 +127,6 @@ class Baseline(ShortRepr, BaselineMemory):
         if any(other.others for other in self.others):
             raise ValueError("others must have no others")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_nothing(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what is `NEWER_FIELDS`, where there is none: files of earlier versions are written as they were."""
-        fields: dict[str, Any] = write(self)
-        return {name: value for name, value in fields.items() if value or name not in NEWER_FIELDS}
 
     @cached_property
     def loop(self) -> Loop:
@@ -228,28 +176,28 @@ class Baseline(ShortRepr, BaselineMemory):
         covariance = self.covariance_array() + model.theta_covariance(origin, c)
         update: dict[str, Any] = {"theta": tuple(theta.tolist()), "covariance": tuple(map(tuple, covariance.tolist()))}
         update["covariates"] = None
-        if self.model_theta:
-            update["model_theta"] = tuple((np.array(self.model_theta) + theta - origin).tolist())
-        if self.ratios:
+        moved: dict[str, Any] = {}
+        if self.healthy.theta:
+            moved["theta"] = tuple((np.array(self.healthy.theta) + theta - origin).tolist())
+        if self.healthy.ratios:
             wanted = nominal_theta(self.loop, self.plant) + theta - origin
-            update["ratios"] = match_ratios(self.loop, self.ratios, wanted, covariance)
+            moved["ratios"] = match_ratios(self.loop, self.healthy.ratios, wanted, covariance)
+        update["healthy"] = self.healthy.model_copy(update=moved)
         if self.axis is not None:
             shift = dict(zip(self.names, (theta - origin).tolist(), strict=True))
-            moved = {name: value + shift.get(name, 0.0) for name, value in self.axis.coefficients.items()}
-            update["axis"] = self.axis.model_copy(update={"coefficients": moved})
+            coefficients = {name: value + shift.get(name, 0.0) for name, value in self.axis.coefficients.items()}
+            update["axis"] = self.axis.model_copy(update={"coefficients": coefficients})
         return self.model_copy(update=update)
 
     @property
     def plant(self) -> Plant:
         """The plant with its healthy parameters as learned."""
-        return self.loop.plant.scaled(self.ratios) if self.ratios else self.loop.plant
+        return self.loop.plant.scaled(self.healthy.ratios) if self.healthy.ratios else self.loop.plant
 
     @property
     def tuning(self) -> Tuning:
         """What the recursion takes."""
-        theta, scale, P_d = map(np.array, (self.theta, self.scale, self.P_d))
-        a, b, gamma = map(np.array, (self.noise_a, self.noise_b, self.noise_gamma))
-        return Tuning(theta, scale, P_d, self.R, ArmaNoise(a, b, gamma, self.noise_variance))
+        return self.recursion.at(np.array(self.theta))
 
     @property
     def extrapolates(self) -> bool:
@@ -259,9 +207,10 @@ class Baseline(ShortRepr, BaselineMemory):
         linear, or a file that is wrong, asks for further parameters, or leaves no sequential test.
         """
         exact = self.exact is not None and self.exact.misfit <= 1.0
-        as_it_stands = set(self.ratios) <= set(self.loop.plant.parameters)
+        ratios = self.healthy.ratios
+        as_it_stands = set(ratios) <= set(self.loop.plant.parameters)
         # a baseline of nominal parameters has no ratios, and its motion was simulated
-        return as_it_stands and (bool(self.members) or (exact and not self.ratios))
+        return as_it_stands and (bool(self.thresholds.hypotheses) or (exact and not ratios))
 
     @property
     def limited_motion(self) -> MotionRange | None:
@@ -274,7 +223,8 @@ class Baseline(ShortRepr, BaselineMemory):
 
     @cached_property
     def _pipeline(self) -> Pipeline:
-        return Pipeline.of(self.loop, self.stage_one, self.still_speed, self.instrument)
+        tuning = self.recursion
+        return Pipeline.of(self.loop, tuning.stage_one, tuning.still_speed, tuning.instrument)
 
     @cached_property
     def fault_directions(self) -> dict[str, FloatArray]:
@@ -284,9 +234,9 @@ class Baseline(ShortRepr, BaselineMemory):
     @cached_property
     def bias(self) -> FloatArray:
         """What the biases of the regression add to the healthy coefficients, shape (n,)."""
-        if not self.model_theta or self.loop.monitor.structure != "svf":
+        if not self.healthy.theta or self.loop.monitor.structure != "svf":
             return np.zeros(len(self.theta))
-        return np.array(self.model_theta) - nominal_theta(self.loop, self.plant)
+        return np.array(self.healthy.theta) - nominal_theta(self.loop, self.plant)
 
     def shared(self, assets: int) -> Self:
         """Return the baseline of one among many assets that share its budget of false alarms.
@@ -302,11 +252,18 @@ class Baseline(ShortRepr, BaselineMemory):
         budget = monitor.false_alarms_per_year / assets
         loop = self.loop.model_copy(update={"monitor": monitor.model_copy(update={"false_alarms_per_year": budget})})
         features = self.features.shared(budget) if self.features is not None else None
-        tests = bool(self.members), features is not None
-        limit = t2_threshold(loop, len(self.names), self.dof, self.rehearsed, *tests)
+        known = self.thresholds
+        tests = bool(known.hypotheses), features is not None
+        limit = t2_threshold(loop, len(self.names), known.dof, known.calibration, *tests)
+        thresholds = known.model_copy(update={"statistic": limit})
         others = tuple(other.shared(assets) for other in self.others)
         return self.model_copy(
-            update={"loop_settings": loop.to_dict(), "limit": limit, "features": features, "others": others}
+            update={
+                "loop_settings": loop.to_dict(),
+                "thresholds": thresholds,
+                "features": features,
+                "others": others,
+            }
         )
 
     def covariance_array(self) -> FloatArray:
@@ -353,11 +310,12 @@ class Baseline(ShortRepr, BaselineMemory):
             ) from None
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
-        if content.get("version") != VERSION:
-            raise BaselineError(
-                f"{path}: baseline of version {content.get('version')!r}, this program reads {VERSION}: learn it again"
-            )
+        version = content.get("version")
+        if version not in (FLAT_VERSION, VERSION):
+            known = f"{FLAT_VERSION} and {VERSION}"
+            raise BaselineError(f"{path}: baseline of version {version!r}, this program reads {known}: learn it again")
         fields = {key: value for key, value in content.items() if key not in ("format", "version")}
+        fields = group_flat_fields(fields) if version == FLAT_VERSION else fields
         try:
             baseline = cls.model_validate(fields)
             _ = [one.loop for one in baseline.per_point]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,8 @@ from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise, sample_autocovariance
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit
+from servoscope.fit import search
+from servoscope.fit.search import Experiment
 from servoscope.models.loop import Loop
 from servoscope.models.lti import autocovariances, solve_scaled
 from servoscope.models.plants import Plant
@@ -21,14 +23,11 @@ from servoscope.signals import Recording
 
 COVARIATE_PRIOR_STD = 1.0  # standard deviation of how far covariates may move the logarithm of a parameter
 MAX_COVARIATE_LOGARITHM = 3.0  # how far they move it at most
-NEWTON_STEPS, STEP_TOLERANCE, CONVERGENCE_TOLERANCE = (
-    20,
-    1e-6,
-    1e-9,
-)  # of the search for it: steps, and lengths in the logarithm
+EXACT = 1e-9  # of the squared distance in standard deviations: two neighbours of a covariate differ by little
 PRIOR_STD = 0.05  # standard deviation of the logarithm of a nominal parameter, where the recordings know no better
-
-
+MAX_LOGARITHM = 1.5  # of a parameter relative to the loop file's
+DIFFERENCE = 1e-4  # of that logarithm, for derivatives
+MAX_STEPS = 12  # of the search for the parameters
 MAX_SATURATED_SHARE = 0.5  # share of rows with u at a limit, from which u says nothing
 
 
@@ -96,7 +95,6 @@ def fit_healthy_plant(
     found: TuningFit,
     theta: FloatArray,
     noise: ArmaNoise,
-    prior: float = PRIOR_STD,
 ) -> HealthyPlant:
     """Fit the plant's parameters to the healthy recordings, held near the loop file's by a prior.
 
@@ -104,28 +102,21 @@ def fit_healthy_plant(
     mean that a simulated loop has under the same reference, and a colour that is known. Nothing of the intersample
     behaviour and of the noise in phi is left in it (prediction errors; Ljung, 1999, section 7.4).
     """
-    from scipy.optimize import least_squares as minimise
-
     plant = expectations[0].pipeline.loop.plant
     measured = [(g.eta - g.phi @ theta)[g.ok] for g in regressions]
 
-    def ratios(x: FloatArray) -> dict[str, float]:
-        return dict(zip(plant.parameters, np.exp(x).tolist(), strict=True))
-
     def misfit(x: FloatArray) -> FloatArray:
-        changed = plant.with_ratios(ratios(x))
+        changed = plant.with_ratios(dict(zip(plant.parameters, np.exp(x).tolist(), strict=True)))
         parts = [
             noise.whiten(v - e.mean_residual(changed, theta, g.ok))
             for v, e, g in zip(measured, expectations, regressions, strict=True)
         ]
-        return np.concatenate([*parts, x / prior])
+        return np.concatenate(parts)
 
     start = np.zeros(len(plant.parameters))
-    found_x = minimise(misfit, start, x_scale=prior, diff_step=[1e-4], max_nfev=12, bounds=(-1.5, 1.5))
-    slope = np.asarray(found_x.jac)
-    return describe_healthy_plant(
-        expectations, regressions, found, plant.parameters, np.asarray(found_x.x), np.linalg.inv(slope.T @ slope)
-    )
+    experiment = Experiment(misfit, start + PRIOR_STD, low=-MAX_LOGARITHM, high=MAX_LOGARITHM, difference=DIFFERENCE)
+    fitted = search.fit(experiment, start, steps=MAX_STEPS)
+    return describe_healthy_plant(expectations, regressions, found, plant.parameters, fitted.x, fitted.covariance)
 
 
 def describe_healthy_plant(
@@ -183,29 +174,12 @@ def match_ratios(
 
     def misfit(x: FloatArray) -> FloatArray:
         plant = loop.plant.scaled(dict(zip(ratios, np.exp(before + x).tolist(), strict=True)))
-        return np.concatenate([white @ (nominal_theta(loop, plant) - theta), x / COVARIATE_PRIOR_STD])
+        return np.asarray(white @ (nominal_theta(loop, plant) - theta))
 
-    x = _minimise_squares(misfit, len(before))
+    start = np.zeros(len(before))
+    reach = MAX_COVARIATE_LOGARITHM
+    x = search.fit(Experiment(misfit, start + COVARIATE_PRIOR_STD, low=-reach, high=reach), start, tolerance=EXACT).x
     return dict(zip(ratios, np.exp(before + x).tolist(), strict=True))
-
-
-def _minimise_squares(misfit: Callable[[FloatArray], FloatArray], parameters: int) -> FloatArray:
-    """Return where the sum of squares is least, near 0 and within `MAX_COVARIATE_LOGARITHM`."""
-    x = np.zeros(parameters)
-    for _ in range(NEWTON_STEPS):  # a window of a service moves a few parameters a little: three or four steps
-        now = misfit(x)
-        slopes = [(misfit(x + STEP_TOLERANCE * e) - now) / STEP_TOLERANCE for e in np.eye(parameters)]
-        step = np.linalg.lstsq(np.stack(slopes, axis=1), -now, rcond=None)[0]
-        x = x + step
-        if not np.abs(x).max() < MAX_COVARIATE_LOGARITHM:
-            break
-        if np.abs(step).max() < CONVERGENCE_TOLERANCE:
-            return x
-    from scipy.optimize import least_squares  # several times as slow near 0, and sure of its way
-
-    return np.asarray(
-        least_squares(misfit, np.zeros(parameters), bounds=(-MAX_COVARIATE_LOGARITHM, MAX_COVARIATE_LOGARITHM)).x
-    )
 
 
 def fault_directions(

@@ -9,15 +9,22 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from servoscope.baseline.hypothesis import CusumHypothesis
+from servoscope.baseline.threshold import CalibrationFactors
 from servoscope.core.arrays import FloatArray
-from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.estimation.instrument import InstrumentTuning
+from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
+from servoscope.estimation.pipeline import Tuning
+from servoscope.estimation.two_stage import StageOneTuning
 from servoscope.models.loop import Loop
 
 Value = TypeVar("Value")
+Vector = tuple[float, ...]
+Matrix = tuple[Vector, ...]
 
 # what a baseline remembers: computed from the fields of its loop alone, or from any but some that stand beside it
 OF_LOOP, OF_ALL = ("loop", "_pipeline"), ("baseline_run", "bias", "fault_directions")
-LOOP_FIELDS = {"loop", "loop_settings", "stage_one", "still_speed", "instrument"}
+LOOP_FIELDS = {"loop", "loop_settings", "recursion"}
 SEPARATE_FIELDS = {"features", "point", "others"}
 
 
@@ -75,6 +82,67 @@ class ExactPredictorFit(BaselineModel):
     # what it leaves unexplained in the worst of them, over what noise leaves in all but one of a thousand: the refit
     # is made where this is at most 1
     misfit: float
+
+
+class RecursionTuning(BaselineModel):
+    """What the recursion takes (see `servoscope.estimation.pipeline.Tuning`), but for the healthy coefficients."""
+
+    scale: Vector
+    P_d: Matrix
+    R: float
+    # of the residual, see `servoscope.estimation.noise_model.ArmaNoise`
+    noise_a: Vector
+    noise_b: Vector
+    noise_gamma: Vector
+    noise_variance: float
+    stage_one: StageOneTuning | None = None  # of two stages
+    instrument: InstrumentTuning | None = None  # model behind the instrument of a loop without a controller
+    # speed below which the axis stands still [output per s]; 0 where rest is part of what is expected
+    still_speed: float
+
+    def at(self, theta: FloatArray) -> Tuning:
+        """Return the tuning around healthy coefficients (n,)."""
+        a, b, gamma = map(np.array, (self.noise_a, self.noise_b, self.noise_gamma))
+        noise = ArmaNoise(a, b, gamma, self.noise_variance)
+        return Tuning(theta, np.array(self.scale), np.array(self.P_d), self.R, noise)
+
+
+class HealthyParameters(BaselineModel):
+    """The healthy plant; None or empty where the loop has no controller or no physics."""
+
+    noise: WhiteNoise | None = None  # n_u and n_y
+    loudest: WhiteNoise | None = None  # the largest that the recordings allow; None where white noises explain nothing
+    ratios: dict[str, float] = {}  # parameters relative to the loop file's nominal values
+    std: dict[str, float] = {}  # standard deviations of their logarithms
+    covariance: Matrix = ()  # of these logarithms, (m, m)
+    theta: Vector = ()  # coefficients that they lead to, (n,)
+
+
+class HealthyScatter(BaselineModel):
+    """How healthy recordings differ from each other."""
+
+    # covariance (n, n) of the coefficients between them beyond their noise; empty where there was one recording
+    between: Matrix = ()
+    left_out: Vector = ()  # largest T^2 of each over its limit when learned without it; empty of less than four
+
+
+class AlarmThresholds(BaselineModel):
+    """Where both tests raise an alarm."""
+
+    dof: float  # effective number of independent residuals
+    statistic: float  # threshold of T^2
+    calibration: CalibrationFactors  # counted false alarms over those of theory
+    hypotheses: tuple[CusumHypothesis, ...] = ()  # of the sequential test; empty where there is none
+
+
+class Detectability(BaselineModel):
+    """What a baseline is good for."""
+
+    explained: float  # share of eta's variance that the model explains
+    suggested_model_error: float  # `model_error` that the recordings ask for
+    supported_false_alarms_per_year: float  # smallest budget that they speak for
+    # smallest changes that are detected with 90 % probability within the baseline's own excitation
+    changes: tuple[DetectableChange, ...]
 
 
 def parse_stored_loop(settings: Mapping[str, Any]) -> Loop:

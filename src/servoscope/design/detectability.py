@@ -39,7 +39,7 @@ class AlarmPower:
         self.pipeline = baseline.pipeline()
         kept = np.arange(len(r))
         self.expectation = Expectation(self.pipeline, baseline.tuning, scene.noise, ReferencePath(r, kept, kept == 0))
-        self.theta, self.start = nominal_theta(loop, self.plant), np.array(baseline.model_theta)
+        self.theta, self.start = nominal_theta(loop, self.plant), np.array(baseline.healthy.theta)
         healthy = loop.model_copy(update={"plant": self.plant})
         u_std, y_std = scene.noise.u_std, scene.noise.y_std
         recording, _ = simulate(healthy, r, noise_u_std=u_std, noise_y_std=y_std, seed=SEED)
@@ -54,17 +54,17 @@ class AlarmPower:
         """Prepare what the CUSUMs are designed for, shape (q, K), their limits, and what the baseline's error does."""
         watch = cusum_constants(self.baseline, self.pipeline, self.expectation)
         self.limits = watch.limits if watch is not None else np.zeros(0)
-        if watch is None or self.baseline.loudest is None:
+        if watch is None or self.baseline.healthy.loudest is None:
             return
         g = self.expectation.regression(self.plant)
         self.ok = g.ok
-        self.noise_model = residual_noise_model(self.pipeline, self.plant, self.baseline.loudest)
+        self.noise_model = residual_noise_model(self.pipeline, self.plant, self.baseline.healthy.loudest)
         self.healthy_residual = self.noise_model.whiten((g.eta - g.phi @ self.theta)[g.ok])
         self.begin = max(int(np.searchsorted(np.flatnonzero(g.ok), self.onset)), watch.warm)
         columns = lagged_columns(self.noise_model.whiten(g.phi[g.ok]))
         scale = np.pad(self.baseline.tuning.scale, (0, LAGS), mode="edge")
         self.designed = (watch.changes / scale @ columns.T)[:, self.begin :]
-        C = np.array(self.baseline.ratios_covariance)
+        C = np.array(self.baseline.healthy.covariance)
         nudged = [
             self.plant.with_ratios({name: float(np.exp(STEP))}) for name in self.plant.physical_parameters[: len(C)]
         ]
@@ -89,7 +89,7 @@ class AlarmPower:
         path = self.expectation.mean_path(self.start, self.plant, faulty, self.onset)[self.evaluated] - self.healthy
         distance = (np.einsum("kij,kj->ki", self.whitening, path) ** 2).sum(axis=1)
         every = max(round(INDEPENDENT_MEMORIES * self.pipeline.memory_samples / self.pipeline.every), 1)
-        missed = chndtr(self.baseline.limit, path.shape[1], distance[::-1][::every])
+        missed = chndtr(self.baseline.thresholds.statistic, path.shape[1], distance[::-1][::every])
         return 1.0 - float(np.prod(missed))
 
     def _sequential_power(self, faulty: Plant) -> float:

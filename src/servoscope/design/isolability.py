@@ -18,6 +18,7 @@ from servoscope.design.fisher_information import (
     misnaming_probability,
 )
 from servoscope.design.scenario import Scenario
+from servoscope.fit.search import Experiment, fit
 from servoscope.isolation.ml.hypothesis import log_ratio_bounds
 from servoscope.isolation.ml.least_squares import solve_least_squares
 from servoscope.isolation.ml.window import RefitWindow
@@ -26,8 +27,7 @@ from servoscope.models.plants import Fault
 # squared distance from which hypotheses are never taken for each other, and not fitted any closer
 MAX_SQUARED_DISTANCE = 200.0
 STEPS = 8  # of Gauss and Newton
-SHORTER = (1.0, 0.3, 0.1)  # shares of a step that are tried
-CONVERGED = 1e-3  # of a squared distance of one
+CONVERGED = 1e-3  # of a squared distance
 GRID = 12  # sizes between the radius that linear distances promise and the end of the range
 FINE = 0.01  # relative precision of a radius
 SUSPICIOUS = 1.0  # logarithm of a distance relative to what is needed, below which a dip is looked into
@@ -175,30 +175,23 @@ def minimise_distance(
 ) -> tuple[FloatArray, FloatArray]:
     """Go down from z = [d, x] to where some faults are closest to the truth, by Gauss and Newton.
 
-    `own` (N + m,) are the innovations and the prior of the truth; with `held`, d stays as it is, and else the search
-    ends as soon as a linear step leaves more than `MAX_SQUARED_DISTANCE`. Returns the closest point and what differs
+    `own` (N + m,) are the innovations and the prior of the truth; with `held`, d stays as it is, and else there is no
+    search where a linear step leaves more than `MAX_SQUARED_DISTANCE`. Returns the closest point and what differs
     there, (N + m,).
     """
-    m, names, profile = window.nuisance_count, tuple(fault.parameter for fault in faults), scene.profile
-    first = m if held else 0
-    low, high = log_ratio_bounds(faults)
-    left = window.residual(z, names, profile) - own
-    for _ in range(STEPS):
-        J = window.jacobian(z, names, profile, slice(first, None))
+    m, names = window.nuisance_count, tuple(fault.parameter for fault in faults)
+    if not held:
+        left = window.residual(z, names, scene.profile) - own
+        J = window.jacobian(z, names, scene.profile)
         step, distance = solve_least_squares(J, left)
-        if not held and distance > MAX_SQUARED_DISTANCE:
+        if distance > MAX_SQUARED_DISTANCE:
             return z, left + J @ step
-        for shorter in SHORTER:
-            new = z.copy()
-            new[first:] += shorter * step
-            new[m:] = np.clip(new[m:], low, high)
-            following = window.residual(new, names, profile) - own
-            gained = float(left @ left - following @ following)
-            if gained >= 0.0:
-                break
-        else:
-            break
-        z, left = new, following
-        if gained < CONVERGED * (1.0 + float(left @ left)):
-            break
-    return z, left
+    anywhere, (low, high) = np.full(m, np.inf), log_ratio_bounds(faults)
+    experiment = Experiment(
+        lambda z: window.residual(z, names, scene.profile) - own,
+        np.full(len(z), np.inf),  # the prior is among the residuals
+        low=np.append(-anywhere, low),
+        high=np.append(anywhere, high),
+    )
+    closest = fit(experiment, z, np.arange(m if held else 0, len(z)), STEPS, CONVERGED)
+    return closest.x, closest.residual

@@ -10,7 +10,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message, text_message
 from servoscope.design.fisher_information import MISNAMED, cosines, equivalent_distance
 from servoscope.design.scenario import Scenario
-from servoscope.isolation.ml.predictor import Predictor
+from servoscope.fit.predictor import Predictor
 from servoscope.isolation.ml.window import COMPLEX_STEP
 
 PARALLEL = 1e-6  # 1 - cosine^2 below which two changes are one and the same

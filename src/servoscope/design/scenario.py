@@ -17,8 +17,8 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError, SimulationError
 from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.fit.predictor import Predictor
 from servoscope.isolation.ml.least_squares import orthonormal_basis
-from servoscope.isolation.ml.predictor import Predictor
 from servoscope.isolation.ml.search import BEFORE_S
 from servoscope.isolation.ml.start_values import GRID
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
@@ -133,7 +133,7 @@ class Scenario:
         return np.asarray(columns - Q @ (Q.T @ columns))
 
     def _prior_before_onset(self) -> FloatArray:
-        C = np.array(self.baseline.ratios_covariance)
+        C = np.array(self.baseline.healthy.covariance)
         if not len(C):
             return np.zeros((0, 0))
         known = np.linalg.inv(C)

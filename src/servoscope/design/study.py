@@ -31,7 +31,8 @@ from servoscope.design.result import (
 from servoscope.design.scenario import Scenario, require_exact_predictor, require_study
 from servoscope.detection.statistic import required_noncentrality
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.learning.learn import MIN_MEMORIES, learn_baseline
+from servoscope.learning.detectability import MIN_MEMORIES
+from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Fault
 from servoscope.signals import Recording
@@ -274,13 +275,13 @@ def learned_study(baseline: Baseline, missing: str) -> BaselineStudy:
     covariance P_d/2, to which the baseline adds its own C, so that two faults are alike by d_i' (P_d/2 + C)^-1 d_j.
     The promises, which know the colour of the noise, say how large each has to be.
     """
-    promises = {promise.parameter: promise.change for promise in baseline.promises}
+    promises = {promise.parameter: promise.change for promise in baseline.detectability.changes}
     names = tuple(fault.name for fault in baseline.loop.plant.faults)
     changes = np.array([promises.get(fault.parameter) or np.inf for fault in baseline.loop.plant.faults])
     signatures = np.array([baseline.fault_directions[fault.parameter] for fault in baseline.loop.plant.faults])
-    root = np.linalg.cholesky(np.linalg.inv(np.array(baseline.P_d) / 2.0 + baseline.covariance_array()))
+    root = np.linalg.cholesky(np.linalg.inv(np.array(baseline.recursion.P_d) / 2.0 + baseline.covariance_array()))
     cosine = cosines(root.T @ signatures.T, root.T @ signatures.T)
-    sensitivity = np.sqrt(required_noncentrality(len(baseline.theta), baseline.limit)) / changes
+    sensitivity = np.sqrt(required_noncentrality(len(baseline.theta), baseline.thresholds.statistic)) / changes
     F = cosine * np.outer(sensitivity, sensitivity)
     alike = np.abs(cosine) - 2.0 * np.eye(len(names))
     faults = {

@@ -29,12 +29,12 @@ def baseline_run(baseline: Baseline) -> BaselineRun:
 
 def _make_run(baseline: Baseline) -> BaselineRun:
     pipeline, tuning, mean = baseline.pipeline(), baseline.tuning, None
-    if baseline.noise is not None:
-        expectation = Expectation(pipeline, tuning, baseline.noise, NO_REFERENCE)
-        mean = expectation.propagator(np.array(baseline.model_theta), baseline.plant)
+    if baseline.healthy.noise is not None:
+        expectation = Expectation(pipeline, tuning, baseline.healthy.noise, NO_REFERENCE)
+        mean = expectation.propagator(np.array(baseline.healthy.theta), baseline.plant)
     estimates = EstimationRunner(pipeline, tuning, cusum_constants(baseline, pipeline))
-    budget = baseline.rehearsed.sequential_budget(baseline.loop)
-    return BaselineRun(estimates, mean, sure_level(baseline.members, budget))
+    budget = baseline.thresholds.calibration.sequential_budget(baseline.loop)
+    return BaselineRun(estimates, mean, sure_level(baseline.thresholds.hypotheses, budget))
 
 
 def cusum_constants(
@@ -45,11 +45,15 @@ def cusum_constants(
     `expectation` is that of a recording, to whose reference the limits are then fitted, instead of that of the
     baseline; `growth` is that of the noise's variance.
     """
-    if baseline.loudest is None or not baseline.members:
+    if baseline.healthy.loudest is None or not baseline.thresholds.hypotheses:
         return None
-    noise, plant, hypotheses = baseline.loudest.times(np.sqrt(growth)), baseline.plant, baseline.members
+    noise, plant, hypotheses = (
+        baseline.healthy.loudest.times(np.sqrt(growth)),
+        baseline.plant,
+        baseline.thresholds.hypotheses,
+    )
     if expectation is not None:
-        covariance = np.array(baseline.ratios_covariance)
-        hypotheses = worst_case_hypotheses(expectation, plant, baseline.loudest, covariance, hypotheses)
-    budget = baseline.rehearsed.sequential_budget(baseline.loop)
-    return build_cusum_constants(pipeline, plant, noise, np.array(baseline.scale), hypotheses, budget)
+        covariance = np.array(baseline.healthy.covariance)
+        hypotheses = worst_case_hypotheses(expectation, plant, baseline.healthy.loudest, covariance, hypotheses)
+    budget = baseline.thresholds.calibration.sequential_budget(baseline.loop)
+    return build_cusum_constants(pipeline, plant, noise, np.array(baseline.recursion.scale), hypotheses, budget)

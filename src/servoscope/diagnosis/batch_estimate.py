@@ -27,7 +27,7 @@ def stretch_begin(baseline: Baseline, low_s: float, high_s: float) -> float:
     Directions are learned and compared from the earliest onset on: cutting a motion elsewhere turns them more than some
     healthy samples do. A fit by an instrument, whose deviation is small, may have nothing from before the change.
     """
-    return low_s if baseline.instrument is None else high_s
+    return low_s if baseline.recursion.instrument is None else high_s
 
 
 def estimate_batch_deviation(exam: Examination, from_s: float, to_s: float = np.inf) -> tuple[FloatArray, FloatArray]:
@@ -36,7 +36,7 @@ def estimate_batch_deviation(exam: Examination, from_s: float, to_s: float = np.
     Raises NotEnoughError if the stretch is too short or does not excite all coefficients.
     """
     baseline, name = exam.baseline, exam.recording.name
-    if baseline.instrument is not None:
+    if baseline.recursion.instrument is not None:
         return _deviation_by_instrument(exam, from_s, to_s)
     try:
         rec = exam.recording.part(from_s, to_s)
@@ -46,7 +46,7 @@ def estimate_batch_deviation(exam: Examination, from_s: float, to_s: float = np.
     expected = np.array(baseline.theta)
     if exam.noise is not None:  # the bias that this reference has under any plant
         bias = Expectation(exam.pipeline, exam.tuning, exam.noise, reference_path(rec)).batch_estimate(baseline.plant)
-        expected = expected + bias - np.array(baseline.model_theta)
+        expected = expected + bias - np.array(baseline.healthy.theta)
     return found.each[0] - expected, found.each_covariance[0]
 
 
@@ -65,10 +65,12 @@ def _deviation_by_instrument(exam: Examination, from_s: float, to_s: float) -> t
 def _fit_stretch(exam: Examination, from_s: float, to_s: float) -> InstrumentalFit:
     """Return the fit of a stretch by an instrument; NotEnoughError where it cannot be trusted."""
     baseline, name = exam.baseline, exam.recording.name
-    assert baseline.instrument is not None
+    assert baseline.recursion.instrument is not None
     try:
         rec = exam.recording.part(from_s, to_s)
-        found = fit_with_instrument(exam.pipeline, [rec], baseline.instrument.source, np.array(baseline.theta))
+        found = fit_with_instrument(
+            exam.pipeline, [rec], baseline.recursion.instrument.source, np.array(baseline.theta)
+        )
     except (RecordingError, np.linalg.LinAlgError) as error:
         raise NotEnoughError(f"{name}, from {from_s:.4g} s on: {error}") from None
     if found is None or not found.trusted:
@@ -85,7 +87,7 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     """
     recording, e, last = exam.recording, exam.estimates, int(exam.estimates.index[at])
     first, whole = exam.memory_start(at), None
-    if (exam.baseline.learned or exam.baseline.instrument is not None) and exam.noise is None:
+    if (exam.baseline.learned or exam.baseline.recursion.instrument is not None) and exam.noise is None:
         begin = max(
             stretch_begin(exam.baseline, onset.low_s, onset.high_s),
             float(recording.t[max(last - MAX_STRETCH_SAMPLES, 0)]),

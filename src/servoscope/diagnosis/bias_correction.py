@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from servoscope.baseline.expectation import Expectation
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import SimulationError
 from servoscope.detection.onset import Onset
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
@@ -18,13 +17,15 @@ from servoscope.diagnosis.result import VIBRATION
 from servoscope.estimation import frequency_response
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.fit.search import Experiment, fit
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.models.plants import Plant
 
 AT_ONCE = 4096  # evaluations whose responses are computed together
 PRIOR_LOG_STD = 3.0  # standard deviation of the logarithm of a parameter before anything is known
 STEP = 1e-3  # of the logarithm of a parameter, for derivatives
-UNSTABLE_MISFIT = 1e6  # stands for the misfit of an actuator that cannot run
+EXACT = 1e-9  # of the squared distance in standard deviations: a trace is made of it, not only a size
+MAX_STEPS = 12  # of the search for the actuator
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ def estimate_bias_correction(
     ratios = {fault.parameter: fault.ratio for fault in likely.faults} if likely else {}
     ratios.pop(VIBRATION, None)  # it changes no parameter
     guess = baseline.plant.expand_rays(ratios)
-    first, start = exam.memory_start(at), np.array(baseline.model_theta)
+    first, start = exam.memory_start(at), np.array(baseline.healthy.theta)
     expectation, since = exam.expectation(first, int(e.index[at]) + 1), max(onset.sample - first, 0)
     plant, gain = fit_actuator(expectation, baseline.plant, start, e.theta[at], exam.covariance(at), since, guess)
     return BiasCorrection(gain, at, plant, onset.sample)
@@ -91,7 +92,7 @@ def corrected_trace(exam: Examination, correction: BiasCorrection | None, at: sl
         covariance=covariance,
         expected=expected,
         statistic=np.where(ready, exam.statistic[at], 0.0),
-        threshold=baseline.limit,
+        threshold=baseline.thresholds.statistic,
         level=e.level[at],
         crossed=passed,
         ifrf=response,
@@ -107,7 +108,7 @@ def _faulty_path(
     """Return the expected path of the faulty actuator and the covariance under its noise, None where not known."""
     if correction is None or correction.faulty_plant is None or at.start == at.stop:
         return None, None
-    spread = exam.covariance_under(at, correction.faulty_plant) if exam.baseline.loudest is not None else None
+    spread = exam.covariance_under(at, correction.faulty_plant) if exam.baseline.healthy.loudest is not None else None
     return exam.expected_path(at, correction.faulty_plant, correction.onset_sample), spread
 
 
@@ -118,7 +119,7 @@ def _correct_bias(
     e, C, expected = exam.estimates, exam.baseline.covariance_array(), exam.expected[at]
     if correction is None:
         return e.theta[at], exam.covariance(at), expected
-    plant, start = exam.baseline.plant, np.array(exam.baseline.model_theta)
+    plant, start = exam.baseline.plant, np.array(exam.baseline.healthy.theta)
     true = nominal_theta(exam.pipeline.loop, plant)
     # the healthy path: what was expected, without what the model leaves unexplained
     bias = shift = expected - (exam.tuning.theta - start) - true
@@ -174,13 +175,10 @@ def fit_actuator(
         return last
 
     def misfit(x: FloatArray) -> FloatArray:
-        try:
-            off = np.linalg.solve(L, (theta - expected(x)) / size)
-        except SimulationError:
-            off = np.full(len(theta), UNSTABLE_MISFIT)
-        return np.concatenate([off, x / PRIOR_LOG_STD])
+        return np.asarray(np.linalg.solve(L, (theta - expected(x)) / size))
 
-    x = _search(misfit, np.log([guess.get(name, 1.0) for name in names]))
+    experiment = Experiment(misfit, np.full(len(names), PRIOR_LOG_STD), difference=STEP)
+    x = fit(experiment, np.log([guess.get(name, 1.0) for name in names]), steps=MAX_STEPS, tolerance=EXACT).x
     here = expected(x)
     J, T = np.empty((len(theta), len(names))), np.empty((len(theta), len(names)))
     loop = expectation.pipeline.loop
@@ -192,10 +190,3 @@ def fit_actuator(
     white = np.linalg.solve(L, J / size[:, None])
     fitted = np.linalg.solve(white.T @ white + np.eye(len(names)) / PRIOR_LOG_STD**2, white.T @ np.linalg.inv(L) / size)
     return faulty(x), np.eye(len(theta)) + (T - J) @ fitted
-
-
-def _search(misfit: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
-    from scipy.optimize import least_squares as minimise
-
-    found = minimise(misfit, start, diff_step=[STEP], max_nfev=12, x_scale=0.1)
-    return np.asarray(found.x if found.cost < UNSTABLE_MISFIT else start, dtype=np.float64)

@@ -98,7 +98,7 @@ class Examination:
         replaced = _has_failed_instrument(exam)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
-            pipeline = Pipeline.of(other, baseline.stage_one, baseline.still_speed)
+            pipeline = Pipeline.of(other, baseline.recursion.stage_one, baseline.recursion.still_speed)
             exam = _run_recursion(baseline, recording, pipeline, along)
         growth = 1.0 if exam.noise is None else _noise_growth(exam.pipeline, exam.estimates)
         if growth > 1.0:  # it shifts the expectation, and the sequential test would take it for steps of a change
@@ -141,7 +141,9 @@ class Examination:
     def statistics(self) -> tuple[Statistic, ...]:
         """The statistics that raise the alarm: T^2, the sequential test and, where they were learned, the features."""
         features = self.features.at(self.estimates.index) if self.features is not None else None
-        return detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready, features)
+        return detection_statistics(
+            self.statistic, self.baseline.thresholds.statistic, self.estimates.level, self.ready, features
+        )
 
     @cached_property
     def features(self) -> FeatureEvidence | None:
@@ -151,7 +153,9 @@ class Examination:
 
     @property
     def _of_coefficients(self) -> tuple[Statistic, ...]:
-        return detection_statistics(self.statistic, self.baseline.limit, self.estimates.level, self.ready)
+        return detection_statistics(
+            self.statistic, self.baseline.thresholds.statistic, self.estimates.level, self.ready
+        )
 
     @property
     def features_changed_s(self) -> float | None:
@@ -177,7 +181,7 @@ class Examination:
         if not self.apparent_alarm.any() or self.motion is None:  # in this order: the motion takes a second reading
             return self.apparent_alarm
         exceeded = np.zeros(self.evaluations, dtype=np.bool_)
-        e, limit = self.estimates, self.baseline.limit
+        e, limit = self.estimates, self.baseline.thresholds.statistic
         for at in outofcore.iter_chunks(0, self.evaluations, e.theta, e.S, at_once=AT_ONCE):
             C = self.covariance(at) + self.model_error(at)
             T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
@@ -238,7 +242,7 @@ class Examination:
 
     def expected_path(self, at: slice, plant: Plant, onset: int) -> FloatArray:
         """Return the expected theta_hat at some evaluations, shape (K, n), under a change of plant at a sample."""
-        first, start = self.memory_start(at.start), np.array(self.baseline.model_theta)
+        first, start = self.memory_start(at.start), np.array(self.baseline.healthy.theta)
         walk = self.expectation(first, first + 1).propagator(start, self.baseline.plant, plant, max(onset - first, 0))
         return self._collect(at, first, lambda rows: walk.advance(_reference_piece(self.recording, rows, first)))
 
@@ -286,7 +290,7 @@ def _run_quickly(baseline: Baseline, recording: Recording) -> Examination | None
     run = baseline_run(baseline)
     exam = _run_recursion(baseline, recording, baseline.pipeline(), run=run)
     quiet = exam.estimates.level.max(initial=0.0) < run.sure_level
-    return exam if quiet and exam.statistic.max(initial=0.0) <= baseline.limit else None
+    return exam if quiet and exam.statistic.max(initial=0.0) <= baseline.thresholds.statistic else None
 
 
 def _run_recursion(
@@ -302,8 +306,8 @@ def _run_recursion(
     `run`: with the baseline's own sequential test; None: with limits for the recording's reference.
     """
     tuning, C, noise, walk, watch = baseline.tuning, baseline.covariance_array(), None, None, None
-    if baseline.noise is not None:
-        noise = baseline.noise.times(np.sqrt(growth))
+    if baseline.healthy.noise is not None:
+        noise = baseline.healthy.noise.times(np.sqrt(growth))
     if run is not None:
         walk = None if run.mean is None else run.mean.again()
     elif noise is None:
@@ -312,13 +316,13 @@ def _run_recursion(
         beginning = recording.rows(slice(0, round(cusum_design.design_duration_s(pipeline) * recording.sample_rate)))
         expectation = Expectation(pipeline, tuning, noise, reference_path(beginning))
         watch = cusum_constants(baseline, pipeline, expectation, growth)
-        walk = expectation.propagator(np.array(baseline.model_theta), baseline.plant)
+        walk = expectation.propagator(np.array(baseline.healthy.theta), baseline.plant)
 
     def healthy(rows: slice) -> FloatArray:
         if walk is None:
             return tuning.theta
         return np.asarray(
-            walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.model_theta))
+            walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.healthy.theta))
         )
 
     started = tuning if along is None else replace(tuning, theta=along.start)
@@ -370,7 +374,7 @@ def _has_failed_instrument(exam: Examination) -> bool:
     The mean of theta moves by -E[z z']^-1 E[z phi'] theta/N: its eigenvalues tell where it goes. Coefficients that an
     instrument has been learned for are not those of the AKF, which therefore cannot take over there.
     """
-    if exam.baseline.instrument is not None or not exam.pipeline.bank.has_instrument:
+    if exam.baseline.recursion.instrument is not None or not exam.pipeline.bank.has_instrument:
         return False
     recording, runner, scale = exam.recording, RegressionRunner(exam.pipeline), exam.tuning.scale
     own = shared = np.zeros((len(scale), len(scale)))

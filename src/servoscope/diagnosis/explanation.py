@@ -190,7 +190,9 @@ def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
     if exam.estimates.level[first] >= 1.0:
         return message("diagnosis.alarm_cusum", t=interval.detected_at_s)
     value = float(exam.statistic[first])
-    return message("diagnosis.alarm_t2", t=interval.detected_at_s, value=value, limit=exam.baseline.limit)
+    return message(
+        "diagnosis.alarm_t2", t=interval.detected_at_s, value=value, limit=exam.baseline.thresholds.statistic
+    )
 
 
 def _distance_message(deviations: float, first: bool) -> Message:

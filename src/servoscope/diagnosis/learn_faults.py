@@ -121,7 +121,7 @@ def fit_learned_fault(
 def _undetected_message(name: str, exams: Sequence[Examination]) -> str:
     if not exams:
         return f"{name}: no recording to learn from, give at least one"
-    share = max(float(exam.statistic.max(initial=0.0)) / exam.baseline.limit for exam in exams)
+    share = max(float(exam.statistic.max(initial=0.0)) / exam.baseline.thresholds.statistic for exam in exams)
     one = len(exams) == 1
     subject = f"{exams[0].recording.name} does not differ" if one else f"none of {len(exams)} recordings of it differs"
     return (

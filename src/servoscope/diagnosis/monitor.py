@@ -116,7 +116,7 @@ class Monitor:
             "H": deduplicate([each.healthy.H for each in self._constants_of]),
             "covariance of H": deduplicate([each.healthy.covariance for each in self._constants_of]),
         }
-        self._limits = np.array([each.limit for each in self.baselines])[:, None]
+        self._limits = np.array([each.thresholds.statistic for each in self.baselines])[:, None]
         self._prefix_size = max(each.prefix_size for each in self._constants_of)  # where the state of stage 2 begins
         self._side_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
         self._sides = SideLanes([each.side for each in self._constants_of], self._side_at)
@@ -374,7 +374,7 @@ class Monitor:
             columns = {name: values[0] for name, values in columns.items()}
             if motion is not None:
                 columns["statistic"] = motion.soften_statistic(**{name: columns[name] for name in JUDGED_COLUMNS})
-            response, threshold = (response[0][0], response[1][0]), self.baselines[0].limit
+            response, threshold = (response[0][0], response[1][0]), self.baselines[0].thresholds.statistic
         expected = FrequencyResponse(f, columns.pop("H"), columns.pop("covariance of H"))
         trace = Trace(
             t=index / self.loop.sample_rate,

@@ -45,7 +45,7 @@ class MonitorConstants:
         """Derive the constants; the bias under the baseline's references is taken out of estimate and expectation."""
         from servoscope.estimation.recursion import EvaluationConstants
 
-        pipeline, stage = baseline.pipeline(), StageOneRunner(baseline.loop, baseline.stage_one)
+        pipeline, stage = baseline.pipeline(), StageOneRunner(baseline.loop, baseline.recursion.stage_one)
         frequencies, expected = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
         E = pipeline.bank.E(frequencies)
         response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)

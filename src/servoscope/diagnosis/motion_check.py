@@ -22,7 +22,7 @@ def motion_warnings(exam: Examination) -> list[DiagnosisWarning]:
     if exam.motion is None:
         return [warning_throughout(exam, "motion", message("warning.motion_not_stored"))]
     alarm = exam.alarm if exam.alarm.any() else exam.apparent_alarm
-    ratio = np.where(alarm, np.maximum(exam.statistic / exam.baseline.limit, exam.estimates.level), -1.0)
+    ratio = np.where(alarm, np.maximum(exam.statistic / exam.baseline.thresholds.statistic, exam.estimates.level), -1.0)
     at = int(np.argmax(ratio))
     withheld = not exam.alarm.any()
     if not withheld and exam.motion_excess(slice(at, at + 1))[0] < UNSEEN_EXCESS:

@@ -25,7 +25,7 @@ MIN_PROBABILITY_NOTED = 0.05  # probability from which a fault is noted that loo
 
 def learn(
     loop: Loop | str | Path,
-    recordings: Sequence[Recording | Source] | Mapping[str, Sequence[Recording | Source]],
+    recordings: Recording | str | Path | Sequence[Recording | Source] | Mapping[str, Sequence[Recording | Source]],
     progress: Progress = lambda _: None,
     *,
     compare: Baseline | None = None,
@@ -44,8 +44,8 @@ def learn(
     loop
         The loop, or its path.
     recordings
-        Healthy recordings, or what `read` reads (paths, frames, arrays by name), one or more; by the name of their
-        operating point (a load, a temperature, a tool, a season) where there are several,
+        Healthy recordings, or what `read` reads (paths, frames, arrays by name), one or a list of them; by the name of
+        their operating point (a load, a temperature, a tool, a season) where there are several,
         ``{"cold": [...], "warm": [...]}``.
     progress
         Called with the name of each step.
@@ -94,8 +94,8 @@ def learn(
     >>> baseline.save("baseline.json")
     """
     loop = Loop.of(loop)
-    if isinstance(recordings, str | Path):
-        raise TypeError("recordings to learn from are a list, as in [path]")
+    if isinstance(recordings, str | Path | Recording):
+        recordings = [recordings]
     given = recordings if isinstance(recordings, Mapping) else {"": recordings}
     named = {name: [as_recording(one, loop) for one in some] for name, some in given.items()}
     for name, some in named.items():

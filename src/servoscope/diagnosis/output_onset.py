@@ -33,7 +33,7 @@ def refine_onset(exam: Examination, onset: Onset, sample: int, last: int) -> Ons
     `sample` is that of the alarm, `last` the last one that the changed coefficients speak for.
     """
     baseline, recording = exam.baseline, exam.recording
-    tuning = baseline.instrument
+    tuning = baseline.recursion.instrument
     if tuning is None or tuning.source != "input" or baseline.loop.plant.powers[0]:
         return onset
     begin = max(sample - round(MAX_MEMORIES_BEFORE_ALARM * exam.pipeline.memory * exam.pipeline.stride), 0)

@@ -38,9 +38,10 @@ def examine_by_own_past(exam: Examination) -> Examination | None:
         past = learn_baseline(loop, [recording.part(float(recording.t[0]), end_s)])
     except (ServoscopeError, np.linalg.LinAlgError):  # too short, too little motion
         return None
-    known = {promise.parameter: promise.change or np.inf for promise in baseline.promises}
+    known = {promise.parameter: promise.change or np.inf for promise in baseline.detectability.changes}
     sharper = any(
-        promise.change and promise.change < MAX_PROMISE_RATIO * known[promise.parameter] for promise in past.promises
+        promise.change and promise.change < MAX_PROMISE_RATIO * known[promise.parameter]
+        for promise in past.detectability.changes
     )
     if past.exact is None or past.exact.misfit > 1.0 or not sharper:
         return None

@@ -19,7 +19,7 @@ from servoscope.signals import Recording
 def describe_correction(points: Sequence[Baseline], recording: Recording) -> Message | None:
     """Return what makes a recording healthy when its signals are put right; None where nothing does."""
     first = points[0]
-    for correction in find_corrections(first.pipeline(), np.array(first.theta), first.R, recording):
+    for correction in find_corrections(first.pipeline(), np.array(first.theta), first.recursion.R, recording):
         corrected = correction.apply(recording)
         if any(not Examination.from_recording(point, corrected).apparent_alarm.any() for point in points):
             return correction.description

@@ -26,7 +26,9 @@ MAX_DETECTABLE_RATIO = 3.0  # a recording that shows only changes this much larg
 def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
     """Return, by parameter, the smallest change that would have shown here, and what the baseline promises."""
     baseline, e = exam.baseline, exam.estimates
-    promised = {p.parameter: p.change for p in baseline.promises if p.change is not None and p.change < NO_PROMISE}
+    promised = {
+        p.parameter: p.change for p in baseline.detectability.changes if p.change is not None and p.change < NO_PROMISE
+    }
     rows = np.array([baseline.fault_directions[parameter] for parameter in promised])
 
     def largest(first: int, end: int) -> FloatArray:
@@ -40,7 +42,7 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
     with outofcore.second_thread(exam.recording.samples) as second:
         later = second.submit(largest, middle, exam.evaluations)
         best = np.maximum(largest(begin, middle), later.result())
-    needed = required_noncentrality(exam.pipeline.bank.n, baseline.limit)
+    needed = required_noncentrality(exam.pipeline.bank.n, baseline.thresholds.statistic)
     smallest = {
         name: float(np.sqrt(needed / one)) if one > 0.0 else np.inf for name, one in zip(promised, best, strict=True)
     }
@@ -110,7 +112,7 @@ def covariate_warnings(exam: Examination, at: int) -> list[DiagnosisWarning]:
         theta, C = (np.broadcast_to(x, (len(c), *x.shape)) for x in (exam.estimates.theta[at], exam.covariance(at)))
         T2 = t2_statistic(theta, expected, C)
         best = int(np.argmin(T2))
-        if T2[best] <= exam.baseline.limit:
+        if T2[best] <= exam.baseline.thresholds.statistic:
             other, said = float(values[best]), float(logged[j])
             if along.std is None:
                 text = message("warning.covariate", covariate=name, other=f"{other:.3g}", logged=f"{said:.3g}")

@@ -88,7 +88,7 @@ def export_c(
     """
     check_name(name)
     made = ExportConstants.of(baseline, only_coefficients, single)
-    golden = GoldenRun.of(baseline, made.recursion, baseline.limit, made.delays)
+    golden = GoldenRun.of(baseline, made.recursion, baseline.thresholds.statistic, made.delays)
     values = common_words(made, name) | _number_words(single) | _sizes(made, single) | _code(made, name, single)
     values |= _frozen_words(made)
     values["frozen_functions"] = fill_template("frozen.c", values)
@@ -130,7 +130,7 @@ def _sizes(made: ExportConstants, single: bool) -> dict[str, Any]:
         "image_bytes": len(pack_image(made.mark, made.start, 0.0, off + 1.0)),
         "on_delay": on,
         "off_delay": off,
-        "limit": c_literal(made.baseline.limit, single),
+        "limit": c_literal(made.baseline.thresholds.statistic, single),
         "places": f"#define CUSUMS {size.floats}\n" * bool(size.watched)
         + f"#define PRIVATE {size.floats + size.watched}\n" * (not size.steady),
     }

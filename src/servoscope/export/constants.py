@@ -91,7 +91,10 @@ class ExportConstants:
             members=0 if watch is None else len(watch.limits),
             delays=(on, off),
             mark=fingerprint(
-                repr(recursion._spec) + "single" * single, table, start, (baseline.limit, float(on), float(off))
+                repr(recursion._spec) + "single" * single,
+                table,
+                start,
+                (baseline.thresholds.statistic, float(on), float(off)),
             ),
             input_stage=stage,
         )

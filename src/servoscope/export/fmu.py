@@ -145,7 +145,7 @@ def _model_description(baseline: Baseline, made: CMonitor, name: str) -> Xml.Ele
         Xml.SubElement(types, "Item", name=verdict, value=str(value))
     Xml.SubElement(root, "DefaultExperiment", startTime="0", stepSize=sample_time)
     variables = Xml.SubElement(root, "ModelVariables")
-    _describe_variables(variables, (y_unit, u_unit), baseline.limit, outputs)
+    _describe_variables(variables, (y_unit, u_unit), baseline.thresholds.statistic, outputs)
     structure = Xml.SubElement(root, "ModelStructure")
     for kind, attribute, known in (("Output", "causality", "output"), ("InitialUnknown", "initial", "calculated")):
         for each in variables:

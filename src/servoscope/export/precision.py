@@ -22,8 +22,9 @@ def describe_rounding(made: ExportConstants, only_coefficients: bool, golden: Go
     by exp(d h) where d is in units of a CUSUM's limit h.
     """
     double = ExportConstants.of(made.baseline, only_coefficients)
-    exact = GoldenRun.of(made.baseline, double.recursion, made.baseline.limit, made.delays)
-    near = exact.rows[:, 1] < 2.0 * made.baseline.limit  # far above it, nothing hangs on an error
+    exact = GoldenRun.of(made.baseline, double.recursion, made.baseline.thresholds.statistic, made.delays)
+    limit = made.baseline.thresholds.statistic
+    near = exact.rows[:, 1] < 2.0 * limit  # far above it, nothing hangs on an error
     watch = double.recursion.constants[0].watch
     h = 0.0 if watch is None else float(watch.limits.max())
     errors = np.abs(golden.rows.astype(np.float64) - exact.rows)[near][:, 1:3].max(axis=0, initial=0.0)
@@ -35,6 +36,6 @@ def describe_rounding(made: ExportConstants, only_coefficients: bool, golden: Go
         )
     return (
         f"\n * Numbers are of single precision. On the golden samples that moves T^2 by no more than {errors[0]:.2g}"
-        f" near its limit\n * {made.baseline.limit:.4g}, and the level of the sequential test by no more than"
+        f" near its limit\n * {limit:.4g}, and the level of the sequential test by no more than"
         f" {errors[1]:.2g}: a factor of {factor:.4g} in the rate of false alarms.\n *"
     )

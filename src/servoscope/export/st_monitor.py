@@ -69,7 +69,7 @@ def _words(made: ExportConstants) -> dict[str, Any]:
         | {
             "rate": f"{baseline.loop.sample_rate:g}",
             "units": plain_text("; ".join(f"{each} {unit}" for each, unit in made.coefficients)),
-            "limit": st_literal(baseline.limit),
+            "limit": st_literal(baseline.thresholds.statistic),
             "on_delay": f"{on}.0",
             "off_delay": f"{off}.0",
             "off_delay_and_one": f"{off + 1}.0",

@@ -149,7 +149,7 @@ class DayMonitor:
         """Return what `advance` returns, of what the follower has found."""
         (taken, restart), first = ordered, state.last_us is None
         new, (trace, sample, alarms) = followed
-        limits = np.full(len(trace.t), self.baseline.limit)
+        limits = np.full(len(trace.t), self.baseline.thresholds.statistic)
         block = EvaluationBlock(taken.t_us[sample], trace.theta, trace.statistic, limits, trace.level, trace.exceeded)
         if not len(rows):
             return state, block

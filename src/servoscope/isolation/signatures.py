@@ -59,7 +59,7 @@ def _plant_signatures(
     faults, plant = baseline.loop.plant.all_faults, baseline.plant
     if expectation is not None:
         shift = _simulated_shifts(baseline, expectation, onset)
-        std = baseline.ratios_std
+        std = baseline.healthy.std
         return [parameter_signature(f, partial(shift, f.parameter), std.get(f.parameter, 0.0)) for f in faults]
     if plant.has_physics and not plant.parameters_are_coefficients:
         shift = _nominal_shifts(baseline, learned)
@@ -74,7 +74,7 @@ def _plant_signatures(
 
 def _healthy_std(baseline: Baseline, name: str) -> float:
     """Return the relative standard deviation of a healthy coefficient, of which a batch estimate's size is a ratio."""
-    if baseline.instrument is None or name not in baseline.names:
+    if baseline.recursion.instrument is None or name not in baseline.names:
         return 0.0
     at = baseline.names.index(name)
     return float(np.sqrt(baseline.covariance[at][at])) / abs(baseline.theta[at])
@@ -95,7 +95,7 @@ def _ray_signature(
 
 def _simulated_shifts(baseline: Baseline, expectation: Expectation, onset: int) -> Shift:
     """Simulate each fault as a step at the onset, and cache what the recursion estimates at the end."""
-    plant, start = baseline.plant, np.array(baseline.model_theta)
+    plant, start = baseline.plant, np.array(baseline.healthy.theta)
     healthy = expectation.mean_path(start, plant)[-1]
     common = (expectation.hash, plant.model_dump_json(), plant.rays, start.tobytes(), onset)
 

@@ -259,10 +259,16 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
         drift_std=FORCE_OFFSET_SHARE * force,
         unseen=dict(zip(of_unseen, off[unseen].tolist(), strict=True)),
     )
-    changes, shaken = zip(*(largest_changes(loop, model, one) for one in recordings), strict=True)
-    limits = {}
+    model, own_notes = _with_own_limits(loop, model, recordings)
+    return model, [*notes, *own_notes]
+
+
+def _with_own_limits(loop: Loop, model: AxisModel, recordings: Sequence[Recording]) -> tuple[AxisModel, list[Message]]:
+    """Return the axis with what a change within a recording has to exceed where healthy ones change themselves."""
+    changes, shaken = zip(*(largest_changes(loop, model, recording) for recording in recordings), strict=True)
+    limits, notes = {}, []
     for key, key_message, own, usual in (
-        ("change_limit", "learning.axis_own_change", changes, scan_limit(len(model.visible_faults(plant.faults)))),
+        ("change_limit", "learning.axis_own_change", changes, scan_limit(len(model.visible_faults(loop.plant.faults)))),
         ("vibration_limit", "learning.axis_own_vibration", shaken, scan_limit(BANDS)),
     ):
         most = max(own)

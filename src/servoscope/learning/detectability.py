@@ -6,19 +6,75 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servoscope.baseline.records import DetectableChange
+from servoscope.baseline.plant_fit import can_simulate, fault_directions
+from servoscope.baseline.records import AlarmThresholds, Detectability, DetectableChange
 from servoscope.baseline.threshold import SECONDS_PER_YEAR, threshold
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
-from servoscope.estimation.filter_bank import FilterBank, filter_cutoff
+from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.pipeline import Estimates, Pipeline
 from servoscope.estimation.tuning import TuningFit
+from servoscope.learning.healthy_plant import PlantKnowledge
+from servoscope.learning.instrument import noise_moments
+from servoscope.learning.recursion import HealthyRecordings
+from servoscope.learning.scatter import HealthyPaths, Scatter
 from servoscope.models.loop import Loop
-from servoscope.models.lti import autocovariances, solve_scaled
+from servoscope.models.lti import solve_scaled
 
+MIN_MEMORIES = 10.0  # memories; a shorter baseline is warned about
+MAX_SUPPORTED_BUDGET = 8766.0  # false alarms per year, one an hour: above, nothing is supported
+MIN_USELESS_CHANGE = 1.0  # relative change: where only larger ones can be detected, nothing can
+MIN_EXPLAINED_SHARE = 0.9  # share of u's variance
 MAX_SILENT_BIAS_STDS = 1.0 / 3.0  # standard deviations that noise in phi may move the iFRF in silence
 MAX_T2_PER_COEFFICIENT = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
+
+
+def learn_detectability(
+    healthy: HealthyRecordings,
+    plant: PlantKnowledge,
+    paths: HealthyPaths,
+    scatter: Scatter,
+    covariance: FloatArray,
+    thresholds: AlarmThresholds,
+) -> tuple[Detectability, list[Message]]:
+    """Judge what coefficients with a covariance (n, n) can show, and note what limits it."""
+    loop, fit, monitor = healthy.loop, plant.fit, healthy.loop.monitor
+    notes = noise_notes(healthy.pipeline, fit, paths.estimates, can_simulate(loop))
+    excess, suggestion = baseline_misfit(paths.estimates, paths.deviations, covariance, fit)
+    if fit.explained < MIN_EXPLAINED_SHARE:
+        notes.append(message("learning.hardly_explained", share=fit.explained))
+    if excess > MAX_T2_PER_COEFFICIENT and monitor.model_error < suggestion:
+        notes.append(message("learning.model_error", excess=excess, model_error=suggestion))
+    duration, least = sum(rec.duration_s for rec in healthy.recordings), MIN_MEMORIES * monitor.memory
+    if duration < least:
+        notes.append(message("learning.short", duration_s=duration, memory_s=monitor.memory, least_s=least))
+    supported = supported_budget(len(covariance), loop, fit.dof, excess)
+    if supported > max(MAX_SUPPORTED_BUDGET, monitor.false_alarms_per_year):
+        notes.append(message("learning.no_budget", excess=excess))
+    elif supported > monitor.false_alarms_per_year:
+        notes.append(message("learning.budget", supported=supported, budget=monitor.false_alarms_per_year))
+    directions = fault_directions(loop, plant.plant, scatter.theta)
+    changes, without_scatter = (
+        detectable_changes(loop, directions, paths.estimates, C, thresholds.statistic)
+        for C in (covariance, scatter.theta_covariance + scatter.error)
+    )
+    smallest, fault = _smallest_change(changes)
+    if smallest >= MIN_USELESS_CHANGE:
+        key = "scatter" if _smallest_change(without_scatter)[0] < MIN_USELESS_CHANGE else "noise"
+        reason = message(f"learning.nothing_{key}")
+        notes.append(message("learning.nothing_detectable", reason=reason, smallest=smallest, fault=fault))
+    return Detectability(
+        explained=fit.explained,
+        suggested_model_error=suggestion,
+        supported_false_alarms_per_year=supported,
+        changes=changes,
+    ), notes
+
+
+def _smallest_change(changes: Sequence[DetectableChange]) -> tuple[float, str]:
+    """Return the smallest change that can be detected, infinite where there is none, and the name of its fault."""
+    return min(((one.change or np.inf, one.name) for one in changes), default=(0.0, ""))
 
 
 def baseline_misfit(
@@ -59,12 +115,6 @@ def supported_budget(n: int, loop: Loop, dof: float, excess: float) -> float:
         if threshold(n, *looks, budget, dof) <= 1.5 * threshold(n, *looks, budget, 1e9):
             return budget
     return SECONDS_PER_YEAR * looks[0]
-
-
-def noise_moments(bank: FilterBank) -> FloatArray:
-    """Return the covariance of phi under white noise of variance one in y, shape (n, n)."""
-    of_y = bank.linear.input(np.eye(2, 1, -1)).output(np.eye(bank.n, 1 + bank.n, 1))
-    return np.asarray(autocovariances(of_y, 0)[0])
 
 
 def noise_bias(pipeline: Pipeline, fit: TuningFit, estimates: Sequence[Estimates]) -> tuple[FloatArray, FloatArray]:

@@ -10,6 +10,7 @@ import numpy as np
 from servoscope.baseline.plant_fit import can_simulate
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
+from servoscope.estimation.filter_bank import FilterBank
 from servoscope.estimation.instrument import Source, unbroken
 from servoscope.estimation.instrumental_fit import (
     MAX_RELATIVE_STD,
@@ -19,9 +20,8 @@ from servoscope.estimation.instrumental_fit import (
 )
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.estimation.tuning import TuningFit
-from servoscope.learning.detectability import noise_moments
 from servoscope.models.loop import Loop
-from servoscope.models.lti import solve_scaled
+from servoscope.models.lti import autocovariances, solve_scaled
 from servoscope.signals import Recording
 
 INSTRUMENT_ESTIMATORS = (
@@ -96,3 +96,9 @@ def _attenuation(found: InstrumentalFit, recordings: Sequence[Recording]) -> Flo
     variance = float(np.mean(rough**2)) / math.comb(2 * DIFFERENCES, DIFFERENCES) if len(rough) else 0.0
     S = variance * noise_moments(found.pipeline.bank)
     return solve_scaled(phi.T @ phi / len(phi), S @ found.fit.tuning.theta)
+
+
+def noise_moments(bank: FilterBank) -> FloatArray:
+    """Return the covariance of phi under white noise of variance one in y, shape (n, n)."""
+    of_y = bank.linear.input(np.eye(2, 1, -1)).output(np.eye(bank.n, 1 + bank.n, 1))
+    return np.asarray(autocovariances(of_y, 0)[0])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
@@ -21,6 +23,7 @@ POSITIVE_COEFFICIENTS = (
     "coulomb_friction",
 )
 MAX_NEGATIVE_STDS = 3.0  # standard deviations below 0
+MAX_NEGATIVE_SHARE = 0.1  # share of u (rms) that a negative coefficient carries, which no scatter excuses
 
 
 def check_wraps(recordings: Sequence[Recording]) -> None:
@@ -36,10 +39,15 @@ def check_wraps(recordings: Sequence[Recording]) -> None:
 
 def negative_coefficients(baseline: Baseline) -> list[tuple[str, float, float]]:
     """Return names, values and standard deviations of coefficients that are negative and cannot be."""
-    each = zip(
-        baseline.names, baseline.theta, (math.sqrt(row[i]) for i, row in enumerate(baseline.covariance)), strict=True
-    )
-    return [one for one in each if one[0] in POSITIVE_COEFFICIENTS and one[1] + MAX_NEGATIVE_STDS * one[2] < 0.0]
+    tuning, std = baseline.recursion, np.sqrt(np.diag(baseline.covariance_array()))
+    shares = np.array(baseline.theta) * np.array(tuning.scale)
+    shares *= math.sqrt(max(1.0 - baseline.detectability.explained, 0.0) / tuning.R)
+    return [
+        (name, value, deviation)
+        for name, value, deviation, share in zip(baseline.names, baseline.theta, std.tolist(), shares, strict=True)
+        if name in POSITIVE_COEFFICIENTS
+        and (value + MAX_NEGATIVE_STDS * deviation < 0.0 or share < -MAX_NEGATIVE_SHARE)
+    ]
 
 
 def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
@@ -49,8 +57,8 @@ def check_plausibility(baseline: Baseline, force: bool) -> list[Message]:
     """
     odd = []
     # an instrument sees through noise of y that leaves more of u than the motion explains
-    if baseline.explained < MIN_EXPLAINED_SHARE and baseline.instrument is None:
-        odd.append(message("learning.unexplained", share=baseline.explained))
+    if baseline.detectability.explained < MIN_EXPLAINED_SHARE and baseline.recursion.instrument is None:
+        odd.append(message("learning.unexplained", share=baseline.detectability.explained))
     below = [
         message("learning.negative", name=name, value=value, deviation=deviation)
         for name, value, deviation in negative_coefficients(baseline)

@@ -104,7 +104,7 @@ class Population:
             _ratios(each),
             scatter,
             degrees,
-            2 * sum(bool(one.members) for one in each) > len(each),
+            2 * sum(bool(one.thresholds.hypotheses) for one in each) > len(each),
         )
 
     def pooled_scatter(self, own: FloatArray, recordings: int) -> FloatArray:
@@ -159,11 +159,11 @@ def _common_scatter(each: Sequence[Baseline], n: int) -> tuple[FloatArray, float
     machines with a coefficient of variation c come from an inverse gamma law of 4 + 2/c^2 degrees (by moments). The
     correlations between coefficients are shrunk towards none (oracle approximating shrinkage).
     """
-    known = [one for one in each if len(one.scatter)]
+    known = [one for one in each if one.scatter.between]
     if len(known) < MIN_MACHINES:
         return np.zeros((n, n)), 0.0
     degrees = np.array([len(one.sources) - 1.0 for one in known])
-    covariances = np.array([_scatter_array(one) for one in known])
+    covariances = np.array([one.scatter.between for one in known])
     S = np.einsum("k,kij->ij", degrees, covariances) / degrees.sum()
     least = FLOOR * np.mean([np.diag(one.covariance_array()) for one in known], axis=0)
     variances = np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)
@@ -176,11 +176,6 @@ def _common_scatter(each: Sequence[Baseline], n: int) -> tuple[FloatArray, float
     return correlations * np.outer(size, size), float(min(4.0 + 2.0 / between, degrees.sum()))
 
 
-def _scatter_array(baseline: Baseline) -> FloatArray:
-    S = np.array(baseline.scatter)
-    return S if S.ndim == 2 else np.diag(S)
-
-
 def _without_negative(S: FloatArray, size: FloatArray) -> FloatArray:
     """Return a symmetric matrix without its negative directions, as seen in units of `size` (n,)."""
     units = np.outer(*(np.where(size > 0.0, size, 1.0),) * 2)
@@ -190,8 +185,8 @@ def _without_negative(S: FloatArray, size: FloatArray) -> FloatArray:
 
 def _estimation_error(baseline: Baseline, scatter: FloatArray) -> FloatArray:
     """Return the covariance of a baseline's own coefficients: noise, and its recordings' share of the scatter."""
-    m = len(baseline.sources)
-    own = np.maximum(np.diag(_scatter_array(baseline)), 0.0) if len(baseline.scatter) else np.zeros(len(scatter))
+    m, between = len(baseline.sources), baseline.scatter.between
+    own = np.maximum(np.diag(np.array(between)), 0.0) if between else np.zeros(len(scatter))
     noise = baseline.covariance_array() - np.diag(own * prediction_factor(m))
     lowest = 1e-3 * np.diag(baseline.covariance_array())  # a scatter that was widened is more than what it adds
     noise[np.diag_indices_from(noise)] = np.maximum(np.diag(noise), lowest)
@@ -199,8 +194,10 @@ def _estimation_error(baseline: Baseline, scatter: FloatArray) -> FloatArray:
 
 
 def _ratios(each: Sequence[Baseline]) -> NormalPrior | None:
-    names = tuple(each[0].ratios)
-    if not names or any(tuple(one.ratios) != names or len(one.ratios_covariance) != len(names) for one in each):
+    names = tuple(each[0].healthy.ratios)
+    if not names or any(
+        tuple(one.healthy.ratios) != names or len(one.healthy.covariance) != len(names) for one in each
+    ):
         return None
-    values = np.log([[one.ratios[name] for name in names] for one in each])
-    return NormalPrior.from_machines(names, values, np.array([one.ratios_covariance for one in each]))
+    values = np.log([[one.healthy.ratios[name] for name in names] for one in each])
+    return NormalPrior.from_machines(names, values, np.array([one.healthy.covariance for one in each]))

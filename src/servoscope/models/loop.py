@@ -29,6 +29,7 @@ FEATURE_FALSE_ALARMS = 0.005
 COVARIATE_HOLD_S = 600.0  # a thermometer may tell rarely, and only what has changed
 RESERVED_FAULTS = ("unknown", "healthy", "sensor_gain", "delay", "backlash")  # names that mean something else
 MAX_DELAY_SAMPLES = 100  # samples; a longer one is a delay in ms given as s, as a rule
+MIN_DEFAULT_MEMORY = 50.0  # samples; a shorter memory hardly averages noise
 MIN_FREQUENCY_SHARE = 1e-6  # of the sample rate: a slower filter would take millions of samples to settle
 
 Interval = tuple[Finite, Finite]
@@ -111,7 +112,9 @@ class MonitorSettings(Settings):
     # how many of them; None: 40 samples or 12 functions
     stage_one_length: Annotated[int, Field(strict=True, ge=1, le=500)] | None = None
     stage_one_pole: Annotated[Finite, Field(gt=-1.0, lt=1.0)] = 0.5  # pole of the Laguerre functions, per sample
-    memory: Positive = 5.0  # memory of the estimator [s]
+    memory: Positive = 5.0  # memory of the estimator [s]; at least 50 samples where the file does not say
+    # the same in samples, in the place of seconds
+    memory_samples: Annotated[int, Field(strict=True, ge=2)] | None = None
     # share of u (rms) that the model may leave unexplained, 0 to 1
     model_error: Annotated[NonNegative, Field(lt=1.0)] = 0.0
     # when the estimator may learn: ``auto``, until the axis has stood still for longer than the filters remember (a
@@ -162,11 +165,9 @@ class Loop(ShortRepr, Settings):
     @field_validator("checks", mode="before")
     @classmethod
     def _one_or_several(cls, value: object) -> object:
-        return (
-            {name: [one] if isinstance(one, str) else one for name, one in value.items()}
-            if isinstance(value, Mapping)
-            else value
-        )
+        if not isinstance(value, Mapping):
+            return value
+        return {name: [one] if isinstance(one, str) else one for name, one in value.items()}
 
     @field_validator("plant", mode="before")
     @classmethod
@@ -184,11 +185,12 @@ class Loop(ShortRepr, Settings):
         updates: dict[str, Any] = {}
         frequencies = tuple(f for f in DEFAULT_FREQUENCIES if f < rate / 2) or (rate / 10,)
         evaluation = min(MonitorSettings.model_fields["evaluation_rate"].default, float(rate))
+        defaults: dict[str, Any] = {"frequencies": frequencies, "evaluation_rate": evaluation}
         if isinstance(monitor, Mapping):
-            updates["monitor"] = {"frequencies": frequencies, "evaluation_rate": evaluation, **monitor}
+            updates["monitor"] = {**defaults, "memory": _default_memory(monitor, rate), **monitor}
         elif isinstance(monitor, MonitorSettings):
-            slow = {"frequencies": frequencies, "evaluation_rate": evaluation}
-            kept = {key: value for key, value in slow.items() if key not in monitor.model_fields_set}
+            defaults["memory"] = _default_memory(monitor.model_dump(exclude_unset=True), rate)
+            kept = {key: value for key, value in defaults.items() if key not in monitor.model_fields_set}
             updates["monitor"] = monitor.model_copy(update=kept)
         if isinstance(plant, plants.Plant):
             updates["plant"] = plant.with_sample_rate(rate)
@@ -242,14 +244,11 @@ class Loop(ShortRepr, Settings):
                 "[columns.covariates]"
             )
         if self.monitor.evaluation_rate > self.sample_rate:
-            raise ValueError(
-                f"[monitor] evaluation_rate: {self.monitor.evaluation_rate:g} Hz is above"
-                f" sample_rate = {self.sample_rate:g} Hz, lower it"
-            )
+            rates = f"{self.monitor.evaluation_rate:g} Hz is above sample_rate = {self.sample_rate:g} Hz"
+            raise ValueError(f"[monitor] evaluation_rate: {rates}, lower it")
         if self.monitor.memory * self.sample_rate < 2:
-            raise ValueError(
-                f"[monitor] memory: {self.monitor.memory:g} s is shorter than two samples, give it in seconds"
-            )
+            seconds = self.monitor.memory
+            raise ValueError(f"[monitor] memory: {seconds:g} s is shorter than two samples, give it in seconds")
         if self.monitor.update_when == "moving" and not (self.monitor.rest_speed or self.input_deadzone):
             raise ValueError(
                 '[monitor] rest_speed: missing, update_when = "moving" needs the speed below which the axis rests '
@@ -353,16 +352,13 @@ class Loop(ShortRepr, Settings):
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, ready for JSON, that `from_dict` turns into an equal loop."""
         plain: dict[str, Any] = self.model_dump(mode="json")
-        for key in (
-            "text",
-            "resample",
-            "time_zone",
-            "covariates",
-        ):  # came later: hashes of loops without them stay as they were
+        # came later: hashes of loops without them stay as they were
+        for key in ("text", "resample", "time_zone", "covariates"):
             if not plain["columns"][key]:
                 del plain["columns"][key]
         if self.implausible == "refuse":
             del plain["implausible"]
+        del plain["monitor"]["memory" if self.monitor.memory_samples else "memory_samples"]
         if self.monitor.feature_false_alarms == FEATURE_FALSE_ALARMS:
             del plain["monitor"]["feature_false_alarms"]  # came later: files and hashes of loops without it stay
         if not self.monitor.hidden_warm_up:
@@ -378,6 +374,16 @@ class Loop(ShortRepr, Settings):
             del plain["monitor"]["sequential_step"]  # what loops meant that were hashed before it came
         canonical = json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def _default_memory(monitor: Mapping[str, Any], rate: float) -> float:
+    """Return the memory [s] of a table that gives it in samples, or not at all."""
+    samples = monitor.get("memory_samples")
+    if samples is None:
+        return max(float(MonitorSettings.model_fields["memory"].default), MIN_DEFAULT_MEMORY / rate)
+    if "memory" in monitor:
+        raise ValueError("[monitor] memory_samples: stands for memory, given in samples: remove one of them")
+    return samples / rate if isinstance(samples, int) else MIN_DEFAULT_MEMORY / rate
 
 
 def _parse_plant_table(mapping: Mapping[str, Any], source: str) -> plants.Plant:

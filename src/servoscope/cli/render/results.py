@@ -126,15 +126,16 @@ def _print_operating_point(out: Console, b: Baseline) -> None:
         (name, f"{value:.5g}", f"{s:.2g}", f"{100.0 * abs(s / value):.2g} %" if value else DASH)
         for name, value, s in zip(b.names, b.theta, std, strict=True)
     ]
-    header = ("fault",) if all(p.name == p.parameter for p in b.promises) else ("fault", "parameter")
+    changes = b.detectability.changes
+    header = ("fault",) if all(p.name == p.parameter for p in changes) else ("fault", "parameter")
     promised = [
         (*(p.name, p.parameter)[: len(header)], format_percent(p.change) if p.change is not None else "never")
-        for p in b.promises
+        for p in changes
     ]
     severity = [(f.name, f"{len(f.shares)}", f"{min(f.shares):.2f} to {max(f.shares):.2f}") for f in b.learned]
     for head, cells, words in (
         (("coefficient", "value", "std. dev.", "relative"), rows, 1),
-        (("parameter", "healthy / nominal"), [(name, f"{x:.4g}") for name, x in b.ratios.items()], 1),
+        (("parameter", "healthy / nominal"), [(name, f"{x:.4g}") for name, x in b.healthy.ratios.items()], 1),
         ((*header, "detected from a change of"), promised, len(header)),
         (("labelled fault", "recordings", "severity"), severity, 1),
     ):
@@ -146,22 +147,22 @@ def _print_operating_point(out: Console, b: Baseline) -> None:
 
 
 def _baseline_facts(b: Baseline) -> Iterator[tuple[str, str]]:
-    yield "explained", say("cli.baseline.explained", share=format_percent(b.explained), R=b.R)
-    if b.noise is not None:
-        yield "noise", say("cli.baseline.noise", u=b.noise.u_std, y=b.noise.y_std)
+    yield "explained", say("cli.baseline.explained", share=format_percent(b.detectability.explained), R=b.recursion.R)
+    if b.healthy.noise is not None:
+        yield "noise", say("cli.baseline.noise", u=b.healthy.noise.u_std, y=b.healthy.noise.y_std)
     delay = say("cli.baseline.delay", ms=1e3 * b.delay_s) if b.delay_s is not None else say("cli.baseline.no_delay")
     yield "delay", delay
-    cusums = say("cli.baseline.cusums", count=len(b.members)) if b.members else None
-    budget, supported = b.loop.monitor.false_alarms_per_year, b.supported_false_alarms_per_year
-    yield "false alarms", say("cli.baseline.false_alarms", limit=b.limit, cusums=cusums, budget=budget)
+    cusums = say("cli.baseline.cusums", count=len(b.thresholds.hypotheses)) if b.thresholds.hypotheses else None
+    budget, supported = b.loop.monitor.false_alarms_per_year, b.detectability.supported_false_alarms_per_year
+    yield "false alarms", say("cli.baseline.false_alarms", limit=b.thresholds.statistic, cusums=cusums, budget=budget)
     yield "data support", say("cli.baseline.data_support", budget=supported)
-    error = {"set": b.loop.monitor.model_error, "suggested": b.suggested_model_error}
+    error = {"set": b.loop.monitor.model_error, "suggested": b.detectability.suggested_model_error}
     yield "model_error", say("cli.baseline.model_error", **error)
     if b.features is None:
         return
     n = b.features.recordings
     for name, ratios in (
-        ("coefficients", b.left_out),
+        ("coefficients", b.scatter.left_out),
         ("features", [x / b.features.limit for x in b.features.left_out]),
     ):
         if ratios:

@@ -16,14 +16,14 @@ from servoscope.core.jit import minimum, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.estimation.axis_filter import NO_LAG, AxisFilter, AxisSignals, DriveLag
 from servoscope.estimation.noise_model import sample_autocovariance
-from servoscope.isolation.ml.kernels import Array
+from servoscope.fit.kernels import Array
+from servoscope.fit.plant_experiment import plant_input
 from servoscope.isolation.ml.window import (
     SENSOR_GAIN,
     ChangeProfile,
     ChangeSums,
     ChangeWindow,
     delay_input,
-    plant_input,
 )
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant

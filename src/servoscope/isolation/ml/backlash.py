@@ -10,9 +10,9 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.jit import maximum, minimum, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
-from servoscope.isolation.ml.kernels import PlantArrays, input_before, restart_state, samples_since_restart
+from servoscope.fit.kernels import PlantArrays, input_before, restart_state, samples_since_restart
+from servoscope.fit.predictor import Predictor
 from servoscope.isolation.ml.least_squares import minimise_from_grid
-from servoscope.isolation.ml.predictor import Predictor
 from servoscope.isolation.ml.window import RefitWindow
 
 GAP_COUNT = 33  # gaps, in even ratios, before the best is refined

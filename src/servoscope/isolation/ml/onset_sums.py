@@ -10,7 +10,7 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import minimum
 from servoscope.core.jit.array_function import ArrayFunction
-from servoscope.isolation.ml.kernels import (
+from servoscope.fit.kernels import (
     Array,
     PlantArrays,
     advance_plant,
@@ -22,7 +22,7 @@ from servoscope.isolation.ml.kernels import (
     run_plants,
     samples_since_restart,
 )
-from servoscope.isolation.ml.predictor import PlantVariants, Predictor
+from servoscope.fit.predictor import PlantVariants, Predictor
 
 MAX_REMAINING_SHARE = 1e-3  # share of its state from before a change that a predictor may still hold
 

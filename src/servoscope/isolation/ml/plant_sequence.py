@@ -12,7 +12,7 @@ from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.jit import where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
-from servoscope.isolation.ml.kernels import (
+from servoscope.fit.kernels import (
     Array,
     PlantArrays,
     advance_plant,
@@ -22,7 +22,7 @@ from servoscope.isolation.ml.kernels import (
     run_plants,
     samples_since_restart,
 )
-from servoscope.isolation.ml.predictor import Predictor
+from servoscope.fit.predictor import Predictor
 from servoscope.isolation.ml.window import RefitWindow
 
 

@@ -9,10 +9,10 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
+from servoscope.fit.predictor import Predictor
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.onset import onset_posterior
 from servoscope.isolation.ml.plant_sequence import SequenceCost, likeliest_sequence
-from servoscope.isolation.ml.predictor import Predictor
 from servoscope.isolation.ml.search import RefitResult, fit_stretch
 from servoscope.isolation.ml.start_values import SizeGrid
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow

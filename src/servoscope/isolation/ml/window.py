@@ -13,8 +13,9 @@ import numpy as np
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.isolation.ml.kernels import Array
-from servoscope.isolation.ml.predictor import PlantVariants, Predictor, PredictorFactory
+from servoscope.fit.kernels import Array
+from servoscope.fit.plant_experiment import plant_input
+from servoscope.fit.predictor import PlantVariants, Predictor, PredictorFactory
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
@@ -187,10 +188,10 @@ class RefitWindow(ChangeWindow):
         """Cut samples `first` to `end` out of a recording; the baseline has an exact predictor."""
         if baseline.exact is None:
             raise ValueError("a window needs a baseline with an exact predictor")
-        C = np.array(baseline.ratios_covariance)
+        C = np.array(baseline.healthy.covariance)
         prior = np.linalg.inv(np.linalg.cholesky(C)) if len(C) else np.zeros((0, 0))
         whole = cls.of_healthy(baseline.loop, baseline.plant, baseline.exact.noise, recording)
-        return replace(whole, prior=prior, names=tuple(baseline.ratios)[: len(C)]).cut(first, end)
+        return replace(whole, prior=prior, names=tuple(baseline.healthy.ratios)[: len(C)]).cut(first, end)
 
     @classmethod
     def of_healthy(cls, loop: Loop, plant: Plant, noise: WhiteNoise, recording: Recording) -> RefitWindow:
@@ -262,16 +263,6 @@ class RefitWindow(ChangeWindow):
         moved = np.vstack([np.zeros(len(x)), step * np.eye(len(x))])
         variants = self.variants(np.column_stack([np.tile(d, (len(moved), 1)), x + moved]), names, DRIFT)
         return prepare_sums(variants, step, self.u, self.y, self.restart, Q)
-
-
-def plant_input(loop: Loop, u: FloatArray) -> FloatArray:
-    """Return what acted on the plant, shape (N,): u within its limits, and nothing inside the dead zone."""
-    if loop.input_logged == "before_limiter" and loop.input_limits is not None:
-        u = np.clip(u, *loop.input_limits)
-    if loop.input_deadzone is not None:
-        low, high = loop.input_deadzone
-        u = np.where((u >= low) & (u <= high), 0.0, u)
-    return u
 
 
 def delayed(x: FloatArray, samples: int) -> FloatArray:

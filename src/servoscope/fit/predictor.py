@@ -11,7 +11,7 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.isolation.ml.kernels import Array
+from servoscope.fit.kernels import Array
 from servoscope.models.discretise import discretise, split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
@@ -23,7 +23,7 @@ DOUBLINGS = 8  # 2^8 samples before a restart that it may come from
 
 
 class Predictor(NamedTuple):
-    """One plant or several in a row; the arrays are those of `servoscope.isolation.ml.kernels.innovations`."""
+    """One plant or several in a row; the arrays are those of `servoscope.fit.kernels.innovations`."""
 
     A: Array
     b: Array
@@ -50,7 +50,7 @@ class Predictor(NamedTuple):
 
         Shape (N,), or (V, N) for V variants of the change, the rows of `plants` (V, p): which ones it goes through.
         """
-        from servoscope.isolation.ml.kernels import innovations
+        from servoscope.fit.kernels import innovations
 
         rows = np.arange(len(self.b))[None] if plants is None else plants
         e: Array = innovations(*self, rows, onset, duration, u, y, restart)
@@ -101,7 +101,7 @@ class PredictorFactory:
         The parameters of the plants may be complex, and `output_gains` (P,) multiply their y. `later_s` [s] is delay
         beyond the loop file's; `noise` takes the place of the factory's, but for the state after a restart.
         """
-        from servoscope.isolation.ml.plant_kernels import sample_plants
+        from servoscope.fit.plant_kernels import sample_plants
 
         F, g, c = state_spaces
         F, g = F * self.scale / self.scale[:, None], g[..., 0] / self.scale
