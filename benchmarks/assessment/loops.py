@@ -3,7 +3,8 @@
 Time is in samples and signals are in percent of span. Two families share nothing of what makes a cause: `training`
 has two-parameter stiction, an ideal gap, a lag with dead time and PI control; `test` has a friction equation with mass
 (Karnopp, 1985, with Stribeck's curve), a gap behind a lag, three lags, inverse response and PID control. The ranges of
-`DRAWS` were fixed before any method was tuned.
+`DRAWS` were fixed before any method was tuned. The training family is
+wider: valves that seize, processes that are faster than the sampling, cascades, converters of few bits.
 """
 
 from __future__ import annotations
@@ -86,7 +87,9 @@ class _Lanes:
     def _draw_process(self) -> None:
         rng, n = self.rng, self.n
         self.tau = self.draw("time constant")
-        self.dead = np.maximum(self.tau * self.draw("dead time"), 1.0)
+        if not self.test:  # plants are sampled more slowly than the test family is
+            self.tau *= np.where(rng.random(n) < 0.3, 0.25, 1.0)
+        self.dead = np.maximum(self.tau * self.draw("dead time"), 1.0 if self.test else 0.25)
         small = 0.02 if not self.test else 0.5
         self.lag2 = np.maximum(self.tau * small * rng.random(n), 0.25)
         self.lag3 = np.maximum(self.lag2 * rng.random(n), 0.25)
@@ -140,6 +143,8 @@ class _Lanes:
             elif rng.random() < 0.35:
                 for _ in range(rng.integers(1, 4)):
                     self.r[lane, rng.integers(WARM_UP, total) :] += rng.choice([-1, 1]) * rng.uniform(1.0, 6.0)
+            elif not self.test and rng.random() < 0.25:  # the inner loop of a cascade
+                self.r[lane] += rng.uniform(0.1, 1.0) * _wander(rng, total, rng.uniform(0.5, 20.0))
         self.noise = self.draw("noise")[:, None] * rng.standard_normal((n, total))
         pole = np.exp(-1.0 / (self.tau * rng.uniform(0.3, 3.0, n)))
         load = np.zeros((n, total))
@@ -239,6 +244,8 @@ class _Lanes:
                 compress = swinging_door if self.test else dead_band
                 y = compress(y, size * float(np.std(y - r)))
                 u = compress(u, size * float(np.std(u))) if rng.random() < 0.5 else u
+        elif not self.test and cause != "frozen sensor":  # converters of few bits spoil the other logs a little
+            u, y = (_round(x, rng.uniform(0.1, 0.8)) if rng.random() < 0.3 else x for x in (u, y))
         return Loop(cause, size, r, u, y, str(self.kind[lane]))
 
 
@@ -248,11 +255,15 @@ class _TwoParameters:
     def __init__(self, lanes: _Lanes) -> None:
         self.static, self.kinetic = 0.5 * (lanes.stick + lanes.jump), 0.5 * (lanes.stick - lanes.jump)
         self.gap, self.x, self.contact = 0.5 * lanes.gap, np.zeros(lanes.n), np.zeros(lanes.n)
-        self.sticks = lanes.stick > 0.0
+        self.sticks, self.done = lanes.stick > 0.0, 0
+        seized = self.sticks & (lanes.rng.random(lanes.n) < 0.35)  # some do not move again
+        onset = WARM_UP + lanes.rng.uniform(-0.2, 0.5, lanes.n) * lanes.length
+        self.seized_from = np.where(seized, np.maximum(onset, WARM_UP - 100.0) * STEPS, np.inf)
 
     def advance(self, u: Floats, h: float) -> Floats:
-        off = u - self.x
-        slipped = np.where(np.abs(off) > self.static, u - np.sign(off) * self.kinetic, self.x)
+        off, self.done = u - self.x, self.done + 1
+        static = np.where(self.done > self.seized_from, np.inf, self.static)
+        slipped = np.where(np.abs(off) > static, u - np.sign(off) * self.kinetic, self.x)
         self.x = np.where(self.sticks, slipped, u)
         self.contact = np.clip(self.contact, self.x - self.gap, self.x + self.gap)
         return np.asarray(self.contact)
@@ -299,6 +310,20 @@ def _trajectory(rng: np.random.Generator, total: int, crossover: float) -> Float
         return np.asarray(rng.uniform(5.0, 30.0) * np.clip(1.6 * corner, -1.0, 1.0))
     waves = sum(np.sin(2.0 * np.pi * t / period * f + rng.uniform(0.0, 6.28)) / f for f in (1.0, 1.7, 2.9))
     return np.asarray(rng.uniform(3.0, 15.0) * waves)
+
+
+def _round(x: Floats, share: float) -> Floats:
+    """Round to a grid of a share of the standard deviation from one sample to the next."""
+    grid = max(share * float(np.std(np.diff(x))), 1e-9)
+    return np.asarray(grid * np.round(x / grid))
+
+
+def _wander(rng: np.random.Generator, total: int, memory: float) -> Floats:
+    """Return a first-order process of variance 1."""
+    x, pole = rng.standard_normal(total), np.exp(-1.0 / memory)
+    for k in range(1, total):
+        x[k] = pole * x[k - 1] + np.sqrt(1.0 - pole**2) * x[k]
+    return x
 
 
 def dead_band(x: Floats, band: float) -> Floats:
