@@ -33,9 +33,22 @@ from accuracy.cylinder_days import (
 WINDOW_S, CUTOFF_HZ = 10.0, 10.0
 PLANTS: dict[str, dict[str, object]] = {
     "linear": {"kind": "polynomial", "order": 2, "offset": True},
+    "cylinder": {"kind": "cylinder", "terms": ["spring", "process", "overlap", "offset"], "contact": 0.06},
 }
 # by fault of the rig: what a diagnosis may call it
-NAMES: dict[str, set[str]] = {}
+NAMES: dict[str, set[str]] = {
+    "supply": {"supply"},
+    "valve, extending": {"valve_forward"},
+    "valve, retracting": {"valve_backward"},
+    "leakage": {"leakage"},
+    "friction": {"friction"},
+    "air": {"air"},
+    "overlap": {"overlap"},
+    "zero": {"zero"},
+    "spool lag": {"lag"},
+    "mass": {"lag"},
+    "process": {"process_force"},
+}
 
 
 def loop(plant: dict[str, object]) -> ss.Loop:

@@ -239,14 +239,16 @@ def simulate_cylinder(
         channels={**channels, "T_oil": temperature[used]},
     )
     truth = CylinderTruth(
-        states[used, 0],
-        acting[used],
-        *channels.values(),
-        states[used, 4],
-        temperature[used],
-        states[used],
-        laws[used],
-        tuple(faults),
+        y_true=states[used, 0],
+        drive=acting[used],
+        p_a=channels["p_A"],
+        p_b=channels["p_B"],
+        p_s=channels["p_S"],
+        spool=states[used, 4],
+        temperature=temperature[used],
+        states=states[used],
+        laws=laws[used],
+        faults=tuple(faults),
     )
     return recording, truth
 
