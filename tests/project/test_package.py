@@ -60,12 +60,11 @@ for words in {commands}:
 
 def test_files_are_judged_without_what_only_unix_has(project: Path, tmp_path: Path) -> None:
     """Windows has none of these modules: init, learn, diagnose and reports do without."""
-    golden = project / "tests" / "golden"
+    golden, report = project / "tests" / "golden", str(tmp_path / "report.html")
     commands = [
         ["init", str(golden / "axis.parquet"), "-o", str(tmp_path / "axis.toml"), "--yes"],
         ["learn", str(golden / "axis.toml"), str(golden / "axis.parquet"), "-o", str(tmp_path / "axis.json")],
-        ["diagnose", str(golden / "axis.json"), str(golden / "axis-suspect.parquet")]
-        + ["--report", str(tmp_path / "report.html")],
+        ["diagnose", str(golden / "axis.json"), str(golden / "axis-suspect.parquet"), "--report", report],
     ]
     program = COMMANDS.format(unix=UNIX_ONLY, commands=commands)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=300)
