@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import computed_field, model_validator
@@ -22,6 +23,8 @@ from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
 from servoscope.signals import Defect, Recording
 
 Verdict = Literal["healthy", "fault", "undetermined"]
+MAX_ALIKE = 3  # defects of one kind that are shown one by one
+DEFECT_KINDS = ("gap", "nan", "repeat", "spike", "order", "text", "saturation")
 VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
 
 
@@ -121,6 +124,21 @@ class DiagnosisWarning(ResultModel):
             count=defect.count,
             description=text_message(defect.message),
         )
+
+
+def sum_up(warnings: Sequence[DiagnosisWarning]) -> list[DiagnosisWarning]:
+    """Return warnings, defects of a kind that came more than MAX_ALIKE times as one."""
+    kinds = Counter(warning.kind for warning in warnings if warning.kind in DEFECT_KINDS)
+    summed: dict[str, DiagnosisWarning] = {}
+    for number, warning in enumerate(warnings):
+        if kinds[warning.kind] <= MAX_ALIKE:
+            summed[str(number)] = warning
+        elif warning.kind not in summed:
+            alike = [each for each in warnings if each.kind == warning.kind]
+            text = message("diagnosis.alike", first=warning.description, times=len(alike))
+            count, to_s = sum(each.count for each in alike), max(each.to_s for each in alike)
+            summed[warning.kind] = warning.model_copy(update={"description": text, "count": count, "to_s": to_s})
+    return list(summed.values())
 
 
 class FaultInterval(ResultModel):
