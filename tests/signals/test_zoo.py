@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from zoo import ZOO, Exhibit, motion
+from zoo import Exhibit, motion
+from zoo_tables import ZOO
 
 from servoscope.core.errors import RecordingError
 from servoscope.learning.proposal import propose_columns, propose_loop

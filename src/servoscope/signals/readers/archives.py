@@ -23,7 +23,7 @@ _T = TypeVar("_T")
 
 GZIP, ZIP = ".gz", ".zip"
 ARCHIVES = (GZIP, ZIP)
-BESIDE = re.compile(
+ACCOMPANYING_FILES = re.compile(
     r"(?:^|/)(?:read\W?me|lies\W?mich|lisez\W?moi|licen[cs]e|notes?)\b[^/]*$|\.(?:md|pdf|rtf|docx?|png|jpe?g)$", re.I
 )
 MAX_UNPACKED_BYTES = 8_000_000_000  # of one file when it is unpacked
@@ -89,7 +89,7 @@ def _open_version(path: Path, _changed: int, _size: int) -> tuple[zipfile.ZipFil
     names = [info.filename for info in archive.infolist() if not info.is_dir()]
     names = sorted(name for name in names if not name.rpartition("/")[2].startswith((".", "_")))
     # what is beside a log: a text that describes it, its pictures
-    logs = [name for name in names if not BESIDE.search(name)]
+    logs = [name for name in names if not ACCOMPANYING_FILES.search(name)]
     return archive, logs or names
 
 

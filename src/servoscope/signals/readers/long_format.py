@@ -36,7 +36,7 @@ ROLES = {
     "quality": ("quality", "validity", "status", "qualitat", "statuscode"),
     "unit": ("unit", "units", "einheit", "engunits", "uom"),
 }
-BESIDE = ("result", "table", "start", "stop", "measurement")  # of InfluxDB, which tell no signals apart
+INFLUX_COLUMNS = ("result", "table", "start", "stop", "measurement")  # of InfluxDB, which tell no signals apart
 DAY_COLUMN, DAY_UNIT_S = "timems", 0.0864  # of WinCC: millionths of a day since 1899
 GOOD = re.compile(r"\s*(?:good|ok|valid|gut|true)", re.IGNORECASE)
 GOOD_OPC = 192.0  # least quality code of OPC that is good
@@ -56,7 +56,7 @@ def widen(opened: TableFile) -> TableFile:
     if DAY_COLUMN in plain:
         roles["time"] = plain[DAY_COLUMN]
     known = (*roles.values(), *(plain[word] for word in ROLES["time"] if word in plain))
-    labels = [name for word, name in plain.items() if name not in known and word not in BESIDE]
+    labels = [name for word, name in plain.items() if name not in known and word not in INFLUX_COLUMNS]
     columns = _read_columns(opened, [*roles.values(), *labels])
     named = _text_codes(columns[roles["name"]])
     if named is None or 2 * len(named[1]) > len(named[0]):

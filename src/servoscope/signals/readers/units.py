@@ -73,8 +73,9 @@ BARE_UNIT = re.compile(r"^(.+?)(?:[_ ]|\s*/\s*)([A-Za-zµμ°%/]{1,5})$")  # a u
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Return a column's name with its unit in brackets, unless it has one, or the unit is none that is known."""
-    return f"{name} [{unit}]" if unit and is_unit(unit) and unit not in "1-" and not split_unit(name)[1] else name
+    """Return a column's name with its unit in brackets, unless it has one, or the unit is none that is known, or s."""
+    told = unit and is_unit(unit) and unit not in ("1", "-", "s") and not split_unit(name)[1]
+    return f"{name} [{unit}]" if told else name
 
 
 def parse_quantity(text: str, name: str) -> float | None:
