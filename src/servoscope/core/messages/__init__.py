@@ -224,6 +224,7 @@ FORMATS: Mapping[str, Callable[[Any], str]] = {
     "probability": _format_probability,
     "utc": _format_utc,
     "moment": format_moment,
+    "first_moment": lambda value: format_moment(value).removesuffix(" s"),  # whose unit follows the second one
     "capitalised": lambda value: str(value)[:1].upper() + str(value)[1:],
 }
 JOINS: Mapping[str, str] = {
