@@ -155,7 +155,7 @@ class AssetStates:
         exceeded, new = one["exceeded"], found.evaluations
         if new is not None:
             exceeded = new.exceeded
-            quiet &= np.isfinite(one["period"]) & (new.count_periods(one["period"]) <= 1)
+            quiet &= np.isfinite(one["period"])
         return np.asarray(quiet & (exceeded == one["is_fault"]))
 
     def advance(
@@ -176,14 +176,11 @@ class AssetStates:
             one[name] += more
         if new is not None:
             before = np.stack([one["excess"], one["level"]])
-            (one["excess"], one["level"]), due, values = new.update_histories(lanes, one["period"], before)
+            (one["excess"], one["level"]), complete = new.update_histories(lanes, one["period"], before)
             one["period"] = new.periods[lanes, -1]
-            one["rows"][due] += 1
-            counts = one["rows"][due].tolist()
-            history = [
-                (lane, TableRow("residuals", {"number": number, **row}))
-                for lane, number, row in zip(due.tolist(), counts, values, strict=True)
-            ]
+            for lane, row in complete:
+                one["rows"][lane] += 1
+                history.append((lane, TableRow("residuals", {"number": one["rows"][lane].item(), **row})))
             sized = new.t[lanes] // SIZE_EVERY_S != one["evaluated"] // SIZE_EVERY_S  # as `period_number` says
             for lane in np.flatnonzero(sized).tolist():
                 latest = new.latest(int(lanes[lane]))
