@@ -374,4 +374,5 @@ def compile_function(name: str, spec: KernelSpec, lanes: int = 1, single: bool =
     write(printer, spec, lanes, "float" if single else "double", own)
     if result == "void":
         printer.write("ret void")
-    return native_function(printer.text(), arguments, result, brief=name == "run_sample")
+    is_step = name == "run_sample"  # one sample at a time, for which all optimisation pays
+    return native_function(printer.text(), arguments, result, brief=is_step, straight=not is_step)
