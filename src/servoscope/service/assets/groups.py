@@ -75,7 +75,7 @@ class AssetGroups:
         for key, own in monitors.items():
             if len(names := members[key]) > 1:
                 size = len(assets[names[0]].monitor.init())
-                baselines = {each: i for i, each in enumerate(own)}
+                baselines = {monitor: i for i, monitor in enumerate(own)}
                 for row, name in enumerate(names):
                     asset = assets[name]
                     self._places[name] = _Place(asset, len(self._fleets), baselines[id(asset.monitor)], row)
@@ -90,11 +90,11 @@ class AssetGroups:
         while waiting:
             self.layers.enter("assemble")
             turn, later = dict[str, Block](), list[Block]()  # a round has at most one block of each asset
-            for one in waiting:
-                if one.asset in turn:
-                    later.append(one)
+            for block in waiting:
+                if block.asset in turn:
+                    later.append(block)
                 else:
-                    turn[one.asset] = one
+                    turn[block.asset] = block
             waiting = later
             yield from self._process_round(turn.values(), latest)
 
@@ -185,19 +185,19 @@ class AssetGroups:
         assets, blocks, states = [place.asset for place, _ in placed], [block for _, block in placed], fleet.states
         part = fleet.monitor.select(np.array([place.baseline for place, _ in placed]))
         before, samples = (monitors, states.quality[rows]), int(states.columns["samples"][rows[0]])
-        found = assets[0].lanes.follow_lanes(part, before, samples, signals, is_new, self.layers)
-        are_quiet, packed = states.are_quiet(rows, found) & ~is_new, pack_samples(signals)
+        output = assets[0].lanes.follow_lanes(part, before, samples, signals, is_new, self.layers)
+        are_quiet, packed = states.are_quiet(rows, output) & ~is_new, pack_samples(signals)
         for i in np.flatnonzero(~are_quiet).tolist():
             accepted = NextBlock(blocks[i], packed=packed[i])
-            followed = found.lane(i, assets[i].take_state())
+            followed = output.lane(i, assets[i].take_state())
             yield BlockResult(blocks[i], assets[i].conclude(accepted, followed))
         quiet = np.flatnonzero(are_quiet)
         if quiet.size:
             chosen = quiet.tolist()
             own, theirs = [packed[i] for i in chosen], [assets[i] for i in chosen]
-            numbers, history = states.advance(rows[quiet], found, quiet, signals)
+            numbers, history = states.advance(rows[quiet], output, quiet, signals)
             times = signals[quiet, 0][:, [0, -1]].T.tolist()
-            kept = list(zip(numbers, *times, repeat(found.size, quiet.size), *zip(*own, strict=True), strict=True))
+            kept = list(zip(numbers, *times, repeat(output.size, quiet.size), *zip(*own, strict=True), strict=True))
             for asset, block in zip(theirs, kept, strict=True):
                 asset.keep(block)
             yield QuietBlocks(theirs, [blocks[i] for i in chosen], kept, history)
