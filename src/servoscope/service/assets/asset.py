@@ -14,8 +14,8 @@ import numpy as np
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import StateError
 from servoscope.core.messages import message, render
-from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCommand
 from servoscope.service.assets.alarms import AssetAlarms
