@@ -89,11 +89,13 @@ class Columns(Settings):
 
 
 class Controller(Settings):
-    """Discrete PI controller, u(k) = k_p e(k) + k_i T sum e, e = r - y."""
+    """Discrete PI controller with feed-forward, u(k) = k_p e(k) + k_i T sum e + k_v (r(k) - r(k-1))/T, e = r - y."""
 
     kind: Literal["pi"]
     k_p: Positive
     k_i: NonNegative
+    # feed-forward of the reference's speed; hashes of loops without it stay as they were
+    k_v: Annotated[NonNegative, Field(exclude_if=lambda value: value == 0.0)] = 0.0
 
 
 class MonitorSettings(Settings):
