@@ -59,7 +59,7 @@ def measured(folder: Path) -> Records:
 
 
 def servos(folder: Path) -> Records:
-    """Return healthy servo recordings, of two large folders every twelfth: their causes are any but stiction and backlash."""
+    """Return healthy servo recordings, of two large folders every twelfth: any cause but stiction and backlash."""
     rows, names = [], []
     for i, (of, name, log) in enumerate(servo_logs(folder)):
         if of in ("sts3215", "ur10e") and i % EVERY:
