@@ -10,6 +10,7 @@ LuGre friction: Canudas de Wit, Olsson, Astrom, Lischinsky, 1995.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -226,18 +227,18 @@ def record_day(
     return replace(recording, channels={"temperature": logged})
 
 
-def learned_days(count: int = 7) -> list[ss.Recording]:
+def learned_days(count: int = 7, seed: int = 0) -> list[ss.Recording]:
     """Return the healthy days that are learned from; their temperatures are spread over the range."""
-    order = np.random.default_rng(0).permutation(count)
+    order = np.random.default_rng(seed).permutation(count)
     starts = COLD_C + (WARM_C - 1.5 - COLD_C) * order / (count - 1.0)
-    return [record_day(k, start_c=float(start)) for k, start in enumerate(starts)]
+    return [record_day(1000 * seed + k, start_c=float(start)) for k, start in enumerate(starts)]
 
 
-def healthy_days(count: int = 32) -> list[ss.Recording]:
+def healthy_days(count: int = 32, seed: int = 0) -> list[ss.Recording]:
     """Return further healthy days."""
-    return [record_day(100 + k) for k in range(count)]
+    return [record_day(1000 * seed + 100 + k) for k in range(count)]
 
 
-def faulty_days() -> list[ss.Recording]:
-    """Return one day per fault of the table."""
-    return [record_day(200 + k, change) for k, change in enumerate(FAULTS)]
+def faulty_days(changes: Sequence[Change] = FAULTS, seed: int = 0) -> list[ss.Recording]:
+    """Return one day per fault."""
+    return [record_day(1000 * seed + 200 + k, change) for k, change in enumerate(changes)]

@@ -176,6 +176,7 @@ class Baseline(ShortRepr, BaselineMemory):
         covariance = self.covariance_array() + model.theta_covariance(origin, c)
         update: dict[str, Any] = {"theta": tuple(theta.tolist()), "covariance": tuple(map(tuple, covariance.tolist()))}
         update["covariates"] = None
+        update["features"] = None if self.features is None else self.features.at(c)
         moved: dict[str, Any] = {}
         if self.healthy.theta:
             moved["theta"] = tuple((np.array(self.healthy.theta) + theta - origin).tolist())

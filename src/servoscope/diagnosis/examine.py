@@ -90,8 +90,9 @@ class Examination:
             else:
                 along = follow_warm_up(pipeline, model, theta, recording, memory)
             place = ", ".join(filter(None, [baseline.point, along.place]))
+            features = baseline.features  # they are compared at the covariates of each span
             baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
-            baseline = baseline.model_copy(update={"point": place})
+            baseline = baseline.model_copy(update={"point": place, "features": features})
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
         skipped = _skipped_share(exam.estimates)

@@ -150,7 +150,7 @@ class SideLanes:
             return SideValues(None)
         r, u, y = (np.asarray(signal, dtype=np.float64) for signal in signals)
         if self._features is not None:
-            features = self._features.run(rows, r, u, y, restart)
+            features = self._features.run(rows, r, u, y, restart, channels)
         if len(self._lanes) > 1:
             return SideValues(features)
         return self.first.run(self._own(rows), (r[0], u[0], y[0]), restart[0], channels, features)

@@ -108,8 +108,9 @@ def _learn_axis(healthy: HealthyRecordings) -> tuple[AxisModel | None, list[Mess
 
 
 def _learn_features(healthy: HealthyRecordings) -> tuple[FeatureModel | None, list[Message]]:
-    """Features move with covariates too, and nothing says how."""
-    return learn_features(healthy.loop, healthy.recordings) if healthy.covariates is None else (None, [])
+    """Features move with a warm-up that is not logged too, and nothing says how."""
+    hidden = healthy.covariates is not None and healthy.covariates.warm_up is not None
+    return (None, []) if hidden else learn_features(healthy.loop, healthy.recordings)
 
 
 def _assemble_baseline(
