@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.feature_model import FeatureModel, SpanFeatures, SpanSums
+from servoscope.baseline.feature_model import FeatureModel
+from servoscope.baseline.feature_spans import SpanFeatures, SpanSums
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.window_features import Window, WindowFeatures, WindowLanes
 

@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from servoscope.baseline.feature_model import FeatureModel, FeatureName, SpanFeatures
+from servoscope.baseline.feature_model import FeatureModel, FeatureName
+from servoscope.baseline.feature_spans import SpanFeatures
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.messages import Message, message

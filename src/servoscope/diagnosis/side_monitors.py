@@ -12,7 +12,7 @@ import numpy.typing as npt
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import BaselineError
-from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
+from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor, read_channels
 from servoscope.detection.feature_monitor import FeatureLanes, FeatureMonitor, FeatureValues
 from servoscope.detection.motion_monitor import MotionEvidence, MotionMonitor
 from servoscope.detection.trace import Trace
@@ -34,7 +34,7 @@ class SideMonitors:
 
     def __init__(self, baseline: Baseline, pipeline: Pipeline) -> None:
         self._baseline, self._pipeline = baseline, pipeline
-        model, covariates = baseline.features, baseline.covariates
+        model, covariates, self.logged = baseline.features, baseline.covariates, baseline.logged_covariates
         self.features = None if model is None else FeatureMonitor(model)
         self.covariates: CovariateMonitor | None = None
         if covariates is not None and covariates.warm_up is not None:
@@ -150,6 +150,8 @@ class SideLanes:
             return SideValues(None)
         r, u, y = (np.asarray(signal, dtype=np.float64) for signal in signals)
         if self._features is not None:
+            if len(self._lanes) == 1:
+                channels = read_channels(self.first.logged, channels, r[0].shape)
             features = self._features.run(rows, r, u, y, restart, channels)
         if len(self._lanes) > 1:
             return SideValues(features)

@@ -11,11 +11,11 @@ from servoscope.baseline.feature_model import (
     WIDENING_SHARE,
     FeatureModel,
     GroupStatistic,
-    SpanFeatures,
     fit_groups,
     score_limit,
     spans_in_a_row,
 )
+from servoscope.baseline.feature_spans import SpanFeatures
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.messages import Message, message
