@@ -90,9 +90,12 @@ class Examination:
             else:
                 along = follow_warm_up(pipeline, model, theta, recording, memory)
             place = ", ".join(filter(None, [baseline.point, along.place]))
-            features = baseline.features  # they are compared at the covariates of each span
+            # features are compared at the covariates of each span, and the axis at those of each sample
+            followed: dict[str, Any] = {"features": baseline.features}
+            if baseline.axis is not None and baseline.axis.moves is not None:
+                followed["axis"] = baseline.axis
             baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
-            baseline = baseline.model_copy(update={"point": place, "features": features})
+            baseline = baseline.model_copy(update={"point": place, **followed})
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
         skipped = _skipped_share(exam.estimates)
@@ -113,8 +116,12 @@ class Examination:
 
     @cached_property
     def drifts(self) -> bool:
-        """Whether covariates move the healthy coefficients within the recording by as much as their uncertainty."""
-        if self.along is None or not self.evaluations:
+        """Whether covariates move the healthy coefficients within the recording by as much as their uncertainty.
+
+        A refit of an axis follows them.
+        """
+        axis = self.baseline.axis
+        if self.along is None or not self.evaluations or (axis is not None and axis.moves is not None):
             return False
         theta = self.along.expected(self.estimates.index)
         C = np.broadcast_to(self.covariance(self.evaluations - 1), self.estimates.S.shape)
