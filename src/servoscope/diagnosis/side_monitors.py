@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -56,8 +57,6 @@ class SideMonitors:
     def check_motion(self) -> None:
         """Let a motion never seen make an alarm harder."""
         one = self._baseline
-        if one.covariates is not None:
-            raise BaselineError("the motion is not checked where there are covariates: leave motion_check out")
         if one.motion is None and not one.extrapolates:
             raise BaselineError("this baseline does not hold the motion of its recordings: learn it again")
         if one.limited_motion is not None:
@@ -106,10 +105,13 @@ class SideMonitors:
         return {} if self.covariates is None else self.covariates.history(self._split(state)[1])
 
     def compare(self, trace: Trace, values: SideValues, index: npt.NDArray[np.int64]) -> Trace:
-        """Return the evaluations at some samples of a block, compared with what is healthy at the covariates there."""
-        if self.covariates is None or values.averages is None:
+        """Return the evaluations at some samples of a block, compared with what is healthy there."""
+        if self.covariates is not None and values.averages is not None:
+            trace = self.covariates.compare(trace, values.averages[index])
+        if values.motion is None:
             return trace
-        return self.covariates.compare(trace, values.averages[index])
+        softer = values.motion.soften_statistic(trace.statistic, trace.theta, trace.expected, trace.covariance)
+        return replace(trace, statistic=softer if self.covariates is None else np.where(trace.ready, softer, 0.0))
 
 
 class SideLanes:
