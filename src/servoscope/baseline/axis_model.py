@@ -27,7 +27,7 @@ class AxisMoves(BaseModel):
         """Return what multiplies u and the terms in ``y'' = b u - sum a_i column_i``, shape (1 + terms, N)."""
         along = dict(zip(self.names, self.covariates.factors(channels).T, strict=True))
         inertia = along["inertia"]
-        return np.array([1.0 / inertia, *(along[column.coefficient] / inertia for column in plant.columns)])
+        return np.array([1.0 / inertia, *(along[column.coefficient] / inertia for column in plant.acting)])
 
 
 class AxisModel(BaseModel):
