@@ -130,6 +130,17 @@ def read_log(path: str | Path, loop: Loop, by: str | None = None) -> Log:
     return _read_log(path, loop, loop.columns, {}, by)
 
 
+def read_rows(
+    source: Source, columns: Columns | None = None, where: Mapping[str, str] | None = None, by: str | None = None
+) -> dict[str, Samples]:
+    """Read rows without judging them, by the recording's name: signals may be constant, and values may be missing.
+
+    Parameters and errors are those of `read_parts`.
+    """
+    parts = _read_log(source, None, columns or Columns(), where or {}, by).parts.values()
+    return {part.name: part.samples() for part in parts}
+
+
 def first_time(path: str | Path, loop: Loop) -> float:
     """Return the first time stamp of a file [s since 1970, or since its own beginning]; NaN if it has none.
 
@@ -255,7 +266,7 @@ class LoggedRows:
         labels: tuple[str, str, str],
         target: ResampleTarget | None,
     ) -> None:
-        self._name, self._has_time, self._channels = name, timed, channels
+        self.name, self._has_time, self._channels = name, timed, channels
         self._loop, self._labels, self._target = loop, labels, target if timed else None
         self._columns: list[GrowableArray] = []
         self._broken: list[tuple[int, float, int, str]] = []
@@ -294,7 +305,7 @@ class LoggedRows:
         if self._target is not None:
             return self.recording()
         (t, *signals), run, channels = self._split_columns()
-        axis = build_time_axis(t, run, self._rate, self._name)
+        axis = build_time_axis(t, run, self._rate, self.name)
         r, u, y = map(axis.reorder, signals)
         return Samples.from_columns(
             axis.t, r, u, y, channels={name: axis.reorder(channel) for name, channel in channels.items()}
@@ -322,7 +333,7 @@ class LoggedRows:
         limits = self._loop.input_limits if self._loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]
         options = {"sample_rate": self._rate, "run": run, "limits": limits, "labels": self._labels, "channels": each}
-        recording = clean(t, r, u, y, name=self._name, target=self._target, **options)  # type: ignore[arg-type]
+        recording = clean(t, r, u, y, name=self.name, target=self._target, **options)  # type: ignore[arg-type]
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)
             notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))
