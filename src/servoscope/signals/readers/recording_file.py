@@ -128,6 +128,16 @@ def read_log(path: str | Path, loop: Loop, by: str | None = None) -> Log:
     return _read_log(path, loop, loop.columns, {}, by)
 
 
+def read_channels(path: Source, columns: Columns) -> tuple[str, FloatArray, dict[str, FloatArray]]:
+    """Return the name of a file, its time stamps [s] as logged (N,), and the covariates of `columns`, (N,) each.
+
+    Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
+    """
+    rows = _read_log(path, None, columns, {}, None).parts[""]
+    (t, *_), _, channels = rows.split_columns()
+    return rows.name, t, channels
+
+
 def first_time(path: str | Path, loop: Loop) -> float:
     """Return the first time stamp of a file [s since 1970, or since its own beginning]; NaN if it has none.
 
@@ -253,7 +263,7 @@ class LoggedRows:
         labels: tuple[str, str, str],
         target: ResampleTarget | None,
     ) -> None:
-        self._name, self._has_time, self._channels = name, timed, channels
+        self.name, self._has_time, self._channels = name, timed, channels
         self._loop, self._labels, self._target = loop, labels, target if timed else None
         self._columns: list[GrowableArray] = []
         self._broken: list[tuple[int, float, int, str]] = []
@@ -275,7 +285,7 @@ class LoggedRows:
     def _rate(self) -> float | None:
         return self._loop.sample_rate if self._loop is not None else None
 
-    def _split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
+    def split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
         """Return t, r, u and y; the runs, if there are some; the channels."""
         columns = [column.to_array() for column in self._columns]
         if not self._has_time:
@@ -291,8 +301,8 @@ class LoggedRows:
         """
         if self._target is not None:
             return self.recording()
-        (t, *signals), run, channels = self._split_columns()
-        axis = build_time_axis(t, run, self._rate, self._name)
+        (t, *signals), run, channels = self.split_columns()
+        axis = build_time_axis(t, run, self._rate, self.name)
         r, u, y = map(axis.reorder, signals)
         return Samples.from_columns(
             axis.t, r, u, y, channels={name: axis.reorder(channel) for name, channel in channels.items()}
@@ -300,11 +310,11 @@ class LoggedRows:
 
     def recording(self) -> Recording:
         """Return the rows cleaned."""
-        (t, r, u, y), run, each = self._split_columns()
+        (t, r, u, y), run, each = self.split_columns()
         limits = self._loop.input_limits if self._loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]
         options = {"sample_rate": self._rate, "run": run, "limits": limits, "labels": self._labels, "channels": each}
-        recording = clean(t, r, u, y, name=self._name, target=self._target, **options)  # type: ignore[arg-type]
+        recording = clean(t, r, u, y, name=self.name, target=self._target, **options)  # type: ignore[arg-type]
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)
             notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))
