@@ -12,7 +12,7 @@ from servoscope.baseline.arm import UNKNOWN, ArmBaseline, Cause
 from servoscope.core.arrays import FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.messages import Message, message
-from servoscope.detection.arm_evidence import INTERVAL, CauseEvidence, ChangeEvidence, weigh_changes
+from servoscope.detection.arm_evidence import INTERVAL, CauseEvidence, ChangeEvidence, ChangeTest
 from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, FinalCoefficient, Verdict
 from servoscope.estimation.arm_regression import (
@@ -67,7 +67,7 @@ def examine_arm(baseline: ArmBaseline, recording: ArmRecording) -> tuple[Diagnos
     information = block_information(signals.t, columns * w[:, None], residual * w)
     prior = _random_effect(baseline)
     scale = np.array(baseline.scale)
-    evidence = weigh_changes(information, prior, baseline.causes, scale, np.array(baseline.drift))
+    evidence = ChangeTest(information, prior, baseline.causes, scale, np.array(baseline.drift)).weigh()
     examination = ArmExamination(signals, outside, evidence, events)
     parameters = _coefficients(baseline, information, prior)
     if evidence.log_factor <= baseline.limit:

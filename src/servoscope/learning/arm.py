@@ -23,9 +23,9 @@ from servoscope.core.messages import Message, message
 from servoscope.detection.arm_evidence import (
     BETWEEN_SHARE,
     DRIFT_SHARE,
+    ChangeTest,
     random_effect,
     second_half,
-    weigh_changes,
 )
 from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, largest_events
 from servoscope.estimation.arm_regression import (
@@ -105,21 +105,23 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
     drift = random_effect(halves, scale, DRIFT_SHARE)
     information /= np.median(inflation)
     notes = list(_mounting_notes(model, signals, designs, fit, recordings[0].name))
-    limit = -float(np.log(loop.false_alarms))
-    if several:
+    limits = []
+    for i, one in enumerate(whole):
+        others = random_effect(found[:i] + found[i + 1 :], scale, BETWEEN_SHARE) if several else between
         prior = np.zeros((len(theta) + scale.size,) * 2)
-        for i, one in enumerate(whole):
-            others = random_effect(found[:i] + found[i + 1 :], scale, BETWEEN_SHARE)
-            prior[: len(theta), : len(theta)] = information - fit.A[i] / np.median(inflation)
-            prior[moves, moves] = np.diag(others**-2.0)
-            evidence = weigh_changes(one, prior, arm_causes(model), scale, drift)
+        prior[: len(theta), : len(theta)] = information - several * fit.A[i] / np.median(inflation)
+        prior[moves, moves] = np.diag(others**-2.0)
+        test = ChangeTest(one, prior, arm_causes(model), scale, drift)
+        if i == len(whole) // 2:
+            limits.append(test.healthy_limit(loop.false_alarms))
+        if several:
+            evidence = test.weigh()
+            limits.append(evidence.log_factor)
             if evidence.log_factor > -float(np.log(loop.false_alarms)):
                 cause = evidence.causes[0].cause
-                notes.append(
-                    message("arm.odd_recording", name=recordings[i].name, kind=cause.kind, joint=_of(cause.joint))
-                )
-            limit = max(limit, evidence.log_factor)
-    else:
+                text = {"kind": cause.kind, "joint": message("arm.of_joint", joint=cause.joint) if cause.joint else None}
+                notes.append(message("arm.odd_recording", name=recordings[i].name, **text))
+    if not several:
         notes.append(message("arm.few_recordings", least=MIN_RECORDINGS))
     events = np.max(
         [largest_events(each, X, e, fit.noise, model, theta) for each, X, e in zip(signals, designs, residuals, strict=True)],
@@ -142,7 +144,7 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
         drift=to_tuples(drift),
         torque=to_tuples(torque),
         event_limits=to_tuples(np.maximum(EVENT_MARGIN * events, MIN_EVENT_LIMIT)),
-        limit=limit,
+        limit=max(0.0, *limits),
         undetermined=tuple(_undetermined(model, theta, std * np.sqrt(np.median(inflation)))),
         notes=tuple(notes),
     )
@@ -154,10 +156,6 @@ def weighted(
     """Return columns (n, D, M) and residual (n, M) over a standard deviation (n,), 0 where a joint rests."""
     w = signals.moving / weight[:, None]
     return columns * w[:, None], residual * w
-
-
-def _of(joint: str) -> Message | None:
-    return message("arm.of_joint", joint=joint) if joint else None
 
 
 def _start(model: ArmModel) -> FloatArray:
