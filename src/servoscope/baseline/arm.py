@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationError
 
+from servoscope.baseline.baseline import ARM_FORMAT
 from servoscope.baseline.records import BaselineModel, BaselineSource, Matrix, Vector
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError
@@ -20,8 +21,8 @@ from servoscope.estimation.arm_regression import ANGLE_STEP, ArmSignals
 from servoscope.models.arm.model import FRICTION, ArmModel
 from servoscope.models.arm.settings import ArmLoop
 
-FORMAT = "servoscope-arm-baseline"
 VERSION = 1
+HEAD_LENGTH = 200  # characters, in which a baseline says what it is
 UNKNOWN = "unknown"
 PAYLOAD = ("m", "mx", "my", "mz")
 # standard deviations of a change, by kind: kg and kg m of a payload, rad of an encoder, shares of friction, of the
@@ -113,7 +114,19 @@ class ArmBaseline(BaselineModel):
 
     @cached_property
     def _std(self) -> FloatArray:
-        return np.sqrt(np.diag(np.linalg.inv(np.array(self.information))))
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.array(self.information)))))
+
+    def summary(self) -> dict[str, Any]:
+        """Return friction and the share of unexplained torque of each joint, as plain values."""
+        joints = {
+            name: {
+                "friction": [self.coefficient(f"{name}.{what}") for what in FRICTION[:2]],
+                "unexplained": self.noise[j] / self.torque[j],
+            }
+            for j, name in enumerate(self.model.arm.names)
+        }
+        notes = [str(note) for note in self.notes]
+        return {"joints": joints, "undetermined": list(self.undetermined), "notes": notes, "hash": self.hash}
 
     def design(self, signals: ArmSignals) -> FloatArray:
         """Return the columns of all coefficients, (n, P, M)."""
@@ -130,7 +143,7 @@ class ArmBaseline(BaselineModel):
 
     def save(self, path: str | Path) -> None:
         """Write the baseline as JSON; nothing half-written stays behind."""
-        content = {"format": FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
+        content = {"format": ARM_FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
         atomic_write(Path(path), (json.dumps(content, indent=1) + "\n").encode())
 
     @classmethod
@@ -140,13 +153,16 @@ class ArmBaseline(BaselineModel):
         Raises BaselineError if it is damaged.
         """
         try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
+            text = Path(path).read_text(encoding="utf-8")
+            content = json.loads(text) if ARM_FORMAT in text[:HEAD_LENGTH] else {}
         except (OSError, ValueError, RecursionError):
-            return None
-        if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
+            return None  # whoever reads other baselines says what is wrong
+        if content.pop("format", None) != ARM_FORMAT:
             return None
         if (version := content.pop("version", None)) != VERSION:
-            raise BaselineError(f"{path}: baseline of version {version!r}, this program reads {VERSION}: learn it again")
+            raise BaselineError(
+                f"{path}: baseline of version {version!r}, this program reads {VERSION}: learn it again"
+            )
         try:
             baseline = cls.model_validate(content)
             _ = baseline.model
@@ -169,15 +185,17 @@ def coefficient_names(model: ArmModel) -> tuple[str, ...]:
     return (*model.names, *load, *warm, *tool)
 
 
-def complete_columns(
-    model: ArmModel, signals: ArmSignals, theta: FloatArray, temperature: FloatArray
-) -> FloatArray:
+def complete_columns(model: ArmModel, signals: ArmSignals, theta: FloatArray, temperature: FloatArray) -> FloatArray:
     """Return columns with friction by load, by temperature, and of a known tool, (n, P, M).
 
     `theta`: coefficients, of which the base parameters give the load on the joints; `temperature`: to which friction
     belongs (n,).
     """
-    n, still, at = model.arm.size, np.zeros_like(signals.q), dict(zip(model.names, range(len(model.names)), strict=True))
+    n, still, at = (
+        model.arm.size,
+        np.zeros_like(signals.q),
+        dict(zip(model.names, range(len(model.names)), strict=True)),
+    )
     load = np.abs(model.inertial_torque(signals.q, still, still, theta[: len(model.base.names)]))
     own = [{what: signals.columns[:, at[f"{name}.{what}"]] for what in FRICTION[:2]} for name in model.arm.names]
     more = [own[j]["coulomb_friction"] * load[j] for j in range(n)]
@@ -214,7 +232,9 @@ def deviation_scales(model: ArmModel, theta: FloatArray, torque: FloatArray) -> 
     names = coefficient_names(model)
     scales = list(PAYLOAD_SIZES)
     for j, (name, joint) in enumerate(zip(model.arm.names, model.loop.columns_of(model.arm), strict=True)):
-        coulomb, viscous = (abs(theta[names.index(f"{name}.{what}")]) for what in ("coulomb_friction", "viscous_friction"))
+        coulomb, viscous = (
+            abs(theta[names.index(f"{name}.{what}")]) for what in ("coulomb_friction", "viscous_friction")
+        )
         least = 0.01 * torque[j]  # of friction that is nearly none
         scales += [FRICTION_SIZE * max(viscous, least), FRICTION_SIZE * max(coulomb, least), LOAD_SIZE]
         scales += [TORQUE_SIZE * torque[j]] * 3 + [GAIN_SIZE]

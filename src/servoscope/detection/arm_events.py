@@ -11,8 +11,8 @@ from servoscope.estimation.arm_regression import ArmSignals
 from servoscope.models.arm.model import ArmModel
 
 EVENT_WINDOW_S = 0.5  # over which the torque is averaged
-EVENT_MARGIN = 1.5  # times the largest of healthy recordings
-MIN_EVENT_LIMIT = 4.0  # times the noise
+EVENT_MARGIN = 2.0  # times the largest of healthy recordings
+MIN_EVENT_LIMIT = 8.0  # times the noise
 BREAKAWAY = 1.5  # times Coulomb friction that may hold a joint at rest
 MAX_EVENT_S = 8.0  # what lasts longer is a change
 MAX_EVENT_SHARE = 0.5  # share of the recording's time that events may take
@@ -40,7 +40,9 @@ def outside_torque(
     held = []
     for j in range(n):
         coulomb = theta[p + 3 * j + 1]
-        by_load = np.abs(design[j, loads + j] / np.where(design[j, p + 3 * j + 1] == 0.0, np.inf, design[j, p + 3 * j + 1]))
+        by_load = np.abs(
+            design[j, loads + j] / np.where(design[j, p + 3 * j + 1] == 0.0, np.inf, design[j, p + 3 * j + 1])
+        )
         held.append(BREAKAWAY * (abs(coulomb) + abs(theta[loads + j]) * by_load))
     period = float(np.median(np.diff(signals.t)))
     allowed = np.where(signals.moving, 0.0, np.array(held))

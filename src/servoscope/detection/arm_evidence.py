@@ -1,8 +1,9 @@
 """How much better a change of an arm explains a recording than no change: Bayes factors over causes and onsets.
 
-The residual e of a recording is X delta + X (d + B c) 1(t >= t_k) + noise: delta, how this recording differs from others and
-what the coefficients are off, and d, what changes within healthy recordings, are random effects of known covariance; c, the
-change from t_k on in the columns of one cause, has a Gaussian prior. All is linear and Gaussian, so that each cause and onset has its evidence in closed form.
+The residual e of a recording is X delta + X (d + B c) 1(t >= t_k) + noise. delta, how this recording differs from
+others and what the coefficients are off, and d, what changes within healthy recordings, are random effects of known
+covariance; c, the change from t_k on in the columns of one cause, has a Gaussian prior. All is linear and Gaussian, so
+that each cause and onset has its evidence in closed form.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ class ChangeTest:
         first = g.shape[2] - self._drift.size
         late = g[:, ::-1, first:].cumsum(1)[:, ::-1][:, : len(self._gain)]
         r = late - np.einsum("kpd,sp->skd", self._gain, g.sum(1))
-        return np.einsum("kij,skj->ski", self._damping, r, optimize=True)
+        return np.asarray(np.einsum("kij,skj->ski", self._damping, r, optimize=True))
 
 
 class _Term(NamedTuple):
@@ -126,10 +127,11 @@ class _Term(NamedTuple):
         own = R[:, columns][:, :, columns]
         precision = (own + own.transpose(0, 2, 1)) / 2.0 + np.diag(scale[columns] ** -2.0)
         log_det = np.linalg.slogdet(precision * np.outer(scale[columns], scale[columns]))[1]
-        return cls(columns, np.linalg.inv(precision), log_det)
+        covariance: FloatArray = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+        return cls(columns, covariance, np.asarray(log_det, dtype=np.float64))
 
     def sizes(self, r: FloatArray) -> FloatArray:
-        return np.einsum("kij,skj->ski", self.covariance, r[:, :, self.columns])
+        return np.asarray(np.einsum("kij,skj->ski", self.covariance, r[:, :, self.columns]))
 
     def log_factors(self, r: FloatArray) -> FloatArray:
         return np.asarray(0.5 * np.einsum("ski,ski->sk", r[:, :, self.columns], self.sizes(r)) - 0.5 * self.log_det)

@@ -12,8 +12,8 @@ from servoscope.baseline.arm import UNKNOWN, ArmBaseline, Cause
 from servoscope.core.arrays import FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.messages import Message, message
-from servoscope.detection.arm_evidence import INTERVAL, CauseEvidence, ChangeEvidence, ChangeTest
 from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque
+from servoscope.detection.arm_evidence import INTERVAL, CauseEvidence, ChangeEvidence, ChangeTest
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, FinalCoefficient, Verdict
 from servoscope.estimation.arm_regression import (
     MIN_MOVING_S,
@@ -25,9 +25,10 @@ from servoscope.estimation.arm_regression import (
 from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.signals.readers.arm_log import ArmRecording
 
-MIN_CERTAINTY = 0.95  # probability from which a cause is named
+MIN_CERTAINTY = 0.9  # probability from which a cause is named
 MIN_PROBABILITY = 0.01  # of a cause that is listed
 MIN_RIVAL_PROBABILITY = 0.05  # of a cause that the headline of an open answer lists
+MAX_FACTOR = 20.0  # power of ten up to which evidence is written
 ONSET_TAIL = 0.025  # probability on either side of an onset's interval
 UNITS = {"offset": "N m", "counterbalance": "N m", "gear ripple": "N m", "encoder offset": "rad"}
 
@@ -188,7 +189,8 @@ def _explain(
         faults=candidates[0].faults if certain else (),
         candidates=tuple(candidates),
     )
-    reasons = (message("arm.evidence", factor=min(evidence.log_factor / np.log(10.0), 99.0), limit=baseline.limit / np.log(10.0)),)
+    factor = min(np.floor(evidence.log_factor / np.log(10.0)), MAX_FACTOR)
+    reasons = (message("arm.evidence", factor=float(factor), limit=float(np.exp(baseline.limit))),)
     if certain and best.cause.kind == "payload" and baseline.loop.payload == "change":
         return "healthy", message("arm.payload_changed", size=_size(baseline, best), since=since), interval, reasons
     if certain:
@@ -196,8 +198,10 @@ def _explain(
         return "fault", message("arm.fault", **name, size=_size(baseline, best), since=since), interval, reasons
     if best.cause.kind == UNKNOWN:
         return "fault", message("arm.unknown", since=since), interval, reasons
-    likely = [key for key in ranked if odds[key] >= MIN_RIVAL_PROBABILITY]
-    rivals = [message("arm.rival", kind=kind, joint=_joint(joint), probability=odds[kind, joint]) for kind, joint in likely]
+    likely = [key for index, key in enumerate(ranked) if index < 2 or odds[key] >= MIN_RIVAL_PROBABILITY]
+    rivals = [
+        message("arm.rival", kind=kind, joint=_joint(joint), probability=odds[kind, joint]) for kind, joint in likely
+    ]
     joints = sorted({joint for _, joint in likely if joint})
     told = message("arm.would_tell_joints" if len(joints) > 1 else "arm.would_tell", joints=joints or ["the last link"])
     return "fault", message("arm.ambiguous", rivals=rivals, since=since, told=told), interval, reasons

@@ -1,12 +1,13 @@
 """An arm's log as a regression: torques and columns behind one filter, and what each stretch of time says of changes.
 
-Both sides of the regression pass the same zero-phase low-pass (Gautier and Poignet, Extended Kalman filtering and weighted
-least squares dynamic identification of robot, 2001: parallel filtering). Samples of a joint that rests have no weight:
-friction at rest is not known.
+Both sides of the regression pass the same zero-phase low-pass (parallel filtering: Gautier and Poignet, Extended
+Kalman filtering and weighted least squares dynamic identification of robot, 2001). Samples of a joint that rests have
+no weight: friction at rest is not known.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -76,7 +77,7 @@ def _filter_pieces(recording: ArmRecording, model: ArmModel) -> Iterator[ArmSign
     for begin, end in zip(recording.begins, ends, strict=True):
         count = -(-(end - begin) // longest)
         cuts = np.linspace(begin, end, count + 1).astype(int)
-        for first, last in zip(cuts[:-1], cuts[1:], strict=True):
+        for first, last in itertools.pairwise(cuts):
             rows = slice(max(begin, first - edge), min(end, last + edge))
             if rows.stop - rows.start < 4 * edge:
                 continue
@@ -118,7 +119,9 @@ class Information(NamedTuple):
         return Information(self.t, self.A[:, columns, columns], self.g[:, columns])
 
 
-def block_information(t: FloatArray, columns: FloatArray, residual: FloatArray, block_s: float = BLOCK_S) -> Information:
+def block_information(
+    t: FloatArray, columns: FloatArray, residual: FloatArray, block_s: float = BLOCK_S
+) -> Information:
     """Return the information of the blocks of a recording.
 
     `t`: (M,) [s]; `columns`: (n, D, M) and `residual`: (n, M), both over the residual's standard deviation, 0 where a
@@ -131,7 +134,7 @@ def block_information(t: FloatArray, columns: FloatArray, residual: FloatArray, 
     number = np.floor((t - t[0]) / length).astype(int)
     cuts = np.append(np.flatnonzero(np.diff(number, prepend=-1)), t.size)
     A, g = [], []
-    for first, end in zip(cuts[:-1], cuts[1:], strict=True):
+    for first, end in itertools.pairwise(cuts):
         X = columns[:, :, first:end].transpose(1, 0, 2).reshape(columns.shape[1], -1)
         A.append(X @ X.T)
         g.append(X @ residual[:, first:end].ravel())

@@ -20,6 +20,7 @@ from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
+from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, largest_events
 from servoscope.detection.arm_evidence import (
     BETWEEN_SHARE,
     DRIFT_SHARE,
@@ -27,7 +28,6 @@ from servoscope.detection.arm_evidence import (
     random_effect,
     second_half,
 )
-from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, largest_events
 from servoscope.estimation.arm_regression import (
     MIN_MOVING_S,
     ArmSignals,
@@ -45,6 +45,7 @@ MAX_REVERSED = -3.0  # standard deviations below 0, from which friction says tha
 MOUNTING_RATIO = 2.0  # by which another mounting has to explain more before the given one is doubted
 MAX_COEFFICIENT = 1e3  # standard deviation of friction and offset a priori [N m, N m s]: nothing is known
 MAX_LOAD_FRICTION = 1.0  # the same of friction by load [N m per N m]
+NO_LOAD_FRICTION = 1e-6  # the same where the loop file leaves it out
 MIN_RECORDINGS = 3  # from which recordings are judged by the others
 
 
@@ -84,10 +85,14 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
     # each recording by the coefficients of the others
     several = len(signals) >= MIN_RECORDINGS
     thetas = [
-        np.linalg.solve(information - fit.A[i], fit.b.sum(0) + fit.prior @ _start(model) - fit.b[i]) if several else theta
+        np.linalg.solve(information - fit.A[i], fit.b.sum(0) + fit.prior @ _start(model) - fit.b[i])
+        if several
+        else theta
         for i in range(len(signals))
     ]
-    residuals = [each.tau - np.einsum("jpm,p->jm", X, own) for each, X, own in zip(signals, designs, thetas, strict=True)]
+    residuals = [
+        each.tau - np.einsum("jpm,p->jm", X, own) for each, X, own in zip(signals, designs, thetas, strict=True)
+    ]
     columns = [
         np.concatenate([X, deviation_columns(model, each, X, theta)], axis=1)
         for each, X in zip(signals, designs, strict=True)
@@ -119,12 +124,18 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
             limits.append(evidence.log_factor)
             if evidence.log_factor > -float(np.log(loop.false_alarms)):
                 cause = evidence.causes[0].cause
-                text = {"kind": cause.kind, "joint": message("arm.of_joint", joint=cause.joint) if cause.joint else None}
+                text = {
+                    "kind": cause.kind,
+                    "joint": message("arm.of_joint", joint=cause.joint) if cause.joint else None,
+                }
                 notes.append(message("arm.odd_recording", name=recordings[i].name, **text))
     if not several:
         notes.append(message("arm.few_recordings", least=MIN_RECORDINGS))
     events = np.max(
-        [largest_events(each, X, e, fit.noise, model, theta) for each, X, e in zip(signals, designs, residuals, strict=True)],
+        [
+            largest_events(each, X, e, fit.noise, model, theta)
+            for each, X, e in zip(signals, designs, residuals, strict=True)
+        ],
         axis=0,
     )
     return ArmBaseline(
@@ -173,7 +184,7 @@ def _fit(model: ArmModel, signals: Sequence[ArmSignals], designs: Sequence[Float
     rest = np.arange(size.size, start.size)
     prior[rest, rest] = MAX_COEFFICIENT**-2.0
     load = len(model.names) + np.arange(model.arm.size)
-    prior[load, load] = MAX_LOAD_FRICTION**-2.0
+    prior[load, load] = (MAX_LOAD_FRICTION if model.loop.load_friction else NO_LOAD_FRICTION) ** -2.0
     moving = np.concatenate([each.moving for each in signals], axis=1)
     tau = np.concatenate([each.tau for each in signals], axis=1)
     noise = np.sqrt((np.square(tau) * moving).sum(1) / moving.sum(1))
@@ -195,8 +206,8 @@ def _check_motion(model: ArmModel, signals: Sequence[ArmSignals]) -> None:
     for name, seconds in zip(model.arm.names, moved, strict=True):
         if seconds < MIN_MOVING_S:
             raise NotEnoughError(
-                f"{name}: moves for {seconds:.1f} s in all recordings, at least {MIN_MOVING_S:g} s are needed: add a log"
-                " in which it moves, or lower rest_speed"
+                f"{name}: moves for {seconds:.1f} s in all recordings, at least {MIN_MOVING_S:g} s are needed:"
+                " add a log in which it moves, or lower rest_speed"
             )
 
 
@@ -204,7 +215,10 @@ def _check_signs(model: ArmModel, theta: FloatArray, std: FloatArray, name: str)
     """Refuse friction that drives: the sign of a torque or of a gear is wrong."""
     names = coefficient_names(model)
     for joint in model.arm.names:
-        signs = [theta[i] / std[i] for i in (names.index(f"{joint}.{what}") for what in ("viscous_friction", "coulomb_friction"))]
+        signs = [
+            theta[i] / std[i]
+            for i in (names.index(f"{joint}.{what}") for what in ("viscous_friction", "coulomb_friction"))
+        ]
         if sum(signs) < 0.0 and min(signs) < MAX_REVERSED:
             raise RecordingError(
                 f"{name}: {joint}: its friction comes out negative, so position and torque have opposite signs: give it"

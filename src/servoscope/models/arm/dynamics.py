@@ -1,9 +1,9 @@
 """Joint torques of an arm, linear in the inertial parameters of its links: Newton and Euler, vectorised over samples.
 
-tau_j = z_j . (n_i + (p_i - p_j) x f_i), summed over the links i that joint j carries, where force f_i and moment n_i about
-the frame of link i are linear in its ten parameters (Khalil and Dombre, Modeling, Identification and Control of Robots,
-2002, section 9.6). Each link's terms are expressed in its own frame, component by component, so that all arithmetic runs
-along the samples.
+tau_j = z_j . (n_i + (p_i - p_j) x f_i), summed over the links i that joint j carries, where force f_i and moment n_i
+about the frame of link i are linear in its ten parameters (Khalil and Dombre, Modeling, Identification and Control of
+Robots, 2002, section 9.6). Each link's terms are expressed in its own frame, component by component, so that all
+arithmetic runs along the samples.
 """
 
 from __future__ import annotations
@@ -73,9 +73,7 @@ def _fill(
             _link_terms(z_j, m_j, w, dw, acc, Y[j, 10 * i : 10 * i + 10])
 
 
-def _link_terms(
-    z: FloatArray, m: FloatArray, w: FloatArray, dw: FloatArray, acc: FloatArray, into: FloatArray
-) -> None:
+def _link_terms(z: FloatArray, m: FloatArray, w: FloatArray, dw: FloatArray, acc: FloatArray, into: FloatArray) -> None:
     """Write what the ten parameters of a link add to the torque about an axis z with m = z x lever, shape (10, N)."""
     into[0] = (m * acc).sum(0)
     # of a force on the centre of mass, and of the moment c x acc

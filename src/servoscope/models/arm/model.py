@@ -2,12 +2,14 @@
 
     K_j i_j = Y_j(q, v, a) pi + F_vj v_j + F_cj s(v_j) + F_lj abs(g_j(q)) s(v_j) + I_aj a_j + b_j,   s(v) = tanh(v/v0)
 
-Only base parameters, linear combinations of the ten parameters per link and the rotor inertias, show in torques (Gautier,
-Numerical calculation of the base inertial parameters of robots, 1991): pivoted QR finds them from random motion.
+Only base parameters, linear combinations of the ten parameters per link and the rotor inertias, show in torques
+(Gautier, Numerical calculation of the base inertial parameters of robots, 1991): pivoted QR finds them from random
+motion.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -68,12 +70,12 @@ class ArmModel:
         size = np.concatenate([np.outer(self.arm.inertial[:, 0], LINK_SIZES).ravel(), np.full(rotors, ROTOR_SIZE)])
         # in the order of the links
         rows = np.argsort(order[:rank])
-        chosen, added, others = order[:rank][rows], added[rows], order[rank:]
+        chosen, added, others = order[:rank][rows], np.asarray(added)[rows], order[rank:]
         return BaseParameters(
             tuple(chosen.tolist()),
             tuple(
                 _base_name(names[index], row, [names[i] for i in others])
-                for index, row in zip(chosen, added, strict=True)
+                for index, row in zip(chosen.tolist(), added.tolist(), strict=True)
             ),
             nominal[chosen] + added @ nominal[others],
             np.hypot(size[chosen], np.linalg.norm(added * size[others], axis=1)),
@@ -88,7 +90,9 @@ class ArmModel:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the columns of `columns`."""
-        own = [f"{joint}.{what}" for joint in self.arm.names for what in ("viscous_friction", "coulomb_friction", "offset")]
+        own = [
+            f"{joint}.{what}" for joint in self.arm.names for what in ("viscous_friction", "coulomb_friction", "offset")
+        ]
         motors = [
             f"motor{index + 1}.{what}"
             for index in range(len(self.coupled))
@@ -114,7 +118,7 @@ class ArmModel:
     def inertial_torque(self, q: FloatArray, v: FloatArray, a: FloatArray, base: FloatArray) -> FloatArray:
         """Return the torques of base parameters (p,) alone, (n, N)."""
         columns = self._inertial_columns(q, v, a)[:, list(self.base.chosen)]
-        return np.einsum("jpn,p->jn", columns, base)
+        return np.asarray(np.einsum("jpn,p->jn", columns, base))
 
 
 def _own_row(j: int, x: FloatArray, n: int) -> FloatArray:
@@ -128,7 +132,7 @@ def _stack(columns: list[FloatArray]) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def _base_name(name: str, row: FloatArray, others: list[str]) -> str:
+def _base_name(name: str, row: Sequence[float], others: list[str]) -> str:
     terms = [(factor, other) for factor, other in zip(row, others, strict=True) if abs(factor) > 1e-6]
     texts = [f" {'-' if factor < 0.0 else '+'} {abs(factor):.3g} {other}" for factor, other in terms[:MAX_NAME_TERMS]]
     return name + "".join(texts) + (" + ..." if len(terms) > MAX_NAME_TERMS else "")

@@ -53,6 +53,7 @@ class ArmLoop(Settings):
     cutoff: Positive = DEFAULT_CUTOFF  # of the filters on motion and torque [Hz]
     rest_speed: Positive = 0.03  # speed below which a joint rests, and its friction is not known [rad/s or m/s]
     sign_speed: Positive = 0.01  # v0 of tanh(v/v0), which stands for the sign in Coulomb friction [rad/s or m/s]
+    load_friction: bool = True  # whether Coulomb friction grows with the load on a joint
     # where drive gains come from: data sheets, or a known load, without which masses are relative to the gains
     gains: Literal["data sheet", "load"] = "data sheet"
     payload: Literal["change", "fault"] = "change"  # what a change of the payload is

@@ -70,7 +70,9 @@ def read_arm_log(path: Source | Path, loop: ArmLoop, arm: Kinematics) -> ArmReco
     if whole.mean() < 1.0 - MAX_DROPPED_SHARE:
         share = {key: float(np.isfinite(channel).mean()) for key, channel in ordered.items()}
         worst = min(share, key=lambda key: share[key])
-        raise RecordingError(f"{name}: {worst} is missing in {1.0 - share[worst]:.0%} of the rows, choose another column")
+        raise RecordingError(
+            f"{name}: {worst} is missing in {1.0 - share[worst]:.0%} of the rows, choose another column"
+        )
     target = ResampleTarget(loop.sample_rate, loop.cutoff)
     rows = resample_rows(
         axis.t[whole], axis.run[whole], [channel[whole] for channel in ordered.values()], set(), target, name
@@ -89,7 +91,9 @@ def read_arm_log(path: Source | Path, loop: ArmLoop, arm: Kinematics) -> ArmReco
         resampled.get("tool", np.zeros(rows.t.size)),
     )
     if recording.duration_s < MIN_DURATION_S:
-        raise RecordingError(f"{name}: {recording.duration_s:.2g} s are too short, at least {MIN_DURATION_S:g} s are needed")
+        raise RecordingError(
+            f"{name}: {recording.duration_s:.2g} s are too short, at least {MIN_DURATION_S:g} s are needed"
+        )
     _check_range(recording, loop, arm)
     return recording
 
@@ -99,7 +103,7 @@ def _joint_positions(loop: ArmLoop, arm: Kinematics, channels: Mapping[str, Floa
     if loop.angle_unit == "deg":
         logged = logged * np.where(arm.prismatic, 1.0, DEGREE)
     offsets = np.array([joint.offset for joint in loop.columns_of(arm)])
-    return np.linalg.solve(loop.gear_matrix(arm), logged.T).T + offsets
+    return np.asarray(np.linalg.solve(loop.gear_matrix(arm), logged.T).T + offsets)
 
 
 def _joint_torques(loop: ArmLoop, arm: Kinematics, channels: Mapping[str, FloatArray]) -> FloatArray:
