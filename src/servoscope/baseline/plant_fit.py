@@ -57,7 +57,12 @@ def saturated_share(loop: Loop, recording: Recording) -> float:
 
     A plant that is not simulated with its controller takes u as it acted, at a limit as elsewhere.
     """
-    if loop.input_limits is None or not can_simulate(loop):
+    return share_at_limits(loop, recording) if can_simulate(loop) else 0.0
+
+
+def share_at_limits(loop: Loop, recording: Recording) -> float:
+    """Return the share of samples with u at or beyond a limit."""
+    if loop.input_limits is None:
         return 0.0
     low, high = loop.input_limits
     count = 0
@@ -194,5 +199,5 @@ def fault_directions(
             return nominal_theta(loop, plant.scaled({parameter: ratio}))
 
         return {p: (at(np.exp(step), p) - at(np.exp(-step), p)) / (2.0 * step) for p in parameters}
-    names = plant.names
-    return {p: np.where(np.array(names) == p, theta, 0.0) if p in names else np.array(theta) for p in parameters}
+    moved = {p: plant.exponents(p) for p in parameters}
+    return {p: np.array([powers.get(name, 0.0) for name in plant.names]) * theta for p, powers in moved.items()}
