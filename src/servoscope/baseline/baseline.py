@@ -44,6 +44,7 @@ from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 
 FORMAT = "servoscope-baseline"
+ARM_FORMAT = "servoscope-arm-baseline"  # what `ArmBaseline` writes
 VERSION = 3
 
 
@@ -311,6 +312,8 @@ class Baseline(ShortRepr, BaselineMemory):
             raise BaselineError(
                 f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
             ) from None
+        if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
+            raise BaselineError(f"{path}: baseline of an arm, which diagnose takes, and no other command")
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
         version = content.get("version")
