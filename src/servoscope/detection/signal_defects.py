@@ -229,9 +229,24 @@ def _frozen_defect(recording: Recording, finding: QualityFinding) -> SignalDefec
         begin -= 1
     if name == "u" and not x.min() < x[at] < x.max():
         return None  # it is limited
+    if name == "y" and _follows_late(recording, begin):
+        return None
     other = "r" if name == "y" else "r - y"
     text = message("signals.frozen", name=name, t=float(recording.t[begin]), other=other, by=finding.value)
     return SignalDefect(begin, text)
+
+
+def _follows_late(recording: Recording, begin: int) -> bool:
+    """Return whether y, at rest from a sample on, moves within `FROZEN_S` of the motion of r that should move it.
+
+    A rest before the command says nothing of the sensor, and a loop may take a while to break away.
+    """
+    travel = TRAVEL_SHARE * float(np.ptp(recording.y))
+    moved = np.flatnonzero(recording.y[begin:] != recording.y[begin])
+    end = begin + int(moved[0]) if len(moved) else recording.samples
+    r = recording.r[begin:end]
+    demanded = np.maximum.accumulate(r) - np.minimum.accumulate(r) > travel
+    return bool(demanded.any()) and len(r) - int(np.argmax(demanded)) <= FROZEN_S * recording.sample_rate
 
 
 def _largest_near(steps: FloatArray, at: npt.NDArray[np.intp], lead: int) -> float:
