@@ -244,10 +244,11 @@ def deviation_scales(model: ArmModel, theta: FloatArray, torque: FloatArray) -> 
 
 def arm_causes(model: ArmModel) -> tuple[Cause, ...]:
     """Return the changes that are told apart, as columns of `deviation_columns`; the last is any of them at once."""
-    found = [Cause("payload", "", (0, 1, 2, 3), "m")]
+    found, coulombs = [], []
     first = len(PAYLOAD)
     for name, joint in zip(model.arm.names, model.loop.columns_of(model.arm), strict=True):
         viscous, coulomb, load, offset, sine, cosine, gain = range(first, first + 7)
+        coulombs.append(coulomb)
         found += [
             Cause("friction", name, (coulomb,), "coulomb_friction"),
             Cause("friction", name, (viscous,), "viscous_friction"),
@@ -261,4 +262,7 @@ def arm_causes(model: ArmModel) -> tuple[Cause, ...]:
             found.append(Cause("gear ripple", name, sines, f"ripple {period:g}"))
         first += 8 + 2 * len(joint.ripple)
         found.append(Cause("encoder offset", name, (first - 1,), "encoder"))
+    # a payload loads the gears, which rub more then
+    payload = tuple(range(len(PAYLOAD)))
+    found += [Cause("payload", "", payload, "m"), Cause("payload", "", (*payload, *coulombs), "m")]
     return (*found, Cause(UNKNOWN, "", tuple(range(first)), UNKNOWN))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servoscope.baseline.arm import UNKNOWN, ArmBaseline, Cause
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.messages import Message, message
 from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque
@@ -56,19 +56,17 @@ def examine_arm(baseline: ArmBaseline, recording: ArmRecording) -> tuple[Diagnos
     residual = signals.tau - np.einsum("jpm,p->jm", design, theta)
     outside = outside_torque(signals, design, residual, model, theta)
     events = find_events(signals.t, outside, np.array(baseline.event_limits) * noise, model.arm.names)
-    clear = outside_events(signals.t, events)
-    period = float(np.median(np.diff(signals.t)))
-    moved = (signals.moving & clear).sum(1) * period >= MIN_MOVING_S
+    columns = np.concatenate([design, baseline.deviations(signals, design)], axis=1)
+    prior = _random_effect(baseline)
+    moved, information, evidence = _weigh(baseline, signals, columns, residual, prior, events)
+    if events and evidence is not None and evidence.log_factor > baseline.limit:
+        # what differs without them is a change, of which they are the peaks
+        events = []
+        moved, information, evidence = _weigh(baseline, signals, columns, residual, prior, events)
     warnings = [*_event_warnings(events), *_still_warnings(model.arm.names, moved, recording)]
-    if not moved.any():
+    if evidence is None or information is None:
         headline = message("arm.undetermined_pushed" if events else "arm.undetermined")
         return _result(recording, "undetermined", headline, warnings), ArmExamination(signals, outside, None, events)
-    columns = np.concatenate([design, baseline.deviations(signals, design)], axis=1)
-    w = signals.moving * clear / (noise * np.sqrt(baseline.inflation))[:, None]
-    information = block_information(signals.t, columns * w[:, None], residual * w)
-    prior = _random_effect(baseline)
-    scale = np.array(baseline.scale)
-    evidence = ChangeTest(information, prior, baseline.causes, scale, np.array(baseline.drift)).weigh()
     examination = ArmExamination(signals, outside, evidence, events)
     parameters = _coefficients(baseline, information, prior)
     if evidence.log_factor <= baseline.limit:
@@ -82,6 +80,25 @@ def examine_arm(baseline: ArmBaseline, recording: ArmRecording) -> tuple[Diagnos
     diagnosis = _result(recording, verdict, headline, warnings, parameters)
     update = {"intervals": (interval,), "reasons": reasons, "checks": checks if verdict == "fault" else ()}
     return diagnosis.model_copy(update=update), examination
+
+
+def _weigh(
+    baseline: ArmBaseline,
+    signals: ArmSignals,
+    columns: FloatArray,
+    residual: FloatArray,
+    prior: FloatArray,
+    events: list[ArmEvent],
+) -> tuple[BoolArray, Information | None, ChangeEvidence | None]:
+    """Return which joints moved (n,) outside of events, and the evidence of that; None where none did."""
+    clear = outside_events(signals.t, events)
+    moved = (signals.moving & clear).sum(1) * float(np.median(np.diff(signals.t))) >= MIN_MOVING_S
+    if not moved.any():
+        return moved, None, None
+    w = signals.moving * clear / (np.array(baseline.noise) * np.sqrt(baseline.inflation))[:, None]
+    information = block_information(signals.t, columns * w[:, None], residual * w)
+    scale, drift = np.array(baseline.scale), np.array(baseline.drift)
+    return moved, information, ChangeTest(information, prior, baseline.causes, scale, drift).weigh()
 
 
 def _random_effect(baseline: ArmBaseline) -> FloatArray:
@@ -122,7 +139,7 @@ def _event_warnings(events: Sequence[ArmEvent]) -> Iterator[DiagnosisWarning]:
         yield _warning("event", event.from_s, event.to_s, text)
 
 
-def _still_warnings(names: Sequence[str], moved: FloatArray, recording: ArmRecording) -> Iterator[DiagnosisWarning]:
+def _still_warnings(names: Sequence[str], moved: BoolArray, recording: ArmRecording) -> Iterator[DiagnosisWarning]:
     still = [name for name, each in zip(names, moved, strict=True) if not each]
     if still:
         yield _warning("rest", recording.t[0], recording.t[-1], message("arm.still", joints=still))
@@ -144,7 +161,7 @@ def _coefficients(baseline: ArmBaseline, information: Information, prior: FloatA
 
 
 def _smallest_changes(
-    baseline: ArmBaseline, information: Information, prior: FloatArray, moved: FloatArray
+    baseline: ArmBaseline, information: Information, prior: FloatArray, moved: BoolArray
 ) -> list[Message]:
     """Return the smallest payload and friction that would have been found in this recording from its start on."""
     first, scale = len(baseline.theta), np.array(baseline.scale)

@@ -44,7 +44,7 @@ MAX_FRICTION_STD = 0.3  # share of a friction torque from which the motion does 
 MAX_REVERSED = -3.0  # standard deviations below 0, from which friction says that a sign is wrong
 MOUNTING_RATIO = 2.0  # by which another mounting has to explain more before the given one is doubted
 MAX_COEFFICIENT = 1e3  # standard deviation of friction and offset a priori [N m, N m s]: nothing is known
-MAX_LOAD_FRICTION = 1.0  # the same of friction by load [N m per N m]
+MAX_LOAD_FRICTION = 0.05  # the same of friction by load [N m per N m], of which little is known where the load is small
 NO_LOAD_FRICTION = 1e-6  # the same where the loop file leaves it out
 MIN_RECORDINGS = 3  # from which recordings are judged by the others
 

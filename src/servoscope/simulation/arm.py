@@ -32,7 +32,8 @@ CENTRE = (0.0, 0.4, -0.3, 0.0, 0.5, 0.0)  # rad
 HARMONICS = 5
 LONGEST_PERIOD_S = 10.0
 DAY_SPREAD, TORQUE_NOISE, ANGLE_NOISE = 0.03, 0.02, 2e-5  # of friction; of the rms current; rad
-ITERATIONS = 12  # of the motion, which is then known to 1e-9 rad
+EXAMPLE_S = 40.0  # of the logs of `write_example`
+ITERATIONS = 8  # of the motion, which is then known to 1e-7 rad
 KINDS = ("payload", "friction", "drive gain", "offset", "encoder offset")
 
 
@@ -83,7 +84,7 @@ def simulate_arm(seed: int, duration_s: float = 60.0, change: ArmChange | None =
         tau = np.einsum("jpn,p->nj", Y, arm.inertial.ravel())
         if change is not None and change.kind == "payload":
             tau += ((Y[:, 10 * n - 10] + 0.1 * Y[:, 10 * n - 9]) * (size * late)).T  # its centre is 0.1 m ahead
-        return tau + np.array(ROTOR) * a
+        return np.asarray(tau + np.array(ROTOR) * a)
 
     def resist(q: FloatArray, v: FloatArray) -> FloatArray:
         load = np.abs(needed(q, np.zeros_like(v), np.zeros_like(v)))
@@ -93,7 +94,7 @@ def simulate_arm(seed: int, duration_s: float = 60.0, change: ArmChange | None =
     foreseen = np.einsum("jpn,p->nj", torque_regressor(arm, *reference), arm.inertial.ravel())
     for _ in range(ITERATIONS):
         tau = needed(q, v, a) + resist(q, v)
-        # what is left once the servo's own inertia is on the other side: M e'' + d e' + k e = this, with e = reference - q
+        # with the servo's own inertia on the other side: M e'' + d e' + k e = this, with e = reference - q
         left = tau - foreseen - M * (a - reference[2])
         e, de, dde = (
             lfilter(*bilinear(power, servo, RATE), left / M, axis=0) for power in ([1.0], [1.0, 0.0], [1.0, 0.0, 0.0])
@@ -117,3 +118,24 @@ def _motion(rng: np.random.Generator, t: FloatArray) -> tuple[FloatArray, FloatA
     angle = t[:, None, None] * w + rng.uniform(0.0, 2.0 * np.pi, size.shape)
     q, v, a = ((size * part).sum(2) for part in (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle)))
     return q + np.array(CENTRE), v, a
+
+
+def write_example(folder: str | Path) -> None:
+    """Write a loop file, its URDF, five healthy logs, and two in which the friction or the payload changes.
+
+    Raises OutputError if one of them cannot be written.
+    """
+    folder = Path(folder)
+    atomic_write(folder / "six_joints.urdf", URDF.read_bytes())
+    lines = ['kind = "arm"', 'name = "six joints"', 'urdf = "six_joints.urdf"', "sample_rate = 100.0"]
+    for j, name in enumerate(simulated_arm().names):
+        columns = [f'position = "q{j + 1}"', f'torque = "i{j + 1}"', f"gain = {GAINS[j]}"]
+        lines += ["", f"[joints.{name}]", *columns]
+    atomic_write(folder / "arm.toml", ("\n".join(lines) + "\n").encode())
+    logs: dict[str, ArmChange | None] = {f"day{day + 1}": None for day in range(5)}
+    logs |= {"tuesday": ArmChange("friction", 1.4, 3, 20.0), "pallet": ArmChange("payload", 2.0, 6, 20.0)}
+    for seed, (name, change) in enumerate(logs.items()):
+        log = simulate_arm(seed, EXAMPLE_S, change)
+        rows = np.column_stack(list(log.values()))
+        text = ",".join(log) + "\n" + "\n".join(",".join(f"{x:.7g}" for x in row) for row in rows) + "\n"
+        atomic_write(folder / f"{name}.csv", text.encode())

@@ -9,7 +9,6 @@ motion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -70,15 +69,16 @@ class ArmModel:
         size = np.concatenate([np.outer(self.arm.inertial[:, 0], LINK_SIZES).ravel(), np.full(rotors, ROTOR_SIZE)])
         # in the order of the links
         rows = np.argsort(order[:rank])
-        chosen, added, others = order[:rank][rows], np.asarray(added)[rows], order[rank:]
+        chosen, others = order[:rank][rows], order[rank:]
+        sums: FloatArray = np.asarray(added)[rows]
         return BaseParameters(
             tuple(chosen.tolist()),
             tuple(
                 _base_name(names[index], row, [names[i] for i in others])
-                for index, row in zip(chosen.tolist(), added.tolist(), strict=True)
+                for index, row in zip(chosen.tolist(), list(sums), strict=True)
             ),
-            nominal[chosen] + added @ nominal[others],
-            np.hypot(size[chosen], np.linalg.norm(added * size[others], axis=1)),
+            nominal[chosen] + sums @ nominal[others],
+            np.hypot(size[chosen], np.linalg.norm(sums * size[others], axis=1)),
         )
 
     def _inertial_columns(self, q: FloatArray, v: FloatArray, a: FloatArray) -> FloatArray:
@@ -132,7 +132,7 @@ def _stack(columns: list[FloatArray]) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def _base_name(name: str, row: Sequence[float], others: list[str]) -> str:
+def _base_name(name: str, row: FloatArray, others: list[str]) -> str:
     terms = [(factor, other) for factor, other in zip(row, others, strict=True) if abs(factor) > 1e-6]
     texts = [f" {'-' if factor < 0.0 else '+'} {abs(factor):.3g} {other}" for factor, other in terms[:MAX_NAME_TERMS]]
     return name + "".join(texts) + (" + ..." if len(terms) > MAX_NAME_TERMS else "")
