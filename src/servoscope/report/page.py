@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from servoscope.core import messages
 from servoscope.core.errors import OutputError
@@ -64,6 +64,7 @@ class ResultTable:
     head: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     words: int = 1
+    kind: ClassVar[str] = "table"
 
     def without(self, *names: str) -> ResultTable:
         """Return the table without some of its columns."""
@@ -89,7 +90,9 @@ def write_page(path: str | Path, content: str) -> None:
     """
     # A file name that is no valid text must not stop the report on the file.
     page = content.encode("utf-8", errors="replace")
-    atomic_write(path, _printed(page, path) if Path(path).suffix.lower() == ".pdf" else page)
+    # nobody unfolds what is on paper
+    printed = Path(path).suffix.lower() == ".pdf"
+    atomic_write(path, _printed(page.replace(b"<details", b"<details open"), path) if printed else page)
 
 
 def find_browser(path: str | Path) -> str:

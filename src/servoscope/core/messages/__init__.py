@@ -282,8 +282,9 @@ def translate(words: str, language: str | None = None) -> str:
     if language == "en":
         return words
     known = catalogue(language)
-    if f"word.{words}" in known:
-        return known[f"word.{words}"]
+    for spelling in (words, words.replace(" ", "_")):  # names of faults are written either way
+        if f"word.{spelling}" in known:
+            return known[f"word.{spelling}"]
     if " + " in words:  # a pair of faults
         return " + ".join(translate(each, language) for each in words.split(" + "))
     what, bracket, unit = words.partition(" [")
