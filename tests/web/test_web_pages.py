@@ -6,8 +6,10 @@ SCREENSHOTS=docs/images/pages writes the pictures of README and docs while the t
 from __future__ import annotations
 
 import re
+from datetime import datetime
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import pytest
 import screens
@@ -79,10 +81,14 @@ def test_the_fleet_is_walked_with_the_keyboard(open_page: Open) -> None:
 
 def test_an_asset_says_what_is_wrong_how_much_and_since_when(open_page: Open) -> None:
     page = open_page("/assets/press-1")
-    verdict = page.get_by_role("region", name="Verdict on press-1")
-    expect(verdict).to_contain_text("Internal leakage")
+    verdict = page.get_by_role("region", name="Verdict")
+    expect(verdict).to_contain_text("Fault: leakage has risen by")
     expect(verdict).to_contain_text("Since")
+    expect(verdict).to_contain_text("piston seal and valve edges")
     expect(verdict).to_contain_text(re.compile(r"Cie \+(19|20)"))
+    assert verdict.get_by_role("listitem").first.bounding_box()["y"] < SIZE["height"] / 2  # without a click or a scroll
+    expect(page.get_by_text("Statistic T²")).to_be_hidden()
+    page.get_by_text("For experts").click()
     expect(page.get_by_role("img", name=re.compile("complex plane"))).to_have_count(3)
     expect(page.get_by_role("row", name=re.compile("θ₀"))).to_contain_text("A/m")
     expect(page.get_by_text("samples in")).to_be_visible()
@@ -93,9 +99,8 @@ def test_an_asset_says_what_is_wrong_how_much_and_since_when(open_page: Open) ->
 
 def test_an_asset_says_how_its_fault_grows_and_what_to_check(open_page: Open, tmp_path: Path) -> None:
     page = open_page("/assets/press-1?limit=1.5&span=7+d")
-    expect(page.get_by_text("What to check: plan an inspection.")).to_be_visible()
-    expect(page.get_by_role("heading", name="How sure, and what else it could be")).to_be_visible()
-    expect(page.get_by_role("region", name="Candidates, the most probable first")).to_contain_text("leakage")
+    expect(page.get_by_role("heading", name="What to check")).to_be_visible()
+    expect(page.get_by_role("region", name="What else it could be").first).to_contain_text("leakage")
     expect(page.get_by_label("What is followed")).to_have_value("leakage")
     expect(page.get_by_role("button", name="7 d").first).to_have_attribute("aria-pressed", "true")
     expect(page.get_by_text("values are shown")).to_be_visible()
@@ -131,6 +136,7 @@ def test_an_asset_says_how_its_fault_grows_and_what_to_check(open_page: Open, tm
 def test_a_chart_is_zoomed_saved_and_its_address_opens_the_same_view(open_page: Open, tmp_path: Path) -> None:
     page = open_page("/assets/press-1")
     label = "Both tests over time, as multiples of their limits"
+    page.get_by_text("For experts").click()
     page.get_by_label(f"View and save: {label}").click()
     with page.expect_response(re.compile("/history\\?.*to=")):  # what is zoomed into is asked for more closely
         page.get_by_role("button", name=f"Zoom in: {label}").click()
@@ -142,6 +148,7 @@ def test_a_chart_is_zoomed_saved_and_its_address_opens_the_same_view(open_page: 
     head, first, *_ = (tmp_path / "tests.csv").read_text().splitlines()
     assert head == "what,x,y" and re.match(r'"(statistic T²|sequential test)",20\d\d-', first)
     again = open_page(page.url.removeprefix(page.url.split("/assets")[0]))
+    again.get_by_text("For experts").click()
     again.get_by_label(f"View and save: {label}").click()
     again.get_by_role("button", name=f"Later: {label}").click()
     again.wait_for_url("**view-both-tests*=25%2C75")  # on from where it was
@@ -151,6 +158,7 @@ def test_a_chart_is_zoomed_saved_and_its_address_opens_the_same_view(open_page: 
 
 def test_an_asset_shows_before_and_now_and_two_periods(open_page: Open) -> None:
     page = open_page("/assets/press-1")
+    page.get_by_text("For experts").click()
     expect(page.get_by_role("img", name="Magnitude and phase over frequency, before and now")).to_be_visible()
     expect(page.get_by_role("img", name="Mean input over position and speed, before and now")).to_be_visible()
     expect(page.get_by_text(re.compile("^Friction band: .* now .* ± "))).to_be_visible()
@@ -255,10 +263,12 @@ def test_an_asset_is_live(open_page: Open) -> None:
 def test_an_alarm_is_acknowledged_and_another_shelved(open_page: Open, base: str) -> None:
     page, watching = open_page("/alarms"), open_page("/assets/press-1")
     row = page.get_by_role("row").filter(has=page.get_by_role("link", name="press-1")).first
-    expect(row).to_contain_text("plan an inspection")
+    expect(row).to_contain_text("piston seal and valve edges")  # without a click
+    since = row.get_by_role("cell").nth(2).inner_text()
     shot(page, "alarms")
     row.get_by_role("button", name=re.compile("^Acknowledge")).click()
     expect(row).to_contain_text("acknowledged")
+    assert row.get_by_role("cell").nth(2).inner_text() == since
     expect(row.get_by_role("button", name=re.compile("^Acknowledge"))).to_have_count(0)
     expect(watching.get_by_role("region", name="Alarms of this asset")).to_contain_text("acknowledged")
     other = page.get_by_role("row").filter(has=page.get_by_role("link", name="rig-1")).first
@@ -274,16 +284,59 @@ def test_an_alarm_is_acknowledged_and_another_shelved(open_page: Open, base: str
 
 def test_a_diagnosis_prints_in_black_on_white(open_page: Open, base: str, tmp_path: Path) -> None:
     page = open_page(f"/diagnoses/{diagnosis_of(base, 'press-1')}", "dark")
-    expect(page.get_by_role("region", name="Verdict")).to_contain_text("Internal leakage")
+    expect(page.get_by_role("region", name="Verdict")).to_contain_text("leakage has risen")
+    page.get_by_text("For experts").click()
     page.wait_for_timeout(1000)
     pdf = page.pdf(path=tmp_path / "diagnosis.pdf", format="A4", print_background=True)
-    assert len(re.findall(rb"/Type\s*/Page\b", pdf)) == 2 and len(pdf) > 20_000
+    assert len(re.findall(rb"/Type\s*/Page\b", pdf)) <= 3 and len(pdf) > 20_000
     page.emulate_media(media="print")
     assert page.evaluate("getComputedStyle(document.body).color") == "rgb(28, 37, 48)"
     expect(page.locator("header.top")).to_be_hidden()
     page.wait_for_timeout(500)  # sizes are watched
     sizes = page.locator("canvas").evaluate_all("all => all.map(c => c.getBoundingClientRect().height)")
     assert painted(page) and min(sizes) > 50.0
+
+
+def test_from_an_alarm_to_the_reasons_is_one_click(open_page: Open) -> None:
+    page = open_page("/assets/press-1")
+    page.get_by_role("link", name="all of it, with the reasons").click()
+    expect(page.get_by_role("heading", name="What to check")).to_be_visible()
+    page.get_by_text("For experts").click()
+    expect(page.get_by_role("heading", name="Why")).to_be_visible()
+
+
+def test_what_to_check_is_written_in_words_of_ones_own(open_page: Open, base: str) -> None:
+    page = open_page("/assets/rig-1")
+    page.get_by_text("Change what to check on this machine").click()
+    text = "Filter F3 behind the cabinet <b>first</b>"
+    page.get_by_label(re.compile("^pump")).fill(f"{text}\n\nthen the valve")
+    page.get_by_role("button", name="Save").click()
+    verdict = page.get_by_role("region", name="Verdict")
+    expect(verdict.get_by_role("list").first).to_contain_text(text)
+    expect(verdict).to_contain_text(re.compile("Written by local, 20"))
+    page.get_by_role("link", name="all of it, with the reasons").click()
+    expect(verdict.get_by_role("listitem").first).to_have_text(text)
+    page.goto(f"{base}/alarms")
+    row = page.get_by_role("row").filter(has=page.get_by_role("link", name="rig-1")).first
+    expect(row).to_contain_text(text)
+    entry = [one for one in asked(base, "/audit?asset=rig-1")["entries"] if one["what"] == "checks"][-1]
+    assert entry["who"] == "local" and entry["document"] == {"fault": "pump", "texts": [text, "then the valve"]}
+
+
+def test_sentences_come_in_the_readers_language_and_clock(chromium: Any, base: str) -> None:
+    """Of a service that speaks English, on a German browser in Berlin."""
+    context = chromium.new_context(viewport=SIZE, locale="de-DE", timezone_id="Europe/Berlin")
+    page = context.new_page()
+    for path in ("/assets/press-1", f"/diagnoses/{diagnosis_of(base, 'press-1')}"):
+        page.goto(base + path)
+        verdict = page.get_by_role("region", name="Urteil")
+        expect(verdict).to_contain_text("die innere Leckage ist um ")
+        expect(verdict).to_contain_text("Kolbendichtung und Steuerkanten")
+        onset = asked(base, "/assets/press-1")["onset"]
+        expect(verdict).to_contain_text(f"{datetime.fromtimestamp(onset, ZoneInfo('Europe/Berlin')):%Y-%m-%d %H:%M}")
+        expect(page.locator("header.top")).to_contain_text("Europe/Berlin")
+        assert not re.search(r"\b(the|Fault|since|leakage)\b", verdict.inner_text())
+    context.close()
 
 
 @pytest.mark.parametrize("theme", THEMES)

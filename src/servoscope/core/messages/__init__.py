@@ -26,6 +26,7 @@ from contextvars import ContextVar
 from datetime import UTC, datetime
 from importlib.resources import files
 from typing import Annotated, Any
+from zoneinfo import ZoneInfo
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, field_validator
 
@@ -41,6 +42,7 @@ __all__ = [
     "catalogue",
     "count_words",
     "current_language",
+    "current_zone",
     "languages",
     "message",
     "read_messages",
@@ -81,6 +83,7 @@ LANGUAGE = next((each for each in languages() if each == os.environ.get(SETTING,
 
 
 _spoken: ContextVar[str | None] = ContextVar("spoken", default=None)
+_zone: ContextVar[ZoneInfo | None] = ContextVar("zone", default=None)
 
 
 def current_language() -> str:
@@ -88,14 +91,26 @@ def current_language() -> str:
     return _spoken.get() or LANGUAGE
 
 
+def current_zone() -> ZoneInfo | None:
+    """Return the time zone of the reader of `speak`; None: dates are in UTC and say so."""
+    return _zone.get()
+
+
 @contextlib.contextmanager
-def speak(name: str) -> Iterator[None]:
-    """Speak another language than the process for a while, in this thread or task and those that it starts."""
-    before = _spoken.set(name)
+def speak(name: str, zone: str | None = None) -> Iterator[None]:
+    """Speak another language than the process for a while, in this thread or task and those that it starts.
+
+    `zone`: the reader's time zone, as ``Europe/Berlin``; one that this machine does not know is not used.
+    """
+    found = None
+    with contextlib.suppress(ValueError, OSError):
+        found = ZoneInfo(zone) if zone else None
+    before, clock = _spoken.set(name), _zone.set(found)
     try:
         yield
     finally:
         _spoken.reset(before)
+        _zone.reset(clock)
 
 
 class Message(BaseModel):
@@ -187,7 +202,10 @@ def _format_probability(value: float) -> str:
 
 
 def _format_utc(value: float) -> str:
+    zone = _zone.get()
     try:
+        if zone is not None:  # which the page names
+            return f"{datetime.fromtimestamp(value, zone):%Y-%m-%d %H:%M:%S}"
         return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%d %H:%M:%S} UTC"
     except (OverflowError, OSError, ValueError):  # a clock that was set to what is in no calendar
         return f"{value:.0f} s"

@@ -48,7 +48,8 @@ class StoredDiagnosis(BaseModel):
 
     def columns(self) -> dict[str, Any]:
         """Return its columns in the table of diagnoses."""
-        return {"verdict": self.verdict, "summary": self.summary, "onset": self.onset, "document": self.document}
+        document = {**self.document, "said": self.headline.model_dump(mode="json")}
+        return {"verdict": self.verdict, "summary": self.summary, "onset": self.onset, "document": document}
 
     def with_onset(self, onset: float | None) -> StoredDiagnosis:
         """Return it with the onset [UTC s] that an earlier window has found, if its own window begins after that."""
