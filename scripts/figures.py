@@ -64,7 +64,7 @@ def programs(root: Path) -> dict[str, Program]:
 
 def pages(root: Path) -> list[Path]:
     """Return the documents that may hold figures."""
-    return [*sorted(root.glob("*.md")), *sorted((root / "docs").rglob("*.md"))]
+    return [*sorted(root.glob("*.md")), *sorted((root / "docs").rglob("*.md")), *(root / "benchmarks").rglob("*.md")]
 
 
 def run(program: Program, root: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Run scenarios of accuracy in parallel, keep their results as JSON, and render them into docs/accuracy.md.
+"""Run scenarios of accuracy in parallel, keep their results as JSON, and render them into RESULTS.md beside it.
 
     python benchmarks/accuracy/run.py [ID ...] [--list] [--workers N] [--share 0.1] [--render]
 
@@ -53,7 +53,7 @@ from servoscope.core.files import atomic_write  # noqa: E402
 
 RESULTS = BENCHMARKS / "accuracy" / "results"
 DOCS = BENCHMARKS.parent / "docs"
-PAGE, IMAGES = DOCS / "accuracy.md", DOCS / "images" / "accuracy"
+PAGE, IMAGES = BENCHMARKS / "accuracy" / "RESULTS.md", DOCS / "images" / "accuracy"
 TABLES: tuple[Table, ...] = (
     *(*bias.TABLES, *confidence.TABLES, *alarms.TABLES, *delay.TABLES),
     *(*isolation.TABLES, *unknown.TABLES, *pairs.TABLES, *sizes.TABLES, *onset.TABLES, *timelines.TABLES),
@@ -158,7 +158,7 @@ def main() -> None:
     command.add_argument("--list", action="store_true", help="list the scenarios and stop")
     command.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     command.add_argument("--share", type=float, help="run this share of the units of each, 0 to 1")
-    command.add_argument("--render", action="store_true", help="write docs/accuracy.md from the results")
+    command.add_argument("--render", action="store_true", help="write RESULTS.md from the results")
     given = command.parse_args()
     chosen = [scenario for id_, scenario in SCENARIOS.items() if not given.ids or id_.startswith(tuple(given.ids))]
     if not chosen:

@@ -45,7 +45,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Table:
-    """The place of some scenarios in ``docs/accuracy.md``: between the markers of its key."""
+    """The place of some scenarios in ``RESULTS.md``: between the markers of its key."""
 
     key: str
     columns: Row

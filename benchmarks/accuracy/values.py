@@ -1,4 +1,4 @@
-"""Prints figures of docs/accuracy.md that stand alone in sentences of other documents; measures nothing.
+"""Prints the figures of docs/accuracy.md and of sentences in other documents from stored results; measures nothing.
 
 python benchmarks/accuracy/values.py [--json]
 """
@@ -30,6 +30,46 @@ def leading(cell: str) -> float:
     return float(cell.replace("**", "").split("%")[0].split()[0])
 
 
+def span(key: str, column: int, digits: int = 1) -> str:
+    """Return the least and the largest number of a column of a table."""
+    numbers = [leading(row[column]) for row in rows_of(key) if row[column].strip("* ")]
+    least, most = f"{min(numbers):.{digits}f}", f"{max(numbers):.{digits}f}"
+    return least if least == most else f"{least} to {most}"
+
+
+def total(key: str, column: int) -> str:
+    """Return the sum of the counts of a column."""
+    return f"{sum(leading(row[column]) for row in rows_of(key) if row[column].strip('* ')):.0f}"
+
+
+# of each figure: the table, the column, and the decimals that are shown
+SPANS = {
+    "isolation.right": ("isolation", 3, 1),
+    "isolation.named": ("isolation", 5, 1),
+    "isolation.unknown": ("isolation", 7, 1),
+    "isolation.onset": ("isolation-by-size", 6, 0),
+    "isolation.size": ("isolation-by-size", 7, 0),
+    "sizes": ("sizes", 3, 2),
+    "onset": ("onset", 3, 1),
+    "onset.axes": ("onset-axes", 3, 0),
+    "timelines": ("timelines", 2, 0),
+    "second-rig.named": ("second-rig", 5, 1),
+    "second-rig.size": ("second-rig", 7, 1),
+    "wrong-file.named": ("wrong-file", 5, 1),
+    "wrong-file.size": ("wrong-file", 7, 1),
+}
+TOTALS = {
+    "isolation.runs": ("isolation", 1),
+    "timelines.runs": ("timelines", 1),
+    "timelines.wrong": ("timelines", 3),
+    "motion.runs": ("motion", 2),
+    "motion.wrong": ("motion", 8),
+    "motion.unchecked": ("motion", 9),
+    "smooth.healthy-refused": ("smooth", 1),
+    "own-past.wrong": ("own-past", 5),
+}
+
+
 def values() -> dict[str, str]:
     """Return the figures by name."""
     bias = [tuple(map(leading, row[1:])) for row in rows_of("bias")]
@@ -47,6 +87,10 @@ def values() -> dict[str, str]:
         ratios = [ratio for ratio, _ in counts]
         found[f"alarms.{budget}"] = f"{min(ratios):.2f} to {max(ratios):.2f}"
     found["alarms.hours"] = f"{sum(float(hours) for _, hours in alarms['1']):g}"
+    found |= {name: span(*place) for name, place in SPANS.items()}
+    found |= {name: total(*place) for name, place in TOTALS.items()}
+    mixed = next(row for row in rows_of("mixed") if row[0] == "all")
+    found |= {"mixed.faults": mixed[1], "mixed.named": mixed[6], "mixed.error": mixed[9]}
     return found | {"delay.leakage": leak[4], "delay.leakage-best": leak[6]}
 
 

@@ -54,7 +54,7 @@ def constants(n: int = 4, frequencies: int = 3) -> RecursionConstants:
     view = EvaluationConstants(np.eye(n), np.zeros(n), rng.standard_normal((2 * frequencies, n)), RATE)
     one, a = np.eye(n), np.array([0.5, 0.1, 0.05, 0.01])
     return RecursionConstants(
-        estimator="akf", steady=True, bank=system, velocity=velocity, v_of_r=False, codes=(),
+        estimator="akf", steady=True, bank=system, velocity=velocity, v_of_r=False, nonlinear=(), shapes=(),
         limits=(-np.inf, np.inf), deadzone=(np.inf, -np.inf), sign_speed=0.0, rest_speed=0.0, still_speed=0.0,
         only_moving=False, wait=20, stride=1, every=10, scale=np.ones(n), basis=one, theta=np.zeros(n),
         origin=np.zeros(n), P_d=one, R=100.0, a=a, heads=a, variance=1.0, memory=500.0, extra=0, watch=None, view=view,

@@ -27,7 +27,6 @@ from servoscope.baseline.feature_model import (
 from servoscope.detection.feature_monitor import hold, smallest_in_a_row
 from servoscope.detection.homogeneity import leave_one_out, scatter, scatter_of_others
 from servoscope.detection.statistic import t2_statistic
-from servoscope.diagnosis.follower import Follower, FollowerState
 from servoscope.estimation.window_features import FeatureLayout, Window, WindowFeatures
 from servoscope.learning.features import choose_layout, learn_features
 from servoscope.service.assets.asset import Asset
@@ -35,7 +34,6 @@ from servoscope.service.assets.checkpoint import pack_state
 from servoscope.service.assets.examination import examine_blocks
 from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.sources.block import Block
-from servoscope.signals.samples import Samples
 
 PROJECT = Path(__file__).parents[2]
 LAYOUT = FeatureLayout(
@@ -334,11 +332,10 @@ class TestStreams:
             assert (asset.state.evaluation.features or 0.0) > 0.0
 
     def test_the_service_believes_the_monitor(self, baseline: ss.Baseline) -> None:
-        rec, follower = axis(302, seconds=150.0, ripple=0.15), Follower(baseline)
-        samples = Samples(rec.t, rec.r, rec.u, rec.y, rec.restart)
-        _, evaluations = follower.follow(FollowerState(monitor=follower.init()), samples)
-        assert evaluations.trace.features is not None and evaluations.alarms.size
-        score = float(evaluations.trace.features[-1])
+        rec, monitor = axis(302, seconds=150.0, ripple=0.15), ss.Monitor(baseline)
+        _, trace = monitor.run(monitor.init(), rec.r, rec.u, rec.y, rec.restart)
+        assert trace.features is not None and trace.exceeded.any()
+        score = float(trace.features[-1])
         block = Block("axis", 0, rec.t, rec.r, rec.u, rec.y)
         assert examine_blocks(baseline, "axis", [block], 0.5).verdict == "healthy"
         found = examine_blocks(baseline, "axis", [block], score)

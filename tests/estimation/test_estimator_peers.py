@@ -245,8 +245,7 @@ class TestInTheRecursion:
             run.step(g.eta[k], g.phi[k] / tuning.scale, g.z[k] / tuning.scale)
             assert out[0, k, 5 : 5 + n] + c.theta == pytest.approx(run.theta, rel=1e-7, abs=1e-9)
         assert 900 < out[0, -1, 0] <= 1200
-        size = recursion.slices["extra"]
-        assert size.stop - size.start == estimators.extra_state_size(name, n, c.memory)
+        assert recursion.state_type["extra"].shape[0] == estimators.extra_state_size(name, n, c.memory)
 
     def test_a_missing_value_keeps_the_state(self, name: str) -> None:
         _, _, c, signals = chain(name)
@@ -255,7 +254,7 @@ class TestInTheRecursion:
         nothing = np.full((1, 40), np.nan)
         state, _ = recursion.run(kept, nothing, nothing, nothing, np.zeros((1, 40), dtype=np.bool_))
         for part in ("theta", "P", "S", "Psi", "extra"):
-            assert np.array_equal(state[0, recursion.slices[part]], kept[0, recursion.slices[part]]), part
+            assert np.array_equal(recursion.named(state)[part], recursion.named(kept)[part]), part
 
     def test_split_saved_and_resumed_anywhere(self, name: str) -> None:
         _, _, c, signals = chain(name)

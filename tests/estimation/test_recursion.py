@@ -18,7 +18,7 @@ from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.estimation.pipeline import Estimates, Pipeline, Tuning
-from servoscope.estimation.recursion import EvaluationConstants, Recursion
+from servoscope.estimation.recursion import EvaluationConstants
 from servoscope.estimation.tuning import fit_tuning
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
@@ -265,11 +265,11 @@ class TestMonitor:
 
     def test_missing_samples_hold_theta_and_P(self, baseline: Baseline) -> None:
         monitor, signals = Monitor(baseline), _signals(2)
-        at = Recursion([baseline.pipeline().constants(baseline.tuning, view=NOWHERE)]).slices
+        ((_, recursion),) = monitor._groups
         state, _ = monitor.run(monitor.init(), *(signal[:90] for signal in signals))
         later, trace = monitor.run(state, *np.full((3, 200), np.nan))
         for name in ("theta", "S"):
-            assert np.array_equal(later[at[name]], state[at[name]]), name
+            assert np.array_equal(*(recursion.named(row[None])[name] for row in (later, state))), name
         assert len(trace.t) == 20 and np.ptp(trace.theta, axis=0).max() == 0.0
 
     def test_refusals(self, baseline: Baseline, rig: dict[str, Any]) -> None:

@@ -61,7 +61,7 @@ def same(whole: Trace, asset: int, alone: Trace) -> None:
 def test_each_asset_of_a_fleet_is_itself_alone_to_the_last_bit(own: bool) -> None:
     count = LANE_COUNT["float64"] + 5  # a whole block of lanes, and one that is not full
     kinds = [learned(), learned("profile", 2)] if own else [learned()]
-    assert {len(b.thresholds.hypotheses) for b in kinds} == ({len(kinds[0].members)} | {len(kinds[-1].members)})
+    assert all(baseline.thresholds.hypotheses for baseline in kinds)  # the sequential test is compared, too
     baselines = [kinds[i % len(kinds)] for i in range(count)]
     r, u, y, restart = signals(count)
     fleet = Monitor(baselines)

@@ -155,7 +155,7 @@ def test_the_budget_of_false_alarms_is_shared(done: tuple[Plan, fleet.Fleet]) ->
     trace = pq.read_table(
         plan.output / "traces" / "asset=P0" / f"day={lakes.DAYS[0]}" / "trace.parquet", partitioning=None
     )
-    assert trace.column("threshold")[0].as_py() == own.shared(4).thresholds.statistic > own.limit
+    assert trace.column("threshold")[0].as_py() == own.shared(4).thresholds.statistic > own.thresholds.statistic
 
 
 def test_a_run_goes_on_where_it_was_and_does_nothing_twice(

@@ -13,6 +13,7 @@ import pytest
 from commands import one_line, run
 
 import servoscope as ss
+from servoscope.baseline.baseline import VERSION
 from servoscope.baseline.learned_fault import LearnedFault
 from servoscope.core.errors import BaselineError, NotEnoughError
 from servoscope.diagnosis.learn_faults import fit_learned_fault
@@ -192,7 +193,7 @@ class TestFiles:
         assert ss.Baseline.load(path).model_dump_json() == worn.model_dump_json()
         content = json.loads(path.read_text())
         plain = ss.learn(LOOP, [record(1), record(2, "multisine")])
-        assert content["hash"] != plain.hash and content["version"] == 2
+        assert content["hash"] != plain.hash and content["version"] == VERSION
         del content["learned"]  # as written by a program that knows no labels
         path.write_text(json.dumps(content))
         assert ss.Baseline.load(path).learned == ()

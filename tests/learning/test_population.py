@@ -93,7 +93,7 @@ class TestPopulation:
             i = like.names.index(name)
             assert abs(like.theta[i] / value - 1.0) < 0.05
         # the scatter between recordings of the others is believed too: the covariance is honest, not small
-        assert np.array(like.scatter).size == 0
+        assert like.scatter.between == ()
         assert np.trace(np.linalg.solve(alone.covariance_array(), like.covariance_array())) > 0.0
 
     def test_a_machine_of_another_kind_is_learned_alone(self, known: dict[str, ss.Baseline]) -> None:

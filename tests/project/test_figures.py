@@ -28,7 +28,7 @@ def figures() -> ModuleType:
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
     """Return a copy of the documents and of the stored results."""
-    for name in ("README.md", "docs", "benchmarks/figures", "benchmarks/figures.toml"):
+    for name in ("README.md", "docs", "benchmarks/figures", "benchmarks/figures.toml", "benchmarks/RECORDINGS.md"):
         source, target = PROJECT / name, tmp_path / name
         target.parent.mkdir(parents=True, exist_ok=True)
         (shutil.copytree if source.is_dir() else shutil.copy)(source, target)
@@ -50,7 +50,7 @@ def test_a_changed_number_is_found(figures: ModuleType, copy: Path, capsys: pyte
 
 
 def test_a_changed_cell_of_a_table_is_found(figures: ModuleType, copy: Path) -> None:
-    page = copy / "docs" / "results.md"
+    page = copy / "benchmarks" / "RECORDINGS.md"
     page.write_text(
         page.read_text(encoding="utf-8").replace("| viscous_friction | 203.5", "| viscous_friction | 204.5")
     )
@@ -58,7 +58,7 @@ def test_a_changed_cell_of_a_table_is_found(figures: ModuleType, copy: Path) -> 
 
 
 def test_what_depends_on_the_machine_is_compared_in_form_only(figures: ModuleType, copy: Path) -> None:
-    page = copy / "docs" / "results.md"
+    page = copy / "benchmarks" / "RECORDINGS.md"
     text = page.read_text(encoding="utf-8")
     row = next(line for line in text.splitlines() if line.startswith("| profile_healthy_1 "))
     slower = row.rsplit("|", 2)[0] + "| 99.99 s |"

@@ -162,9 +162,9 @@ def test_packed_blocks_tell_their_columns_themselves() -> None:
 def test_messages_carry_the_columns_that_the_loop_names() -> None:
     one, names = block(), ("load", "oil")
     for message in (payload.encode_binary(one), payload.encode_json(one, covariates=names)):
-        found = payload.decode_block("axis", message, covariates=names).block
+        found = payload.decode_block("axis", message, covariates=names)
         np.testing.assert_array_equal(found.signals, one.signals)
-        assert len(payload.decode_block("axis", message).block.covariates) == 0  # nobody wants them
+        assert len(payload.decode_block("axis", message).covariates) == 0  # nobody wants them
     for message in (
         payload.encode_binary(replace(one, covariates=one.covariates[:1])),
         payload.encode_json(replace(one, covariates=one.covariates[:1]), covariates=names[:1]),
@@ -174,7 +174,7 @@ def test_messages_carry_the_columns_that_the_loop_names() -> None:
             payload.decode_block("axis", message, covariates=names)
     swapped = json.loads(payload.encode_json(one, covariates=names))
     swapped["covariates"] = dict(reversed(swapped["covariates"].items()))
-    found = payload.decode_block("axis", json.dumps(swapped).encode(), covariates=names).block
+    found = payload.decode_block("axis", json.dumps(swapped).encode(), covariates=names)
     np.testing.assert_array_equal(found.signals, one.signals)
 
 

@@ -57,7 +57,12 @@ def saturated_share(loop: Loop, recording: Recording) -> float:
 
     A plant that is not simulated with its controller takes u as it acted, at a limit as elsewhere.
     """
-    if loop.input_limits is None or not can_simulate(loop):
+    return share_at_limits(loop, recording) if can_simulate(loop) else 0.0
+
+
+def share_at_limits(loop: Loop, recording: Recording) -> float:
+    """Return the share of samples with u at or beyond a limit."""
+    if loop.input_limits is None:
         return 0.0
     low, high = loop.input_limits
     count = 0

@@ -323,8 +323,8 @@ class Monitor:
             signals[0] = np.where(np.isnan(found.averages).any(axis=1), np.nan, signals[0])
         if found.start is not None:
             ((_, recursion),), constants = self._groups, self._constants_of[0].constants
-            theta = rows[0, self._prefix_size :][recursion.slices["theta"]]
-            theta[:] = np.linalg.solve(constants.basis, found.start - constants.origin)
+            state = rows[:, self._prefix_size : self._prefix_size + recursion.size]
+            recursion.named(state)["theta"][0] = np.linalg.solve(constants.basis, found.start - constants.origin)
         return found
 
     def latest(self, state: FloatArray) -> Trace:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servoscope.baseline.motion import QUANTITIES
-from servoscope.baseline.plant_fit import saturated_share
+from servoscope.baseline.plant_fit import share_at_limits
 from servoscope.core.messages import Message, message
 from servoscope.detection.trace import UNSEEN_EXCESS
 from servoscope.diagnosis.examine import Examination
@@ -57,5 +57,5 @@ def _describe_quantities(exam: Examination, at: int) -> tuple[Message, ...]:
 
 
 def _describe_saturation(exam: Examination) -> Message | None:
-    share = saturated_share(exam.baseline.loop, exam.recording)
+    share = share_at_limits(exam.baseline.loop, exam.recording)
     return message("motion.saturated", share=share) if share > MIN_SATURATED_SHARE else None

@@ -1,8 +1,8 @@
 """The compiled recursion: from constants, state and a block of samples to a new state and evaluations.
 
 One sample, a log and a fleet run through the same lines (`kernel.sample_steps`), compiled for the sizes at hand. The
-state of an asset is one row of floats, described by `Recursion.slices`. A recording may be split anywhere, because all
-that is carried from sample to sample is in that row.
+state of an asset is one row of floats, whose names are those of `Recursion.state_type`. A recording may be split
+anywhere, because all that is carried from sample to sample is in that row.
 """
 
 from __future__ import annotations
@@ -121,16 +121,10 @@ class Recursion:
         self._spec = _kernel_spec(self.constants)
         self.sizes = self._spec.sizes
         self._type = np.dtype(np.float32 if single else np.float64)
-        to = dict(self._spec.to)
-        names = list(to)
-        spans = {a: slice(HEADER_SIZE + to[a], HEADER_SIZE + to[b]) for a, b in itertools.pairwise(names)}
-        lowest = HEADER_SIZE + to["end"]
-        self.size = lowest + self.sizes.watched + first.extra
-        self.slices = {
-            **spans,
-            "cusum": slice(lowest, lowest + self.sizes.watched),
-            "extra": slice(lowest + self.sizes.watched, self.size),
-        }
+        fields = [(name, end - begin) for (name, begin), (_, end) in itertools.pairwise(self._spec.to)]
+        numbers = [("counters", HEADER_SIZE), *fields, ("cusum", self.sizes.watched), ("extra", first.extra)]
+        self.state_type = np.dtype([(name, np.float64, (count,)) for name, count in numbers])
+        self.size = self.state_type.itemsize // 8
         self._buffers = BufferPool()
         self._per_asset = len({id(c) for c in self.constants}) > 1
         table = np.array([_pack_constants(c, self._spec) for c in (self.constants if self._per_asset else (first,))])
@@ -179,14 +173,17 @@ class Recursion:
     def start(self) -> FloatArray:
         """Return the states before the first sample, shape (assets, size): theta at the baseline, P = P_d."""
         state = np.zeros((len(self.constants), self.size))
-        n, at = self.sizes.n, self.slices
-        for row, c in zip(state, self.constants, strict=True):
-            row[at["power"]] = c.variance
+        for row, c in zip(self.named(state), self.constants, strict=True):
+            row["power"] = c.variance
             if not self.sizes.steady:
-                row[at["P"]] = c.P_d.ravel()
-        if self.sizes.start:
-            state[:, at["Psi"]] = np.eye(n).ravel()
+                row["P"] = c.P_d.ravel()
+            if self.sizes.start:
+                row["Psi"] = np.eye(self.sizes.n).ravel()
         return state
+
+    def named(self, state: FloatArray) -> npt.NDArray[Any]:
+        """Return a view of states (assets, size) as records of `state_type`, shape (assets,)."""
+        return state.view(self.state_type)[:, 0]
 
     def rows(self, state: FloatArray, samples: int) -> IntArray:
         """Return the samples, counted from 0 since the start, at whose end a block of so many evaluates."""
@@ -347,50 +344,48 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
 
 
 def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
-    """Return the constants of one asset as one row."""
-    n, lags, memory, watched, v = spec.sizes.n, spec.sizes.lags, spec.sizes.memory, spec.sizes.watched, c.velocity
+    """Return the constants of one asset as one row, each in its place; what an asset lacks is zero."""
+    n, lags, memory, v, places = spec.sizes.n, spec.sizes.lags, spec.sizes.memory, c.velocity, dict(spec.at)
     test, view = c.watch, c.view
 
     def pad(x: FloatArray, size: int) -> FloatArray:
         return np.pad(x, (0, size - len(x)))
 
-    shadow = pad(np.zeros(0), dict(spec.at)["white"] - dict(spec.at)["shadow"] + 1 + 2 * memory)
-    members = np.zeros((spec.sums or n + LAGS + 1, watched))
+    members = np.zeros((spec.sums or n + LAGS + 1, spec.sizes.watched))
+    values: dict[str, Any] = {
+        **{"every": c.every, "stride": c.stride, "low": c.limits[0], "high": c.limits[1], "wait": c.wait},
+        **{"dead_low": c.deadzone[0], "dead_high": c.deadzone[1], "sign_speed": c.sign_speed},
+        **{"rest_speed": c.rest_speed, "still_speed": c.still_speed, "forget": 1.0 / c.wait, "R": c.R},
+        **{"memory": c.memory, "share": 1.0 / c.memory, "steady": c.bank.steady, "shapes": c.shapes},
+        "velocity": np.concatenate([v.A.ravel(), v.B[:, 0], v.C[0], v.D[0], v.steady[:, 0]]),
+        "bank": pack_coefficients(spec.bank, c.bank),
+        "P_d": np.zeros(0) if c.steady else c.P_d,
+        "noise": np.concatenate([[c.variance], pad(c.a, lags), pad(c.heads, lags)]),
+        "tail": members,
+    }
     if test is not None:
         system = _shadow_system(test, spec.sizes.shadow, len(spec.shadow[0]))
-        apart = np.linalg.solve(c.basis, test.theta / c.scale) - c.theta
-        shadow = np.concatenate(
-            [
-                *(pack_coefficients(spec.shadow, system), pad(test.X0[:, 0], spec.sizes.shadow), apart, [test.gain]),
-                *(pad(test.numerator[1 : 1 + memory], memory), pad(test.denominator[1 : 1 + memory], memory)),
-            ]
-        )
+        filters = (pad(x[1 : 1 + memory], memory) for x in (test.numerator, test.denominator))
+        values |= {
+            "warm": test.warm,
+            "shadow": pack_coefficients(spec.shadow, system),
+            "shadow_steady": test.X0[:, 0],
+            "apart": np.linalg.solve(c.basis, test.theta / c.scale) - c.theta,
+            "white": np.concatenate([[test.gain], *filters]),
+        }
         if spec.sums:
             directions = np.pad(test.directions, ((0, spec.sizes.directions - len(test.directions)), (0, 0)))
             members[:, : len(test.limits)] = evaluation_weights(test.changes, directions, test.limits)
         else:
             members[:, : len(test.limits)] = np.vstack([test.changes.T / test.limits, -0.5 * test.limits])
-    evaluation: list[Any] = []
     if view is not None:
         E = view.response.reshape(-1, 2, n)
-        parts = [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E]
         back = np.linalg.inv(c.basis)
-        evaluation = [(back @ view.covariance @ back.T).ravel(), view.origin, c.basis.ravel(), [view.rate], *parts]
-    counts = [c.every, c.stride]
-    gates = [*c.limits, *c.deadzone, c.sign_speed, c.rest_speed, c.still_speed, c.wait, 1.0 / c.wait]
-    return np.concatenate(
-        [
-            *([float(x) for x in (*counts, *gates, c.memory, 1.0 / c.memory, c.R, test.warm if test else 0)],),
-            *(v.A.ravel(), v.B[:, 0], v.C[0], v.D[0], v.steady[:, 0]),
-            *(pack_coefficients(spec.bank, c.bank), c.bank.steady.ravel(), np.zeros(0) if c.steady else c.P_d.ravel()),
-            *(
-                [c.variance],
-                pad(c.a, lags),
-                pad(c.heads, lags),
-                shadow,
-                *evaluation,
-                c.shapes,
-                members.ravel(),
-            ),
-        ]
-    )
+        values |= {
+            **{"prior": back @ view.covariance @ back.T, "origin": view.origin, "basis": c.basis, "rate": view.rate},
+            "response": [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E],
+        }
+    row = np.zeros(places["tail"] + members.size)
+    for name, value in values.items():
+        row[places[name] : places[name] + np.size(value)] = np.ravel(value)
+    return row

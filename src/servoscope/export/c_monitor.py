@@ -9,8 +9,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.files import atomic_write, exclusive_folder
@@ -21,7 +19,7 @@ from servoscope.export.constants import ExportConstants, check_name, common_word
 from servoscope.export.golden import GoldenRun, golden_text
 from servoscope.export.image import pack_image
 from servoscope.export.precision import describe_rounding
-from servoscope.export.steps_c import step_functions
+from servoscope.export.steps_c import state_places, step_functions
 from servoscope.signals.quality import QualitySettings
 from servoscope.signals.quality import kernel as quality
 
@@ -131,7 +129,8 @@ def _sizes(made: ExportConstants, single: bool) -> dict[str, Any]:
         "on_delay": on,
         "off_delay": off,
         "limit": c_literal(made.baseline.thresholds.statistic, single),
-        "places": f"#define CUSUMS {size.floats}\n" * bool(size.watched)
+        "places": "".join(f"#define {name} {i}\n" for i, name in state_places(made.spec).items() if " " not in name)
+        + f"#define CUSUMS {size.floats}\n" * bool(size.watched)
         + f"#define PRIVATE {size.floats + size.watched}\n" * (not size.steady),
     }
 
@@ -150,7 +149,7 @@ def _frozen_words(made: ExportConstants) -> dict[str, Any]:
 
 def _code(made: ExportConstants, name: str, single: bool) -> dict[str, str]:
     """Return constants and functions."""
-    size, start = made.spec.sizes, made.start
+    size, start, places = made.spec.sizes, made.start, state_places(made.spec)
     functions = "\n\n".join(step_functions(made.spec, made.members, single))
     healthy = [(c_literal(H.real, single), c_literal(H.imag, single)) for H in made.healthy.H]
     return {
@@ -166,7 +165,9 @@ def _code(made: ExportConstants, name: str, single: bool) -> dict[str, str]:
         "update": f"update_estimate(s, h, v, shadow, e{'' if size.steady else ', &state->numbers[PRIVATE]'});",
         "after": _after(made) if size.watched else "",
         "initial": "\n".join(
-            f"    state->numbers[{i - HEADER_SIZE}] = {c_literal(start[i], single)};" for i in np.flatnonzero(start)
+            f"    state->numbers[{places.get(i, i)}] = {c_literal(number, single)};"
+            for i, number in enumerate(start[HEADER_SIZE:])
+            if number
         ),
     }
 
@@ -229,8 +230,8 @@ def _before(every: int, shadow: bool) -> str:
 
 def _after(made: ExportConstants) -> str:
     if made.spec.sums:
-        every, sums = made.recursion.constants[0].every, dict(made.spec.to)["sums"]
-        lines = [f"if (((number + 1u) % {every}u) == 0u) {{", f"    top[0] = update_cusums(g, &s[{sums}]);"]
+        every = made.recursion.constants[0].every
+        lines = [f"if (((number + 1u) % {every}u) == 0u) {{", "    top[0] = update_cusums(g, &s[AT_SUMS]);"]
         lines += ["    end_evaluation(s, h, top);", "}"]
     else:
         lines = ["store_residual(s, h, status, e, w, when);"]

@@ -15,7 +15,8 @@ from servoscope.core.jit.st_source import st_literal
 from servoscope.estimation.kernel.sample_steps import HEADER_SIZE
 from servoscope.export.c_monitor import NAME, fill_template, wrapped
 from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text
-from servoscope.export.steps_st import StepTexts, step_texts, temporaries
+from servoscope.export.steps import StepTexts
+from servoscope.export.steps_st import step_texts, temporaries
 
 __all__ = ["export_st", "save_st"]
 
@@ -109,11 +110,11 @@ def _blocks(texts: StepTexts, by_evaluation: int) -> dict[str, str]:
     """
     depths = {"begin_filters": 2, "advance_filters": 1, "update_estimate": 1, "reset_noise": 1, "evaluate": 1}
     blocks = {name: _indented(texts[name], depth) for name, depth in depths.items()}
-    test = [*texts["update_cusums"], *texts["update_alarm"]]
+    test = [line for name in ("update_cusums", "update_alarm", "end_evaluation") for line in texts.get(name, ())]
     if test and by_evaluation:
         test = [f"IF evaluation_phase + 1 >= {by_evaluation} THEN", *(f"    {line}" for line in test), "END_IF;"]
-    test = [*texts["store_residual"], *test]
-    begin = texts["begin_evaluation"]
+    test = [*texts.get("store_residual", ()), *test]
+    begin = texts.get("begin_evaluation", [])
     if begin:
         begin = ["IF evaluation_phase = 0 THEN", *(f"    {line}" for line in begin), "END_IF;"]
     return blocks | {"sequential_test": _indented(test, 0), "begin_evaluation": _indented(begin, 0)}

@@ -19,16 +19,18 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import ServoscopeError
 from servoscope.detection.covariate_monitor import fill_channels
+from servoscope.detection.statistic import consecutive_exceedances
+from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose_with_trace
-from servoscope.diagnosis.follower import DiagnosisSchedule, Evaluations, Follower, FollowerState
+from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.fleet.common_cause import trace_evidence
 from servoscope.fleet.rows import MICRO, Rows
-from servoscope.signals.samples import Samples
 from servoscope.signals.timebase import Timebase
 
 WINDOW = 120.0  # s of raw rows that a diagnosis covers, unless the user chooses otherwise
 
+_RowOrder = tuple[Rows, BoolArray]  # without repeated ones; which do not follow their predecessor by one sample period
 RowLookup = Callable[[int, int], Rows]  # rows of the day with after < t <= to, in order
 
 
@@ -45,9 +47,12 @@ class EvaluationBlock:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class DayState(FollowerState):
-    """What is kept of a day between two blocks; `samples` are the rows that the monitor processed."""
+class DayState:
+    """What is kept of a day between two blocks."""
 
+    monitor: FloatArray  # state of the monitor, shape (size,)
+    samples: int = 0  # rows that the monitor has processed
+    exceeding: int = 0  # the number of evaluations above a limit, without interruption until now
     baseline: str = ""  # hash of the one that it is followed with
     first_us: int | None = None  # first row of the day [us]
     last_us: int | None = None  # last row so far [us]
@@ -91,11 +96,6 @@ class RowHistory:
         return Rows.concatenate([block.between(after_us, to_us) for block in self.blocks])
 
 
-class _RowOrder(NamedTuple):
-    rows: Rows  # without repeated ones
-    restart: BoolArray  # which of them do not follow their predecessor by one sample period
-
-
 class DayMonitor:
     """Follows days of assets of one baseline, which has its share of the fleet's budget of false alarms.
 
@@ -104,15 +104,15 @@ class DayMonitor:
 
     def __init__(self, baseline: Baseline, window_s: float = WINDOW) -> None:
         self.baseline = baseline
-        self._follower = Follower(baseline)
-        self._lane_key = self._follower.monitor.lane_key
+        self.monitor = Monitor(baseline)
+        self._lane_key = self.monitor.lane_key
         self._window = round(window_s * MICRO)
         self._schedule = DiagnosisSchedule(self._window, self._window // 2)
         self._timebase = Timebase(MICRO / baseline.loop.sample_rate)
 
     def start(self) -> DayState:
         """Return the state before the first row of a day."""
-        return DayState(monitor=self._follower.init(), baseline=self.baseline.hash)
+        return DayState(monitor=self.monitor.init(), baseline=self.baseline.hash)
 
     def needed_since(self, state: DayState) -> int:
         """Return the time [us] up to which rows are not needed any more."""
@@ -124,10 +124,10 @@ class DayMonitor:
 
         `history`: rows of this day, those of the block included, as far back as `needed_since` requires.
         """
-        block = self._order(state, rows)
-        t, taken = block.rows.t_us / MICRO, block.rows
-        samples = Samples(t, taken.r, taken.u, taken.y, block.restart, taken.channels)
-        return self._judge(state, rows, block, self._follower.follow(state, samples), history)
+        (advanced,) = self.advance_lanes([DayStep(self, state, rows, history)])
+        if isinstance(advanced, Exception):
+            raise advanced
+        return advanced
 
     def _order(self, state: DayState, rows: Rows) -> _RowOrder:
         """Return which rows are taken, and which of them do not follow their predecessors."""
@@ -136,19 +136,16 @@ class DayMonitor:
         repeated = self._timebase.is_repeat(steps)
         if repeated.any():
             steps, rows = steps[~repeated], rows[~repeated]
-        return _RowOrder(rows, self._timebase.is_gap(steps))
+        return rows, self._timebase.is_gap(steps)
 
     def _judge(
-        self,
-        state: DayState,
-        rows: Rows,
-        ordered: _RowOrder,
-        followed: tuple[DayState, Evaluations],
-        history: RowLookup,
+        self, step: DayStep, ordered: _RowOrder, monitor: FloatArray, trace: Trace
     ) -> tuple[DayState, EvaluationBlock]:
-        """Return what `advance` returns, of what the follower has found."""
-        (taken, restart), first = ordered, state.last_us is None
-        new, (trace, sample, alarms) = followed
+        """Return what `advance` returns, of what the monitor has made of a block: its state, and its evaluations."""
+        (_, state, rows, history), (taken, restart), first = step, ordered, step.state.last_us is None
+        sample = np.rint(trace.t * self.baseline.loop.sample_rate).astype(np.int64) - state.samples
+        exceeding = consecutive_exceedances(trace.exceeded, state.exceeding)
+        alarms = np.flatnonzero(exceeding > self.monitor.pipeline.delays[0])
         limits = np.full(len(trace.t), self.baseline.thresholds.statistic)
         block = EvaluationBlock(taken.t_us[sample], trace.theta, trace.statistic, limits, trace.level, trace.exceeded)
         if not len(rows):
@@ -156,7 +153,10 @@ class DayMonitor:
         peaks = np.maximum(trace.statistic / limits, trace.level)[trace.ready]
         empty = np.isnan(taken.r) | np.isnan(taken.u) | np.isnan(taken.y)
         new = replace(
-            new,
+            state,
+            monitor=monitor,
+            samples=state.samples + len(taken),
+            exceeding=int(exceeding[-1]) if exceeding.size else state.exceeding,
             first_us=int(rows.t_us[0]) if first else state.first_us,
             last_us=int(rows.t_us[-1]),
             repeats=state.repeats + len(rows) - len(taken),
@@ -184,7 +184,7 @@ class DayMonitor:
         # without an alarm features stay out: their limit over single windows is no part of the fleet's budget
         baseline = self.baseline if state.alarm_us is not None else self.baseline.model_copy(update={"features": None})
         rows = history(max(end_us - self._window, state.first_us - 1), end_us)
-        known, now = self._follower.monitor.covariate_history(state.monitor), state.last_us or 0
+        known, now = self.monitor.covariate_history(state.monitor), state.last_us or 0
         rows = replace(rows, channels=fill_channels(rows.channels, (rows.t_us - now) / MICRO, known))
         try:
             recording = rows.to_recording(state.first_us, self.baseline.loop, "window")
@@ -203,32 +203,25 @@ class DayMonitor:
         side.
         """
         lanes: dict[Hashable, list[tuple[int, DayStep, _RowOrder]]] = defaultdict(list)
-        found: dict[int, tuple[DayState, EvaluationBlock] | Exception] = {}
+        advanced: dict[int, tuple[DayState, EvaluationBlock] | Exception] = {}
         for i, step in enumerate(steps):
-            monitor, state, rows, _ = step
-            ordered = monitor._order(state, rows)
-            if monitor._lane_key is not None and len(ordered.rows) and not ordered.restart.any():
-                phase = int(monitor._follower.monitor.phase(state.monitor)[0])
-                lanes[monitor._lane_key, phase, len(ordered.rows)].append((i, step, ordered))
+            monitor, ordered = step.monitor, step.monitor._order(step.state, step.rows)
+            key: Hashable = i
+            if monitor._lane_key is not None and len(ordered[0]) and not ordered[1].any():
+                phase = int(monitor.monitor.phase(step.state.monitor)[0])
+                key = monitor._lane_key, phase, len(ordered[0])
+            lanes[key].append((i, step, ordered))
         for together in lanes.values():
-            if len(together) < 2:
-                continue
-            distinct = list(dict.fromkeys(step.monitor for _, step, _ in together))
-            fleet = _join_monitors(tuple(distinct))
-            fleet = fleet.select(np.array([distinct.index(step.monitor) for _, step, _ in together]))
-            r, u, y = (np.array([getattr(one.rows, name) for *_, one in together]) for name in ("r", "u", "y"))
-            monitors, trace = fleet.run(np.array([step.state.monitor for _, step, _ in together]), r, u, y)
-            for lane, (i, (monitor, state, rows, history), ordered) in enumerate(together):
-                judged = monitor._follower.judge(state, monitors[lane].copy(), trace.lane(lane), r.shape[1])
-                try:
-                    found[i] = monitor._judge(state, rows, ordered, judged, history)
-                except Exception as error:  # garbage of one asset must not cost another
-                    found[i] = error
-        for i, step in enumerate(steps):
             try:
-                yield found[i] if i in found else step.monitor.advance(step.state, step.rows, step.history)
+                followed = _follow([step for _, step, _ in together], [ordered for *_, ordered in together])
+                for (i, step, ordered), (state, trace) in zip(together, followed, strict=True):
+                    try:
+                        advanced[i] = step.monitor._judge(step, ordered, state, trace)
+                    except Exception as error:  # garbage of one asset must not cost another
+                        advanced[i] = error
             except Exception as error:
-                yield error
+                advanced |= {i: error for i, *_ in together}
+        yield from (advanced[i] for i in range(len(steps)))
 
 
 class DayStep(NamedTuple):
@@ -240,7 +233,20 @@ class DayStep(NamedTuple):
     history: RowLookup
 
 
+def _follow(steps: Sequence[DayStep], ordered: Sequence[_RowOrder]) -> list[tuple[FloatArray, Trace]]:
+    """Return the state of the monitor and the evaluations of one block, or of several that go side by side."""
+    states = [step.state.monitor for step in steps]
+    if len(steps) == 1:
+        ((rows, restart),) = ordered
+        return [steps[0].monitor.monitor.run(states[0], rows.r, rows.u, rows.y, restart, channels=rows.channels)]
+    distinct = list(dict.fromkeys(step.monitor for step in steps))
+    fleet = _join_monitors(tuple(distinct)).select(np.array([distinct.index(step.monitor) for step in steps]))
+    signals = (np.array([getattr(rows, name) for rows, _ in ordered]) for name in ("r", "u", "y"))
+    monitors, trace = fleet.run(np.array(states), *signals)
+    return [(monitors[lane].copy(), trace.lane(lane)) for lane in range(len(steps))]
+
+
 @lru_cache(maxsize=256)
 def _join_monitors(monitors: tuple[DayMonitor, ...]) -> Monitor:
     """Return the fleet of some monitors."""
-    return Monitor.join([each._follower.monitor for each in monitors])
+    return Monitor.join([each.monitor for each in monitors])

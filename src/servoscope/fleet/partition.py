@@ -10,6 +10,7 @@ import numpy as np
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.fleet.day_monitor import DayMonitor
+from servoscope.fleet.read import merge_rows
 from servoscope.fleet.rows import Rows, rows_from_table
 from servoscope.fleet.tasks import examine_day, failed_result
 from servoscope.models.loop import Columns
@@ -40,7 +41,7 @@ def examine_days(
             yield {"asset": asset, "day": day, "status": "failed", "error": f"no baseline: {error}"}
             continue
         try:
-            result, _ = examine_day(monitor, _complete_times(piece[3] for piece in chain([first], pieces)))
+            result, _ = examine_day(monitor, merge_rows(_sorted_parts(piece[3] for piece in chain([first], pieces))))
         except Exception as error:  # garbage in one day must not cost another
             result = failed_result(error)
         yield {"asset": asset, "day": day, **result}
@@ -49,24 +50,16 @@ def examine_days(
 Piece = tuple[str, str, str, Rows | Exception]  # asset, day, baseline, rows or why they cannot be read
 
 
-def _complete_times(parts: Iterable[Rows | Exception]) -> Iterator[Rows]:
-    """Yield rows in the order of time; rows of the last time wait for others of the same time.
+def _sorted_parts(parts: Iterable[Rows | Exception]) -> Iterator[tuple[str, Rows, int]]:
+    """Yield sorted rows as `merge_rows` takes them; those of the last time wait for others of the same time.
 
     Raises the error that stands in the place of rows.
     """
-    waiting = Rows.empty()
     for rows in parts:
         if isinstance(rows, Exception):
             raise rows
-        if not len(rows):
-            continue
-        waiting = Rows.concatenate([each for each in (waiting, rows) if len(each)])
-        complete = waiting.t_us < waiting.t_us.max()
-        if complete.any():
-            yield waiting[complete].sort_by_time()
-            waiting = waiting[~complete]
-    if len(waiting):
-        yield waiting.sort_by_time()
+        if len(rows):
+            yield "rows", rows, int(rows.t_us.max())
 
 
 def _split_by_day(batches: Iterable[Any], keys: Sequence[str], by: str, columns: Columns) -> Iterator[Piece]:

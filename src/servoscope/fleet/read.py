@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from servoscope.core.errors import RecordingError
@@ -29,20 +29,26 @@ def read_blocks(files: Sequence[str], columns: Columns) -> Iterator[Rows]:
         (part for file in files for part in _list_row_groups(file, columns)),
         key=lambda part: (part.first_us, part.file, part.group),
     )
+    later = [*(part.first_us for part in parts[1:]), LAST_TIME]
+    yield from merge_rows((part.file, part.read(columns), until) for part, until in zip(parts, later, strict=True))
+
+
+def merge_rows(parts: Iterable[tuple[str, Rows, int]]) -> Iterator[Rows]:
+    """Yield rows in the order of time; of each part: where it is from, its rows, and what none comes before then [us].
+
+    Raises RecordingError if there are too many in no order.
+    """
     waiting = Rows.empty()
-    for part, later in zip(parts, [*(p.first_us for p in parts[1:]), LAST_TIME], strict=True):
-        waiting = Rows.concatenate([each for each in (waiting, part.read(columns)) if len(each)])
+    for where, rows, until in parts:
+        waiting = Rows.concatenate([waiting, rows])
         if len(waiting) > MAX_UNSORTED_ROWS:
-            raise RecordingError(
-                f"{part.file}: more than {MAX_UNSORTED_ROWS} rows in no order of time: write them sorted"
-            )
-        done = waiting.t_us < later
-        if done.all():
-            ready, waiting = waiting, Rows.empty()
-        else:
-            ready, waiting = waiting[done], waiting[~done]
-        if len(ready):
-            yield ready.sort_by_time()
+            raise RecordingError(f"{where}: more than {MAX_UNSORTED_ROWS} rows in no order of time: write them sorted")
+        done = waiting.t_us < until
+        if done.any():
+            yield (waiting if done.all() else waiting[done]).sort_by_time()
+            waiting = waiting[~done]
+    if len(waiting):
+        yield waiting.sort_by_time()
 
 
 class _RowGroup(NamedTuple):

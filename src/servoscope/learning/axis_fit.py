@@ -24,7 +24,7 @@ from servoscope.signals import Recording
 REST_SHARE = 0.03  # of the speed of motion (rms), below which the axis counts as resting
 MAX_FORCE_CORRELATION_S = 0.05  # correlation of the unexplained force: a slower one would take over what friction does
 SCATTER = 0.05  # standard deviation of a coefficient's logarithm between recordings, before any is compared
-SCATTER_DOF = 2.0  # recordings that this is worth
+SCATTER_DOF = 0.5  # recordings that this is worth: three that agree are believed more than it
 MIN_SCATTER = 0.01
 FORCE_OFFSET_SHARE = 0.05  # of the force (rms), by which the constant one may differ between recordings and within one
 MIN_COEFFICIENT_STDS = 3.0  # standard deviations from which a coefficient is seen

@@ -192,8 +192,7 @@ def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
     explained = message("init.explained", share=100.0 * share)
     lines = []
     for key, value in chosen.settings.items():
-        known = f"init.of_{key}"
-        why = explained if key == "kind" else message(known)
+        why = explained if key == "kind" else message(f"init.of_{key}")
         lines.append(ProposalLine("plant", key, json.dumps(value), why, key == "kind" and share < MIN_CLEAR_SHARE))
     return lines
 

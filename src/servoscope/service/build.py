@@ -17,7 +17,7 @@ from servoscope.core.settings_errors import suggest_name
 from servoscope.design.operating_limits import LimitKind, OperatingLimit, operating_limits
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.models.loop import Loop
-from servoscope.service.actions import CommandSettings, EmailSettings, WebhookSettings, load_secret
+from servoscope.service.actions import CommandSettings, EmailSettings, WebhookSettings
 from servoscope.service.actions.settings import SINKS, Sink
 from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.checkpoint import StreamPosition, unpack_state
@@ -31,7 +31,7 @@ from servoscope.service.publishers.base import StatusPublisher
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.message import SourceAsset
-from servoscope.service.store import CheckpointRow, Store
+from servoscope.service.store import Row, Store
 from servoscope.service.store.engine import parse_store_url
 
 
@@ -94,7 +94,7 @@ def resume_assets(
     groups: AssetGroups,
     assets: Mapping[str, Asset],
     store: Store,
-    rows: Mapping[str, CheckpointRow],
+    rows: Mapping[str, Row],
     restarted: Collection[str],
 ) -> None:
     """Let assets go on from their rows in the store; those in `restarted` with a new state behind what was counted.
@@ -309,8 +309,8 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
 def _check_sink(where: str, sink: Sink) -> None:
     if isinstance(sink, WebhookSettings | EmailSettings):
         try:
-            load_secret(sink)
-        except ValueError as error:
+            sink.load_secret(Path())
+        except ConfigError as error:
             key = "secret_env" if sink.secret_env is not None else "secret_file"
             raise ConfigError(f"{where}.{key}: {error}") from None
         if sink.has_certificates:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
+from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, Field, PrivateAttr, ValidationError
+from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
 
 from servoscope.core.errors import ConfigError
-from servoscope.core.settings import Settings, parse_toml, read_toml_text
+from servoscope.core.settings import NonEmptyStr, Settings, parse_toml, read_toml_text
 from servoscope.core.settings_errors import describe_error
 
 Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e9)]  # what means something as a time
@@ -30,8 +32,57 @@ def _check_address(value: str) -> str:
     return value
 
 
+def _check_http_url(value: str) -> str:
+    try:
+        parts = urlsplit(value)
+        good = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port is None or parts.port > 0)
+    except ValueError:
+        good = False
+    if not good:
+        raise ValueError("is no address, write http://... or https://...")  # it may hold a token
+    return value
+
+
 Name = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
 Address = Annotated[str, Field(strict=True), AfterValidator(_check_address)]
+HttpUrl = Annotated[str, Field(strict=True, min_length=1), AfterValidator(_check_http_url)]
+
+
+class SecretSettings(Settings):
+    """A table with a secret: that of a signature, of a client, or a password; none: there is none."""
+
+    # secret_env, secret_file: the environment variable or file with it
+    secret_env: NonEmptyStr | None = None
+    secret_file: NonEmptyStr | None = None
+
+    @property
+    def has_secret(self) -> bool:
+        """Whether one is named."""
+        return self.secret_env is not None or self.secret_file is not None
+
+    @model_validator(mode="after")
+    def _check_one_secret(self) -> Self:
+        if self.secret_env is not None and self.secret_file is not None:
+            raise ValueError("give secret_env or secret_file, not both")
+        return self
+
+    def load_secret(self, folder: Path) -> bytes | None:
+        """Return the secret, None where there is none; raises ConfigError if it is missing."""
+        if self.secret_env is not None:
+            value = os.environ.get(self.secret_env, "")
+            if not value:
+                raise ConfigError(f"the environment variable {self.secret_env} holds no secret, set it")
+            return value.encode()
+        if self.secret_file is None:
+            return None
+        path = folder / self.secret_file
+        try:
+            content = path.read_bytes().strip()
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+        if not content:
+            raise ConfigError(f"{path}: holds no secret, write it there")
+        return content
 
 
 def read_password(name: str | None, folder: Path) -> str | None:

@@ -18,7 +18,7 @@ from servoscope.service.log import log
 from servoscope.service.metrics import MetricsContext, ServiceMetrics
 from servoscope.service.notifications import Notifier
 from servoscope.service.sources.message import RejectionCounter
-from servoscope.service.store import CommandOutcome, CommandRow, Store
+from servoscope.service.store import CommandOutcome, Row, Store
 from servoscope.service.store.series import thin_sizes
 
 DAY_S = 86400.0
@@ -116,7 +116,7 @@ class Housekeeping:
                 self._executed.add(row["id"])
                 self._execute_command(row)
 
-    def _execute_command(self, row: CommandRow) -> None:
+    def _execute_command(self, row: Row) -> None:
         service, name, document = self._service, row["asset"], row["document"]
         asset, notifier = service.assets.get(name), service.notifier
         if asset is None and name != notifier.name:

@@ -112,7 +112,8 @@ def _create_single_sign_on(settings: WebSettings, folder: Path) -> SingleSignOn 
         return None
     from servoscope.web.oidc_client import OidcClient  # late: it needs an extra
 
-    return SingleSignOn(OidcClient(settings.oidc, settings.oidc.load_secret(folder)))
+    secret = settings.oidc.load_secret(folder)
+    return SingleSignOn(OidcClient(settings.oidc, secret.decode(errors="replace") if secret else None))
 
 
 def _uvicorn_config(context: Context, tls: dict[str, Any]) -> uvicorn.Config:

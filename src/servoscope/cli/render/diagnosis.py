@@ -19,7 +19,7 @@ from servoscope.diagnosis.result import Diagnosis
 from servoscope.report.diagnosis_document import diagnosis_document
 from servoscope.report.document import DETAILS, HEADLINE, Document, Facts, Notes, Section, with_pictures
 from servoscope.report.format_values import format_duration
-from servoscope.report.page import say
+from servoscope.report.page import ResultTable, say
 
 
 def print_diagnosis(out: Console, d: Diagnosis, details: bool = False) -> None:
@@ -50,5 +50,5 @@ def _print_section(out: Console, section: Section) -> None:
             print_facts(out, [(translate(f.name).lower(), "; ".join([f.value, *f.lines])) for f in part.facts])
         elif isinstance(part, Notes):
             print_notes(out, part.texts, "blue", "-")
-        else:
+        elif isinstance(part, ResultTable):
             print_result_table(out, part)

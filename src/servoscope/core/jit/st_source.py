@@ -57,6 +57,10 @@ class STPrinter(CPrinter):
         """Return the statement that makes a number or a condition; its variable is declared elsewhere."""
         return self.assignment(name, text)
 
+    def declarations(self) -> list[str]:
+        """Return nothing: a function block declares the variables of all its statements together."""
+        return []
+
     def convert(self, kind: str, a: str, target: str) -> str:
         """Return a number as it is: there is one precision."""
         return a

@@ -82,8 +82,8 @@ class ResidualGenerator:
         recursion = Recursion([c])
         state = recursion.start()
         if from_zero:
-            state[:, recursion.slices["theta"]] = -c.theta
-            state[:, recursion.slices["P"]] *= INITIAL_COVARIANCE_FACTOR
+            recursion.named(state)["theta"] = -c.theta
+            recursion.named(state)["P"] *= INITIAL_COVARIANCE_FACTOR
         r, restart = recording.r, recording.restart
         u, y = pipeline.input(r, recording.u, restart), self.output(recording)
         _, out = recursion.run(state, r[None], u[None], y[None], restart[None])

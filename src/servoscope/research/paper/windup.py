@@ -38,7 +38,7 @@ def covariance_at_rest(estimator: str, seed: int) -> tuple[FloatArray, FloatArra
     for begin in range(0, recording.samples, every):
         signals = (getattr(recording, name)[None, begin : begin + every] for name in ("r", "u", "y", "restart"))
         state, _ = recursion.run(state, *signals)
-        sizes.append(_largest_eigenvalue(L, state[0, recursion.slices["P"]].reshape(n, n)))
+        sizes.append(_largest_eigenvalue(L, recursion.named(state)["P"][0].reshape(n, n)))
     return recording.t[every - 1 :: every], np.array(sizes)
 
 

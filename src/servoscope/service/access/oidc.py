@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, Self
 from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator, model_validator
 
-from servoscope.core.errors import ConfigError
-from servoscope.core.settings import NonEmptyStr, Positive, Settings
+from servoscope.core.settings import NonEmptyStr, Positive
 from servoscope.service.access.allowed_hosts import is_loopback
 from servoscope.service.access.users import ROLES, USER_NAME, Role
+from servoscope.service.config_types import HttpUrl, SecretSettings
 
 CALLBACK = "/api/v1/session/oidc/callback"
 Values = Annotated[tuple[NonEmptyStr, ...], Field(min_length=1)]
 
 
-class OidcSettings(Settings):
-    """A provider that says who somebody is."""
+class OidcSettings(SecretSettings):
+    """A provider that says who somebody is; without a secret we are a public client."""
 
-    issuer: NonEmptyStr  # address of the provider, as its ID tokens name it
+    issuer: HttpUrl  # address of the provider, as its ID tokens name it
     client_id: NonEmptyStr  # under which this server is registered there
-    # secret_env, secret_file: the environment variable or file with the secret of the client; none: a public client
-    secret_env: NonEmptyStr | None = None
-    secret_file: NonEmptyStr | None = None
-    address: NonEmptyStr  # of this server, as browsers call it; with `CALLBACK` behind it, registered at the provider
+    address: HttpUrl  # of this server, as browsers call it; with `CALLBACK` behind it, registered at the provider
     scopes: tuple[NonEmptyStr, ...] = ("openid", "profile")
     user_claim: NonEmptyStr = "preferred_username"  # what becomes the name of the user
     role_claim: NonEmptyStr = "groups"  # a text or a list of texts; dots lead into tables
@@ -38,25 +33,15 @@ class OidcSettings(Settings):
     @field_validator("issuer", "address")
     @classmethod
     def _check_url(cls, value: str) -> str:
-        try:
-            parts = urlsplit(value)
-            host, is_bare = (
-                parts.hostname or "",
-                not (parts.username or parts.password or parts.query or parts.fragment),
-            )
-            good = bool(host) and is_bare and (parts.port is None or parts.port > 0)
-        except ValueError:
-            good = False
-        if not good or parts.scheme not in ("http", "https"):
+        parts = urlsplit(value)
+        if parts.username or parts.password or parts.query or parts.fragment:
             raise ValueError("is no address, write https://host/path without user and query")  # it may hold a secret
-        if parts.scheme == "http" and not is_loopback(host):
+        if parts.scheme == "http" and not is_loopback(parts.hostname or ""):
             raise ValueError("write https://: codes and tokens can be read on the way")
         return value
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.secret_env is not None and self.secret_file is not None:
-            raise ValueError("give secret_env or secret_file, not both")
         if "openid" not in self.scopes:
             raise ValueError('scopes: "openid" is missing, without it there is no ID token')
         if urlsplit(self.address).path not in ("", "/"):
@@ -67,24 +52,6 @@ class OidcSettings(Settings):
     def callback(self) -> str:
         """Where the provider sends browsers back to."""
         return self.address.rstrip("/") + CALLBACK
-
-    def load_secret(self, folder: Path) -> str | None:
-        """Return the secret of the client; None: it has none. Raises ConfigError if it is missing."""
-        if self.secret_env is not None:
-            value = os.environ.get(self.secret_env, "")
-            if not value:
-                raise ConfigError(f"[web.oidc] secret_env: {self.secret_env} holds no secret, set it")
-            return value
-        if self.secret_file is None:
-            return None
-        path = folder / self.secret_file
-        try:
-            value = path.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
-        if not value:
-            raise ConfigError(f"{path}: holds no secret, write it there")
-        return value
 
     def user_name(self, claims: Mapping[str, Any]) -> str | None:
         """Return the name of the user; None: the claim is missing, or will not do as a name."""

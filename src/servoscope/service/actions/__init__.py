@@ -5,7 +5,7 @@ entries = transition_entries(settings, transition, priority, now)  # stored with
 attempt = deliver(entry, settings, now)          # attempt.retry_entry takes the entry's place; None: it is removed
 """
 
-from servoscope.service.actions.delivery import deliver, load_secret, signature
+from servoscope.service.actions.delivery import deliver, signature
 from servoscope.service.actions.fault_tolerance import (
     ControlChange,
     FaultToleranceState,
@@ -35,5 +35,5 @@ __all__ = [
     "FaultToleranceSettings",
     "FaultToleranceState", "MqttMessageSettings", "OutboxEntry", "RetrySettings", "WebhookSettings",
     "accommodate_fault", "deliver", "diagnosis_entries", "flood_entries", "idempotency_key", "initial_tolerance_state",
-    "load_secret", "signature", "transition_entries",
+    "signature", "transition_entries",
 ]  # fmt: skip

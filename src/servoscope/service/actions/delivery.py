@@ -27,7 +27,6 @@ from servoscope.service.actions.settings import (
     CommandSettings,
     EmailSettings,
     MqttMessageSettings,
-    SecretSettings,
     Sink,
     WebhookSettings,
 )
@@ -99,7 +98,7 @@ def _send(rows: Sequence[OutboxEntry], sink: Sink) -> str:
 
 def _mail(rows: Sequence[OutboxEntry], sink: EmailSettings) -> str:
     try:
-        secret = load_secret(sink)
+        secret = sink.load_secret(Path())
         return send_mail(rows[0].key, [row.event for row in rows], sink, secret.decode() if secret else None)
     except (ValueError, OSError, ConfigError) as error:
         raise _DeliveryError(f"{sink.host}: {error}") from None
@@ -136,8 +135,8 @@ def _post(row: OutboxEntry, sink: WebhookSettings) -> str:
     body = json.dumps(row.event, allow_nan=False).encode()
     headers = {"Content-Type": "application/json", "Idempotency-Key": row.key}
     try:
-        secret = load_secret(sink)
-    except ValueError as error:
+        secret = sink.load_secret(Path())
+    except ConfigError as error:
         raise _DeliveryError(str(error)) from None
     if secret is not None:
         # by the clock of the machine, which receivers compare with theirs
@@ -211,24 +210,6 @@ def _checked_request(sink: WebhookSettings) -> _Target:
     name = {"sni_hostname": url.host}  # the certificate is compared with it
     # a proxy would look up the name itself
     return _Target(url.copy_with(host=address), {"Host": url.netloc.decode()}, name, verify, False)
-
-
-def load_secret(sink: SecretSettings) -> bytes | None:
-    """Return the secret of a sink; None where it has none; ValueError if it is missing."""
-    if sink.secret_env is not None:
-        value = os.environ.get(sink.secret_env, "")
-        if not value:
-            raise ValueError(f"the environment variable {sink.secret_env} holds no secret, set it")
-        return value.encode()
-    if sink.secret_file is None:
-        return None
-    try:
-        content = Path(sink.secret_file).read_bytes().strip()
-    except OSError as error:
-        raise ValueError(f"{sink.secret_file}: cannot be read ({error.strerror})") from None
-    if not content:
-        raise ValueError(f"{sink.secret_file}: holds no secret, write it there")
-    return content
 
 
 def _run_command(row: OutboxEntry, sink: CommandSettings) -> str:

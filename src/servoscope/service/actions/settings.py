@@ -8,12 +8,12 @@ from collections import Counter
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
-from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from servoscope.core.settings import Finite, NonEmptyStr, Positive, Settings
 from servoscope.service.alarms import LifecycleEvent, LifecycleState, Priority
+from servoscope.service.config_types import HttpUrl, SecretSettings
 from servoscope.service.mqtt.client import BrokerSettings
 from servoscope.service.network import NetworkSettings, TlsSettings, apply_network
 
@@ -68,41 +68,10 @@ class SinkSettings(Settings):
     timeout_s: Positive = 10.0  # how long one attempt may take [s]
 
 
-class SecretSettings(SinkSettings):
-    """Such a table with a secret: that of the signature, or a password; none: there is none."""
-
-    # secret_env, secret_file: the environment variable or file with it
-    secret_env: NonEmptyStr | None = None
-    secret_file: NonEmptyStr | None = None
-
-    @property
-    def has_secret(self) -> bool:
-        """Whether one is named."""
-        return self.secret_env is not None or self.secret_file is not None
-
-    @model_validator(mode="after")
-    def _check_one_secret(self) -> Self:
-        if self.secret_env is not None and self.secret_file is not None:
-            raise ValueError("give secret_env or secret_file, not both")
-        return self
-
-
-class WebhookSettings(TlsSettings, SecretSettings):
+class WebhookSettings(TlsSettings, SecretSettings, SinkSettings):
     """A POST of the event as JSON; over https the other side has to prove its identity."""
 
-    url: NonEmptyStr  # where to; http or https
-
-    @field_validator("url")
-    @classmethod
-    def _check_url(cls, value: str) -> str:
-        try:
-            parts = urlsplit(value)
-            good = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port is None or parts.port > 0)
-        except ValueError:
-            good = False
-        if not good:
-            raise ValueError("is no address, write http://... or https://...")  # it may hold a token
-        return value
+    url: HttpUrl  # where to; http or https
 
     @model_validator(mode="after")
     def _check_certificates(self) -> Self:
@@ -145,7 +114,7 @@ class MqttMessageSettings(SinkSettings):
 MailAddress = Annotated[str, Field(strict=True, pattern=r"^[^@\s,;<>]+@[^@\s,;<>]+$", max_length=254)]
 
 
-class EmailSettings(TlsSettings, SecretSettings):
+class EmailSettings(TlsSettings, SecretSettings, SinkSettings):
     """A mail in plain text, one for each episode of an alarm; the secret is the password of `user`."""
 
     once_per_episode: ClassVar[bool] = True

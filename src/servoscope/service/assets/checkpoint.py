@@ -13,7 +13,6 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import StateError
-from servoscope.diagnosis.follower import FollowerState
 from servoscope.service.alarms import AlarmState
 from servoscope.service.assets.examination_schedule import ExaminationState, PendingDiagnosis
 from servoscope.service.assets.outlook import Outlook
@@ -66,17 +65,16 @@ class StreamPosition:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class AssetState(FollowerState):
-    """Everything that decides what the next block of an asset leads to.
-
-    `exceeding` is not saved: the service's alarms follow examinations, which have delays of their own.
-    """
+class AssetState:
+    """Everything that decides what the next block of an asset leads to."""
 
     asset: str
     baseline: str  # hash of the baseline that it is compared with
     position: StreamPosition
+    monitor: FloatArray  # state of the monitor, shape (size,)
     quality: FloatArray  # state of `servoscope.signals.quality`, shape (size,)
     examination: ExaminationState
+    samples: int = 0  # that the monitor has processed
     last_t: float | None = None  # time of the last sample that the monitor processed [UTC s]
     history: HistoryState = field(default_factory=HistoryState)
     pending_diagnoses: tuple[PendingDiagnosis, ...] = ()

@@ -1,6 +1,6 @@
 """History in SQL: diagnoses, alarms, residuals, audit, checkpoints; SQLite in a file, or PostgreSQL by URL."""
 
-from servoscope.service.store.rows import CheckpointRow, CommandOutcome, CommandRow, Row
+from servoscope.service.store.rows import CommandOutcome, Row
 from servoscope.service.store.store import Batch, Store
 
-__all__ = ["Batch", "CheckpointRow", "CommandOutcome", "CommandRow", "Row", "Store"]
+__all__ = ["Batch", "CommandOutcome", "Row", "Store"]

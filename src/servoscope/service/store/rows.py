@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple, NotRequired, TypedDict
+from typing import Any, NamedTuple
 
 from servoscope.core.messages import message, render
 from servoscope.prognosis.series import NORMAL_95
@@ -14,38 +14,6 @@ NOTE = "note"  # in the audit: what somebody noted about an asset
 SIZE_EVERY_S = 600.0  # between two stored values of a coefficient
 # how the outcome of a refused command begins in rows of version 0.1, which have no fields for it
 REFUSAL_PREFIX = "refused: "
-
-
-class CheckpointRow(TypedDict):
-    """The newest checkpoint of an asset, or of the service."""
-
-    asset: str
-    sequence: int
-    state: bytes  # from which the asset continues
-    status: dict[str, Any]  # what `watch --json` shows
-    at: float  # when it was written [UTC s]
-
-
-class CommandDocument(TypedDict, total=False):
-    """Why an operator asks for a command, and what became of it."""
-
-    why: str
-    for_s: NotRequired[float]  # how long an alarm is shelved [s]
-    accepted: NotRequired[bool]
-    refusal: NotRequired[str]  # why it was refused
-
-
-class CommandRow(TypedDict):
-    """What an operator asks for; `outcome` is None until the service has executed it."""
-
-    id: int
-    at: float
-    who: str
-    asset: str
-    alarm: str
-    command: str
-    document: CommandDocument
-    outcome: str | None
 
 
 class CommandOutcome(NamedTuple):
@@ -61,13 +29,13 @@ class CommandOutcome(NamedTuple):
             message("service.command_done" if self.accepted else "service.command_refused", reason=self.refusal)
         )
 
-    def extend(self, document: CommandDocument) -> CommandDocument:
+    def extend(self, document: Row) -> Row:
         """Return a command's document with the outcome."""
-        refusal: CommandDocument = {} if self.accepted else {"refusal": self.refusal}
+        refusal = {} if self.accepted else {"refusal": self.refusal}
         return {**document, "accepted": self.accepted, **refusal}
 
     @classmethod
-    def from_row(cls, outcome: str, document: CommandDocument) -> CommandOutcome:
+    def from_row(cls, outcome: str, document: Row) -> CommandOutcome:
         """Return the outcome that a row of the commands holds."""
         if "accepted" in document:
             return cls(document["accepted"], document.get("refusal", ""))

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
@@ -25,15 +25,7 @@ from servoscope.service.store.bundles import (
     read_samples,
     write_bundles,
 )
-from servoscope.service.store.rows import (
-    CHECKS,
-    NOTE,
-    CheckpointRow,
-    CommandDocument,
-    CommandOutcome,
-    CommandRow,
-    Row,
-)
+from servoscope.service.store.rows import CHECKS, NOTE, CommandOutcome, Row
 
 Result = TypeVar("Result")
 OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
@@ -238,7 +230,7 @@ class Store:
         self, user: str, asset: str, alarm: str, command: str, *, reason: str = "", for_s: float | None = None
     ) -> int:
         """Add a command of an operator, from any process; return its id. `for_s`: how long to shelve [s]."""
-        document: CommandDocument = {"why": reason} if for_s is None else {"why": reason, "for_s": for_s}
+        document = {"why": reason} if for_s is None else {"why": reason, "for_s": for_s}
         row = {"at": time.time(), "who": user, "asset": asset, "alarm": alarm, "command": command, "document": document}
         with self._transaction() as connection:
             return int(connection.execute(tables.commands.insert().returning(tables.commands.c.id), row).scalar_one())
@@ -249,17 +241,14 @@ class Store:
         query = sa.select(table.c.outcome, table.c.document).where(table.c.id == command, table.c.outcome.is_not(None))
         return next((CommandOutcome.from_row(row["outcome"], row["document"]) for row in self.fetch(query)), None)
 
-    def pending_commands(self) -> list[CommandRow]:
+    def pending_commands(self) -> list[Row]:
         """Return the commands that are not yet executed."""
         table = tables.commands
-        return cast(
-            list[CommandRow], self.fetch(sa.select(table).where(table.c.outcome.is_(None)).order_by(table.c.id))
-        )
+        return self.fetch(sa.select(table).where(table.c.outcome.is_(None)).order_by(table.c.id))
 
-    def checkpoints(self, assets: Sequence[str] | None = None) -> dict[str, CheckpointRow]:
+    def checkpoints(self, assets: Sequence[str] | None = None) -> dict[str, Row]:
         """Return the newest checkpoint of these assets, or of all, by name; without those that have none."""
-        found = self._checkpoints(sa.select(tables.checkpoints), assets)
-        return cast(dict[str, CheckpointRow], found)
+        return self._checkpoints(sa.select(tables.checkpoints), assets)
 
     def statuses(self, assets: Sequence[str] | None = None) -> dict[str, Row]:
         """Return what `checkpoints` returns, without the states."""
