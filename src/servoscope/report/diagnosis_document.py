@@ -199,13 +199,14 @@ def _explanations(d: Diagnosis, known: Context) -> Iterator[ResultTable]:
     if shown:
         compare, labelled = len(shown) > 1 and any(c.misfit for c in shown), any(c.cosine is not None for c in shown)
         size = "Size, relative to healthy or labelled" if labelled else "Size, relative to healthy"
-        head = ["Explanation", "Probability", size, "95 % interval", *(["Fits worse by"] if compare else [])]
-        yield ResultTable(tuple(head), [_candidate_row(c, known, compare) for c in shown])
+        head = ("Explanation", "Probability", size, "95 % interval", "Fits worse by", "Cosine")
+        table = ResultTable(head, [_candidate_row(c, known) for c in shown])
+        yield table.without(*(() if compare else ("Fits worse by",)), *(() if labelled else ("Cosine",)))
     if d.refit is not None and d.refit.mimics:
         yield ResultTable(("Cause outside the list of faults", "Size"), [_mimic_row(m) for m in d.refit.mimics])
 
 
-def _candidate_row(c: Candidate, known: Context, compare: bool) -> tuple[str, ...]:
+def _candidate_row(c: Candidate, known: Context) -> tuple[str, ...]:
     name = " + ".join(translate(fault_label(each)) for each in c.names)
     meaning = describe_candidate(c, known.words)
     lines = [name, *([meaning] if meaning.replace(f" {translate('and')} ", " + ") != name else [])]
@@ -216,8 +217,9 @@ def _candidate_row(c: Candidate, known: Context, compare: bool) -> tuple[str, ..
     named = [f"{parameter_label(f.parameter)} " if several else "" for f in c.faults]
     ratios = "\n".join(f"{label}× {size}" for label, (size, _, _) in zip(named, sizes, strict=True))
     intervals = "\n".join(say("report.range", low=low, high=high) for _, low, high in sizes)
-    misfit = (f"{format_number(math.sqrt(max(c.misfit, 0.0)), 3)} σ" if c.misfit else "",) if compare else ()
-    return "\n".join(lines), format_probability(c.probability), ratios or DASH, intervals or DASH, *misfit
+    misfit = f"{format_number(math.sqrt(max(c.misfit, 0.0)), 3)} σ" if c.misfit else ""
+    cosine = f"{c.cosine:.3f}" if c.cosine is not None else ""
+    return "\n".join(lines), format_probability(c.probability), ratios or DASH, intervals or DASH, misfit, cosine
 
 
 def _mimic_row(mimic: Mimic) -> tuple[str, str]:

@@ -34,23 +34,15 @@ BROWSERS = (
 PRINT_S = 120.0  # the longest that printing may take
 FILTERS = {
     "capitalised": lambda text: str(text)[:1].upper() + str(text)[1:],
-    "change": format_values.format_change,
-    "clock_time": format_values.format_clock_time,
-    "correlation": format_values.pair_correlation,
     "count": format_values.format_count,
     "duration": format_values.format_duration,
-    "number": format_values.format_number,
     "percent": format_values.format_percent,
     "plain_name": lambda name: translate(format_values.plain_name(translate(name))),
     "probability": format_values.format_probability,
-    "quantity": format_values.format_quantity,
-    "ratios": lambda fault: format_values.format_ratios(fault.ratio, *fault.interval),
-    "signed_percent": format_values.format_signed_percent,
     "split_symbols": lambda text: format_values.split_symbols(str(text)),
     "symbol_parts": format_values.symbol_parts,
     "word": translate,
     "word_range": lambda cell: type(cell)(translate_range(cell)) if isinstance(cell, str) else cell,  # Markup stays so
-    "with_std": lambda values: format_values.format_with_std(*values),
 }
 
 
