@@ -51,10 +51,20 @@ def asset_document(status: AssetStatus, diagnosis: Diagnosis | None, checks: Seq
     if is_fault:
         texts = tuple(checks) or (say("report.check.waiting" if status.pending_diagnoses else "report.check.nothing"),)
         sections.append(Section("What to check", (Notes(texts, ordered=len(texts) > 1),), HEADLINE))
+    else:
+        sections.append(Section("What to do", (Notes((_next_step(status),)),), HEADLINE))
     if is_fault and diagnosis is not None:
         known = Context(words=status.metadata.faults)
         sections += [one for one in diagnosis_document(diagnosis, known) if one.title == "What else it could be"]
     return tuple(section for section in sections if section.body)
+
+
+def _next_step(status: AssetStatus) -> str:
+    """Return what to do where there is no fault."""
+    if status.verdict == "healthy":
+        return say("report.check.healthy")
+    kind = "reception" if status.reception != "followed" else "data_quality" if status.quality else "undetermined"
+    return say(f"alarm.operator_action.{kind}")
 
 
 def _facts(status: AssetStatus, diagnosis: Diagnosis | None) -> Iterator[Fact]:

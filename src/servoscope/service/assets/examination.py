@@ -123,11 +123,7 @@ def examine_blocks(
     first = 0 if exam.alarm.all() else len(exam.alarm) - int(np.argmin(exam.alarm[::-1]))
     crossed = int(exam.estimates.crossed[first]) - 1
     onset = start + float(recording.t[crossed if crossed >= 0 else int(exam.estimates.index[first])])
-    excess = float((exam.statistic / baseline.thresholds.statistic)[first:].max())
-    level = message("service.examination.level", level=float(exam.estimates.level[first:].max()))
-    headline = message(
-        "service.examination.fault", excess=excess, level=level if baseline.thresholds.hypotheses else None
-    )
+    headline = message("service.examination.fault")
     size = _follow_size(exam, fault, first) if fault is not None else None
     return StoredDiagnosis(verdict="fault", headline=headline, onset=onset, size=size)
 
