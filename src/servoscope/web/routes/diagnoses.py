@@ -99,7 +99,7 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
         raise HTTPException(404, f"there is no diagnosis {id_}")
     document = dict(rows[0]["document"])
     diagnosis = read_diagnosis(document)
-    began, signature = document.pop("began", None), document.pop("signature", [])
+    began, signature, _ = document.pop("began", None), document.pop("signature", []), document.pop("said", None)
     facts = next((one.metadata for _, one in asset_statuses(read_statuses(context.store, [asset]).values())), None)
     baseline = None
     if facts is not None and facts.model_fields_set:
