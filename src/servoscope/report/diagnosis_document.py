@@ -14,7 +14,18 @@ from servoscope.diagnosis.change_words import fault_label
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
 from servoscope.diagnosis.result import Diagnosis, FaultInterval, Mimic, RefitSummary, ResponsePoint
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
-from servoscope.report.document import DETAILS, EVIDENCE, HEADLINE, Document, Fact, Facts, Notes, Part, Picture, Section
+from servoscope.report.document import (
+    DETAILS,
+    EVIDENCE,
+    HEADLINE,
+    Document,
+    Fact,
+    Facts,
+    Notes,
+    Part,
+    PicturePart,
+    Section,
+)
 from servoscope.report.format_values import (
     DASH,
     describe_candidate,
@@ -39,7 +50,7 @@ HEALTHY_KEYS = "diagnosis.healthy", "diagnosis.healthy_limits"
 LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
 
 
-class Context(NamedTuple):
+class DiagnosisContext(NamedTuple):
     """What a diagnosis does not know itself.
 
     `words`: by name, what a fault means; `units`: of y and u; `coefficient_units`: by coefficient; `checks`: what to
@@ -62,31 +73,36 @@ class Context(NamedTuple):
         return format_clock_time(t, decimals) if self.began is None else say("report.date", t=self.began + t)
 
 
-def diagnosis_document(d: Diagnosis, context: Context | None = None) -> Document:
+def diagnosis_document(d: Diagnosis, context: DiagnosisContext | None = None) -> Document:
     """Return the sections of a diagnosis."""
-    known = context or Context()
+    known = context or DiagnosisContext()
     sections = (
         _headline(d, known),
         Section("What to check", tuple(_checks(d, known)), HEADLINE),
         Section("When it was there", _timeline(d, known), EVIDENCE),
         Section("What else it could be", tuple(_explanations(d, known)), EVIDENCE, _other_causes(d)),
-        Section("Signals", (Picture("signals"),), EVIDENCE, say("report.signals")),
+        Section("Signals", (PicturePart("signals"),), EVIDENCE, say("report.signals")),
         Section("Warnings", _warnings(d, known), EVIDENCE, "What the reader should know about the recording."),
         Section("Why", _reasons(d), DETAILS, _clock_note(known)),
-        Section("Change over time", (Picture("statistic"), *_largest(known.trace)), DETAILS, _over_time(known)),
+        Section("Change over time", (PicturePart("statistic"), *_largest(known.trace)), DETAILS, _over_time(known)),
         Section(
-            "Refit beside recursion", (*_refit(d), *((Picture("sizes"),) if d.refit else ())), DETAILS, _agreement(d)
+            "Refit beside recursion",
+            (*_refit(d), *((PicturePart("sizes"),) if d.refit else ())),
+            DETAILS,
+            _agreement(d),
         ),
-        Section("Inverse frequency response", (Picture("ifrf"), *_responses(d, known)), DETAILS, say("report.ifrf")),
         Section(
-            "Coefficients", (Picture("coefficients"), *_coefficients(d, known)), DETAILS, say("report.coefficients")
+            "Inverse frequency response", (PicturePart("ifrf"), *_responses(d, known)), DETAILS, say("report.ifrf")
         ),
-        Section("Motion signature", (Picture("signature"),), DETAILS, say("report.signature")),
+        Section(
+            "Coefficients", (PicturePart("coefficients"), *_coefficients(d, known)), DETAILS, say("report.coefficients")
+        ),
+        Section("Motion signature", (PicturePart("signature"),), DETAILS, say("report.signature")),
     )
     return tuple(section for section in sections if section.body)
 
 
-def _headline(d: Diagnosis, known: Context) -> Section:
+def _headline(d: Diagnosis, known: DiagnosisContext) -> Section:
     dated = d.headline if known.began is None else d.dated_headline(known.began, known.onset)
     if d.verdict == "fault":
         asides = tuple(_asides(d, known.words))
@@ -115,7 +131,7 @@ def _asides(d: Diagnosis, words: Mapping[str, str]) -> Iterator[str]:
             yield say("report.aside", fault=what, aside=aside)
 
 
-def _fault_facts(d: Diagnosis, known: Context) -> Iterator[Fact]:
+def _fault_facts(d: Diagnosis, known: DiagnosisContext) -> Iterator[Fact]:
     onset, detected = d.onset_s, d.detected_at_s
     decimals = time_decimals(onset[2] - onset[0]) if onset is not None else 1
     seen = () if detected is None else (say("report.detected", time=known.moment(detected, decimals)),)
@@ -154,7 +170,7 @@ def parameter_label(name: str) -> str:
     return name if symbol_parts(name) else translate(fault_label(name))
 
 
-def _checks(d: Diagnosis, known: Context) -> Iterator[Part]:
+def _checks(d: Diagnosis, known: DiagnosisContext) -> Iterator[Part]:
     """Yield what to look at on the machine, the likeliest first."""
     if d.verdict != "fault":
         return
@@ -168,7 +184,7 @@ def _checks(d: Diagnosis, known: Context) -> Iterator[Part]:
         yield Notes(tuple(text[:1].upper() + text[1:] if text[1:2] != "_" else text for text in texts), ordered=True)
 
 
-def _timeline(d: Diagnosis, known: Context) -> tuple[ResultTable, ...]:
+def _timeline(d: Diagnosis, known: DiagnosisContext) -> tuple[ResultTable, ...]:
     """Return what was there from when to when, one row per interval, where there is more than "since"."""
     if d.current.end_interval_s is None and len(d.intervals) < 2:
         return ()
@@ -179,7 +195,7 @@ def _timeline(d: Diagnosis, known: Context) -> tuple[ResultTable, ...]:
     return (ResultTable(("From", "To", "Fault", "Probability"), rows, words=3),)
 
 
-def _interval_ends(interval: FaultInterval, known: Context) -> tuple[str, ...]:
+def _interval_ends(interval: FaultInterval, known: DiagnosisContext) -> tuple[str, ...]:
     def when(t: tuple[float, float, float] | None) -> str:
         if t is None:
             return ""
@@ -194,7 +210,7 @@ def _interval_sizes(interval: FaultInterval) -> str:
     return "\n".join(sizes) or say("report.not_named")
 
 
-def _explanations(d: Diagnosis, known: Context) -> Iterator[ResultTable]:
+def _explanations(d: Diagnosis, known: DiagnosisContext) -> Iterator[ResultTable]:
     shown = [c for i, c in enumerate(d.candidates) if c.probability >= MIN_PROBABILITY_SHOWN or not i]
     if shown:
         compare, labelled = len(shown) > 1 and any(c.misfit for c in shown), any(c.cosine is not None for c in shown)
@@ -206,7 +222,7 @@ def _explanations(d: Diagnosis, known: Context) -> Iterator[ResultTable]:
         yield ResultTable(("Cause outside the list of faults", "Size"), [_mimic_row(m) for m in d.refit.mimics])
 
 
-def _candidate_row(c: Candidate, known: Context) -> tuple[str, ...]:
+def _candidate_row(c: Candidate, known: DiagnosisContext) -> tuple[str, ...]:
     name = " + ".join(translate(fault_label(each)) for each in c.names)
     meaning = describe_candidate(c, known.words)
     lines = [name, *([meaning] if meaning.replace(f" {translate('and')} ", " + ") != name else [])]
@@ -234,7 +250,7 @@ def _other_causes(d: Diagnosis) -> str:
     return say("report.none_explains" if unknown else "report.none_as_well")
 
 
-def _warnings(d: Diagnosis, known: Context) -> tuple[Part, ...]:
+def _warnings(d: Diagnosis, known: DiagnosisContext) -> tuple[Part, ...]:
     def when(low: float, high: float) -> str:
         return f"{low:.2f}" if low == high else say("report.range", low=f"{low:.2f}", high=f"{high:.2f}")
 
@@ -251,7 +267,7 @@ def _reasons(d: Diagnosis) -> tuple[Notes, ...]:
     return (Notes(tuple(map(render, d.reasons))),) if d.reasons else ()
 
 
-def _clock_note(known: Context) -> str:
+def _clock_note(known: DiagnosisContext) -> str:
     return "" if known.began is None else say("report.clock", t=known.began)
 
 
@@ -266,7 +282,7 @@ def _largest(trace: Trace | None) -> Iterator[Facts]:
         yield Facts((Fact("Largest statistic T²", format_number(largest, 3), (share, counted)),))
 
 
-def _over_time(known: Context) -> str:
+def _over_time(known: DiagnosisContext) -> str:
     allowed, budget = known.false_alarms_per_year, None
     if allowed is not None:
         budget = message(f"report.budget.{'once' if allowed == 1.0 else 'times'}", count=format_quantity(allowed))
@@ -332,7 +348,7 @@ def _agreement(d: Diagnosis) -> str:
     return say("report.agree.not", **labels)
 
 
-def _responses(d: Diagnosis, known: Context) -> tuple[ResultTable, ...]:
+def _responses(d: Diagnosis, known: DiagnosisContext) -> tuple[ResultTable, ...]:
     unit = f" [{known.units[1]}/{known.units[0]}]" if known.units[1] else ""
     head = ("Frequency", f"Real part{unit}", "healthy", f"Imaginary part{unit}", "healthy", "Magnitude", "Phase [°]")
     rows = [(f"{format_quantity(point.frequency_hz)} Hz", *_response_cells(point)) for point in d.ifrf]
@@ -349,7 +365,7 @@ def _response_cells(point: ResponsePoint) -> tuple[str, ...]:
     return f"{real} ± {real_std}", real_healthy, f"{imag} ± {imag_std}", imag_healthy, *change
 
 
-def _coefficients(d: Diagnosis, known: Context) -> tuple[ResultTable, ...]:
+def _coefficients(d: Diagnosis, known: DiagnosisContext) -> tuple[ResultTable, ...]:
     head = ("Coefficient", "Unit", "Estimate", "Standard deviation", "Healthy", "Change", "In standard deviations")
     rows = [
         (

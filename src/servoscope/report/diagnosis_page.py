@@ -13,7 +13,7 @@ from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.motion_signature import compare_signatures
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.models.loop import Loop
-from servoscope.report.diagnosis_document import LABELS, Context, diagnosis_document
+from servoscope.report.diagnosis_document import LABELS, DiagnosisContext, diagnosis_document
 from servoscope.report.document import DETAILS, Section, to_html
 from servoscope.report.format_values import format_clock_time, format_count, format_quantity
 from servoscope.report.page import ResultTable, say, write_page
@@ -74,7 +74,7 @@ def render_diagnosis_page(
     """Return the page that `write_diagnosis_page` writes; it needs nothing from outside, no script and no network."""
     from servoscope.report.plotting import render_svg  # late: matplotlib takes half a second to import
 
-    context = Context(
+    context = DiagnosisContext(
         words={fault.name: fault.words for fault in loop.plant.all_faults},
         units=loop.plant.units,
         coefficient_units=dict(zip(loop.plant.names, loop.plant.coefficient_units, strict=True)),

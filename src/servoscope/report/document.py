@@ -42,14 +42,14 @@ class Notes:
 
 
 @dataclass(frozen=True)
-class Picture:
+class PicturePart:
     """A picture by its name; a view that has none of this name leaves it out."""
 
     name: str
     kind: ClassVar[str] = "picture"
 
 
-Part = Facts | Notes | ResultTable | Picture
+Part = Facts | Notes | ResultTable | PicturePart
 
 
 class Section(NamedTuple):
@@ -65,7 +65,7 @@ class Section(NamedTuple):
 
     def drawn(self, pictures: Container[str] = ()) -> Section:
         """Return it with these pictures alone."""
-        return self._replace(body=tuple(p for p in self.body if not isinstance(p, Picture) or p.name in pictures))
+        return self._replace(body=tuple(p for p in self.body if not isinstance(p, PicturePart) or p.name in pictures))
 
 
 Document = tuple[Section, ...]

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from servoscope.core.messages import message, translate
 from servoscope.diagnosis.change_words import change_messages
 from servoscope.diagnosis.result import Diagnosis
-from servoscope.report.diagnosis_document import Context, diagnosis_document, size_fact
+from servoscope.report.diagnosis_document import DiagnosisContext, diagnosis_document, size_fact
 from servoscope.report.document import HEADLINE, Document, Fact, Facts, Notes, Section
 from servoscope.report.format_values import format_duration, format_probability
 from servoscope.report.page import say
@@ -54,7 +54,7 @@ def asset_document(status: AssetStatus, diagnosis: Diagnosis | None, checks: Seq
     else:
         sections.append(Section("What to do", (Notes((_next_step(status),)),), HEADLINE))
     if is_fault and diagnosis is not None:
-        known = Context(words=status.metadata.faults)
+        known = DiagnosisContext(words=status.metadata.faults)
         sections += [one for one in diagnosis_document(diagnosis, known) if one.title == "What else it could be"]
     return tuple(section for section in sections if section.body)
 

@@ -15,8 +15,7 @@ from starlette.status import HTTP_202_ACCEPTED
 
 from servoscope.diagnosis.checks import suspects
 from servoscope.diagnosis.result import Diagnosis
-from servoscope.report.diagnosis_document import Context as DocumentContext
-from servoscope.report.diagnosis_document import diagnosis_document
+from servoscope.report.diagnosis_document import DiagnosisContext, diagnosis_document
 from servoscope.report.document import to_json
 from servoscope.service.assets.status import AssetMetadata
 from servoscope.service.store import tables
@@ -119,7 +118,7 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
 
 def _asset_context(
     context: Context, asset: str, diagnosis: Diagnosis | None, facts: AssetMetadata | None
-) -> DocumentContext:
+) -> DiagnosisContext:
     """Return what the diagnosis of an asset does not know itself."""
     loop, own = asset_loop(context, asset), read_checks(context.store, asset)
     names = suspects(diagnosis.current) if diagnosis is not None else ()
@@ -127,12 +126,12 @@ def _asset_context(
     if loop is not None or any(name in own for name in names):
         checks = [text for check in fault_checks(context, asset, loop, names) for text in check.texts]
     if facts is None:
-        return DocumentContext(checks=checks)
+        return DiagnosisContext(checks=checks)
     coefficients = dict(
         zip(diagnosis.parameters if diagnosis is not None else (), facts.coefficient_units, strict=False)
     )
     y, u = facts.units or ("", "")
-    return DocumentContext(words=facts.faults, units=(y, u), coefficient_units=coefficients, checks=checks)
+    return DiagnosisContext(words=facts.faults, units=(y, u), coefficient_units=coefficients, checks=checks)
 
 
 def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
@@ -141,7 +140,7 @@ def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     data = responses.DiagnosisData.model_validate_json(path.read_bytes())
     coefficients = {one.name: one.unit for one in data.trace.parameters}
     y, u = data.units
-    known = DocumentContext(words=data.words, units=(y, u), coefficient_units=coefficients)
+    known = DiagnosisContext(words=data.words, units=(y, u), coefficient_units=coefficients)
     return responses.DiagnosisDetail(
         **dict(_upload_row(record)),
         document=data.document,
