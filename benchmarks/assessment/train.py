@@ -12,7 +12,7 @@ import numpy as np
 from records import Records, measured, servos, simulated
 
 from servoscope.assessment import posterior
-from servoscope.assessment.posterior import PENALTY, Posterior
+from servoscope.assessment.posterior import PENALTY, CausePosterior
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tables import parse_with_data, parser
@@ -22,7 +22,7 @@ LOOP_WEIGHT = 8.0  # what one measured loop counts, in simulated ones; its logs 
 SERVO_WEIGHT = 20.0  # the same of all servo recordings in a folder
 
 
-def fit(training: Records, real: Records, servo: Records, left_out: str = "") -> Posterior:
+def fit(training: Records, real: Records, servo: Records, left_out: str = "") -> CausePosterior:
     """Fit the posterior to simulated and measured loops, without one of the latter or one folder."""
     features, possible, weights = [training.features], [training.possible], [np.ones(len(training.features))]
     for records, weight in ((real, LOOP_WEIGHT), (servo, SERVO_WEIGHT)):
@@ -33,7 +33,7 @@ def fit(training: Records, real: Records, servo: Records, left_out: str = "") ->
         possible.append(records.possible[kept])
         weights.append(np.array([share[str(loop)] for loop in records.loops[kept]]))
     stacked = np.vstack(features), np.vstack(possible), np.concatenate(weights)
-    return Posterior.fit(training.names, *stacked, PENALTY)
+    return CausePosterior.fit(training.names, *stacked, PENALTY)
 
 
 def main() -> None:

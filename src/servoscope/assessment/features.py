@@ -26,7 +26,7 @@ class Analysis:
 
     features: dict[str, float]  # by name; bounded numbers for the posterior
     oscillation: Oscillation | None  # of the control error, in samples of the log as thinned
-    evidence: models.Evidence  # at the scale at which stick-slip explains most
+    evidence: models.ModelComparison  # at the scale at which stick-slip explains most
     linear: models.ModelFit  # at the finer scale
     margins: models.Margins
     thinned: int  # samples of the log in one sample of the analysis
@@ -123,7 +123,7 @@ def _thinning(samples: int, oscillation: Oscillation | None) -> int:
 
 
 def _scale_features(
-    fit: models.Evidence, margins: models.Margins, u: FloatArray, y: FloatArray, scale: int
+    fit: models.ModelComparison, margins: models.Margins, u: FloatArray, y: FloatArray, scale: int
 ) -> dict[str, float]:
     f: dict[str, float] = {}
     for name, model, more in (

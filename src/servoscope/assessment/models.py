@@ -19,9 +19,10 @@ ORDER = 3  # lags of y
 INPUTS = 2  # lags of x
 MAX_DELAYS = 15  # tried with the linear loop
 SIZES = tuple(np.geomspace(0.06, 0.95, 15).tolist())  # S over the range of u; slips depend on it sharply
-JUMPS = (0.0, 0.3, 0.6, 0.9)  # J over S; 0 is a dead band
+JUMPS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)  # J over S; 0 is a dead band
 FINER_SIZES = (0.88, 0.92, 0.96, 1.0, 1.04, 1.08, 1.12)  # around the best of the grid
-FINER_JUMPS = (0.6, 1.0, 1.5)
+FINER_JUMPS = (0.8, 1.0, 1.25)
+KEPT, REFINED = 8, 3  # points of the grid that are fitted at all scales, and searched around
 CLIPS = (0.7, 0.85, 0.95)  # quantiles of u from which on the actuator would not follow
 
 
@@ -35,7 +36,7 @@ class ModelFit(NamedTuple):
     jump: float = 0.0  # J [units of u]
 
 
-class Evidence(NamedTuple):
+class ModelComparison(NamedTuple):
     """The best fit of each kind of model to a record of M samples."""
 
     alone: ModelFit  # y from its own past, without u
@@ -72,32 +73,31 @@ def stick_slip(u: FloatArray, static: FloatArray, kinetic: FloatArray) -> FloatA
     return out
 
 
-def compare_models(u: FloatArray, y: FloatArray, period: float, scales: Sequence[int] = (1,)) -> list[Evidence]:
+def compare_models(u: FloatArray, y: FloatArray, period: float, scales: Sequence[int] = (1,)) -> list[ModelComparison]:
     """Fit all models to equidistant samples of u and y, shape (N,); period of the oscillation [samples].
 
     `scales`: how many neighbours are averaged before the fit, once per result: noise hides in one step what is plain
-    over several. Stick band and jump are searched on a grid, and then around its best two points.
+    over several. Stick band and jump are searched on a grid, and then around its best points.
     """
     low, high = np.quantile(u, [0.01, 0.99])
     span = max(float(high - low), 1e-12)
     grid = np.array([(s * span, j * s * span) for s in SIZES for j in JUMPS])
     lanes = _positions(u, grid)
-    delays = _delays(u, y, period)
-    fits = fit_models(lanes, y, delays)
-    ranked = sorted(np.flatnonzero(grid[:, 1] > 0.0).tolist(), key=lambda i: fits[i].variance)[:2]
-    finer = np.array([grid[i] * (s, s * j) for i in ranked for s in FINER_SIZES for j in FINER_JUMPS])
+    probe = scales[min(1, len(scales) - 1)]  # where the likelihood is smooth, and cheap
+    averaged = thin(u, probe), thin(y, probe)
+    fits = fit_models(thin(lanes, probe), averaged[1], _delays(*averaged, period / probe))
+    ranked = sorted(np.flatnonzero(grid[:, 1] > 0.0).tolist(), key=lambda i: fits[i].variance)[:KEPT]
+    finer = np.array([grid[i] * (s, s * j) for i in ranked[:REFINED] for s in FINER_SIZES for j in FINER_JUMPS])
     finer[:, 1] = np.minimum(finer[:, 1], finer[:, 0])
+    kept = [*ranked, *np.flatnonzero(grid[:, 1] == 0.0).tolist()]
+    lanes, grid = np.concatenate([lanes[kept], _positions(u, finer)]), np.concatenate([grid[kept], finer])
     edges = np.quantile(u, [*CLIPS, *(1.0 - q for q in CLIPS)])
     clipped = [np.minimum(u, edge) if i < len(CLIPS) else np.maximum(u, edge) for i, edge in enumerate(edges)]
-    around = np.unique(np.clip(fits[ranked[0]].delay + np.arange(-3, 4), 0, None))
-    more = _positions(u, finer)
-    known = [*fits, *fit_models(more, y, around)]
-    lanes, grid = np.concatenate([lanes, more]), np.concatenate([grid, finer])
-    evidence = [_compare(lanes, np.stack([u, *clipped]), y, period, grid, edges, known)]
-    for scale in scales[1:]:
-        thinned = thin(lanes, scale), thin(np.stack([u, *clipped]), scale), thin(y, scale)
-        evidence.append(_compare(*thinned, period / scale, grid, edges, None))
-    return evidence
+    plain = np.stack([u, *clipped])
+    return [
+        _compare(thin(lanes, scale), thin(plain, scale), thin(y, scale), period / scale, grid, edges)
+        for scale in scales
+    ]
 
 
 def _positions(u: FloatArray, grid: FloatArray) -> FloatArray:
@@ -126,17 +126,16 @@ def _compare(
     period: float,
     grid: FloatArray,
     edges: FloatArray,
-    known: list[ModelFit] | None,
-) -> Evidence:
-    """Return the best of each kind; plain: u, and u clipped at each edge; known: fits of the lanes, if there are."""
+) -> ModelComparison:
+    """Return the best of each kind; plain: u, and u clipped at each edge."""
     delays = _delays(plain[0], y, period)
     wave = 2.0 * np.pi * np.arange(y.size) / period
-    fits = known or fit_models(lanes, y, delays)
+    fits = fit_models(lanes, y, delays)
     linear, *clips = fit_models(plain, y, delays)
     (outside,) = fit_models(plain[:1], y, delays, np.stack([np.cos(wave), np.sin(wave)]))
     (alone,) = fit_models(np.zeros((1, y.size)), y, delays[-1:])
     slips = [fit._replace(size=s, jump=j) for fit, (s, j) in zip(fits, grid.tolist(), strict=True)]
-    return Evidence(
+    return ModelComparison(
         alone,
         linear,
         min((fit for fit in slips if fit.jump > 0.0), key=_variance),

@@ -32,7 +32,7 @@ PENALTY = 4e-3  # on squared weights, per record
 
 
 @dataclass(frozen=True)
-class Posterior:
+class CausePosterior:
     """P(cause | x) is softmax(W z + b), z: features relative to mean and standard deviation, clipped."""
 
     names: tuple[str, ...]
@@ -53,7 +53,7 @@ class Posterior:
     @classmethod
     def fit(
         cls, names: tuple[str, ...], features: FloatArray, possible: BoolArray, weights: FloatArray, penalty: float
-    ) -> Posterior:
+    ) -> CausePosterior:
         """Fit to records of which the possible causes are known, (N, causes); weights: of each record, (N,).
 
         A record with several possible causes counts with the sum of their probabilities.
@@ -96,8 +96,8 @@ def _expand(features: FloatArray, mean: FloatArray, std: FloatArray) -> FloatArr
 
 
 @cache
-def load_posterior() -> Posterior:
+def load_posterior() -> CausePosterior:
     """Return the posterior that comes with servoscope; `benchmarks/assessment/train.py` writes it."""
     plain = json.loads(files("servoscope.assessment").joinpath("posterior.json").read_text(encoding="utf-8"))
     mean, std, weights = (np.array(plain[name]) for name in ("mean", "std", "weights"))
-    return Posterior(tuple(plain["names"]), mean, std, weights.reshape(-1, len(CAUSES)))
+    return CausePosterior(tuple(plain["names"]), mean, std, weights.reshape(-1, len(CAUSES)))

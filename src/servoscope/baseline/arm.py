@@ -31,7 +31,7 @@ PAYLOAD_SIZES = (2.0, 0.5, 0.5, 0.5)
 FRICTION_SIZE, LOAD_SIZE, TORQUE_SIZE, GAIN_SIZE, ENCODER_SIZE, RIPPLE_SIZE = 0.5, 0.1, 0.3, 0.2, 0.05, 0.1
 
 
-class Cause(NamedTuple):
+class ArmCause(NamedTuple):
     """A way in which an arm changes: columns of `ArmBaseline.deviations` that are free, and what it is called."""
 
     kind: str
@@ -137,7 +137,7 @@ class ArmBaseline(BaselineModel):
         return deviation_columns(self.model, signals, design, np.array(self.theta))
 
     @cached_property
-    def causes(self) -> tuple[Cause, ...]:
+    def causes(self) -> tuple[ArmCause, ...]:
         """The changes that are told apart."""
         return arm_causes(self.model)
 
@@ -242,7 +242,7 @@ def deviation_scales(model: ArmModel, theta: FloatArray, torque: FloatArray) -> 
     return np.array(scales)
 
 
-def arm_causes(model: ArmModel) -> tuple[Cause, ...]:
+def arm_causes(model: ArmModel) -> tuple[ArmCause, ...]:
     """Return the changes that are told apart, as columns of `deviation_columns`; the last is any of them at once."""
     found, coulombs = [], []
     first = len(PAYLOAD)
@@ -250,19 +250,19 @@ def arm_causes(model: ArmModel) -> tuple[Cause, ...]:
         viscous, coulomb, load, offset, sine, cosine, gain = range(first, first + 7)
         coulombs.append(coulomb)
         found += [
-            Cause("friction", name, (coulomb,), "coulomb_friction"),
-            Cause("friction", name, (viscous,), "viscous_friction"),
-            Cause("friction", name, (coulomb, viscous, load), "coulomb_friction"),
-            Cause("offset", name, (offset,), "offset"),
-            Cause("counterbalance", name, (sine, cosine, offset), "counterbalance"),
-            Cause("drive gain", name, (gain,), "gain"),
+            ArmCause("friction", name, (coulomb,), "coulomb_friction"),
+            ArmCause("friction", name, (viscous,), "viscous_friction"),
+            ArmCause("friction", name, (coulomb, viscous, load), "coulomb_friction"),
+            ArmCause("offset", name, (offset,), "offset"),
+            ArmCause("counterbalance", name, (sine, cosine, offset), "counterbalance"),
+            ArmCause("drive gain", name, (gain,), "gain"),
         ]
         for index, period in enumerate(joint.ripple):
             sines = first + 7 + 2 * index, first + 8 + 2 * index
-            found.append(Cause("gear ripple", name, sines, f"ripple {period:g}"))
+            found.append(ArmCause("gear ripple", name, sines, f"ripple {period:g}"))
         first += 8 + 2 * len(joint.ripple)
-        found.append(Cause("encoder offset", name, (first - 1,), "encoder"))
+        found.append(ArmCause("encoder offset", name, (first - 1,), "encoder"))
     # a payload loads the gears, which rub more then
     payload = tuple(range(len(PAYLOAD)))
-    found += [Cause("payload", "", payload, "m"), Cause("payload", "", (*payload, *coulombs), "m")]
-    return (*found, Cause(UNKNOWN, "", tuple(range(first)), UNKNOWN))
+    found += [ArmCause("payload", "", payload, "m"), ArmCause("payload", "", (*payload, *coulombs), "m")]
+    return (*found, ArmCause(UNKNOWN, "", tuple(range(first)), UNKNOWN))

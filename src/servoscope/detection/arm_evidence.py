@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.arm import Cause
+from servoscope.baseline.arm import ArmCause
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.arm_regression import Information
 
-SHORTEST_END = 3  # blocks of a recording that a change has to last
+MIN_END_BLOCKS = 3  # blocks of a recording that a change has to last
 INTERVAL = 1.96  # standard deviations, on both sides
 EM_STEPS = 25  # of expectation and maximisation, after which the variances have settled
 SIMULATED_RECORDINGS = 1000  # healthy ones, from which the limit comes
@@ -28,7 +28,7 @@ BETWEEN_SHARE, DRIFT_SHARE = 0.1, 0.02  # prior of recordings and halves, as a s
 class CauseEvidence(NamedTuple):
     """What a recording says of one cause."""
 
-    cause: Cause
+    cause: ArmCause
     log_factor: float  # logarithm of its Bayes factor against no change, over all onsets
     onset: FloatArray  # (K,) probability of each block to be the first that has changed
     size: FloatArray  # (k,) of its columns, over all onsets
@@ -52,11 +52,16 @@ class ChangeTest:
     """
 
     def __init__(
-        self, information: Information, prior: FloatArray, causes: Sequence[Cause], scale: FloatArray, drift: FloatArray
+        self,
+        information: Information,
+        prior: FloatArray,
+        causes: Sequence[ArmCause],
+        scale: FloatArray,
+        drift: FloatArray,
     ) -> None:
         self._information, self._prior, self._causes, self._drift = information, prior, causes, drift
         first = prior.shape[0] - scale.size
-        A = information.A[::-1].cumsum(0)[::-1][: max(1, len(information.A) - SHORTEST_END)]
+        A = information.A[::-1].cumsum(0)[::-1][: max(1, len(information.A) - MIN_END_BLOCKS)]
         self._gain = np.linalg.solve(information.A.sum(0) + prior, A[:, :, first:])
         R = A[:, first:, first:] - A[:, first:] @ self._gain
         # what changes within healthy recordings may change in any direction, whatever the cause: (R^-1 + drift^2)^-1

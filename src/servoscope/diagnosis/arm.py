@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.arm import UNKNOWN, ArmBaseline, Cause
+from servoscope.baseline.arm import UNKNOWN, ArmBaseline, ArmCause
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.messages import Message, message
@@ -228,7 +228,7 @@ def _joint(name: str) -> Message | None:
     return message("arm.of_joint", joint=name) if name else None
 
 
-def _of(cause: Cause) -> Message | None:
+def _of(cause: ArmCause) -> Message | None:
     return _joint(cause.joint)
 
 

@@ -30,7 +30,7 @@ GAINS = (12.0, 12.0, 10.0, 9.0, 9.0, 8.0)  # N m/A
 AMPLITUDE = (1.2, 0.5, 0.7, 1.2, 1.0, 1.5)  # rad
 CENTRE = (0.0, 0.4, -0.3, 0.0, 0.5, 0.0)  # rad
 HARMONICS = 5
-LONGEST_PERIOD_S = 10.0
+MAX_PERIOD_S = 10.0
 DAY_SPREAD, TORQUE_NOISE, ANGLE_NOISE = 0.03, 0.02, 2e-5  # of friction; of the rms current; rad
 EXAMPLE_S = 40.0  # of the logs of `write_example`
 ITERATIONS = 8  # of the motion, which is then known to 1e-7 rad
@@ -112,7 +112,7 @@ def simulate_arm(seed: int, duration_s: float = 60.0, change: ArmChange | None =
 
 def _motion(rng: np.random.Generator, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return position, velocity and acceleration of a random sum of sines, (N, n) each."""
-    w = 2.0 * np.pi / LONGEST_PERIOD_S * np.arange(1, HARMONICS + 1)
+    w = 2.0 * np.pi / MAX_PERIOD_S * np.arange(1, HARMONICS + 1)
     size = rng.normal(size=(len(AMPLITUDE), HARMONICS)) / np.arange(1, HARMONICS + 1)
     size *= (np.array(AMPLITUDE) / np.abs(size).sum(1))[:, None]
     angle = t[:, None, None] * w + rng.uniform(0.0, 2.0 * np.pi, size.shape)
