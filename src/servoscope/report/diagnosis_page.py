@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.messages import translate
+from servoscope.core.messages import clock_of, format_moment, translate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.checks import checks_of_fault
 from servoscope.diagnosis.diagnose import diagnose_with_trace
@@ -160,6 +160,9 @@ def _fault_facts(diagnosis: Diagnosis) -> Iterator[Fact]:
     seen = () if detected is None else (say("report.detected", time=format_clock_time(detected, decimals)),)
     if onset is not None:
         low, likely, high = (format_clock_time(time, decimals) for time in onset)
+        if diagnosis.began is not None:
+            with clock_of(diagnosis.began):
+                likely = format_moment(onset[1])
         yield Fact("Since when", likely, (say("report.interval", low=low, high=high), *seen))
     elif seen:
         yield Fact("Since when", "not known", seen)

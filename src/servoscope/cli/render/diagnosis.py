@@ -10,9 +10,9 @@ from rich.padding import Padding
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, INDENT, print_facts, print_notes, print_table, print_title
-from servoscope.core.messages import translate, translate_range
+from servoscope.core.messages import clock_of, format_moment, translate, translate_range
 from servoscope.core.number_format import format_ratios, format_short
-from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary, sum_up
 from servoscope.isolation.candidate import Candidate
 from servoscope.report.format_values import format_duration, format_probability
 from servoscope.report.page import say
@@ -24,16 +24,23 @@ MIN_PROBABILITY_SHOWN = 0.01
 
 def print_diagnosis(out: Console, d: Diagnosis, details: bool = False) -> None:
     """Print a verdict, what to check, what it rests on, and the warnings; with `details` the statistics too."""
-    print_title(out, d.recording, f": {format_duration(d.duration_s)}, {d.samples} {translate('samples')}")
+    with clock_of(d.began):
+        _print_diagnosis(out, d, details)
+
+
+def _print_diagnosis(out: Console, d: Diagnosis, details: bool) -> None:
+    size = f": {format_duration(d.duration_s)}, {d.samples} {translate('samples')}"
+    print_title(out, d.recording, size if d.began is None else f"{size}, {say('cli.dates', zone=d.zone or 'local')}")
     out.print(Padding(Text(str(d.summary), style=f"bold {COLOURS[d.verdict]}"), INDENT, expand=False))
     facts = [("what to check", str(check)) for check in d.checks]
     if d.faults:
         facts.append(("how sure", format_probability(d.probability or 0.0)))
     if d.onset_s is not None:
         low, likely, high = d.onset_s
-        facts.append(("onset", f"{likely:.4g} s ({low:.4g} to {high:.4g} s, 95 %)"))
+        at = f"{likely:.4g} s" if d.began is None else format_moment(likely)
+        facts.append(("onset", f"{at} ({low:.4g} to {high:.4g} s, 95 %)"))
     if d.detected_at_s is not None:
-        facts.append(("detected", f"{d.detected_at_s:.4g} s"))
+        facts.append(("detected", f"{d.detected_at_s:.4g} s" if d.began is None else format_moment(d.detected_at_s)))
     if facts:
         print_facts(out, facts)
     if d.current.end_interval_s is not None or len(d.intervals) > 1:
@@ -97,7 +104,7 @@ def _print_candidates(out: Console, shown: Sequence[Candidate]) -> None:
 
 def _print_warnings(out: Console, warnings: Sequence[DiagnosisWarning]) -> None:
     texts = []
-    for w in warnings:
+    for w in sum_up(warnings):
         when = f"{w.from_s:.6g} s" if w.from_s == w.to_s else translate_range(f"{w.from_s:.6g} to {w.to_s:.6g} s")
         # What the recording can show at all is no matter of time.
         texts.append(str(w.message) if w.kind == "power" else f"{when}: {w.message}")
