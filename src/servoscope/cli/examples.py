@@ -2,6 +2,7 @@
 
 EXAMPLES = {
     "assess": "servoscope assess plant/ --csv work-list.csv",
+    "assess": "servoscope assess loops --csv worst.csv",
     "demo": "servoscope demo -o demo",
     "tutorial": "servoscope tutorial -o tutorial",
     "init": "servoscope init monday.csv --columns 'u=Current' -o loop.toml",

@@ -141,6 +141,16 @@ def read_rows(
     return {part.name: part.samples() for part in parts}
 
 
+def read_channels(path: Source, columns: Columns) -> tuple[str, FloatArray, dict[str, FloatArray]]:
+    """Return the name of a file, its time stamps [s] as logged (N,), and the covariates of `columns`, (N,) each.
+
+    Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
+    """
+    rows = _read_log(path, None, columns, {}, None).parts[""]
+    (t, *_), _, channels = rows.split_columns()
+    return rows.name, t, channels
+
+
 def first_time(path: str | Path, loop: Loop) -> float:
     """Return the first time stamp of a file [s since 1970, or since its own beginning]; NaN if it has none.
 
@@ -288,7 +298,7 @@ class LoggedRows:
     def _rate(self) -> float | None:
         return self._loop.sample_rate if self._loop is not None else None
 
-    def _split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
+    def split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
         """Return t, r, u and y; the runs, if there are some; the channels."""
         columns = [column.to_array() for column in self._columns]
         if not self._has_time:
@@ -304,7 +314,7 @@ class LoggedRows:
         """
         if self._target is not None:
             return self.recording()
-        (t, *signals), run, channels = self._split_columns()
+        (t, *signals), run, channels = self.split_columns()
         axis = build_time_axis(t, run, self._rate, self.name)
         r, u, y = map(axis.reorder, signals)
         return Samples.from_columns(
@@ -313,7 +323,7 @@ class LoggedRows:
 
     def dated_recording(self, log: Log) -> Recording:
         """Return the rows cleaned; time stamps that are seconds since 1970 count from the first of them."""
-        (t, *signals), run, each = self._split_columns()
+        (t, *signals), run, each = self.split_columns()
         began = log.origin
         if not began and t.size and MIN_EPOCH_S < t[0] < MAX_EPOCH_S:
             began = float(np.floor(t[0]))
@@ -325,7 +335,7 @@ class LoggedRows:
 
     def recording(self) -> Recording:
         """Return the rows cleaned."""
-        signals, run, each = self._split_columns()
+        signals, run, each = self.split_columns()
         return self._clean(signals, run, each)
 
     def _clean(self, signals: list[FloatArray], run: FloatArray | None, each: dict[str, FloatArray]) -> Recording:
