@@ -1,7 +1,6 @@
 """An example of each command, which its ``--help`` ends with."""
 
 EXAMPLES = {
-    "assess": "servoscope assess plant/ --csv work-list.csv",
     "assess": "servoscope assess loops --csv worst.csv",
     "demo": "servoscope demo -o demo",
     "tutorial": "servoscope tutorial -o tutorial",
