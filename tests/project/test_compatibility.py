@@ -31,6 +31,8 @@ ADDED = {
         "headline",
         "reasons",
         "intervals",
+        "began",
+        "zone",
         "description",
         "sensors",
         "provenance",

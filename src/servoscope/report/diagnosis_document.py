@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from servoscope.core.messages import message, render, translate
+from servoscope.core.messages import clock_of, format_moment, message, render, translate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.change_words import fault_label
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
-from servoscope.diagnosis.result import Diagnosis, FaultInterval, Mimic, RefitSummary, ResponsePoint
+from servoscope.diagnosis.result import Diagnosis, FaultInterval, Mimic, RefitSummary, ResponsePoint, sum_up
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.report.document import (
     DETAILS,
@@ -76,6 +76,11 @@ class DiagnosisContext(NamedTuple):
 def diagnosis_document(d: Diagnosis, context: DiagnosisContext | None = None) -> Document:
     """Return the sections of a diagnosis."""
     known = context or DiagnosisContext()
+    with clock_of(d.began if known.began is None else None):
+        return _sections(d, known)
+
+
+def _sections(d: Diagnosis, known: DiagnosisContext) -> Document:
     sections = (
         _headline(d, known),
         Section("What to check", tuple(_checks(d, known)), HEADLINE),
@@ -141,6 +146,8 @@ def _fault_facts(d: Diagnosis, known: DiagnosisContext) -> Iterator[Fact]:
         yield Fact("Since when", say("report.before", time=known.moment(0.0)), seen)
     elif onset is not None:
         low, likely, high = (known.moment(t, decimals) for t in onset)
+        if d.began is not None and known.began is None:  # a log with dates
+            likely = format_moment(onset[1])
         yield Fact("Since when", likely, (say("report.interval", low=low, high=high), *seen))
     elif seen:
         yield Fact("Since when", "not known", seen)
@@ -254,11 +261,12 @@ def _warnings(d: Diagnosis, known: DiagnosisContext) -> tuple[Part, ...]:
     def when(low: float, high: float) -> str:
         return f"{low:.2f}" if low == high else say("report.range", low=f"{low:.2f}", high=f"{high:.2f}")
 
+    warnings = sum_up(d.warnings)
     rows = [
         (when(w.from_s, w.to_s).replace("-", "−"), translate(fault_label(w.kind)), w.message, format_count(w.count))
-        for w in d.warnings[:MAX_WARNINGS]
+        for w in warnings[:MAX_WARNINGS]
     ]
-    more = len(d.warnings) - MAX_WARNINGS
+    more = len(warnings) - MAX_WARNINGS
     rest = (Notes((say("report.more", count=format_count(more), where=None),)),) if more > 0 else ()
     return (ResultTable(("Time [s]", "Kind", "What happened", "Rows"), rows, words=3), *rest) if rows else ()
 

@@ -24,7 +24,8 @@ from servoscope.report.page import ResultTable, say
 
 def print_diagnosis(out: Console, d: Diagnosis, details: bool = False) -> None:
     """Print a verdict, what to check, what it rests on, and the warnings; with `details` the statistics too."""
-    print_title(out, d.recording, f": {format_duration(d.duration_s)}, {d.samples} {translate('samples')}")
+    size = f": {format_duration(d.duration_s)}, {d.samples} {translate('samples')}"
+    print_title(out, d.recording, size if d.began is None else f"{size}, {say('cli.dates', zone=d.zone or 'local')}")
     print_document(out, diagnosis_document(d), COLOURS[d.verdict], details=details)
     if d.reasons and not details:
         out.print(Padding(Text(say("cli.folded"), style="dim"), INDENT, expand=False))

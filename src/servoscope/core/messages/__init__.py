@@ -40,9 +40,11 @@ __all__ = [
     "MessageText",
     "add_words",
     "catalogue",
+    "clock_of",
     "count_words",
     "current_language",
     "current_zone",
+    "format_moment",
     "languages",
     "message",
     "read_messages",
@@ -111,6 +113,28 @@ def speak(name: str, zone: str | None = None) -> Iterator[None]:
     finally:
         _spoken.reset(before)
         _zone.reset(clock)
+
+
+_began: ContextVar[float | None] = ContextVar("began", default=None)
+
+
+@contextlib.contextmanager
+def clock_of(began: float | None) -> Iterator[None]:
+    """Write moments as dates, those of a recording that began then [s since 1970], in this thread for a while."""
+    before = _began.set(began)
+    try:
+        yield
+    finally:
+        _began.reset(before)
+
+
+def format_moment(seconds: float) -> str:
+    """Return a moment of a recording [s since its beginning], with its date where `clock_of` gives the beginning."""
+    began = _began.get()
+    if began is None:
+        return f"{seconds:.1f} s"
+    date = datetime.fromtimestamp(round(began + seconds, 1), UTC)
+    return render(message("date.after_start", date=f"{date:%Y-%m-%d %H:%M:%S.%f}"[:-5], seconds=seconds))
 
 
 class Message(BaseModel):
@@ -217,6 +241,8 @@ FORMATS: Mapping[str, Callable[[Any], str]] = {
     "share": format_share,
     "probability": _format_probability,
     "utc": _format_utc,
+    "moment": format_moment,
+    "first_moment": lambda value: format_moment(value).removesuffix(" s"),  # whose unit follows the second one
     "capitalised": lambda value: str(value)[:1].upper() + str(value)[1:],
 }
 JOINS: Mapping[str, str] = {

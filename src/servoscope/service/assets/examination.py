@@ -177,7 +177,7 @@ def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> S
     since = diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
     onset = start + since if since is not None else None
     signature = signature_columns(recording, baseline.loop, since)
-    document = {"began": start, "signature": signature, **diagnosis.model_dump(mode="json")}
+    document = {**diagnosis.model_dump(mode="json"), "began": start, "signature": signature}
     headline = diagnosis.dated_headline(start)
     return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
 
