@@ -138,7 +138,7 @@ def _judge_sound_part(
     baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     """Return what `_diagnose_at_point` does, of the recording up to a signal that is stuck or jumps."""
-    defect = find_signal_defect(recording)
+    defect = find_signal_defect(recording, baseline.loop.delay)
     if defect is not None:
         sound = recording.part(float(recording.t[0]), float(recording.t[max(defect.begin, MIN_SAMPLES)]))
         diagnosis, exam, correction = _judge_signals(baseline, sound, progress, point)

@@ -67,17 +67,22 @@ class DiagnosisContext(NamedTuple):
     onset: float | None = None
     trace: Trace | None = None
     false_alarms_per_year: float | None = None
+    dated: bool = False  # whether the recording has dates of its own
 
     def moment(self, t: float, decimals: int = 1) -> str:
         """Return a time of the recording, as a date where it has one."""
-        return format_clock_time(t, decimals) if self.began is None else say("report.date", t=self.began + t)
+        if self.began is not None:
+            return say("report.date", t=self.began + t)
+        return format_moment(t) if self.dated else format_clock_time(t, decimals)
 
 
 def diagnosis_document(d: Diagnosis, context: DiagnosisContext | None = None) -> Document:
     """Return the sections of a diagnosis."""
     known = context or DiagnosisContext()
-    with clock_of(d.began if known.began is None else None):
+    if known.began is not None or d.began is None:
         return _sections(d, known)
+    with clock_of(d.began):
+        return _sections(d, known._replace(dated=True))
 
 
 def _sections(d: Diagnosis, known: DiagnosisContext) -> Document:
@@ -146,8 +151,6 @@ def _fault_facts(d: Diagnosis, known: DiagnosisContext) -> Iterator[Fact]:
         yield Fact("Since when", say("report.before", time=known.moment(0.0)), seen)
     elif onset is not None:
         low, likely, high = (known.moment(t, decimals) for t in onset)
-        if d.began is not None and known.began is None:  # a log with dates
-            likely = format_moment(onset[1])
         yield Fact("Since when", likely, (say("report.interval", low=low, high=high), *seen))
     elif seen:
         yield Fact("Since when", "not known", seen)

@@ -19,6 +19,7 @@ from servoscope.isolation.ml.hypothesis import (
     SizePrior,
     fit_hypothesis,
     integrate_evidence,
+    log_ratio_bounds,
     refit_contenders_jointly,
     refit_jointly,
 )
@@ -37,6 +38,9 @@ MAX_LOOKS = 4  # for the onset, each with the sizes that fit the one before
 ONSET_MISFIT_VARIANCES = 100.0  # variances by which a fit at another onset is worse if that onset is none
 MIN_LOOK_GAIN = 1.0  # of the sum of squares that a look gained, for another one
 MAX_PAIR_MISFIT = 10.0  # of what noise leaves unexplained at most, from which a pair is not followed to its onset
+WIDE_RATIO_RANGE = (0.02, 500.0)  # of a fault whose best size lies at an end of its own range
+MAX_WIDER_SEARCHES = 3  # each with more faults of that range: one, then a pair
+BOUND_SHARE = 1e-3  # of the logarithmic range, within which a size lies at its end
 MAX_SHARP_ONSET_SAMPLES = 20  # samples of an onset's interval, up to which the step is loud
 
 
@@ -111,12 +115,39 @@ def fit_hypotheses(
     faults = baseline.plant.all_faults
     if baseline.axis is not None:
         faults = baseline.axis.visible_faults(faults)
-    return _HypothesisSearch(onset_window(baseline, recording, onset, last), faults, onset, announced, progress).run()
+    return _search(onset_window(baseline, recording, onset, last), faults, onset, announced, progress)
 
 
 def fit_stretch(window: ChangeWindow, faults: Sequence[Fault], progress: Callable[[], None]) -> RefitResult:
     """Fit every fault and every pair to a window in which the plant differs from healthy from the first sample on."""
-    return _HypothesisSearch(window, faults, window.first_sample, window.first_sample, progress).run()
+    return _search(window, faults, window.first_sample, window.first_sample, progress)
+
+
+def _search(
+    window: ChangeWindow, faults: Sequence[Fault], onset: int, announced: int, progress: Callable[[], None]
+) -> RefitResult:
+    """Search, with wider ranges while the best size lies at the end of one: a pair stands in for a severe fault there.
+
+    What lies at the end of the widest range has no name.
+    """
+    for _ in range(MAX_WIDER_SEARCHES):
+        result = _HypothesisSearch(window, faults, onset, announced, progress).run()
+        ends = [fault for fault in _faults_at_ends(result.best.fitted) if fault.ratio_range != WIDE_RATIO_RANGE]
+        if not ends:
+            break
+        faults = [replace(fault, ratio_range=WIDE_RATIO_RANGE) if fault in ends else fault for fault in faults]
+    named = [replace(h, probability=0.0) if _faults_at_ends(h.fitted) else h for h in result.hypotheses]
+    lost = sum(h.probability for h in result.hypotheses) - sum(h.probability for h in named)
+    named.sort(key=lambda hypothesis: -hypothesis.probability)  # stable: where all vanish, the likeliest stays first
+    return replace(result, hypotheses=tuple(named), unknown_probability=result.unknown_probability + lost)
+
+
+def _faults_at_ends(fitted: HypothesisFit) -> list[Fault]:
+    """Return the faults of a hypothesis whose sizes lie at an end of their ranges."""
+    low, high = log_ratio_bounds(fitted.faults)
+    near = BOUND_SHARE * (high - low)
+    at_end = (fitted.x <= low + near) | (fitted.x >= high - near)
+    return [fault for fault, at in zip(fitted.faults, at_end, strict=True) if at]
 
 
 class _HypothesisSearch:
@@ -125,7 +156,7 @@ class _HypothesisSearch:
     ) -> None:
         self.window, self.faults, self.progress = window, faults, progress
         # a ray is several parameters at once already: pairs are made of the plant's own faults
-        self.rays = tuple(ray.fault for ray in window.plant.rays)
+        self.rays = {ray.fault.name for ray in window.plant.rays}
         self.latest = min((announced - window.first_sample) // window.stride, window.samples - 1)
         self.initial_onset = max(min((onset - window.first_sample) // window.stride, self.latest), 0)
         self.profile = ChangeProfile(self.initial_onset)
@@ -140,7 +171,7 @@ class _HypothesisSearch:
         self.profile = found.profile
         pairs = [
             self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
-            for one, other in combinations([f for f in singles if f.faults[0] not in self.rays], 2)
+            for one, other in combinations([f for f in singles if f.faults[0].name not in self.rays], 2)
         ]
         found, best = self._iterate_onset(found, [*singles, *pairs])
         everything = [best] if self._is_hopeless(best) else self._follow_onset([*singles, *pairs])
