@@ -29,7 +29,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_demo_says_what_it_does_and_leaves_all_its_files(tmp_path: Path) -> None:
     result = run("demo", "-o", tmp_path / "out")
     assert result.code == 0
-    assert "C_ie is 1.2" in result.out or "C_ie is 1.19" in result.out
+    assert "leakage has risen by a fifth" in result.out and "C_ie × 1.199" in result.out
     assert result.out.count("$ servoscope ") == 4
     commands = [line for line in result.out.splitlines() if line.startswith(("$", "    "))]
     assert all(len(line) <= 80 or len(line.split()) <= 3 for line in commands)
@@ -128,7 +128,7 @@ def test_learn_keeps_its_columns_in_the_baseline(made: Path, tmp_path: Path) -> 
     assert run("learn", made / "loop.toml", tmp_path / "healthy.csv", "-o", baseline, *mapping).code == 0
     result = run("diagnose", baseline, tmp_path / "suspect.csv")
     assert result.code == 0
-    assert "C_ie is 1.2" in result.out or "C_ie is 1.19" in result.out
+    assert "leakage has risen by a fifth" in result.out and "C_ie × 1.199" in result.out
     assert run("diagnose", baseline, made / "suspect.csv", "--columns", "t=t, u=u").code == 0
 
 
@@ -282,7 +282,7 @@ def test_a_reader_that_leaves_is_no_error(made: Path) -> None:
     gone.stdout.close()
     err = gone.stderr.read()
     gone.stderr.close()
-    assert gone.wait() == 1
+    assert gone.wait() == 0
     assert err == ""
 
 
