@@ -13,6 +13,7 @@ from servoscope.models.arm.model import ArmModel
 EVENT_WINDOW_S = 0.5  # over which the torque is averaged
 EVENT_MARGIN = 2.0  # times the largest of healthy recordings
 MIN_EVENT_LIMIT = 8.0  # times the noise
+MIN_EVENT_SHARE = 0.2  # share of the rms torque of a joint
 BREAKAWAY = 1.5  # times Coulomb friction that may hold a joint at rest
 MAX_EVENT_S = 8.0  # what lasts longer is a change
 MAX_EVENT_SHARE = 0.5  # share of the recording's time that events may take

@@ -26,6 +26,7 @@ from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.signals.readers.arm_log import ArmRecording
 
 MIN_CERTAINTY = 0.9  # probability from which a cause is named
+MIN_EXPLAINED = 0.5  # share of the evidence of an unknown change from which one cause is named all the same
 MIN_PROBABILITY = 0.01  # of a cause that is listed
 MIN_RIVAL_PROBABILITY = 0.05  # of a cause that the headline of an open answer lists
 MAX_FACTOR = 20.0  # power of ten up to which evidence is written
@@ -183,6 +184,13 @@ def _explain(
     baseline: ArmBaseline, evidence: ChangeEvidence
 ) -> tuple[Verdict, Message, FaultInterval, tuple[Message, ...]]:
     """Return verdict, headline, interval and reasons of a change."""
+    named = [index for index, each in enumerate(evidence.causes) if each.cause.kind != UNKNOWN]
+    explained = evidence.causes[named[0]].log_factor / max(evidence.log_factor, 1e-9)
+    remains = named[0] > 0 and explained >= MIN_EXPLAINED
+    if remains:  # one cause explains most: what remains is told, and hides no name
+        causes = tuple(evidence.causes[index] for index in named)
+        logs = np.array([each.log_factor for each in causes])
+        evidence = evidence._replace(causes=causes, probability=np.exp(logs - np.logaddexp.reduce(logs)))
     groups: dict[tuple[str, str], list[int]] = defaultdict(list)
     for index, each in enumerate(evidence.causes):
         groups[each.cause.kind, each.cause.joint].append(index)
@@ -207,7 +215,8 @@ def _explain(
         candidates=tuple(candidates),
     )
     factor = min(np.floor(evidence.log_factor / np.log(10.0)), MAX_FACTOR)
-    reasons = (message("arm.evidence", factor=float(factor), limit=float(np.exp(baseline.limit))),)
+    reasons: tuple[Message, ...] = (message("arm.evidence", factor=float(factor), limit=float(np.exp(baseline.limit))),)
+    reasons += (message("arm.remains"),) if remains else ()
     if certain and best.cause.kind == "payload" and baseline.loop.payload == "change":
         return "healthy", message("arm.payload_changed", size=_size(baseline, best), since=since), interval, reasons
     if certain:

@@ -20,7 +20,7 @@ from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, largest_events
+from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, MIN_EVENT_SHARE, largest_events
 from servoscope.detection.arm_evidence import (
     BETWEEN_SHARE,
     DRIFT_SHARE,
@@ -34,7 +34,7 @@ from servoscope.estimation.arm_regression import (
     block_information,
     filter_arm_log,
 )
-from servoscope.models.arm.model import ArmModel
+from servoscope.models.arm.model import FRICTION, ArmModel
 from servoscope.models.arm.settings import ArmLoop
 from servoscope.signals.readers.arm_log import ArmRecording
 
@@ -154,7 +154,9 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
         between=to_tuples(between),
         drift=to_tuples(drift),
         torque=to_tuples(torque),
-        event_limits=to_tuples(np.maximum(EVENT_MARGIN * events, MIN_EVENT_LIMIT)),
+        event_limits=to_tuples(
+            np.maximum(np.maximum(EVENT_MARGIN * events, MIN_EVENT_LIMIT), MIN_EVENT_SHARE * torque / fit.noise)
+        ),
         limit=max(0.0, *limits),
         undetermined=tuple(_undetermined(model, theta, std * np.sqrt(np.median(inflation)))),
         notes=tuple(notes),
@@ -214,16 +216,16 @@ def _check_motion(model: ArmModel, signals: Sequence[ArmSignals]) -> None:
 def _check_signs(model: ArmModel, theta: FloatArray, std: FloatArray, name: str) -> None:
     """Refuse friction that drives: the sign of a torque or of a gear is wrong."""
     names = coefficient_names(model)
+    friction = {}
     for joint in model.arm.names:
-        signs = [
-            theta[i] / std[i]
-            for i in (names.index(f"{joint}.{what}") for what in ("viscous_friction", "coulomb_friction"))
-        ]
-        if sum(signs) < 0.0 and min(signs) < MAX_REVERSED:
-            raise RecordingError(
-                f"{name}: {joint}: its friction comes out negative, so position and torque have opposite signs: give it"
-                " a negative gain, or correct its gear or its axis in the URDF"
-            )
+        viscous, coulomb = (names.index(f"{joint}.{what}") for what in FRICTION[:2])
+        friction[joint] = (theta[viscous] / std[viscous], theta[coulomb] / std[coulomb])
+    worst = min(friction, key=lambda joint: sum(friction[joint]))
+    if sum(friction[worst]) < 0.0 and min(friction[worst]) < MAX_REVERSED:
+        raise RecordingError(
+            f"{name}: {worst}: its friction comes out negative, so position and torque have opposite signs: give it a"
+            " negative gain, or correct its gear or its axis in the URDF"
+        )
 
 
 def _inflation(
