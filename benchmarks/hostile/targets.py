@@ -5,9 +5,11 @@ from __future__ import annotations
 import gzip
 import json
 import random
+import sqlite3
 import struct
 import zipfile
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -104,6 +106,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
     columns = {name: np.asarray(getattr(recording, name)) for name in "truy"}
     made = {"CSV": "csv", "Parquet": "parquet", "MAT 5": "mat", "MAT 7.3": "mat", "MDF": "mf4", "TDMS": "tdms"}
     made |= {"HDF5": "h5", "Excel": "xlsx", "LVM": "lvm", "MCAP": "mcap", "ULog": "ulg", "gzip": "csv.gz", "ZIP": "zip"}
+    made |= {"JSON": "jsonl", "Feather": "feather", "NumPy": "npz", "SQLite": "db"}
     writing: dict[str, Callable[[Path], object]] = {
         "MAT 5": lambda path: _mat(path, columns),
         "MAT 7.3": lambda path: _hdf5(path, columns),
@@ -116,6 +119,10 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
         "ULog": lambda path: path.write_bytes(_ulog(columns)),
         "gzip": lambda path: path.write_bytes(gzip.compress(_text(columns).encode())),
         "ZIP": lambda path: _zip(path, columns),
+        "JSON": lambda path: path.write_text(_records(columns)),
+        "Feather": lambda path: _feather(path, columns),
+        "NumPy": lambda path: np.savez(path, **columns),
+        "SQLite": lambda path: _sqlite(path, columns),
     }
     found = []
     clocked = {".mf4", ".mcap", ".ulg", ".lvm"}  # whose readers make a column called time
@@ -174,6 +181,26 @@ def _mdf(path: Path, columns: dict[str, Any]) -> None:
 def _text(columns: dict[str, Any]) -> str:
     rows = zip(*(columns[name] for name in "truy"), strict=True)
     return "\n".join(["t,r,u,y", *(",".join(f"{cell:.9g}" for cell in row) for row in rows)]) + "\n"
+
+
+def _records(columns: dict[str, Any]) -> str:
+    rows = zip(*(columns[name].tolist() for name in "truy"), strict=True)
+    return "".join(json.dumps(dict(zip("truy", row, strict=True))) + "\n" for row in rows)
+
+
+def _feather(path: Path, columns: dict[str, Any]) -> None:
+    import pyarrow as pa
+    import pyarrow.feather
+
+    pa.feather.write_feather(pa.table(columns), str(path))
+
+
+def _sqlite(path: Path, columns: dict[str, Any]) -> None:
+    path.unlink(missing_ok=True)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE axis(t REAL, r REAL, u REAL, y REAL)")
+        rows = zip(*(columns[name].tolist() for name in "truy"), strict=True)
+        database.executemany("INSERT INTO axis VALUES (?, ?, ?, ?)", rows)
 
 
 def _zip(path: Path, columns: dict[str, Any]) -> None:

@@ -27,9 +27,12 @@ WORDS |= {"event", "priority", "unit", "loop", "magic", "baseline", "defect"}
 ADDED = {
     *(
         "checks",
+        "said",
         "headline",
         "reasons",
         "intervals",
+        "began",
+        "zone",
         "description",
         "sensors",
         "provenance",

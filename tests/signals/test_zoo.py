@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from zoo import ZOO, Exhibit, motion
+from zoo import Exhibit, motion
+from zoo_tables import ZOO
 
 from servoscope.core.errors import RecordingError
+from servoscope.learning.proposal import propose_columns, propose_loop
 from servoscope.models.loop import Columns, TextLayout
 from servoscope.signals.readers import list_channels, read
-from servoscope.signals.readers.guess_columns import guess_mapping
 
 # asammdf and npTDMS warn of NumPy and pandas while they write
 pytestmark = [pytest.mark.filterwarnings(f"ignore::{name}") for name in ("DeprecationWarning", "FutureWarning")]
@@ -20,9 +20,10 @@ pytestmark = [pytest.mark.filterwarnings(f"ignore::{name}") for name in ("Deprec
 
 def guessed(path: Path, text: TextLayout | None = None) -> Columns:
     """Return the columns as they are proposed for a file."""
-    fields: dict[str, Any] = guess_mapping([channel.name for channel in list_channels(path, text)])
-    assert fields["reference"] and fields["input"] and fields["output"], fields
-    return Columns.model_validate({**fields, "segment": (), "text": text})
+    channels = list_channels(path, text)
+    found = propose_columns(path, channels).model_copy(update={"text": text})
+    assert found.reference != "r" or "r" in [channel.name for channel in channels], found
+    return found
 
 
 @pytest.mark.parametrize("one", [one for one in ZOO if not one.options], ids=lambda one: one.file)
@@ -39,7 +40,8 @@ def test_a_log_is_read_without_an_option(one: Exhibit, tmp_path: Path) -> None:
 
 def test_the_zoo_is_large_and_its_sources_are_named() -> None:
     without = [one for one in ZOO if not one.options]
-    assert len(ZOO) >= 30 and len(without) >= 28
+    assert len(ZOO) >= 50 and len(without) >= 48
+    assert sum("written by" in one.source for one in ZOO) >= 8
     assert len({one.file for one in ZOO}) == len(ZOO) and all(len(one.source) > 20 for one in ZOO)
 
 
@@ -47,6 +49,14 @@ def test_the_zoo_is_large_and_its_sources_are_named() -> None:
 def test_the_others_are_read_with_the_option_that_their_message_names(one: Exhibit, tmp_path: Path) -> None:
     path = tmp_path / one.file
     one.write(path)
+    if "unit" in one.options:  # `init` asks whether the numbers of the clock are seconds
+        lines = propose_loop([path], guessed(path)).lines
+        assert ["--columns 't=" in str(line.why) for line in lines if line.doubtful and line.key == "time_unit"] == [
+            True
+        ]
+        found = read(path, columns=guessed(path).model_copy(update={"time_unit": one.options["unit"]}))
+        assert found.sample_rate == pytest.approx(100.0)
+        return
     with pytest.raises(RecordingError) as caught:
         read(path)
     if "names" in one.options:

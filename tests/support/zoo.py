@@ -6,6 +6,7 @@ All hold the same motion: r, u, y of `motion` at 100 Hz, in the units of the too
 from __future__ import annotations
 
 import gzip
+import struct
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -279,8 +280,6 @@ def _(path: Path) -> None:
 
 @exhibit("flight.ulg", "PX4, 'ULog File Format': header, flag bits, format, subscription, data")
 def _(path: Path) -> None:
-    import struct
-
     def message(kind: bytes, body: bytes) -> bytes:
         return struct.pack("<HB", len(body), kind[0]) + body
 

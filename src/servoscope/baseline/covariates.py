@@ -13,7 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.messages import Message, message
 
-EDGE_SHARE = 0.05  # share of the learned range, by which a covariate may be outside of it
+EDGE_SHARE = (
+    0.2  # of the learned range, by which a covariate may be outside of it: what is not known of the slopes grows
+)
 
 
 class WarmUp(BaseModel):
@@ -69,6 +71,11 @@ class CovariateModel(BaseModel):
         """Return the coefficients (n,) of the origin at covariates (..., k), shape (..., n)."""
         g = self.basis(c) @ np.array(self.slopes)
         return np.asarray(np.where(self.proportional, theta * np.exp(g), theta + g))
+
+    def factors(self, channels: Mapping[str, FloatArray]) -> FloatArray:
+        """Return by what each coefficient is multiplied along a recording, shape (N, n); 1 where not `proportional`."""
+        values = self.clip(CovariatePath.of(self, np.zeros(len(self.proportional)), channels, 1.0).values)
+        return np.asarray(np.where(self.proportional, np.exp(self.basis(values) @ np.array(self.slopes)), 1.0))
 
     def theta_covariance(self, theta: FloatArray, c: FloatArray) -> FloatArray:
         """Return what the uncertain slopes make of the coefficients at covariates (..., k), shape (..., n, n)."""

@@ -6,10 +6,12 @@ import atexit
 import gc
 import sys
 import warnings
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
 
+from servoscope.cli.examples import EXAMPLES
 from servoscope.cli.exit import CommandGroup
 from servoscope.core.cache_folders import replace_library_warnings
 from servoscope.core.errors import ObsoleteSettingWarning
@@ -22,7 +24,7 @@ CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 GROUPS = {
     "Begin": ("demo", "tutorial", "init", "inspect", "docs", "help"),
-    "Judge recordings": ("learn", "diagnose", "verify"),
+    "Judge recordings": ("assess", "learn", "diagnose", "verify"),
     "Follow machines for months": (
         "run",
         "watch",
@@ -136,12 +138,23 @@ def _context_of(whole: Any, name: str) -> Any:
     return type(whole)(found, info_name=name, parent=whole)
 
 
+def iter_commands(group: typer.Typer, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the commands of the application by their names, those of its groups as "users add"."""
+    for info in group.registered_commands:
+        info.name = info.name or (info.callback.__name__ if info.callback is not None else "")
+        yield f"{prefix}{info.name}", info
+    for inner in group.registered_groups:
+        if inner.typer_instance is not None:
+            yield from iter_commands(inner.typer_instance, f"{prefix}{inner.name} ")
+
+
 def group_commands() -> None:
-    """Put each command into its group, in the order in which they are met."""
+    """Put each command into its group, in the order in which they are met, and an example into its help."""
+    for name, info in iter_commands(app):
+        info.epilog = f"Example: {EXAMPLES[name]}"
     panels = {name: panel for panel, names in GROUPS.items() for name in names}
     order = list(panels)
     for info in app.registered_commands:
-        info.name = info.name or (info.callback.__name__ if info.callback is not None else None)
         info.rich_help_panel = panels[info.name or ""]
     for group in app.registered_groups:
         group.rich_help_panel = panels[str(group.name)]

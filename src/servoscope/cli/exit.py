@@ -57,10 +57,12 @@ class CommandGroup(typer.core.TyperGroup):
                 raise
             raise typer.Exit(EXIT_INTERRUPTED) from None
         except OSError as error:
-            if error.errno != errno.ENOSPC:
+            if error.errno not in (errno.ENOSPC, errno.EPIPE):
                 raise
-            print_error(f"cannot be written ({error.strerror})")
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the exit would try once more
+            if error.errno == errno.EPIPE:  # who reads, as head does, has seen enough
+                raise typer.Exit from None
+            print_error(f"cannot be written ({error.strerror})")
             raise typer.Exit(EXIT_INPUT) from None
         return result
 

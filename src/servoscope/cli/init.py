@@ -24,7 +24,7 @@ MAX_LISTED_PLANTS = 6
 
 
 @app.command()
-@with_reading_options("where", "by", "from_s", "to_s")
+@with_reading_options("by", "from_s", "to_s")
 def init(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Logs of the healthy machine at work.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="LOOP", help="Loop file to write.")] = Path(
@@ -48,13 +48,11 @@ def init(
     log, asks = logs[0], not yes and sys.stdin.isatty() and sys.stdout.isatty()
     reader = arguments.RecordingReader.from_options(None, reading)
     out = results.create_console()
-    mapping = reader.columns
-    axes = [reading.axis]
-    if mapping is None:
-        channels = readers.list_channels(log, reader.text)
-        if asks:
-            results.print_channels(out, log, channels)
-        axes = [reading.axis] if reading.axis is not None else [*find_axes([each.name for each in channels])] or [None]
+    channels = readers.list_channels(log, reader.text)
+    if asks and reading.columns is None:
+        results.print_channels(out, log, channels)
+    axes = [reading.axis] if reading.axis is not None or reading.columns is not None else []
+    axes = axes or [*find_axes([each.name for each in channels])] or [None]
     targets = [_axis_file(output, axis) if len(axes) > 1 else output for axis in axes]
     for target in targets:
         if target.exists() and not yes:
@@ -64,19 +62,19 @@ def init(
     failures = FailureCounter()
     for axis, target in zip(axes, targets, strict=True):
         with failures.catch():
-            chosen = mapping
-            if chosen is None:
-                try:
-                    chosen = propose_columns(log, channels, axis)
-                except ServoscopeError as error:
-                    if not asks:
-                        raise
-                    out.print(str(error))
-                if asks and (chosen is None or not typer.confirm(say("init.confirm_columns"), default=True)):
-                    chosen = arguments.parse_mapping(typer.prompt(say("init.ask_columns")), chosen)
+            chosen = None
+            try:
+                chosen = propose_columns(log, channels, axis, reading.columns)
+            except ServoscopeError as error:
+                if not asks or reading.columns is not None:
+                    raise
+                out.print(str(error))
+            open_question = asks and reading.columns is None
+            if open_question and (chosen is None or not typer.confirm(say("init.confirm_columns"), default=True)):
+                chosen = propose_columns(log, channels, axis, typer.prompt(say("init.ask_columns")))
             assert chosen is not None, "it was proposed, or asked for"
             changes = {"text": reader.text or chosen.text, "resample": reading.resample or chosen.resample}
-            _propose(out, logs, chosen.model_copy(update=changes), target, asks)
+            _propose(out, logs, chosen.model_copy(update=changes), target, asks, reader.where)
     failures.exit_if_any()
 
 
@@ -85,7 +83,7 @@ def _axis_file(output: Path, axis: str | None) -> Path:
     return output.with_name(f"{output.stem}-{axis}{output.suffix}")
 
 
-def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, asks: bool) -> None:
+def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, asks: bool, where: dict[str, str]) -> None:
     """Print the proposal for logs with its evidence, write it, and inspect the logs with it."""
     from servoscope.cli.render import results
     from servoscope.core.errors import ServoscopeError
@@ -96,7 +94,7 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
     from servoscope.report.page import say
     from servoscope.signals import readers
 
-    proposal = propose_loop(logs, columns)
+    proposal = propose_loop(logs, columns, where)
     lines = [
         (f"{line.section}.{line.key}".lstrip("."), line.value + " ?" * line.doubtful, render(line.why))
         for line in proposal.lines
@@ -115,13 +113,15 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
     usable = []
     for log in logs:
         try:
-            found = inspection.inspect(readers.read(log, proposal.loop), proposal.loop)
+            found = inspection.inspect(readers.read(log, proposal.loop, where=where), proposal.loop)
         except ServoscopeError:  # the notes say why
             continue
         results.print_inspection(out, found)
         usable += [log] * (found.verdict != "not usable")
     if usable:
         learned = " ".join(shlex.quote(str(log)) for log in usable)
+        if where:
+            learned += " --where " + shlex.quote(",".join(f"{column}={value}" for column, value in where.items()))
         results.print_command(
             out, say("init.next"), f"servoscope learn {shlex.quote(str(output))} {learned} -o baseline.json"
         )

@@ -33,6 +33,7 @@ from servoscope.diagnosis.result import (
     FinalCoefficient,
     ResponsePoint,
     Verdict,
+    recording_facts,
 )
 from servoscope.diagnosis.sensor_check import check_sensors
 from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
@@ -240,9 +241,7 @@ def diagnose_examination(
     if features is not None and changed is not None:
         reasons = (*reasons, *features.reasons(changed))
     diagnosis = Diagnosis(
-        recording=recording.name,
-        samples=recording.samples,
-        duration_s=recording.duration_s,
+        **recording_facts(recording),
         verdict=verdict,
         headline=headline,
         reasons=reasons,

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import computed_field, model_validator
 
-from servoscope.core.messages import Message, MessageField, MessageText, message, read_messages, render, text_message
+from servoscope.core.messages import (
+    Message,
+    MessageField,
+    MessageText,
+    clock_of,
+    message,
+    read_messages,
+    render,
+    text_message,
+)
 from servoscope.core.short_repr import ShortRepr
 from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
-from servoscope.signals import Defect
+from servoscope.signals import Defect, Recording
 
 Verdict = Literal["healthy", "fault", "undetermined"]
+MAX_ALIKE = 3  # defects of one kind that are shown one by one
+DEFECT_KINDS = ("gap", "nan", "repeat", "spike", "order", "text", "saturation")
 VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
 
 
@@ -114,6 +126,21 @@ class DiagnosisWarning(ResultModel):
         )
 
 
+def sum_up(warnings: Sequence[DiagnosisWarning]) -> list[DiagnosisWarning]:
+    """Return warnings, defects of a kind that came more than MAX_ALIKE times as one."""
+    kinds = Counter(warning.kind for warning in warnings if warning.kind in DEFECT_KINDS)
+    summed: dict[str, DiagnosisWarning] = {}
+    for number, warning in enumerate(warnings):
+        if kinds[warning.kind] <= MAX_ALIKE:
+            summed[str(number)] = warning
+        elif warning.kind not in summed:
+            alike = [each for each in warnings if each.kind == warning.kind]
+            text = message("diagnosis.alike", first=warning.description, times=len(alike))
+            count, to_s = sum(each.count for each in alike), max(each.to_s for each in alike)
+            summed[warning.kind] = warning.model_copy(update={"description": text, "count": count, "to_s": to_s})
+    return list(summed.values())
+
+
 class FaultInterval(ResultModel):
     """A time during which the actuator differed from healthy, and what explains that."""
 
@@ -145,6 +172,12 @@ WRITTEN_INTERVAL = frozenset(FaultInterval.model_fields) - {
 }  # fields that a Diagnosis repeats
 
 
+def recording_facts(recording: Recording) -> dict[str, Any]:
+    """Return the fields of a diagnosis that say what was examined."""
+    names = ("samples", "duration_s", "began", "zone")
+    return {"recording": recording.name, **{name: getattr(recording, name) for name in names}}
+
+
 class Diagnosis(ShortRepr, ResultModel):
     """The verdict on one recording.
 
@@ -172,6 +205,9 @@ class Diagnosis(ShortRepr, ResultModel):
         Operating point whose baseline was used; None where the baseline has none.
     provenance
         Versions and hashes by which `servoscope verify` repeats it; None where nobody asked for them.
+    began, zone
+        When the recording began [s since 1970], and UTC, or nothing where its dates are as they are written; None
+        where it has no dates.
     """
 
     recording: str
@@ -187,6 +223,8 @@ class Diagnosis(ShortRepr, ResultModel):
     warnings: tuple[DiagnosisWarning, ...] = ()
     point: str | None = None
     provenance: Provenance | None = None
+    began: float | None = None
+    zone: str = ""
 
     @model_validator(mode="before")
     @classmethod
@@ -212,7 +250,8 @@ class Diagnosis(ShortRepr, ResultModel):
     @property
     def summary(self) -> str:
         """The verdict in one sentence."""
-        return render(self.headline)
+        with clock_of(self.began):
+            return render(self.headline)
 
     @computed_field  # type: ignore[prop-decorator]
     @property

@@ -11,7 +11,7 @@ from servoscope.core.messages import Message
 from servoscope.detection.signal_defects import SignalDefect, begins_wrong, find_corrections
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import undetermined_headline
-from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, recording_facts
 from servoscope.diagnosis.warnings import warning_throughout
 from servoscope.signals import Recording
 
@@ -33,9 +33,7 @@ def leave_undetermined(exam: Examination, reason: Message) -> Diagnosis:
     recording, point = exam.recording, exam.baseline.point
     warnings = [DiagnosisWarning.of(defect) for defect in recording.defects]
     return Diagnosis(
-        recording=recording.name,
-        samples=recording.samples,
-        duration_s=recording.duration_s,
+        **recording_facts(recording),
         verdict="undetermined",
         headline=undetermined_headline(reason, point),
         reasons=(),

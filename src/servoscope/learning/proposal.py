@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from servoscope.core import number_format
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import IrregularTimeError, NotEnoughError, RecordingError, ServoscopeError
+from servoscope.core.errors import IrregularTimeError, LoopError, NotEnoughError, RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
+from servoscope.core.settings_errors import describe_error
 from servoscope.learning.inspection import Inspection, inspect
 from servoscope.learning.inspection.rules import advised_rest_speed
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
@@ -22,9 +24,16 @@ from servoscope.models.loop import Columns, Loop, MonitorSettings
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, list_channels, read
 from servoscope.signals.readers.axes import find_axes, signal_names
-from servoscope.signals.readers.columns import LinearCombination, parse_combination
+from servoscope.signals.readers.columns import LinearCombination, parse_combination, parse_fields
 from servoscope.signals.readers.formats import open_file
-from servoscope.signals.readers.guess_columns import FIELDS, guess_mapping, names_speed, quoted_channel
+from servoscope.signals.readers.guess_columns import (
+    FIELDS,
+    guess_mapping,
+    mapping_template,
+    names_speed,
+    quoted_channel,
+)
+from servoscope.signals.readers.select import RowFilter
 from servoscope.signals.readers.table import number_column
 from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
@@ -48,6 +57,7 @@ COVARIATE_STEMS = (
     "humid",
     "温度",
 )
+MAX_SPAN_RATIO = 8.0  # of r over y, or y over r, beyond which one of them is in another unit
 MIN_CLEAR_SHARE = 0.9  # share of u that a plant explains; below it, the choice is in doubt
 
 
@@ -84,10 +94,14 @@ class LoopProposal:
         return "".join(re.sub(r"[\0-\x1f\x7f]", lambda sign: f"\\u{ord(sign[0]):04X}", line) + "\n" for line in written)
 
 
-def propose_columns(path: Path, channels: Sequence[ChannelInfo], axis: str | None = None) -> Columns:
-    """Return the columns of a log by the words and units in their names; `axis`: of a file with several, which one.
+def propose_columns(
+    path: Path, channels: Sequence[ChannelInfo], axis: str | None = None, given: str | None = None
+) -> Columns:
+    """Return the columns of a log by the words and units in their names.
 
-    Raises RecordingError if no name suggests u or y, or the file has no such axis.
+    `axis`: of a file with several, which one; `given`: what the user says of columns, as ``"u=cur"``; the others are
+    guessed. Raises RecordingError if no name suggests u or y, or the file has no such axis, LoopError if `given` cannot
+    be read.
     """
     names = signal_names(channels)
     axes = find_axes(names)
@@ -96,37 +110,44 @@ def propose_columns(path: Path, channels: Sequence[ChannelInfo], axis: str | Non
             has = f"it has {', '.join(axes)}" if axes else "its names show one axis; name the columns with --columns"
             raise RecordingError(f"{path}: no axis {axis!r}, {has}")
         names = axes[axis]
-    fields = guess_mapping(names)
+    told = parse_fields(given) if given else {}
+    texts = [str(text) for value in told.values() for text in (value if isinstance(value, tuple) else (value,))]
+    # a column that the user names is no other signal
+    used = {*texts, *(word for text in texts for pair in re.findall(r"`([^`]+)`|([\w.]+)", text) for word in pair)}
+    fields = {**guess_mapping([name for name in names if name not in used]), **told}
     missing = [letter for letter in "uy" if fields[FIELDS[letter]] is None]
     if missing:
         shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
         raise RecordingError(
             f"{path}: no name suggests {' and '.join(missing)}: say which columns they are,"
-            f" --columns 't=..., r=..., u=..., y=...'; the file has {shown}"
+            f" {mapping_template(fields)}; the file has {shown}"
         )
     default = Columns()
     fields["reference"] = fields["reference"] or default.reference  # u stands for it where there is none
-    return Columns.model_validate({**fields, "segment": ()})
+    try:
+        return Columns.model_validate({"segment": (), **fields})
+    except ValidationError as error:
+        raise LoopError(f"columns: {describe_error(error, Columns)}") from None
 
 
-def propose_loop(paths: Sequence[Path], columns: Columns) -> LoopProposal:
-    """Return a loop for logs whose columns are known, as `inspect` measures the first of them.
+def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, str] | None = None) -> LoopProposal:
+    """Return a loop for logs whose columns are known, as `inspect` measures the first of them; `where`: as in `read`.
 
     Logs that cannot be used with the first are left out, with a note. Raises RecordingError if the first log cannot be
     read, or nothing moves in it.
     """
     path, others = paths[0], paths[1:]
-    columns, wraps = _unwrapped_columns(path, columns)
+    columns, wraps = _unwrapped_columns(path, columns, where)
     is_speed = names_speed(columns.outputs[0])
     try:
-        recording = read(path, columns=columns)
+        recording = read(path, columns=columns, where=where)
         found = _inspect(recording, is_speed)
         irregular = found.sampling.jitter_percent > JITTER_PERCENT
     except IrregularTimeError:
         irregular = True
     if irregular:
         columns = columns.model_copy(update={"resample": True})
-        recording = read(path, columns=columns)
+        recording = read(path, columns=columns, where=where)
         found = _inspect(recording, is_speed)
     if found.best_order is None or found.suggested_cutoff_hz is None:
         raise RecordingError(f"{path}: {found.summary}")
@@ -148,7 +169,7 @@ def propose_loop(paths: Sequence[Path], columns: Columns) -> LoopProposal:
     recordings, notes = [recording], []
     for other in others:
         try:
-            recordings.append(read(other, loop_of({"kind": "polynomial", "order": 2})))
+            recordings.append(read(other, loop_of({"kind": "polynomial", "order": 2}), where=where))
         except ServoscopeError as error:
             notes.append(message("init.left_out", reason=str(error)))
     assert found.rest is not None, "what has an order has moved"
@@ -169,7 +190,7 @@ def propose_loop(paths: Sequence[Path], columns: Columns) -> LoopProposal:
         ]
     lines = (
         ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
-        *_column_lines(columns, wraps, recording),
+        *_column_lines(path, columns, wraps, recording),
         *_plant_lines(chosen),
         ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff")),
         ProposalLine("monitor", "memory", repr(memory), message("init.memory", length=recording.duration_s)),
@@ -227,13 +248,15 @@ def propose(path: str | Path | Sequence[str | Path], columns: Columns | None = N
     return proposal, inspect(read(paths[0], proposal.loop), proposal.loop)
 
 
-def _unwrapped_columns(path: Path, columns: Columns) -> tuple[Columns, dict[str, float]]:
+def _unwrapped_columns(
+    path: Path, columns: Columns, where: Mapping[str, str] | None
+) -> tuple[Columns, dict[str, float]]:
     """Return the columns with those unwrapped that wrap, and the ranges in which the keys concerned do."""
     opened = open_file(path, columns.text)
     plain: dict[str, LinearCombination] = {}
     for key, text in (("reference", columns.reference), ("input", columns.input), ("output", columns.outputs[0])):
         try:
-            combination = parse_combination(text, opened.columns, path.name)
+            combination = parse_combination(text, opened.known, path.name)
         except ServoscopeError:  # the reference may be missing; what else is wrong is told when the log is read
             continue
         if len(combination.factors) == 1 and not combination.constant and not combination.wraps:
@@ -242,9 +265,11 @@ def _unwrapped_columns(path: Path, columns: Columns) -> tuple[Columns, dict[str,
         plain.pop("output", None)
     wanted = [name for each in plain.values() for name in each.factors]
     pieces: dict[str, list[FloatArray]] = {name: [] for name in wanted}
-    for table in opened.iter_chunks(wanted) if wanted else ():
+    chosen = RowFilter(opened, where or {})
+    for table in opened.iter_chunks({*wanted, *chosen.columns}) if wanted else ():
+        rows = chosen.mask(table)
         for name in wanted:
-            pieces[name].append(number_column(table, name, "init"))
+            pieces[name].append(number_column(table, name, "init")[rows])
     changes, wraps = {}, {}
     for key, each in plain.items():
         ((name, factor),) = each.factors.items()
@@ -255,18 +280,28 @@ def _unwrapped_columns(path: Path, columns: Columns) -> tuple[Columns, dict[str,
     return columns.model_copy(update=changes), wraps
 
 
-def _column_lines(columns: Columns, wraps: Mapping[str, float], recording: Recording) -> list[ProposalLine]:
+def _column_lines(path: Path, columns: Columns, wraps: Mapping[str, float], recording: Recording) -> list[ProposalLine]:
     lines = []
     if columns.time is not None:
+        told = message("init.time_unit"), False
+        if _counts_seconds(columns, recording):  # a counter, or another unit, that nobody names
+            told = message("init.time_counts", step=1.0 / recording.sample_rate), True
         lines.append(ProposalLine("columns", "time", _quoted(columns.time), message("init.column")))
-        lines.append(ProposalLine("columns", "time_unit", _quoted(columns.time_unit), message("init.time_unit")))
+        lines.append(ProposalLine("columns", "time_unit", _quoted(columns.time_unit), *told))
+    without = columns.reference == Columns().reference and columns.reference not in open_file(path, columns.text).known
+    spans = [float(np.ptp(x[np.isfinite(x)])) for x in (recording.r, recording.y)]
     for key, texts in (("reference", (columns.reference,)), ("input", (columns.input,)), ("output", columns.outputs)):
         unit = split_unit(texts[0].rpartition("* ")[2].strip("`"))[1]
         why = message("init.column_unit", unit=unit) if unit else message("init.column_plain")
         value = _quoted(texts[0]) if len(texts) == 1 else f"[{', '.join(map(_quoted, texts))}]"
         if key in wraps:
             why = message("init.wraps", range=wraps[key])
-        lines.append(ProposalLine("columns", key, value, why, doubtful=(not unit and key == "output") or key in wraps))
+        doubtful = (not unit and key == "output") or key in wraps
+        if key == "reference" and without:
+            why, doubtful = message("init.no_reference"), True
+        elif key == "reference" and not 1.0 / MAX_SPAN_RATIO < spans[0] / (spans[1] or math.inf) < MAX_SPAN_RATIO:
+            why, doubtful = message("init.reference_unit", r=spans[0], y=spans[1]), True
+        lines.append(ProposalLine("columns", key, value, why, doubtful))
     if columns.resample:
         how = next(defect.text for defect in recording.defects if defect.kind == "resampled")
         lines.append(ProposalLine("columns", "resample", "true", message("init.resample", how=how)))
@@ -275,6 +310,12 @@ def _column_lines(columns: Columns, wraps: Mapping[str, float], recording: Recor
         value = ", ".join(f"{key} = {json.dumps(each, ensure_ascii=False)}" for key, each in given.items())
         lines.append(ProposalLine("columns", "text", f"{{{value}}}", message("init.layout")))
     return lines
+
+
+def _counts_seconds(columns: Columns, recording: Recording) -> bool:
+    """Tell whether the clock is one of whole numbers without a unit, at most one a second."""
+    plain = columns.time_unit == "s" and not split_unit(columns.time or "")[1] and recording.began is None
+    return plain and recording.sample_rate <= 1.0 and not np.any(recording.t % 1.0)
 
 
 def _quoted(text: str) -> str:

@@ -46,8 +46,9 @@ def text_symbol(name: str) -> str:
 
 
 def split_symbols(text: str) -> list[str]:
-    """Return a sentence in parts, every second of which is a parameter's name; factors get a true sign."""
-    return SYMBOL.split(re.sub(r"\bx (?=\d)", "× ", text))
+    """Return a sentence in parts, every second of which is a parameter's name, with true signs of factors."""
+    factors = re.sub(r"\bx (?=\d)", "× ", text)
+    return SYMBOL.split(re.sub(r"(?<=\d) (?=%|m?s\b|Hz\b)", "\N{NO-BREAK SPACE}", factors))
 
 
 def pair_correlation(covariance: Sequence[Sequence[float]]) -> float:

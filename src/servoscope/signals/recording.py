@@ -26,6 +26,8 @@ class Recording(ShortRepr, Samples):
     sample_rate: float  # sample rate [Hz]
     run: Int32Array  # index of the run, from 0, shape (N,)
     defects: tuple[Defect, ...] = ()  # what was wrong with the rows as logged, in the order of time
+    began: float | None = None  # when t was 0, by the log's own clock [s since 1970]; None where it has no dates
+    zone: str = ""  # of `began`: UTC; empty where dates are local, and nobody says where
 
     @property
     def samples(self) -> int:

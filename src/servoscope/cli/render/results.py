@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
@@ -44,6 +45,10 @@ STEERING = ("Cc", "Cf", "Cs")  # control and format characters, and bytes that a
 
 class _TextConsole(Console):
     """A console to which names of files, columns and assets are text: what would steer a terminal is shown as ?."""
+
+    def on_broken_pipe(self) -> None:
+        """Let the command end as where a plain print meets the end of a pipe."""
+        raise BrokenPipeError(errno.EPIPE, "broken pipe")
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         """Return what is printed, piece by piece."""

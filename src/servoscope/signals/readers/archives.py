@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gzip
 import lzma
+import re
 import tempfile
 import weakref
 import zipfile
@@ -22,6 +23,9 @@ _T = TypeVar("_T")
 
 GZIP, ZIP = ".gz", ".zip"
 ARCHIVES = (GZIP, ZIP)
+ACCOMPANYING_FILES = re.compile(
+    r"(?:^|/)(?:read\W?me|lies\W?mich|lisez\W?moi|licen[cs]e|notes?)\b[^/]*$|\.(?:md|pdf|rtf|docx?|png|jpe?g)$", re.I
+)
 MAX_UNPACKED_BYTES = 8_000_000_000  # of one file when it is unpacked
 MAX_UNPACKED_RATIO = 200  # times its size in the archive; measured values shrink to a tenth
 MIN_UNPACKED_LIMIT_BYTES = 100_000_000  # that any file may have when it is unpacked
@@ -83,7 +87,10 @@ def _open_archive(path: Path) -> tuple[zipfile.ZipFile, list[str]]:
 def _open_version(path: Path, _changed: int, _size: int) -> tuple[zipfile.ZipFile, list[str]]:
     archive = zipfile.ZipFile(path)
     names = [info.filename for info in archive.infolist() if not info.is_dir()]
-    return archive, sorted(name for name in names if not name.rpartition("/")[2].startswith((".", "_")))
+    names = sorted(name for name in names if not name.rpartition("/")[2].startswith((".", "_")))
+    # what is beside a log: a text that describes it, its pictures
+    logs = [name for name in names if not ACCOMPANYING_FILES.search(name)]
+    return archive, logs or names
 
 
 def unpack(path: Path, open_plain: Callable[[Path], TableFile]) -> TableFile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Sequence
@@ -19,11 +20,15 @@ MAX_SUPPLY_RATIO = 2.0
 def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
     """Return the names of columns that may be signals: without those that hardly vary, as a supply or temperature.
 
-    All of them where none of the others may be u.
+    Those are among them where none of the others may be u or y. Text is time only, and a constant is r only.
     """
-    names = [channel.name for channel in channels]
-    moving = [each.name for each in channels if not 0.0 < each.min <= each.max < MAX_SUPPLY_RATIO * each.min]
-    lost = {"t", "u", "y"} & guess_columns(names).keys() - guess_columns(moving).keys()
+    likely = guess_columns([channel.name for channel in channels])
+    clocks = {channel.name for channel in channels if guess_columns([channel.name]).keys() == {"t"}}
+    named = [each for each in channels if each.name in clocks or each.min < each.max or each.name == likely.get("r")]
+    names = [each.name for each in named if each.name in clocks or not math.isnan(each.min)]
+    supplies = {each.name for each in channels if 0.0 < each.min < each.max < MAX_SUPPLY_RATIO * each.min} - clocks
+    moving = [name for name in names if name not in supplies]
+    lost = {"u", "y"} & guess_columns(names).keys() - guess_columns(moving).keys()
     return names if lost else moving
 
 

@@ -19,9 +19,10 @@ MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", 
 MOMENT = re.compile(
     r"(?P<date>\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?\.\d\d?\.\d{2,4}|\d\d?/\d\d?/\d{2,4}|\d\d?-[A-Za-z]{3}-\d{4})?"
     r"(?:^|(?<=\d)$|[T ]+|,\s*)"
-    r"(?:(?P<h>\d\d?):(?P<m>\d\d)(?::(?P<s>\d\d(?:[.,:]\d{1,9})?))?\s*(?P<half>[AaPp][Mm])?"
+    r"(?:(?P<h>\d\d?):(?P<m>\d\d)(?::(?P<s>\d\d(?:[.,:;]\d{1,9})?))?\s*(?P<half>[AaPp][Mm])?"
     r"\s*(?P<zone>Z|UTC|[+-]\d\d:?\d\d)?)?"
 )
+ZONED = re.compile(r":\d\d\S*(?:Z|UTC|[+-]\d\d:?\d\d)\s*$")
 DURATION = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s*(sec|s|ms|min|hr|h)")
 DURATIONS = {"sec": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "hr": 3600.0, "h": 3600.0}
 

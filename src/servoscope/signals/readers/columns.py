@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from servoscope.core.errors import LoopError, RecordingError
 from servoscope.core.settings_errors import closest_names, describe_error
 from servoscope.models.loop import Columns
+from servoscope.signals.readers.guess_columns import guess_mapping, mapping_template
 
 FIELDS = {
     **{key: "time" for key in ("t", "time")},
@@ -26,7 +27,6 @@ ALLOWED_EXPRESSIONS = (
 )
 MAX_SHOWN = 12
 HEADER_HINT = "; if a line of it has their names, say --header-row"
-COLUMNS_HINT = "say where the signals stand: --columns 't=..., r=..., u=..., y=...' or [columns] in the loop file"
 
 
 class LinearCombination(NamedTuple):
@@ -59,7 +59,16 @@ def parse_columns(text: str, base: Columns | None = None) -> Columns:
     there is no such column; y may stand several times, once per sensor. Keys that are not named stay as in `base`.
     Raises LoopError if a pair cannot be read.
     """
-    fields: dict[str, object] = (base or Columns()).model_dump()
+    fields = {**(base or Columns()).model_dump(), **parse_fields(text)}
+    try:
+        return Columns.model_validate(fields)
+    except ValidationError as error:
+        raise LoopError(f"columns: {describe_error(error, Columns)}") from None
+
+
+def parse_fields(text: str) -> dict[str, object]:
+    """Return the fields of `Columns` that a mapping names; raises LoopError if a pair cannot be read."""
+    fields: dict[str, object] = {}
     outputs: list[str] = []
     for pair in re.findall(r"(?:`[^`]*`|[^,`])+", text):
         key, equals, value = (part.strip() for part in pair.partition("="))
@@ -79,10 +88,7 @@ def parse_columns(text: str, base: Columns | None = None) -> Columns:
             fields[field] = tuple(outputs) if len(outputs) > 1 else value
         else:
             fields[field] = value
-    try:
-        return Columns.model_validate(fields)
-    except ValidationError as error:
-        raise LoopError(f"columns: {describe_error(error, Columns)}") from None
+    return fields
 
 
 def find_channel(name: str, known: Iterable[str], where: str) -> str:
@@ -100,7 +106,8 @@ def find_channel(name: str, known: Iterable[str], where: str) -> str:
     key = where.rpartition("[columns] ")[2]
     if not near and name == getattr(defaults, key if key in Columns.model_fields else "name", None):
         where = where.removesuffix(f": [columns] {key}")
-        name_ = f"no column {name!r}; {COLUMNS_HINT}; the file has {', '.join(known[:MAX_SHOWN]) or 'none'}"
+        hint = f"say where the signals stand: {mapping_template(guess_mapping(known))} or [columns] in the loop file"
+        name_ = f"no column {name!r}; {hint}; the file has {', '.join(known[:MAX_SHOWN]) or 'none'}"
         unnamed = HEADER_HINT if known == [f"c{index}" for index in range(len(known))] else ""
         raise RecordingError(f"{where}: {name_}" + (", ..." if len(known) > MAX_SHOWN else "") + unnamed)
     shown = ", ".join(near or known[:MAX_SHOWN]) + (", ..." if not near and len(known) > MAX_SHOWN else "")

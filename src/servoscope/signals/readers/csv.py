@@ -11,7 +11,7 @@ from typing import Any
 from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.guess_columns import WORDS
-from servoscope.signals.readers.layout import check_names, count_numeric, find_table
+from servoscope.signals.readers.layout import THOUSANDS, check_names, count_numeric, find_table
 from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number
 
 COMMENTS = ("#", "%", "//")
@@ -31,7 +31,8 @@ CHINESE_CHARACTER = re.compile("[一-鿿]")
 class CsvLayout:
     """How a text file is laid out: delimiter, decimal sign, names of the columns, lines before the rows, encoding.
 
-    `line_end`: what stands behind each row, if anything does; columns without a name are empty.
+    `line_end`: what stands behind each row, if anything does; columns without a name are empty. `thousands`: the sign
+    between thousands, empty where numbers have none.
     """
 
     delimiter: str
@@ -41,6 +42,7 @@ class CsvLayout:
     encoding: str = "utf-8-sig"
     comments: tuple[str, ...] = COMMENTS
     line_end: str = ""
+    thousands: str = ""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -95,7 +97,7 @@ def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) 
         check_names(cells, str(path))
         named = tuple(cell or f"c{index}" for index, cell in enumerate(cells))
         return CsvLayout(delimiter, ".", named, first + 1, encoding, comments, used)
-    decimal = _detect_decimal(rows[found.first :], delimiter)
+    decimal, thousands = _detect_decimal(rows[found.first :])
     names = found.names
     above = next((row for row in reversed(rows[: found.first]) if row), [])
     if header is None and delimiter == "," and not any(map(is_number, above)) and 2 * len(above) == len(names):
@@ -108,7 +110,7 @@ def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) 
         told = _split_lines(commented[-1:], delimiter, used)[0]  # the names may stand in the last comment
         if len(told) == len(names) and all(told) and len(set(told)) == len(told) and not any(map(is_number, told)):
             names = tuple(told)
-    return CsvLayout(delimiter, decimal, names, found.first, encoding, comments, used)
+    return CsvLayout(delimiter, decimal, names, found.first, encoding, comments, used, thousands)
 
 
 def _score(rows: list[list[str]]) -> tuple[int, int]:
@@ -125,11 +127,14 @@ def _strip_end(line: str, end: str) -> str:
     return line.rstrip().removesuffix(end) if end else line
 
 
-def _detect_decimal(rows: list[list[str]], delimiter: str) -> str:
+def _detect_decimal(rows: list[list[str]]) -> tuple[str, str]:
+    """Return the decimal sign, and the one between thousands, empty where there is none."""
     cells = [cell for row in rows for cell in row]
+    if (grouped := next(filter(THOUSANDS.fullmatch, cells), None)) is not None:
+        return (",", ".") if grouped.rfind(",") > grouped.rfind(".") else (".", ",")
     comma = sum(re.fullmatch(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", cell) is not None for cell in cells)
     point = sum("." in cell and is_number(cell) for cell in cells)
-    return "," if comma > point else "."
+    return ("," if comma > point else "."), ""
 
 
 def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collection[str] = ()) -> Iterator[Table]:
@@ -161,11 +166,8 @@ def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collec
 def _iter_text_chunks(path: Path, layout: CsvLayout) -> Iterator[tuple[bytes, int, bool]]:
     """Yield whole lines, how many lines were before them, and whether they are the last ones."""
     before, held = 0, b""
-    plain = (layout.encoding, layout.line_end, layout.comments) == (
-        "utf-8-sig",
-        "",
-        COMMENTS,
-    ) and layout.delimiter != " "
+    plain = (layout.encoding, layout.line_end, layout.comments, layout.thousands) == ("utf-8-sig", "", COMMENTS, "")
+    plain = plain and layout.delimiter != " "
     for text in _iter_utf8(path) if plain else _iter_recoded(path, layout):
         if held:
             yield held, before, False
@@ -190,7 +192,9 @@ def _replace_invalid(text: bytes) -> bytes:
 
 
 def _iter_recoded(path: Path, layout: CsvLayout) -> Iterator[bytes]:
-    """Yield lines as UTF-8 with single blanks: Arrow knows no runs of them as one delimiter."""
+    """Yield lines as UTF-8 with single blanks: Arrow knows no runs of them as one delimiter, and no thousands."""
+    begin = '(?<=")' if layout.delimiter == layout.thousands else f'(?<![^"\\s{re.escape(layout.delimiter)}])'
+    grouped = re.compile(rf"{begin}[-+]?\d{{1,3}}(?:{re.escape(layout.thousands)}\d{{3}})+(?!\d)")
     with path.open(encoding=layout.encoding, errors="replace") as file:
         while lines := file.readlines(CHUNK_BYTES):
             if layout.comments != COMMENTS:  # what the user calls a comment may have as many cells as a row
@@ -199,7 +203,10 @@ def _iter_recoded(path: Path, layout: CsvLayout) -> Iterator[bytes]:
                 lines = [_strip_end(line, layout.line_end) + "\n" for line in lines]
             if layout.delimiter == " ":
                 lines = [re.sub(r"[ \t]+", " ", line.strip()) + "\n" for line in lines]
-            yield "".join(lines).encode()
+            text = "".join(lines)
+            if layout.thousands:
+                text = grouped.sub(lambda cell: cell[0].replace(layout.thousands, ""), text)
+            yield text.encode()
 
 
 def _parse_chunk(

@@ -15,6 +15,7 @@ from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.addresses import open_address
 from servoscope.signals.readers.archives import ARCHIVES, archive_of, unpack
 from servoscope.signals.readers.csv import is_utf16, open_csv
+from servoscope.signals.readers.long_format import widen
 from servoscope.signals.readers.reader_process import open_bounded
 from servoscope.signals.readers.table import TableFile
 
@@ -68,6 +69,10 @@ BUILT_IN = {
         (".lvm", "LVM", "programs", "open_lvm", "lvm_read", "formats", True),
         (".mcap", "MCAP", "topics", "open_mcap", "mcap_ros2", "formats", True),
         (".ulg", "ULog", "topics", "open_ulog", "pyulog", "formats", True),
+        (".json .jsonl .ndjson", "JSON", "records", "open_json", "", "", True),
+        (".feather .arrow .ipc", "Feather", "records", "open_feather", "", "", True),
+        (".npz .npy", "NumPy", "records", "open_numpy", "", "", True),
+        (".db .sqlite .sqlite3 .db3", "SQLite", "records", "open_sqlite", "", "", True),
     )
     for suffix in suffixes.split()
 }
@@ -89,10 +94,15 @@ MAGIC = {
     b"LabVIEW Measurement": "LVM",
     b"\x89MCAP0\r\n": "MCAP",
     b"ULog\x01": "ULog",
+    b"ARROW1": "Feather",
+    b"\x93NUMPY": "NumPy",
+    b"SQLite format 3": "SQLite",
+    b"#ROSBAG V": "bag of ROS 1",
 }
 COMPATIBLE_KINDS = {
     ("MAT", "HDF5"),
     ("Excel", "ZIP archive or Excel workbook"),
+    ("NumPy", "ZIP archive or Excel workbook"),
     ("Excel", "Excel workbook"),
     ("HDF5", "MAT"),
 }
@@ -136,6 +146,8 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
         raise EmptyRecordingError(f"{path}: is empty")
     suffix = path.suffix.lower()
     reader = BUILT_IN.get(suffix)
+    if reader is not None and reader.format == "CSV" and head.lstrip()[:1] == b"{" and b"}" in head:
+        reader = BUILT_IN[".json"]  # many programs write records as lines of a log
     if reader is not None:
         _check_format(path, head, reader.format)
         opened = reader.open(path, text)
@@ -144,10 +156,14 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
         if other is None:
             found = _recognise(head)
             what = f", it looks like a {found}" if found else ""
+            if found == "bag of ROS 1":
+                convert = f"rosbags-convert --src {path.name} --dst {path.stem} --dst-storage mcap"
+                raise RecordingError(f"{path}: is a bag of ROS 1, convert it: pip install rosbags, then {convert}")
             known = ", ".join(readable_suffixes())
             raise RecordingError(f"{path}: unknown kind of file {path.suffix!r}{what}; readable are {known}")
         opener: Callable[[Path], TableFile] = other.load()
         opened = opener(path)
+    opened = widen(opened)
     if not opened.columns:
         raise RecordingError(f"{path}: holds no columns of numbers")
     return opened
@@ -167,7 +183,7 @@ def _recognise(head: bytes) -> str | None:
 
 def _check_format(path: Path, head: bytes, wanted: str) -> None:
     found = _recognise(head)
-    if found == wanted or (wanted, found) in COMPATIBLE_KINDS or (wanted == "CSV" and found in (None, "LVM")):
+    if found == wanted or (wanted, found) in COMPATIBLE_KINDS or (wanted in ("CSV", "JSON") and found in (None, "LVM")):
         return
     suffix = next((suffix for suffix, reader in BUILT_IN.items() if reader.format == found), None)
     advice = {

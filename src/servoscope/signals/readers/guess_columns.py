@@ -13,7 +13,20 @@ from servoscope.signals.readers.units import SPEEDS, si_factor, split_unit
 # German, French, Italian, Spanish; without accents. Chinese names have no blanks: its words are looked for inside.
 WORDS = {
     "t": (
-        *("t", "time", "timestamp", "zeit", "zeitstempel", "temps", "tempo", "tiempo", "horodatage", "时间", "时刻"),
+        *(
+            "t",
+            "time",
+            "timestamp",
+            "timestamps",
+            "zeit",
+            "zeitstempel",
+            "temps",
+            "tempo",
+            "tiempo",
+            "horodatage",
+            "时间",
+            "时刻",
+        ),
         *(
             "timer",
             "seconds",
@@ -32,7 +45,7 @@ WORDS = {
     "r": (
         *("r", "ref", "reference", "setpoint", "set", "sp", "soll", "sollwert", "sollposition", "sollwinkel", "target"),
         *("solldrehzahl", "sollgeschwindigkeit", "fuhrungsgrosse", "consigne", "riferimento", "consigna", "referencia"),
-        *("desired", "demand", "demanded", "commanded", "objetivo", "obiettivo", "qg", "goal"),
+        *("desired", "des", "demand", "demanded", "dmd", "commanded", "objetivo", "obiettivo", "qg", "goal", "vorgabe"),
         *("设定", "给定", "目标", "指令", "参考"),
     ),
     "u": (
@@ -41,13 +54,29 @@ WORDS = {
         *("motorspannung", "motormoment", "antriebsmoment", "stellspannung", "stellstrom", "ventilspannung"),
         *("strom", "motorstrom", "spannung", "kraft", "couple", "courant", "tension", "commande", "coppia", "corrente"),
         *("tensione", "comando", "forza", "par", "corriente", "tensionsalida", "mando", "fuerza", "voltaje"),
-        *("电流", "转矩", "扭矩", "力矩", "电压", "控制量", "阀", "tau", "duty", "load"),
+        *(
+            "电流",
+            "转矩",
+            "扭矩",
+            "力矩",
+            "电压",
+            "控制量",
+            "阀",
+            "tau",
+            "duty",
+            "load",
+            "cur",
+            "curr",
+            "amps",
+            "trq",
+            "mv",
+        ),
     ),
     "y": (
         *("y", "output", "ist", "istwert", "istposition", "istwinkel", "istdrehzahl", "actual", "act", "measured"),
         *("feedback", "position", "pos", "angle", "speed", "velocity", "encoder", "displacement", "qm", "mesure"),
         *("mesuree", "reelle", "vitesse", "misura", "misurata", "posizione", "reale", "velocita", "posicion", "medida"),
-        *("real", "velocidad", "lage", "winkel", "drehzahl", "geschwindigkeit", "weg"),
+        *("real", "velocidad", "lage", "winkel", "drehzahl", "geschwindigkeit", "weg", "meas", "pv", "fbk", "fdbk"),
         *("实际", "反馈", "位置", "测量", "速度", "角度", "q"),
     ),
 }
@@ -84,6 +113,9 @@ SPEED_WORDS = {
     *("speed", "velocity", "rpm", "drehzahl", "istdrehzahl", "geschwindigkeit", "istgeschwindigkeit"),
     *("vitesse", "velocita", "velocidad", "速度", "转速"),
 }
+# parts of a message's stamp and counters, which are no signals whatever else their names say
+STAMP_WORDS = {"stamp", "timestamp", "sec", "nanosec", "nsec", "secs", "nsecs", "seq"}
+MEASURED_WORDS = {"actual", "act", "ist", "measured", "meas", "feedback", "fbk", "mesure", "misura", "reelle", "real"}
 CONTROLLER_WORDS = {"control", "controller", "command", "cmd", "drive"}  # whose output is u
 COMMAND = ("command", "cmd")  # what the controller commands where there is a reference besides, else the reference
 FIELDS = {"t": "time", "r": "reference", "u": "input", "y": "output"}
@@ -98,9 +130,10 @@ CLOCK_PARTS = (
 def guess_columns(names: Sequence[str]) -> dict[str, str]:
     """Return the likeliest column for t, r, u and y, each column once; without those that no name suggests."""
     parts = {name: _words(name) for name in names}
-    bare = {name: _plain(split_unit(name)[0]) for name in names}
+    bare = {name: re.sub(r"(?<=[a-z])[_\-. ](?=[a-z])", "", _plain(split_unit(name)[0])) for name in names}
     values = [name for name in names if not parts[name] & ERRORS]
-    plain = [name for name in values if not parts[name] & QUANTITIES]
+    signals = [name for name in values if not parts[name] & STAMP_WORDS]
+    plain = [name for name in signals if not parts[name] & QUANTITIES]
     has_reference = any(parts[name] & set(WORDS["r"]) and not parts[name] & set(COMMAND) for name in plain)
     heir = "u" if has_reference else "r"
     words = {**WORDS, heir: (*WORDS[heir][:2], *COMMAND, *WORDS[heir][2:])}
@@ -109,9 +142,9 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
         found["r"], found["y"] = pair
     for whole in (True, False):  # a name that is the word comes before one that only contains it
         for letter in [each for each in words if each not in found]:
-            among = plain if letter == "r" else values
+            among = {"t": values, "r": plain}.get(letter, signals)
             if letter == "y":
-                among = [name for name in values if not ("output" in parts[name] and parts[name] & CONTROLLER_WORDS)]
+                among = [name for name in signals if not ("output" in parts[name] and parts[name] & CONTROLLER_WORDS)]
             left = [name for name in among if name not in found.values()]
             matches = (
                 name
@@ -125,8 +158,16 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
 
 
 def _named_alike(names: Sequence[str], parts: Mapping[str, set[str]]) -> tuple[str, str] | None:
-    """Return the first reference whose name is another's with a word such as target before it, and that other."""
+    """Return the first reference whose name is another's with a word such as target before it, and that other.
+
+    Or the other way round, as Siemens names them: Position, and ActualPosition which follows it.
+    """
     ahead = set(WORDS["r"]) - {"r"}
+    for measured in names:
+        if parts[measured] & MEASURED_WORDS and (rest := parts[measured] - MEASURED_WORDS):
+            for name in names:
+                if parts[name] == rest and rest & set(WORDS["y"]) and _units_agree(measured, name):
+                    return name, measured
     for reference in names:
         if parts[reference] & ahead and (rest := parts[reference] - ahead):
             for name in names:
@@ -179,12 +220,18 @@ def names_speed(channel: str) -> bool:
     return split_unit(column)[1] in SPEEDS or bool(_words(column) & SPEED_WORDS)
 
 
-def format_mapping(fields: dict[str, Any]) -> str:
+def mapping_template(fields: Mapping[str, Any]) -> str:
+    """Return ``--columns`` with what is known of a file, and ... where somebody has to say it."""
+    known = format_mapping({**fields, **{field: fields[field] or "..." for field in FIELDS.values()}})
+    return f"--columns '{known}'"
+
+
+def format_mapping(fields: Mapping[str, Any]) -> str:
     """Return a guess as ``--columns`` takes it; what was not found is left out."""
     pairs = {letter: fields[field] for letter, field in FIELDS.items() if fields[field] is not None}
     if "t" in pairs:
         unit = "" if fields["time_unit"] == "s" else f"[{fields['time_unit']}]"
-        pairs["t"] = pairs["t"] if " + " in pairs["t"] else quoted_channel(pairs["t"]) + unit
+        pairs["t"] = pairs["t"] if " + " in pairs["t"] or pairs["t"] == "..." else quoted_channel(pairs["t"]) + unit
     quoted = {
         letter: text if " " not in text or "`" in text or " + " in text else quoted_channel(text)
         for letter, text in pairs.items()

@@ -11,10 +11,14 @@ from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.clock import is_clock
 from servoscope.signals.readers.guess_columns import guess_columns
 from servoscope.signals.readers.table import NULL_TEXTS, TIME_UNITS, is_number
-from servoscope.signals.readers.units import is_unit
+from servoscope.signals.readers.units import is_unit, parse_quantity, with_unit
 
 LOOKAHEAD_ROWS = 5  # rows that tell whether a table begins
 TABLE_ROW_SHARE = 0.6  # share of them that must look like rows of it
+MAX_UNIT_LENGTH = 12  # of a cell in a row of units
+THOUSANDS = re.compile(
+    r"[-+]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+)"
+)  # signs between thousands, and a decimal one
 PAIR_KEY = "Name"  # before each channel's name in an export of TwinCAT Scope, as the other keys before their values
 SAMPLE_TIME_KEY = re.compile(r"SampleTime\[(\w+)\]")
 
@@ -28,8 +32,14 @@ class TableStart:
 
 
 def is_numeric(cell: str) -> bool:
-    """Tell whether a cell is a number, with a point or a comma, or a date or time."""
-    return is_number(cell) or is_number(cell.replace(",", ".", 1)) or is_clock(cell)
+    """Tell whether a cell is a number, with a point or a comma, or a unit behind it, or a date or time."""
+    return (
+        is_number(cell)
+        or is_number(cell.replace(",", ".", 1))
+        or THOUSANDS.fullmatch(cell) is not None
+        or parse_quantity(cell, "") is not None
+        or is_clock(cell)
+    )
 
 
 def count_numeric(rows: Sequence[Sequence[str]]) -> tuple[int, int]:
@@ -128,20 +138,34 @@ def _pick_names(above: list[list[str]], width: int, file: str) -> list[str] | No
     keyed = {row[0]: row for row in above if row[0]}
     if PAIR_KEY in keyed and any(SAMPLE_TIME_KEY.fullmatch(key) for key in keyed):
         return _scope_names(keyed, width, file)
-    units = next((row for row in above if _is_unit_row(row)), None)
+    units = next((row for row in above if _is_unit_row(row)), None) if len(above) > 1 else None
     others = [row for row in above if row is not units]
     # of several rows, that whose words tell most; descriptions stand below or above it
     row = max(others, key=lambda row: (len(guess_columns([c for c in row if c])), sum(map(bool, row))), default=None)
     if row is None:
         return None
+    index = others.index(row)
+    if len(set(filter(None, row))) < sum(map(bool, row)) and index + 1 < len(others):
+        row = _join_headings(others[index + 1], row)
     if units is None:
         return row
     return [f"{cell} [{unit.strip('[]() ')}]" if cell and unit else cell for cell, unit in zip(row, units, strict=True)]
 
 
+def _join_headings(groups: list[str], row: list[str]) -> list[str]:
+    """Return names under headings of groups; one that spans several columns stands over the first of them."""
+    names, group = [], ""
+    for heading, cell in zip(groups, row, strict=True):
+        group = heading or group
+        names.append(f"{group}.{cell}" if cell and row.count(cell) > 1 else cell)
+    return names
+
+
 def _is_unit_row(row: Sequence[str]) -> bool:
     filled = [cell for cell in row if cell]
-    return bool(filled) and all(is_unit(cell.strip("[]() ")) or cell.strip("[]() ") in ("", "-") for cell in filled)
+    known = sum(is_unit(cell.strip("[]() ")) for cell in filled)
+    # one that is not known is no reason to take the others for nothing
+    return bool(filled) and 2 * known > len(filled) and all(len(cell) <= MAX_UNIT_LENGTH for cell in filled)
 
 
 def _scope_names(keyed: dict[str, list[str]], width: int, file: str) -> list[str]:
@@ -160,7 +184,7 @@ def _scope_names(keyed: dict[str, list[str]], width: int, file: str) -> list[str
     names = [""] * width
     for place in places:
         of = keyed.get("Unit", [""] * width)[place]
-        names[place] = f"{row[place]} [{of}]" if of and is_unit(of) else row[place]
+        names[place] = with_unit(row[place], of)
         if pairs:
             names[place - 1] = f"time {1 + place // 2} [{unit}]"
     names[0] = f"time [{unit}]"

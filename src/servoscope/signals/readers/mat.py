@@ -19,6 +19,7 @@ import numpy.typing as npt
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.reader_process import open_bounded
 from servoscope.signals.readers.table import Table, TableFile, shorten_error
+from servoscope.signals.readers.units import split_unit, with_unit
 
 HEADER_BYTES = 128  # bytes of text, version and byte order
 TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 14: 1, 16: 1, 17: 2, 18: 4}  # bytes of one
@@ -76,7 +77,8 @@ def _open_variables(
     rows = max(lengths, key=lambda size: (lengths.count(size), size), default=0)
     columns = {name: pa.chunked_array([x]) for name, x in variables.items() if x.size == rows}
     others = {name: f"has {x.size} values, the channels have {rows}" for name, x in variables.items() if x.size != rows}
-    return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns)]), others)
+    aliases = {bare: name for name in columns if (bare := split_unit(name)[0]) not in columns}
+    return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns)]), others, aliases=aliases)
 
 
 def _load_mat5(path: Path) -> dict[str, Any]:
@@ -232,6 +234,8 @@ def _control_desk_channels(records: npt.NDArray[Any], name: str) -> Iterator[tup
         values = np.asarray(record["Data"]).reshape(-1)
         label = "".join(map(str, np.asarray(record["Name"]).reshape(-1)))
         label = re.sub(r'^.*?([^/"]+)"?\s*$', r"\1", label) or name
+        if "Unit" in (records.dtype.names or ()):
+            label = with_unit(label, "".join(map(str, np.asarray(record["Unit"]).reshape(-1))))
         if values.dtype.kind in "fiub":
             is_axis = name.rpartition(".")[2] == "X"
             yield "time" if is_axis else label, np.ascontiguousarray(values.astype(values.dtype.newbyteorder("=")))

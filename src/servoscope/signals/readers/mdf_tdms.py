@@ -15,6 +15,7 @@ import numpy as np
 
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.table import Table, TableFile
+from servoscope.signals.readers.units import with_unit
 
 CHUNK_ROWS = 1 << 16  # that are read at a time
 DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
@@ -22,10 +23,19 @@ DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
 
 @dataclass(frozen=True, eq=False)
 class _Raster:
-    """Channels that were sampled together: number of rows, and where each channel is in the file."""
+    """Channels that were sampled together: number of rows, where each channel is in the file, and its unit."""
 
     rows: int
     places: Mapping[str, Any]
+    units: Mapping[str, str]
+
+    def named(self) -> _Raster:
+        """Return it with the units behind the names."""
+        return _Raster(self.rows, {self.label(name): place for name, place in self.places.items()}, self.units)
+
+    def label(self, name: str) -> str:
+        """Return a channel's name with its unit."""
+        return with_unit(name, self.units.get(name, ""))
 
 
 # takes file, raster, names, first row, number of rows
@@ -49,11 +59,14 @@ def open_mdf(path: Path) -> TableFile:
         for g, group in enumerate(file.groups):
             master = file.masters_db.get(g)
             names: dict[str, Any] = {}
+            units: dict[str, str] = {}
             for i, channel in enumerate(group.channels):
-                names.setdefault((channel.name or DEFAULT_TIME_NAME) if i == master else channel.name, (None, g, i))
+                name = (channel.name or DEFAULT_TIME_NAME) if i == master else channel.name
+                names.setdefault(name, (None, g, i))
+                units.setdefault(name, str(file.get_channel_unit(group=g, index=i) or "").strip())
             if group.channel_group.cycles_nr > MAX_RATIO * path.stat().st_size:  # the library would read for ever
                 raise ValueError("names more rows than it can hold")
-            found.append(_Raster(int(group.channel_group.cycles_nr), names))
+            found.append(_Raster(int(group.channel_group.cycles_nr), names, units))
         return found
 
     def read(file: Any, raster: _Raster, names: Sequence[str], first: int, rows: int) -> Mapping[str, Any]:
@@ -91,15 +104,17 @@ def open_tdms(path: Path) -> TableFile:
         channels = [channel for group in file.groups() for channel in group.channels()]
         names = [channel.name for channel in channels]
         rasters: dict[tuple[Any, ...], dict[str, Any]] = {}
+        units: dict[str, str] = {}
         for channel in channels:
             step = float(channel.properties.get("wf_increment", 0.0))
             begin = float(channel.properties.get("wf_start_offset", 0.0))
             name = channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}"
             rasters.setdefault((len(channel), step, begin), {})[name] = (channel.group_name, channel.name)
+            units[name] = str(channel.properties.get("unit_string", "")).strip()
         for (_, step, begin), places in rasters.items():
             if step > 0.0:
                 places.setdefault(DEFAULT_TIME_NAME, (step, begin))
-        return [_Raster(rows, places) for (rows, *_), places in rasters.items()]
+        return [_Raster(rows, places, units) for (rows, *_), places in rasters.items()]
 
     def read(file: Any, raster: _Raster, names: Sequence[str], first: int, rows: int) -> Mapping[str, Any]:
         found: dict[str, Any] = {}
@@ -177,13 +192,16 @@ def _open_measurement(
 
     try:
         with opened() as file:
-            rasters = [raster for raster in list_rasters(file) if raster.rows]
+            found = [raster for raster in list_rasters(file) if raster.rows]
     except Exception as error:
         raise damaged(error) from None
+    rasters = [raster.named() for raster in found]
     names = dict.fromkeys(name for raster in rasters for name in raster.places)
+    aliases = {name: raster.label(name) for raster in found for name in raster.places if raster.label(name) != name}
     if not names:
         raise RecordingError(f"{path}: holds no channels with values")
-    return TableFile(path, tuple(names), read_chunks, channel_groups=tuple(tuple(raster.places) for raster in rasters))
+    groups = tuple(tuple(raster.places) for raster in rasters)
+    return TableFile(path, tuple(names), read_chunks, channel_groups=groups, aliases=aliases)
 
 
 def _common_raster(path: Path, rasters: Sequence[_Raster], wanted: Sequence[str]) -> _Raster:

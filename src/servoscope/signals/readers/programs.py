@@ -27,6 +27,8 @@ def open_sheet(path: Path) -> TableFile:
             sheets = [book.get_sheet_by_name(name).to_python() for name in book.sheet_names]
     # it raises errors of its own, and of the archive and the XML in it
     except Exception as error:
+        if "EncryptedPackage".encode("utf-16-le") in path.read_bytes():
+            raise RecordingError(f"{path}: is protected by a password, save it without one") from None
         raise RecordingError(f"{path}: is a damaged workbook ({shorten_error(error)}), save it again") from None
     for rows in sheets:
         if (found := _find_sheet_table(path, rows)) is not None:

@@ -68,7 +68,7 @@ def open_bounded(path: Path, kind: str, module: str, function: str, library: str
     weakref.finalize(read_chunks, folder.cleanup)
     found = run("describe_file")
     groups = tuple(tuple(each) for each in found["groups"])
-    return TableFile(path, tuple(found["columns"]), read_chunks, found["others"], groups)
+    return TableFile(path, tuple(found["columns"]), read_chunks, found["others"], groups, found["aliases"])
 
 
 def describe_file(_: Progress, module: str, function: str, path: str, shown: str) -> dict[str, Any]:
@@ -77,7 +77,8 @@ def describe_file(_: Progress, module: str, function: str, path: str, shown: str
         opened = _open(module, function, path)
     except RecordingError as error:
         return {"error": str(error).replace(path, shown)}
-    return {"columns": opened.columns, "others": opened.non_channels, "groups": opened.channel_groups}
+    described = {"columns": opened.columns, "others": opened.non_channels, "groups": opened.channel_groups}
+    return {**described, "aliases": opened.aliases}
 
 
 def extract_rows(

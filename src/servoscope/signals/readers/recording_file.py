@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from servoscope.signals.resample import ResampleTarget
 from servoscope.signals.samples import Samples
 from servoscope.signals.time_axis import build_time_axis
 
+MIN_EPOCH_S, MAX_EPOCH_S = 3e8, 5e9  # a time stamp between them counts from 1970: from 1979 to 2128
 TIME_NAMES = ("t", "time", "zeit", "timestamp", "time_s", "seconds", "datetime", "date", "elapsed")
 
 
@@ -117,7 +118,8 @@ def read_parts(
     """
     loop = None if loop is None else Loop.of(loop)
     columns = columns or (loop.columns if loop is not None else Columns())
-    return [part.recording() for part in _read_log(path, loop, columns, where or {}, by).parts.values()]
+    log = _read_log(path, loop, columns, where or {}, by)
+    return [part.dated_recording(log) for part in log.parts.values()]
 
 
 def read_log(path: str | Path, loop: Loop, by: str | None = None) -> Log:
@@ -126,6 +128,27 @@ def read_log(path: str | Path, loop: Loop, by: str | None = None) -> Log:
     Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
     """
     return _read_log(path, loop, loop.columns, {}, by)
+
+
+def read_rows(
+    source: Source, columns: Columns | None = None, where: Mapping[str, str] | None = None, by: str | None = None
+) -> dict[str, Samples]:
+    """Read rows without judging them, by the recording's name: signals may be constant, and values may be missing.
+
+    Parameters and errors are those of `read_parts`.
+    """
+    parts = _read_log(source, None, columns or Columns(), where or {}, by).parts.values()
+    return {part.name: part.samples() for part in parts}
+
+
+def read_channels(path: Source, columns: Columns) -> tuple[str, FloatArray, dict[str, FloatArray]]:
+    """Return the name of a file, its time stamps [s] as logged (N,), and the covariates of `columns`, (N,) each.
+
+    Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
+    """
+    rows = _read_log(path, None, columns, {}, None).parts[""]
+    (t, *_), _, channels = rows.split_columns()
+    return rows.name, t, channels
 
 
 def first_time(path: str | Path, loop: Loop) -> float:
@@ -155,7 +178,7 @@ def _read_log(path: Source, loop: Loop | None, columns: Columns, where: Mapping[
 def _read_rows(
     opened: TableFile, loop: Loop | None, columns: Columns, where: Mapping[str, str], by: str | None, texts: set[str]
 ) -> Log:
-    name, known = opened.name, opened.columns
+    name, known = opened.name, opened.known
     columns = _without_reference(opened, columns, loop)
     chosen = RowFilter(opened, where)
     apart = None if by is None else CellReader(find_channel(by, known, f"{name}: by"))
@@ -217,7 +240,7 @@ def _read_rows(
                 parts[value] = LoggedRows(name if by is None else f"{name}[{by}={value}]", *options)
             parts[value].add(table, values, mine)
     chosen.check_matched()
-    return Log(parts, clock.origin if clock is not None else 0.0)
+    return Log(parts, clock.origin, clock.is_utc) if clock is not None else Log(parts, 0.0)
 
 
 def _resample_target(columns: Columns, loop: Loop | None) -> ResampleTarget | None:
@@ -232,9 +255,9 @@ def _without_reference(opened: TableFile, columns: Columns, loop: Loop | None) -
 
     In a loop that r has a part in, it has to be there: one with a controller, stage 1, or a sign from r.
     """
-    if columns.reference != Columns().reference or columns.reference in opened.columns:
+    if columns.reference != Columns().reference or columns.reference in opened.known:
         return columns
-    defaults = columns.input == Columns().input and columns.input not in opened.columns
+    defaults = columns.input == Columns().input and columns.input not in opened.known
     if defaults or (loop is not None and loop.needs_reference):
         return columns
     _parse_signal(opened, columns.input, f"{opened.name}: [columns] input")  # what is missing is told as what it is
@@ -253,7 +276,7 @@ class LoggedRows:
         labels: tuple[str, str, str],
         target: ResampleTarget | None,
     ) -> None:
-        self._name, self._has_time, self._channels = name, timed, channels
+        self.name, self._has_time, self._channels = name, timed, channels
         self._loop, self._labels, self._target = loop, labels, target if timed else None
         self._columns: list[GrowableArray] = []
         self._broken: list[tuple[int, float, int, str]] = []
@@ -275,7 +298,7 @@ class LoggedRows:
     def _rate(self) -> float | None:
         return self._loop.sample_rate if self._loop is not None else None
 
-    def _split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
+    def split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
         """Return t, r, u and y; the runs, if there are some; the channels."""
         columns = [column.to_array() for column in self._columns]
         if not self._has_time:
@@ -291,20 +314,36 @@ class LoggedRows:
         """
         if self._target is not None:
             return self.recording()
-        (t, *signals), run, channels = self._split_columns()
-        axis = build_time_axis(t, run, self._rate, self._name)
+        (t, *signals), run, channels = self.split_columns()
+        axis = build_time_axis(t, run, self._rate, self.name)
         r, u, y = map(axis.reorder, signals)
         return Samples.from_columns(
             axis.t, r, u, y, channels={name: axis.reorder(channel) for name, channel in channels.items()}
         )
 
+    def dated_recording(self, log: Log) -> Recording:
+        """Return the rows cleaned; time stamps that are seconds since 1970 count from the first of them."""
+        (t, *signals), run, each = self.split_columns()
+        began = log.origin
+        if not began and t.size and MIN_EPOCH_S < t[0] < MAX_EPOCH_S:
+            began = float(np.floor(t[0]))
+            t = t if t.flags.writeable else t.copy()
+            for rows in outofcore.iter_chunks(0, t.size, t):
+                t[rows] -= began
+        recording = self._clean([t, *signals], run, each)
+        return replace(recording, began=began, zone="UTC" if log.is_utc else "") if began else recording
+
     def recording(self) -> Recording:
         """Return the rows cleaned."""
-        (t, r, u, y), run, each = self._split_columns()
+        signals, run, each = self.split_columns()
+        return self._clean(signals, run, each)
+
+    def _clean(self, signals: list[FloatArray], run: FloatArray | None, each: dict[str, FloatArray]) -> Recording:
+        t, r, u, y = signals
         limits = self._loop.input_limits if self._loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]
         options = {"sample_rate": self._rate, "run": run, "limits": limits, "labels": self._labels, "channels": each}
-        recording = clean(t, r, u, y, name=self._name, target=self._target, **options)  # type: ignore[arg-type]
+        recording = clean(t, r, u, y, name=self.name, target=self._target, **options)  # type: ignore[arg-type]
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)
             notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))
@@ -322,6 +361,7 @@ class Log:
 
     parts: dict[str, LoggedRows]  # by what their column says, in the order of appearance; without one, all under ""
     origin: float  # what makes seconds since 1970 of their time stamps, where dates are known [s]
+    is_utc: bool = True  # whether they are UTC then
 
 
 def _uniform_time(rows: int, rate: float) -> FloatArray:
@@ -333,7 +373,7 @@ def _uniform_time(rows: int, rate: float) -> FloatArray:
 
 def _find_time_column(opened: TableFile, columns: Columns, loop: Loop | None) -> TimeColumn | None:
     """Return the time column; None where rows are uniform."""
-    wanted, known = columns.time, opened.columns
+    wanted, known = columns.time, opened.known
     where = f"{opened.name}: [columns] time"
     if wanted is not None and wanted not in known and "+" in wanted:
         parts = [find_channel(part, known, where) for part in wanted.split("+")]
@@ -355,7 +395,7 @@ def _find_time_column(opened: TableFile, columns: Columns, loop: Loop | None) ->
 
 
 def _parse_signal(opened: TableFile, text: str, where: str) -> LinearCombination:
-    combination = parse_combination(text, [*opened.columns, *opened.non_channels], where)
+    combination = parse_combination(text, [*opened.known, *opened.non_channels], where)
     for name in combination.factors:
         if name in opened.non_channels:
             raise RecordingError(f"{where}: {name!r} {opened.non_channels[name]}")

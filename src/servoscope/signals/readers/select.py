@@ -70,7 +70,7 @@ class RowFilter:
         self._name, self._any = opened.name, False
         self._conditions = [
             _RowCondition(
-                CellReader(find_channel(column, opened.columns, f"{opened.name}: where")), str(wanted), opened.name
+                CellReader(find_channel(column, opened.known, f"{opened.name}: where")), str(wanted), opened.name
             )
             for column, wanted in where.items()
         ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import EmptyRecordingError, RecordingError
-from servoscope.signals.readers.clock import ClockParser, ZoneOffset, is_clock
+from servoscope.signals.readers.clock import ZONED, ClockParser, ZoneOffset, is_clock
+from servoscope.signals.readers.units import parse_quantity
 
 NULL_TEXTS = (
     *("", "NaN", "nan", "NAN", "-nan", "-NaN", "NA", "N/A", "#N/A", "#NA", "null", "NULL", "None", "-", "?"),
@@ -88,6 +89,7 @@ class TimeColumn:
         self._zone = ZoneOffset(zone) if zone is not None else None
         self._first_offset: float | None = None
         self._origin: tuple[int, float] | None = None
+        self._has_zone = False  # whether dates that are text end in their offset from UTC
         self._dated = self._naive = False  # whether the column holds dates and times, and those without a zone
         self._begin: float | None = None
         self._clocks = {column: ClockParser() for column in self.columns}
@@ -125,6 +127,11 @@ class TimeColumn:
         0 where no dates are known: it counts from 1970 itself then, or from anywhere.
         """
         return self._start - (self._first_offset or 0.0)
+
+    @property
+    def is_utc(self) -> bool:
+        """Whether its dates are UTC; else they are as they are written, and nobody says where."""
+        return self._zone is not None or self._has_zone or not (self._naive or self._midnights)
 
     @property
     def _midnights(self) -> list[float]:
@@ -171,6 +178,7 @@ class TimeColumn:
         cells = table.columns[name].to_pylist()
         if not any(is_clock(cell) for cell in cells if cell):
             return number_column(table, name, "time") * TIME_UNITS[unit]
+        self._has_zone = self._has_zone or any(ZONED.search(cell) for cell in cells[:1] if cell)
         found = self._clocks[name].seconds(cells)
         if isinstance(found, int):
             raise RecordingError(
@@ -189,6 +197,9 @@ def _parse_numbers(table: Table, name: str, cells: list[str | None]) -> FloatArr
         try:
             numbers[index] = np.nan if text in NULL_TEXTS else float(text.replace("_", "x"))
         except ValueError:
+            if (quantity := parse_quantity(text, name)) is not None:
+                numbers[index] = quantity
+                continue
             shown = text if len(text) <= 40 else f"{text[:37]}..."
             raise RecordingError(
                 f"{table.name}: row {table.row_number(index)}, column {name!r}: {shown!r} is not a number,"
@@ -208,20 +219,30 @@ class TableFile:
     read_chunks: Callable[[Sequence[str], Collection[str]], Iterator[Table]]
     non_channels: dict[str, str] = field(default_factory=dict)  # variables that are no channels, and why
     channel_groups: tuple[tuple[str, ...], ...] = ()  # which columns can be read at once; empty: all of them
+    # columns under the names that the file gives them, where their units stand apart: Position, for Position [mm]
+    aliases: dict[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """What errors call the file."""
         return self.path.name
 
+    @property
+    def known(self) -> tuple[str, ...]:
+        """All names by which its columns may be called."""
+        return (*self.columns, *self.aliases)
+
     def iter_chunks(self, wanted: Collection[str], texts: Collection[str] = ()) -> Iterator[Table]:
         """Yield the rows chunk by chunk, of the columns that are wanted; `texts` among them are text in any case.
 
         Raises RecordingError if the file is damaged or has no rows.
         """
-        rows = 0
-        for table in self.read_chunks([name for name in self.columns if name in wanted], texts):
+        rows, also = 0, {alias: name for alias, name in self.aliases.items() if alias in wanted}
+        places = {*wanted, *also.values()}
+        for table in self.read_chunks([name for name in self.columns if name in places], texts):
             rows += table.rows
+            if table.rows and also:
+                table = replace(table, columns={**table.columns, **{a: table.columns[n] for a, n in also.items()}})
             if table.rows:
                 yield table
         if not rows:

@@ -1,8 +1,10 @@
-"""Logs of robots and vehicles, MCAP of ROS 2 and ULog of PX4: each topic is a raster with its own time."""
+"""Logs of robots and vehicles, bags of ROS 2 and ULog of PX4: each topic is a raster with its own time."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import sqlite3
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,29 +28,60 @@ def open_mcap(path: Path) -> TableFile:
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    rows: dict[str, list[dict[str, float]]] = {}
-    count = 0
     try:
         with path.open("rb") as file:
-            for _, channel, message, decoded in make_reader(
-                file, decoder_factories=[DecoderFactory()]
-            ).iter_decoded_messages():
-                fields = dict(_message_fields(decoded))
-                stamp = [fields.pop(f"header.stamp.{part}", 0.0) for part in ("sec", "nanosec")]
-                seconds = stamp[0] + 1e-9 * stamp[1] if any(stamp) else 1e-9 * message.log_time
-                rows.setdefault(channel.topic, []).append({"time": seconds, **fields})
-                count += len(fields)
-                if count > MAX_VALUES:
-                    raise RecordingError(f"{path}: holds more than {MAX_VALUES} values, leave topics out")
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            decoded = ((channel.topic, m.log_time, each) for _, channel, m, each in reader.iter_decoded_messages())
+            return _open_messages(path, decoded)
     except RecordingError:
         raise
     # the libraries raise nearly anything at damaged files
     except Exception as error:
         raise RecordingError(f"{path}: is a damaged MCAP file ({shorten_error(error)}), record it again") from None
+
+
+def open_bag(path: Path, database: sqlite3.Connection) -> TableFile:
+    """Open a bag of ROS 2 in SQLite (``.db3``) that holds the definitions of its messages, as those of Iron on do."""
+    if find_spec("mcap_ros2") is None:
+        raise RecordingError(f"{path}: bags of ROS 2 need mcap_ros2, pip install 'servoscope[formats]'")
+    from mcap.records import Schema
+    from mcap_ros2.decoder import DecoderFactory
+
+    convert = "convert it to MCAP: ros2 bag convert -i FILE -o OPTIONS.yaml, with storage_id: mcap"
+    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
+        raise RecordingError(f"{path}: a bag without the definitions of its messages (ROS 2 before Iron), {convert}")
+    try:
+        texts = dict(database.execute("SELECT topic_type, encoded_message_definition FROM message_definitions"))
+        topics = database.execute("SELECT id, name, type FROM topics").fetchall()
+        factory: Any = DecoderFactory()
+        decoders: dict[int, tuple[str, Any]] = {}
+        for number, topic, kind in topics:
+            schema = Schema(id=number, name=kind, encoding="ros2msg", data=texts[kind].encode())
+            decoders[number] = topic, factory.decoder_for("cdr", schema)
+        rows = database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp")
+        return _open_messages(path, ((decoders[n][0], at, decoders[n][1](data)) for n, at, data in rows))
+    except RecordingError:
+        raise
+    except Exception as error:
+        raise RecordingError(f"{path}: is a damaged bag ({shorten_error(error)}), {convert}") from None
+
+
+def _open_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> TableFile:
+    """Return the numbers in messages of ROS 2: topic, time of the log [ns], and the message."""
+    rows: dict[str, list[dict[str, float]]] = {}
+    count = 0
+    for topic, logged, decoded in messages:
+        fields = dict(_message_fields(decoded))
+        stamp = [fields.pop(f"header.stamp.{part}", 0.0) for part in ("sec", "nanosec")]
+        seconds = stamp[0] + 1e-9 * stamp[1] if any(stamp) else 1e-9 * logged
+        rows.setdefault(topic, []).append({"time": seconds, **fields})
+        count += len(fields)
+        if count > MAX_VALUES:
+            raise RecordingError(f"{path}: holds more than {MAX_VALUES} values, leave topics out")
     topics = {}
-    for topic, messages in rows.items():
-        names = list(dict.fromkeys(name for fields in messages for name in fields))
-        topics[topic] = {name: np.array([each.get(name, np.nan) for each in messages]) for name in names}
+    for topic, each in rows.items():
+        names = list(dict.fromkeys(name for fields in each for name in fields))
+        topics[topic] = {name: np.array([fields.get(name, np.nan) for fields in each]) for name in names}
     return _open_topics(path, topics)
 
 

@@ -25,13 +25,34 @@ SPEEDS = {
 }
 INPUTS = {
     **{"A": 1.0, "mA": 1e-3, "Arms": 1.0, "V": 1.0, "mV": 1e-3, "N": 1.0, "kN": 1e3, "Nm": 1.0, "N*m": 1.0, "N.m": 1.0},
-    **{"N·m": 1.0, "mNm": 1e-3, "bar": 1e5, "Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "%": 1.0, "W": 1.0, "kW": 1e3},
+    **{
+        "N·m": 1.0,
+        "mNm": 1e-3,
+        "mbar": 1e2,
+        "psi": 6894.757293168,
+        "bar": 1e5,
+        "Pa": 1.0,
+        "kPa": 1e3,
+        "MPa": 1e6,
+        "%": 1.0,
+        "W": 1.0,
+        "kW": 1e3,
+    },
 }
 TIMES = ("s", "ms", "us", "µs", "ns", "min", "sec", "seconds", "h")
 OTHER_UNITS = (
     "°C",
+    "degC",
+    "°F",
+    "degF",
     "C",
     "K",
+    "kg",
+    "l/min",
+    "L/min",
+    "Ohm",
+    "dB",
+    "-",
     "Hz",
     "kHz",
     "inc",
@@ -47,7 +68,22 @@ OTHER_UNITS = (
 )
 FACTORS = {**LENGTHS, **ANGLES, **SPEEDS, **INPUTS}
 BRACKETED_UNIT = re.compile(r"^(.*?)\s*(?:\[\s*([^\[\]]+?)\s*\]|\(\s*([^()]+?)\s*\))\s*$")
+QUANTITY = re.compile(r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s].*)")  # 12.5 mm
 BARE_UNIT = re.compile(r"^(.+?)(?:[_ ]|\s*/\s*)([A-Za-zµμ°%/]{1,5})$")  # a unit without brackets: pos_mm, t/ms
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Return a column's name with its unit in brackets, unless it has one, or the unit is none that is known, or s."""
+    told = unit and is_unit(unit) and unit not in ("1", "-", "s") and not split_unit(name)[1]
+    return f"{name} [{unit}]" if told else name
+
+
+def parse_quantity(text: str, name: str) -> float | None:
+    """Return a number with its unit behind it, in the unit of its column's name, else in SI units; None: it is none."""
+    found = QUANTITY.fullmatch(text)
+    if found is None or not is_unit(found[2]):
+        return None
+    return float(found[1].replace(",", ".")) * FACTORS.get(found[2], 1.0) / si_factor(name)
 
 
 def is_unit(text: str) -> bool:

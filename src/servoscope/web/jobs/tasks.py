@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from servoscope.assessment.assess import assess
+from servoscope.assessment.tags import find_loops
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.workers import Progress
@@ -92,6 +94,18 @@ def inspect_file(
     recording = read_recording(file, settings, request)
     progress("inspecting")
     return _inspection_result(inspection.inspect(recording, settings), recording)
+
+
+def assess_file(progress: Progress, file: str, request: requests.InspectionRequest) -> JsonObject:
+    """Return what is most likely wrong with a loop, from one log without a baseline; of several loops of the first."""
+    found = find_loops(open_file(file).columns)
+    columns = _merge_columns(request.columns, None) if request.columns is not None else next(iter(found.values()))
+    ((name, samples),) = readers.read_rows(file, columns, request.where).items()
+    first = -math.inf if request.from_s is None else request.from_s
+    last = math.inf if request.to_s is None else request.to_s
+    progress("assessing")
+    result = assess(samples[(samples.t >= first) & (samples.t < last)], name=name)
+    return {"assessment": plain_values.to_plain_values(result)}
 
 
 def propose_file(progress: Progress, file: str, request: requests.ProposalRequest) -> JsonObject:

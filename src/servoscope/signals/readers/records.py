@@ -1,0 +1,169 @@
+"""Files of records and arrays: JSON, JSON lines, Feather, arrays of NumPy, tables of SQLite."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
+from servoscope.signals.readers.topics import MAX_ARRAY_LENGTH, open_bag
+
+ROWS_AT_ONCE = 1 << 16  # of a table of a database
+MAX_DEPTH = 6  # of records within records
+
+
+def open_json(path: Path) -> TableFile:
+    """Open records, one per line or in a list, or a mapping of names to lists; records within records are flattened."""
+    import pyarrow as pa
+    import pyarrow.json as pj
+
+    try:
+        with path.open("rb") as file:
+            lines = file.readline().strip().endswith(b"}") and bool(file.readline().strip())
+        if lines:
+            return _open_frame(path, pj.read_json(path))
+        found = json.loads(path.read_bytes())
+        while isinstance(found, dict) and len(found) == 1:  # a name around the table
+            found = next(iter(found.values()))
+        if isinstance(found, dict):
+            found = {name: values for name, values in found.items() if isinstance(values, list)}
+            return _open_frame(path, pa.table(found))
+        return _open_frame(path, pa.Table.from_pylist(found))
+    except (pa.ArrowException, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise RecordingError(
+            f"{path}: is no table in JSON ({shorten_error(error)}), write one record per line"
+        ) from None
+
+
+def open_feather(path: Path) -> TableFile:
+    """Open a Feather file, which is Arrow's own format."""
+    import pyarrow as pa
+    import pyarrow.feather as pf
+
+    try:
+        return _open_frame(path, pf.read_table(path, memory_map=False))
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise RecordingError(f"{path}: is a damaged Feather file ({shorten_error(error)}), write it again") from None
+
+
+def open_numpy(path: Path) -> TableFile:
+    """Open arrays of NumPy, ``.npz`` or ``.npy``: columns by name, fields of records, or columns of a matrix."""
+    import pyarrow as pa
+
+    try:
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            arrays = {"": loaded} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
+    # of headers that are damaged, or hold objects, it raises nearly anything
+    except Exception as error:
+        raise RecordingError(
+            f"{path}: holds no plain arrays ({shorten_error(error)}), save columns of numbers"
+        ) from None
+    columns = dict(pair for name, array in arrays.items() for pair in _array_columns(name, array))
+    length = max(
+        Counter(x.size for x in columns.values()).items(), key=lambda pair: (pair[1], pair[0]), default=(0, 0)
+    )[0]
+    others = {name: f"has {x.size} values, not {length}" for name, x in columns.items() if x.size != length}
+    return _open_frame(path, pa.table({name: x for name, x in columns.items() if name not in others}), others)
+
+
+def _array_columns(name: str, array: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the columns of an array, named after their fields or numbers."""
+    if array.dtype.names:
+        yield from ((f"{name}.{field}".lstrip("."), array[field].ravel()) for field in array.dtype.names)
+    elif array.ndim == 2 and 1 < array.shape[1] <= MAX_ARRAY_LENGTH:
+        yield from ((f"{name}[{k}]" if name else f"c{k}", array[:, k].copy()) for k in range(array.shape[1]))
+    elif array.dtype.kind in "fiubMm" and array.size == max(array.shape, default=0):
+        yield name or "c0", array.ravel()
+
+
+def open_sqlite(path: Path) -> TableFile:
+    """Open a database of SQLite; of several tables columns are ``table.column``. A bag of ROS 2 is one too."""
+    try:
+        with closing(_connect(path)) as database:
+            names = [str(row[0]) for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+            if {"topics", "messages"} <= set(names):
+                return open_bag(path, database)
+            tables = {name: _column_names(database, name) for name in names if not name.startswith("sqlite_")}
+    except sqlite3.Error as error:
+        raise RecordingError(f"{path}: is a damaged SQLite file ({shorten_error(error)}), export it again") from None
+    tables = {name: columns for name, columns in tables.items() if len(columns) > 1}
+    places = {
+        f"{name}.{column}" if len(tables) > 1 else column: (name, column)
+        for name, columns in tables.items()
+        for column in columns
+    }
+    check_width(path, len(places))
+
+    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
+        used = {places[name][0] for name in wanted}
+        if len(used) != 1:
+            raise RecordingError(f"{path}: {', '.join(sorted(used))} are different tables, take columns of one")
+        query = f"SELECT {', '.join(_quote(places[name][1]) for name in wanted)} FROM {_quote(used.pop())}"
+        try:
+            with closing(_connect(path)) as database:
+                rows, first = database.execute(query), 1
+                while piece := rows.fetchmany(ROWS_AT_ONCE):
+                    cells = zip(wanted, zip(*piece, strict=True), strict=True)
+                    yield Table(path.name, {name: _cell_column(column) for name, column in cells}, first)
+                    first += len(piece)
+        except sqlite3.Error as error:
+            raise RecordingError(f"{path}: cannot be read ({shorten_error(error)}), export it again") from None
+
+    groups = tuple(tuple(name for name, (table, _) in places.items() if table == each) for each in tables)
+    return TableFile(path, tuple(places), read_chunks, channel_groups=groups)
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    # immutable: no journal beside the file is looked for
+    return sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable=1", uri=True)
+
+
+def _quote(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
+
+
+def _column_names(database: sqlite3.Connection, table: str) -> list[str]:
+    return [str(row[1]) for row in database.execute(f"PRAGMA table_info({_quote(table)})")]
+
+
+def _cell_column(cells: Sequence[Any]) -> Any:
+    """Return cells as Arrow takes them: numbers where there is nothing else, else text."""
+    import pyarrow as pa
+
+    if all(cell is None or isinstance(cell, int | float) for cell in cells):
+        whole = all(cell is None or isinstance(cell, int) for cell in cells)
+        return pa.chunked_array([pa.array(cells, pa.int64() if whole else pa.float64())])
+    return pa.chunked_array([pa.array([None if cell is None else str(cell) for cell in cells], pa.string())])
+
+
+def _open_frame(path: Path, table: Any, others: Mapping[str, str] | None = None) -> TableFile:
+    """Return a table of Arrow, records and short lists in its cells flattened."""
+    import pyarrow as pa
+
+    for _ in range(MAX_DEPTH):
+        table = table.flatten()
+    columns: dict[str, Any] = {}
+    for name in table.column_names:
+        column = table.column(name)
+        if pa.types.is_list(column.type) or pa.types.is_large_list(column.type):
+            width = max((len(cell) for cell in column.slice(0, 1).to_pylist() if cell), default=0)
+            if 0 < width <= MAX_ARRAY_LENGTH:
+                cells = [
+                    cell if cell is not None and len(cell) == width else [None] * width for cell in column.to_pylist()
+                ]
+                columns |= {f"{name}[{k}]": pa.chunked_array([pa.array([c[k] for c in cells])]) for k in range(width)}
+        else:
+            columns[name] = column
+    check_width(path, len(columns))
+    read = lambda wanted, _: iter([Table(path.name, {name: columns[name] for name in wanted})])  # noqa: E731
+    return TableFile(path, tuple(columns), read, dict(others or {}))
