@@ -19,12 +19,17 @@ from tables import parse_with_data, parser
 
 SIMULATED, SEED = 1200, 2
 LOOP_WEIGHT = 8.0  # what one measured loop counts, in simulated ones; its logs share it
+BACKLASH_WEIGHT = 0.5  # valves stick more often than they have play
 SERVO_WEIGHT = 20.0  # the same of all servo recordings in a folder
 
 
 def fit(training: Records, real: Records, servo: Records, left_out: str = "") -> CausePosterior:
     """Fit the posterior to simulated and measured loops, without one of the latter or one folder."""
-    features, possible, weights = [training.features], [training.possible], [np.ones(len(training.features))]
+    features, possible, weights = (
+        [training.features],
+        [training.possible],
+        [np.where(training.possible[:, 1], BACKLASH_WEIGHT, 1.0)],
+    )
     for records, weight in ((real, LOOP_WEIGHT), (servo, SERVO_WEIGHT)):
         kept = records.loops != left_out
         names, counts = np.unique(records.loops, return_counts=True)

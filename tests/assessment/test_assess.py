@@ -50,7 +50,7 @@ def test_a_sticking_valve_is_found_and_a_good_loop_is_not_called_so() -> None:
     assert sticks.probabilities["stiction"] + sticks.probabilities["backlash"] > 0.5
     assert sticks.period_s is not None
     good = ss.assess(loop(3))
-    assert good.probabilities["stiction"] < 0.3
+    assert good.probabilities["stiction"] < 0.5
     assert sum(good.probabilities.values()) == pytest.approx(1.0)
     assert good.verdict in VERDICTS
 

@@ -35,6 +35,8 @@ UR_HELD_OUT = (
     "identification_data__ur-20_02_19_15harm50sec",
 )
 
+pytestmark = pytest.mark.slow  # each simulates or reads minutes of six joints
+
 Read = Callable[[int, ArmChange | None], ArmRecording]
 
 

@@ -28,7 +28,7 @@ Cause = Literal[
 ]
 CAUSES: tuple[Cause, ...] = get_args(Cause)
 LIMIT = 3.0  # standard deviations at which a feature is clipped
-PENALTY = 4e-3  # on squared weights, per record
+PENALTY = 1.5e-3  # on squared weights, per record
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.messages import Message, message
 
-EDGE_SHARE = (
-    0.2  # of the learned range, by which a covariate may be outside of it: what is not known of the slopes grows
-)
+EDGE_SHARE = 0.05  # share of the learned range, by which a covariate may be outside of it
 
 
 class WarmUp(BaseModel):

@@ -24,7 +24,6 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from servoscope.baseline.covariates import EDGE_SHARE
 from servoscope.baseline.feature_spans import NO_COVARIATES, SpanFeatures
 from servoscope.baseline.threshold import FEATURE_SHARE, SECONDS_PER_YEAR
 from servoscope.core.arrays import FloatArray, to_tuples
@@ -33,6 +32,8 @@ from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayou
 PRIOR_DEGREES = 12.0  # degrees of freedom of the shape of S_w behind S
 SCORE_STD = 0.5  # of the logarithm of healthy scores, expected before any was seen
 SCORE_PRIOR = 8.0  # degrees of freedom of that expectation
+# of the learned range, by which a covariate may be outside of it: the limit widens with the distance
+MAX_EXTRAPOLATION_SHARE = 0.2
 WIDENING_SHARE = 0.5  # share by which the healthy range of motion is widened either way
 MIN_WIDENING = 0.05  # and by how much at least: of a share of time, of a logarithm of speed
 
@@ -128,7 +129,7 @@ class FeatureModel(_FeatureRecord):
     def _is_near(self, covariates: FloatArray) -> bool:
         learned = np.array(self.groups[0].covariates)
         low, high = learned.min(axis=0), learned.max(axis=0)
-        edge = EDGE_SHARE * (high - low)
+        edge = MAX_EXTRAPOLATION_SHARE * (high - low)
         return bool(((covariates >= low - edge) & (covariates <= high + edge)).all())
 
     def conformal_p_value(self, span: SpanFeatures) -> float:
